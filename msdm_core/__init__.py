@@ -1,0 +1,1 @@
+"""msdm_core: a tetrahedral mass-spring-damper organ (Sala et al. 2011) in numba, without MuJoCo and Gymnasium."""

@@ -1,0 +1,572 @@
+"""Every compiled function of the organ, the structures it reads and the constants it uses, in one file.
+
+numba's disk cache does not see edits in other files, so nothing here may come from one (only math, typing,
+numpy and numba are imported). Arrays of `OrganModel` are read-only, which numba holds at compile time; the
+kernels work in place, allocate nothing, and use no fastmath beyond `contract`, so that a run repeats to the bit.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+FAULT_NONE = 0
+FAULT_INVERTED_TET = 1
+FAULT_NOT_FINITE = 2
+
+# Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
+QUADRATURE_COUNT = 4
+QUADRATURE_WEIGHT = 0.25
+QUADRATURE_BARYCENTRIC = np.array(
+    [
+        [1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0],
+        [2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0],
+        [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0],
+        [1.0 / 6.0, 1.0 / 6.0, 2.0 / 3.0],
+    ]
+)
+
+
+class OrganModel(NamedTuple):
+    """What an organ is: read-only arrays, SI units.
+
+    Fields:
+        node_rest_position: undeformed position [m]                              (n_node, 3)
+        node_mass: lumped mass [kg]                                              (n_node,)
+        node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node,)
+        spring_nodes: the two nodes of each spring                               (n_spring, 2)
+        spring_stiffness: [N/m]                                                  (n_spring,)
+        spring_rest_length: [m]                                                  (n_spring,)
+        tet_nodes: corners of each tet                                           (n_tet, 4)
+        tet_rest_volume: [m^3]                                                   (n_tet,)
+        tet_bulk: modulus of the volume term, K_t = lambda - mu [Pa]             (n_tet,)
+        surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
+        surface_rest_area: [m^2]                                                 (n_surface,)
+        gravity: [m/s^2]                                                         (3,)
+        alpha: mass-proportional damping rate [1/s]                              scalar
+        beta: stiffness-proportional damping time [s]                            scalar
+        stable_step: largest stable step without contact [s]                     scalar
+    """
+
+    node_rest_position: FloatArray
+    node_mass: FloatArray
+    node_inverse_mass: FloatArray
+    spring_nodes: NDArray[np.int32]
+    spring_stiffness: FloatArray
+    spring_rest_length: FloatArray
+    tet_nodes: NDArray[np.int32]
+    tet_rest_volume: FloatArray
+    tet_bulk: FloatArray
+    surface_triangles: NDArray[np.int32]
+    surface_rest_area: FloatArray
+    gravity: FloatArray
+    alpha: float
+    beta: float
+    stable_step: float
+
+
+class OrganState(NamedTuple):
+    """What changes while an organ moves, SI units; all of it is saved and restored.
+
+    Fields:
+        node_position: [m]                                                       (n_node, 3)
+        node_velocity: [m/s]                                                     (n_node, 3)
+        node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3)
+        contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
+        contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
+        volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
+        volume_ratio_tet: the tet that had it                                    (1,)
+    """
+
+    node_position: FloatArray
+    node_velocity: FloatArray
+    node_force: FloatArray
+    contact_engaged: NDArray[np.uint8]
+    contact_stretch: FloatArray
+    volume_ratio_smallest: FloatArray
+    volume_ratio_tet: NDArray[np.int32]
+
+
+class ContactShapes(NamedTuple):
+    """Capsules (spheres when both ends coincide) rigidly carried by tools, SI units, world frame.
+
+    Fields:
+        shape_ends: the two end points of the axis [m]                           (n_shape, 2, 3)
+        shape_radius: [m]                                                        (n_shape,)
+        shape_tool: the tool that carries the shape                              (n_shape,)
+        tool_centre: centre of mass, moved along the twist by each substep [m]   (n_tool, 3)
+        tool_twist: linear [m/s] at the centre of mass, angular [rad/s]          (n_tool, 6)
+    """
+
+    shape_ends: FloatArray
+    shape_radius: FloatArray
+    shape_tool: NDArray[np.int32]
+    tool_centre: FloatArray
+    tool_twist: FloatArray
+
+
+class ContactLaw(NamedTuple):
+    """How tissue and instrument push on each other, per unit of surface area.
+
+    Fields:
+        stiffness: pressure per penetration, k_p [N/m^3]
+        damping: pressure per closing speed [N s/m^3]
+        friction: Coulomb coefficient mu
+        tangential_stiffness: traction per stretch while sticking [N/m^3]
+    """
+
+    stiffness: float
+    damping: float
+    friction: float
+    tangential_stiffness: float
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _begin_forces(model, state):
+    """Gravity: f = m g."""
+    for node in range(model.node_mass.shape[0]):
+        for axis in range(3):
+            state.node_force[node, axis] = model.node_mass[node] * model.gravity[axis]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _add_spring_forces(model, state):
+    """Springs with Rayleigh's beta along them: f = k ((l - l0) + beta dl/dt) along the spring (Sala et al. 2011, eq. 1)."""
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    for spring in range(model.spring_nodes.shape[0]):
+        i = model.spring_nodes[spring, 0]
+        j = model.spring_nodes[spring, 1]
+        dx = position[j, 0] - position[i, 0]
+        dy = position[j, 1] - position[i, 1]
+        dz = position[j, 2] - position[i, 2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        stretch = length - model.spring_rest_length[spring]
+        if model.beta > 0.0:
+            rate = (
+                dx * (velocity[j, 0] - velocity[i, 0])
+                + dy * (velocity[j, 1] - velocity[i, 1])
+                + dz * (velocity[j, 2] - velocity[i, 2])
+            ) / length
+            stretch += model.beta * rate
+        scale = model.spring_stiffness[spring] * stretch / length
+        force[i, 0] += scale * dx
+        force[i, 1] += scale * dy
+        force[i, 2] += scale * dz
+        force[j, 0] -= scale * dx
+        force[j, 1] -= scale * dy
+        force[j, 2] -= scale * dz
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _add_volume_forces(model, state):
+    """Volume term W = (K_t / 2) V0 (J - 1)^2 per tet: f_a = -K_t (J - 1) dV/dx_a; watches the smallest J.
+
+    It adds K_t to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020).
+    """
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    smallest = state.volume_ratio_smallest[0]
+    smallest_tet = state.volume_ratio_tet[0]
+    for tet in range(model.tet_nodes.shape[0]):
+        a = model.tet_nodes[tet, 0]
+        b = model.tet_nodes[tet, 1]
+        c = model.tet_nodes[tet, 2]
+        d = model.tet_nodes[tet, 3]
+        bx = position[b, 0] - position[a, 0]
+        by = position[b, 1] - position[a, 1]
+        bz = position[b, 2] - position[a, 2]
+        cx = position[c, 0] - position[a, 0]
+        cy = position[c, 1] - position[a, 1]
+        cz = position[c, 2] - position[a, 2]
+        dx = position[d, 0] - position[a, 0]
+        dy = position[d, 1] - position[a, 1]
+        dz = position[d, 2] - position[a, 2]
+        # Six times dV/dx of the corners b, c and d: the cross products of the other two edges.
+        gbx = cy * dz - cz * dy
+        gby = cz * dx - cx * dz
+        gbz = cx * dy - cy * dx
+        gcx = dy * bz - dz * by
+        gcy = dz * bx - dx * bz
+        gcz = dx * by - dy * bx
+        gdx = by * cz - bz * cy
+        gdy = bz * cx - bx * cz
+        gdz = bx * cy - by * cx
+        ratio = (bx * gbx + by * gby + bz * gbz) / (6.0 * model.tet_rest_volume[tet])
+        if not ratio >= smallest:
+            smallest = ratio
+            smallest_tet = tet
+        strain = ratio - 1.0
+        if model.beta > 0.0:
+            rate = (
+                gbx * (velocity[b, 0] - velocity[a, 0])
+                + gby * (velocity[b, 1] - velocity[a, 1])
+                + gbz * (velocity[b, 2] - velocity[a, 2])
+                + gcx * (velocity[c, 0] - velocity[a, 0])
+                + gcy * (velocity[c, 1] - velocity[a, 1])
+                + gcz * (velocity[c, 2] - velocity[a, 2])
+                + gdx * (velocity[d, 0] - velocity[a, 0])
+                + gdy * (velocity[d, 1] - velocity[a, 1])
+                + gdz * (velocity[d, 2] - velocity[a, 2])
+            )
+            strain += model.beta * rate / (6.0 * model.tet_rest_volume[tet])
+        scale = -model.tet_bulk[tet] * strain / 6.0
+        force[a, 0] -= scale * (gbx + gcx + gdx)
+        force[a, 1] -= scale * (gby + gcy + gdy)
+        force[a, 2] -= scale * (gbz + gcz + gdz)
+        force[b, 0] += scale * gbx
+        force[b, 1] += scale * gby
+        force[b, 2] += scale * gbz
+        force[c, 0] += scale * gcx
+        force[c, 1] += scale * gcy
+        force[c, 2] += scale * gcz
+        force[d, 0] += scale * gdx
+        force[d, 1] += scale * gdy
+        force[d, 2] += scale * gdz
+    state.volume_ratio_smallest[0] = smallest
+    state.volume_ratio_tet[0] = smallest_tet
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _add_contact_forces(model, state, shapes, law, dt, reference, wrench):
+    """Contact of every shape with every surface triangle in its reach; adds the reaction to the tools' wrench."""
+    position = state.node_position
+    for shape in range(shapes.shape_radius.shape[0]):
+        radius = shapes.shape_radius[shape]
+        for triangle in range(model.surface_triangles.shape[0]):
+            a = model.surface_triangles[triangle, 0]
+            b = model.surface_triangles[triangle, 1]
+            c = model.surface_triangles[triangle, 2]
+            # Bounding sphere about corner a: its radius is the longer of the two edges that leave a.
+            bx = position[b, 0] - position[a, 0]
+            by = position[b, 1] - position[a, 1]
+            bz = position[b, 2] - position[a, 2]
+            cx = position[c, 0] - position[a, 0]
+            cy = position[c, 1] - position[a, 1]
+            cz = position[c, 2] - position[a, 2]
+            reach = math.sqrt(max(bx * bx + by * by + bz * bz, cx * cx + cy * cy + cz * cz))
+            first = triangle * QUADRATURE_COUNT
+            engaged = False
+            for point in range(first, first + QUADRATURE_COUNT):
+                if state.contact_engaged[shape, point]:
+                    engaged = True
+            px, py, pz = _closest_on_axis(shapes, shape, position[a, 0], position[a, 1], position[a, 2])
+            gap_x = position[a, 0] - px
+            gap_y = position[a, 1] - py
+            gap_z = position[a, 2] - pz
+            limit = reach + radius
+            if not engaged and gap_x * gap_x + gap_y * gap_y + gap_z * gap_z > limit * limit:
+                continue
+            nx = by * cz - bz * cy
+            ny = bz * cx - bx * cz
+            nz = bx * cy - by * cx
+            twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
+            nx /= twice_area
+            ny /= twice_area
+            nz /= twice_area
+            for point in range(QUADRATURE_COUNT):
+                _add_point_contact(
+                    model, state, shapes, law, dt, reference, wrench, shape, triangle, point, nx, ny, nz, twice_area
+                )
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _closest_on_axis(shapes, shape, x, y, z):
+    """The point of a capsule's axis nearest to (x, y, z) [m]."""
+    ends = shapes.shape_ends
+    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
+    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
+    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    along = 0.0
+    if length_squared > 0.0:
+        along = (
+            (x - ends[shape, 0, 0]) * ux + (y - ends[shape, 0, 1]) * uy + (z - ends[shape, 0, 2]) * uz
+        ) / length_squared
+        along = min(1.0, max(0.0, along))
+    return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _release(state, shape, item):
+    """Forget the contact of one quadrature point with one shape."""
+    state.contact_engaged[shape, item] = 0
+    for axis in range(3):
+        state.contact_stretch[shape, item, axis] = 0.0
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _add_point_contact(
+    model, state, shapes, law, dt, reference, wrench, shape, triangle, point, nx, ny, nz, twice_area
+):
+    """Contact of one quadrature point with one shape, by a penetration that keeps rising with depth.
+
+    With d from the shape's axis to the point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2)
+    the half chord, the line through the point along n leaves the ball t + s below the point. The energy per area is
+    (k_p / 2) g^2 with g = s (s + t) / r: to first order the radial penetration r - |d|, yet growing without bound as
+    the ball sinks below the surface, where a radial one falls again and lets the ball tunnel. Forces are its exact
+    gradient, the turning of n with the corners included, so that action and reaction balance, torque too.
+    A point engages where the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays
+    engaged until it parts, so that the far side of a thin organ is never taken for the near one.
+    """
+    item = triangle * QUADRATURE_COUNT + point
+    a = model.surface_triangles[triangle, 0]
+    b = model.surface_triangles[triangle, 1]
+    c = model.surface_triangles[triangle, 2]
+    wa = QUADRATURE_BARYCENTRIC[point, 0]
+    wb = QUADRATURE_BARYCENTRIC[point, 1]
+    wc = QUADRATURE_BARYCENTRIC[point, 2]
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    x = wa * position[a, 0] + wb * position[b, 0] + wc * position[c, 0]
+    y = wa * position[a, 1] + wb * position[b, 1] + wc * position[c, 1]
+    z = wa * position[a, 2] + wb * position[b, 2] + wc * position[c, 2]
+    px, py, pz = _closest_on_axis(shapes, shape, x, y, z)
+    dx = x - px
+    dy = y - py
+    dz = z - pz
+    radius = shapes.shape_radius[shape]
+    t = dx * nx + dy * ny + dz * nz
+    rx = dx - t * nx
+    ry = dy - t * ny
+    rz = dz - t * nz
+    chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
+    if chord_squared <= 0.0:
+        _release(state, shape, item)
+        return
+    s = math.sqrt(chord_squared)
+    depth = s + t
+    if depth <= 0.0 or (not state.contact_engaged[shape, item] and t > 0.0):
+        _release(state, shape, item)
+        return
+    state.contact_engaged[shape, item] = 1
+
+    tool = shapes.shape_tool[shape]
+    ox = x - shapes.tool_centre[tool, 0]
+    oy = y - shapes.tool_centre[tool, 1]
+    oz = z - shapes.tool_centre[tool, 2]
+    twist = shapes.tool_twist
+    vx = wa * velocity[a, 0] + wb * velocity[b, 0] + wc * velocity[c, 0]
+    vy = wa * velocity[a, 1] + wb * velocity[b, 1] + wc * velocity[c, 1]
+    vz = wa * velocity[a, 2] + wb * velocity[b, 2] + wc * velocity[c, 2]
+    vx -= twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy
+    vy -= twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz
+    vz -= twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox
+    # e: unit vector against the ball's own normal where the line along n leaves the ball.
+    ex = (s * nx - rx) / radius
+    ey = (s * ny - ry) / radius
+    ez = (s * nz - rz) / radius
+    closing = ex * vx + ey * vy + ez * vz
+    load = law.stiffness * depth + law.damping * closing
+    if load < 0.0:
+        load = 0.0
+    weighted_area = model.surface_rest_area[triangle] * QUADRATURE_WEIGHT
+    scale = -weighted_area * load / (radius * radius)
+
+    # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the axis' direction inside a capsule.
+    gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
+    gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
+    gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
+    gx, gy, gz = _without_axis(shapes, shape, px, py, pz, gx, gy, gz)
+
+    # Friction: a tangential spring that sticks until mu times the pressure, then slips.
+    ux = state.contact_stretch[shape, item, 0] + dt * vx
+    uy = state.contact_stretch[shape, item, 1] + dt * vy
+    uz = state.contact_stretch[shape, item, 2] + dt * vz
+    out_of_plane = ux * ex + uy * ey + uz * ez
+    ux -= out_of_plane * ex
+    uy -= out_of_plane * ey
+    uz -= out_of_plane * ez
+    stretch = math.sqrt(ux * ux + uy * uy + uz * uz)
+    longest = law.friction * load * s / radius / law.tangential_stiffness
+    if stretch > longest:
+        ux *= longest / stretch
+        uy *= longest / stretch
+        uz *= longest / stretch
+    state.contact_stretch[shape, item, 0] = ux
+    state.contact_stretch[shape, item, 1] = uy
+    state.contact_stretch[shape, item, 2] = uz
+    drag = law.tangential_stiffness * weighted_area
+    gx -= drag * ux
+    gy -= drag * uy
+    gz -= drag * uz
+
+    # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the gradient is along n.
+    bx = position[b, 0] - position[a, 0]
+    by = position[b, 1] - position[a, 1]
+    bz = position[b, 2] - position[a, 2]
+    cx = position[c, 0] - position[a, 0]
+    cy = position[c, 1] - position[a, 1]
+    cz = position[c, 2] - position[a, 2]
+    # rho . grad(lambda_b) = rho . (c x n) / (2 A) for the corner b, rho . (n x b) / (2 A) for the corner c.
+    turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
+    turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
+    turn = -scale * depth * depth
+    tb = turn * turn_b
+    tc = turn * turn_c
+    ta = -tb - tc
+    for corner in range(3):
+        if corner == 0:
+            node, weight, along_n = a, wa, ta
+        elif corner == 1:
+            node, weight, along_n = b, wb, tb
+        else:
+            node, weight, along_n = c, wc, tc
+        fx = weight * gx + along_n * nx
+        fy = weight * gy + along_n * ny
+        fz = weight * gz + along_n * nz
+        force[node, 0] += fx
+        force[node, 1] += fy
+        force[node, 2] += fz
+        ax = position[node, 0] - reference[tool, 0]
+        ay = position[node, 1] - reference[tool, 1]
+        az = position[node, 2] - reference[tool, 2]
+        wrench[tool, 0] -= fx
+        wrench[tool, 1] -= fy
+        wrench[tool, 2] -= fz
+        wrench[tool, 3] -= ay * fz - az * fy
+        wrench[tool, 4] -= az * fx - ax * fz
+        wrench[tool, 5] -= ax * fy - ay * fx
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _without_axis(shapes, shape, px, py, pz, gx, gy, gz):
+    """Drop the part along a capsule's axis where the nearest axis point lies strictly between the ends."""
+    ends = shapes.shape_ends
+    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
+    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
+    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    if length_squared > 0.0:
+        along = (px - ends[shape, 0, 0]) * ux + (py - ends[shape, 0, 1]) * uy + (pz - ends[shape, 0, 2]) * uz
+        if 0.0 < along < length_squared:
+            share = (gx * ux + gy * uy + gz * uz) / length_squared
+            return gx - share * ux, gy - share * uy, gz - share * uz
+    return gx, gy, gz
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _integrate(model, state, dt, decay):
+    """Symplectic Euler: v = decay v + dt f / m, x = x + dt v; decay = exp(-alpha dt). Returns a sum that is finite if all is."""
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    total = 0.0
+    for node in range(position.shape[0]):
+        scale = dt * model.node_inverse_mass[node]
+        for axis in range(3):
+            speed = decay * velocity[node, axis] + scale * force[node, axis]
+            velocity[node, axis] = speed
+            position[node, axis] += dt * speed
+            total += position[node, axis] + speed
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _move_shapes(shapes, dt):
+    """Carry the shapes along their tool's twist (held constant over the haptic step)."""
+    twist = shapes.tool_twist
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        for end in range(2):
+            ox = shapes.shape_ends[shape, end, 0] - shapes.tool_centre[tool, 0]
+            oy = shapes.shape_ends[shape, end, 1] - shapes.tool_centre[tool, 1]
+            oz = shapes.shape_ends[shape, end, 2] - shapes.tool_centre[tool, 2]
+            shapes.shape_ends[shape, end, 0] += dt * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
+            shapes.shape_ends[shape, end, 1] += dt * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
+            shapes.shape_ends[shape, end, 2] += dt * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
+    for tool in range(shapes.tool_centre.shape[0]):
+        for axis in range(3):
+            shapes.tool_centre[tool, axis] += dt * twist[tool, axis]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def advance_substeps(model, state, shapes, law, dt, decay, substep_count, reference, wrench):
+    """Advance an organ by some substeps against moving shapes; the kernel behind `organ.advance`.
+
+    Model: model, law
+    In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point each tool's torque is taken about [m] (n_tool, 3)
+    Out:   state, shapes (moved), wrench: MEAN force [N] and torque [N m] on each tool (n_tool, 6)
+    Returns a FAULT_ code; a fault stops at the substep that showed it.
+    """
+    wrench[:, :] = 0.0
+    for _ in range(substep_count):
+        _begin_forces(model, state)
+        _add_spring_forces(model, state)
+        _add_volume_forces(model, state)
+        _add_contact_forces(model, state, shapes, law, dt, reference, wrench)
+        total = _integrate(model, state, dt, decay)
+        _move_shapes(shapes, dt)
+        if not math.isfinite(total):
+            return FAULT_NOT_FINITE
+        if not state.volume_ratio_smallest[0] > 0.0:
+            return FAULT_INVERTED_TET
+    for tool in range(wrench.shape[0]):
+        for part in range(6):
+            wrench[tool, part] /= substep_count
+    return FAULT_NONE
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def evaluate_forces(model, state):
+    """Internal forces and gravity of a state into `state.node_force` [N], without contact."""
+    _begin_forces(model, state)
+    _add_spring_forces(model, state)
+    _add_volume_forces(model, state)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def apply_stiffness(model, displacement, force):
+    """Linearised internal forces K u at rest [N], from a displacement u [m], both (n_node, 3)."""
+    rest = model.node_rest_position
+    force[:, :] = 0.0
+    for spring in range(model.spring_nodes.shape[0]):
+        i = model.spring_nodes[spring, 0]
+        j = model.spring_nodes[spring, 1]
+        dx = rest[j, 0] - rest[i, 0]
+        dy = rest[j, 1] - rest[i, 1]
+        dz = rest[j, 2] - rest[i, 2]
+        stretch = (
+            dx * (displacement[j, 0] - displacement[i, 0])
+            + dy * (displacement[j, 1] - displacement[i, 1])
+            + dz * (displacement[j, 2] - displacement[i, 2])
+        )
+        scale = model.spring_stiffness[spring] * stretch / (dx * dx + dy * dy + dz * dz)
+        force[i, 0] -= scale * dx
+        force[i, 1] -= scale * dy
+        force[i, 2] -= scale * dz
+        force[j, 0] += scale * dx
+        force[j, 1] += scale * dy
+        force[j, 2] += scale * dz
+    gradient = np.empty((4, 3))
+    for tet in range(model.tet_nodes.shape[0]):
+        if model.tet_bulk[tet] == 0.0:
+            continue
+        _volume_gradient(rest, model.tet_nodes, tet, gradient)
+        change = 0.0
+        for corner in range(4):
+            node = model.tet_nodes[tet, corner]
+            for axis in range(3):
+                change += gradient[corner, axis] * displacement[node, axis]
+        scale = model.tet_bulk[tet] * change / model.tet_rest_volume[tet]
+        for corner in range(4):
+            node = model.tet_nodes[tet, corner]
+            for axis in range(3):
+                force[node, axis] += scale * gradient[corner, axis]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _volume_gradient(position, tet_nodes, tet, gradient):
+    """dV/dx of the four corners of one tet [m^2], into gradient (4, 3)."""
+    a = tet_nodes[tet, 0]
+    for corner in range(1, 4):
+        p = tet_nodes[tet, 1 + corner % 3]
+        q = tet_nodes[tet, 1 + (corner + 1) % 3]
+        for axis in range(3):
+            u = (axis + 1) % 3
+            v = (axis + 2) % 3
+            gradient[corner, axis] = (
+                (position[p, u] - position[a, u]) * (position[q, v] - position[a, v])
+                - (position[p, v] - position[a, v]) * (position[q, u] - position[a, u])
+            ) / 6.0
+    for axis in range(3):
+        gradient[0, axis] = -(gradient[1, axis] + gradient[2, axis] + gradient[3, axis])

@@ -1,0 +1,284 @@
+"""From a specification to an organ that moves: compile_organ, rest_state, advance."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msdm_core.damping import Damping
+from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.kernels import (
+    FAULT_INVERTED_TET,
+    FAULT_NONE,
+    QUADRATURE_COUNT,
+    ContactLaw,
+    ContactShapes,
+    OrganModel,
+    OrganState,
+    advance_substeps,
+    evaluate_forces,
+)
+from msdm_core.lumping import lump_mass
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
+from msdm_core.stability import largest_frequency, step_limit
+from msdm_core.stiffness import membrane_stiffness, spring_network
+
+# No organ is longer than this: a larger one is a mesh whose unit was forgotten.
+LARGEST_EXTENT = 2.0
+SMALLEST_EXTENT = 1e-3
+
+NO_SHAPES = ContactShapes(
+    np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0, dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 6))
+)
+NO_CONTACT = ContactLaw(stiffness=1.0, damping=0.0, friction=0.0, tangential_stiffness=1.0)
+
+
+@dataclass(frozen=True)
+class OrganSpec:
+    """All that `compile_organ` needs to know of an organ.
+
+    Args:
+        mesh: its tets.
+        materials: one Material, or a mapping from mesh region name to Material that covers every region.
+        capsule: the outer layer, or None.
+        lesions: regions of their own material, applied in order.
+        anchors: indices of the nodes held fixed, shape (n_anchor,).
+        damping: Rayleigh damping; the default damps a 10 Hz mode with ratio 0.1.
+        mass_scheme: "barycentric" (eq. 2) or "voronoi" (eq. 5).
+        stiffness_rule: "lloyd" (eq. 6) or "van_gelder".
+        gravity: [m/s^2]; off by default, because a scanned shape is the equilibrium.
+    """
+
+    mesh: TetMesh
+    materials: Material | Mapping[str, Material]
+    capsule: Capsule | None = None
+    lesions: tuple[Lesion, ...] = ()
+    anchors: ArrayLike = ()
+    damping: Damping = field(default_factory=lambda: Damping(alpha=4.0 * math.pi))
+    mass_scheme: str = "barycentric"
+    stiffness_rule: str = "lloyd"
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def compile_organ(spec: OrganSpec) -> OrganModel:
+    """Masses, springs and volume moduli of an organ, as read-only arrays for the kernels.
+
+    Each tet's modulus, volume modulus and density is the mean over what fills it, by volume fraction.
+
+    Raises:
+        OrganError: an organ of impossible size, a region without material, a lesion outside the organ or smaller than
+            a cell, an anchor that is no node.
+    """
+    mesh = spec.mesh
+    _check_extent(mesh)
+    spring_modulus, bulk, density = _tet_properties(spec)
+    nodes, stiffness = spring_network(mesh, spring_modulus, rule=spec.stiffness_rule)
+    if spec.capsule is not None and spec.capsule.thickness is not None:
+        stiffness = stiffness + membrane_stiffness(mesh, spec.capsule.youngs_modulus, spec.capsule.thickness)
+    mass = lump_mass(mesh, density, scheme=spec.mass_scheme)
+    anchored = _anchor_mask(spec.anchors, mesh.node_count)
+    surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
+    corners = mesh.points[surface]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    model = OrganModel(
+        node_rest_position=_read_only(mesh.points),
+        node_mass=_read_only(mass),
+        node_inverse_mass=_read_only(np.where(anchored, 0.0, 1.0 / mass)),
+        spring_nodes=_read_only(nodes),
+        spring_stiffness=_read_only(stiffness),
+        spring_rest_length=_read_only(np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
+        tet_nodes=_read_only(mesh.tets),
+        tet_rest_volume=_read_only(mesh.volumes),
+        tet_bulk=_read_only(bulk),
+        surface_triangles=_read_only(np.ascontiguousarray(surface)),
+        surface_rest_area=_read_only(area),
+        gravity=_read_only(np.array(spec.gravity, dtype=np.float64)),
+        alpha=float(spec.damping.alpha),
+        beta=float(spec.damping.beta),
+        stable_step=0.0,
+    )
+    return model._replace(stable_step=step_limit(largest_frequency(model), model.alpha, model.beta))
+
+
+def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
+    """A state at rest, with contact memory for `shape_count` shapes; under gravity the settled static equilibrium.
+
+    Raises:
+        OrganDivergedError: gravity turns the organ inside out or it does not settle.
+    """
+    point_count = len(model.surface_triangles) * QUADRATURE_COUNT
+    state = OrganState(
+        node_position=model.node_rest_position.copy(),
+        node_velocity=np.zeros_like(model.node_rest_position),
+        node_force=np.zeros_like(model.node_rest_position),
+        contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
+        contact_stretch=np.zeros((shape_count, point_count, 3)),
+        volume_ratio_smallest=np.ones(1),
+        volume_ratio_tet=np.zeros(1, dtype=np.int32),
+    )
+    if np.any(model.gravity != 0.0):
+        _settle(model, state)
+    return state
+
+
+def advance(
+    model: OrganModel,
+    state: OrganState,
+    *,
+    dt: float,
+    substep_count: int = 1,
+    shapes: ContactShapes = NO_SHAPES,
+    contact: ContactLaw = NO_CONTACT,
+) -> FloatArray:
+    """Advance an organ in place by `substep_count` symplectic Euler steps of dt [s], shapes moving along their twist.
+
+    Returns:
+        The mean wrench on each tool over the substeps, torque about its centre of mass at the start: force [N], torque
+        [N m], shape (n_tool, 6).
+
+    Raises:
+        OrganError: dt above the organ's stable step, or contact memory that does not fit the shapes.
+        OrganDivergedError: an inverted tet (named, with its volume ratio) or a number that is not finite.
+    """
+    if not 0.0 < dt <= model.stable_step:
+        raise OrganError(
+            f"dt is {dt:g} s; it must be above 0 and at most the stable step {model.stable_step:.4g} s: use more substeps"
+        )
+    if len(shapes.shape_radius) > len(state.contact_engaged):
+        raise OrganError(
+            f"{len(shapes.shape_radius)} contact shapes, but the state remembers {len(state.contact_engaged)}: "
+            "make it with rest_state(model, shape_count=...)"
+        )
+    wrench = np.zeros((len(shapes.tool_centre), 6))
+    fault = advance_organ(model, state, shapes, contact, dt, substep_count, wrench)
+    if fault != FAULT_NONE:
+        raise OrganDivergedError(describe_fault(state, fault))
+    return wrench
+
+
+def advance_organ(
+    model: OrganModel,
+    state: OrganState,
+    shapes: ContactShapes,
+    contact: ContactLaw,
+    dt: float,
+    substep_count: int,
+    wrench: FloatArray,
+) -> int:
+    """`advance` without its checks, for a loop that has made them once: fills `wrench`, returns a FAULT_ code."""
+    decay = math.exp(-model.alpha * dt)
+    reference = shapes.tool_centre.copy()
+    return advance_substeps(model, state, shapes, contact, dt, decay, substep_count, reference, wrench)
+
+
+def describe_fault(state: OrganState, fault: int) -> str:
+    """One sentence on a FAULT_ code: what happened and where."""
+    if fault == FAULT_INVERTED_TET:
+        return (
+            f"tet {int(state.volume_ratio_tet[0])} turned inside out: volume ratio "
+            f"{float(state.volume_ratio_smallest[0]):.3g}, it must stay above 0: press less deep, use smaller cells or a higher Poisson's ratio"
+        )
+    bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
+    return f"node {int(bad[0]) if bad.size else 0} is no longer finite: the step is too long for the forces at work"
+
+
+def _check_extent(mesh: TetMesh) -> None:
+    extent = float(np.ptp(mesh.points, axis=0).max())
+    if not SMALLEST_EXTENT <= extent <= LARGEST_EXTENT:
+        raise OrganError(
+            f"the organ is {extent:.4g} m long; between {SMALLEST_EXTENT:g} and {LARGEST_EXTENT:g} m is possible: "
+            'was its length unit forgotten? (length_unit="mm")'
+        )
+
+
+def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Modulus for the springs [Pa], modulus of the volume term [Pa] and density [kg/m^3] of each tet."""
+    mesh = spec.mesh
+    spring_modulus = np.empty(mesh.tet_count)
+    bulk = np.empty(mesh.tet_count)
+    density = np.empty(mesh.tet_count)
+    layer = boundary_layer(mesh) if spec.capsule is not None and spec.capsule.thickness is None else None
+    for tag, material in _materials_by_tag(spec).items():
+        members = slice(None) if tag is None else mesh.region == tag
+        spring_modulus[members] = material.spring_modulus
+        bulk[members] = material.volume_modulus
+        density[members] = material.density
+        if layer is not None:
+            stroma = Material(
+                cast(Capsule, spec.capsule).youngs_modulus, material.density, material.poisson_ratio
+            )
+            in_layer = layer if tag is None else layer & (mesh.region == tag)
+            spring_modulus[in_layer] = stroma.spring_modulus
+            bulk[in_layer] = stroma.volume_modulus
+    for lesion in spec.lesions:
+        material = cast(Material, lesion.material)
+        fraction = lesion_fraction(mesh, lesion)
+        spring_modulus += fraction * (material.spring_modulus - spring_modulus)
+        bulk += fraction * (material.volume_modulus - bulk)
+        density += fraction * (material.density - density)
+    return spring_modulus, bulk, density
+
+
+def _materials_by_tag(spec: OrganSpec) -> dict[int | None, Material]:
+    if isinstance(spec.materials, Material):
+        return {None: spec.materials}
+    mesh = spec.mesh
+    by_tag: dict[int | None, Material] = {mesh.region_tag(name): part for name, part in spec.materials.items()}
+    missing = sorted(set(np.unique(cast(NDArray[np.int32], mesh.region)).tolist()) - set(by_tag))
+    if missing:
+        names = dict(mesh.region_names)
+        raise OrganError(
+            f"mesh region {names.get(missing[0], missing[0])!r} has no material; give one for every region in `materials`"
+        )
+    return by_tag
+
+
+def _anchor_mask(anchors: ArrayLike, node_count: int) -> NDArray[np.bool_]:
+    nodes = np.asarray(anchors)
+    mask = np.zeros(node_count, dtype=bool)
+    if nodes.size == 0:
+        return mask
+    if nodes.dtype.kind not in "iu" or nodes.min() < 0 or nodes.max() >= node_count:
+        raise OrganError(
+            f"anchors are node indices in 0..{node_count - 1}; got {nodes.dtype} from {nodes.min()} to {nodes.max()}"
+        )
+    mask[nodes] = True
+    return mask
+
+
+def _settle(model: OrganModel, state: OrganState, *, force_tolerance: float = 1e-6, rounds: int = 4000) -> None:
+    """Dynamic relaxation: run the organ, dropping its velocity whenever kinetic energy peaks, till forces balance."""
+    undamped = model._replace(alpha=0.0, beta=0.0)
+    free = model.node_inverse_mass > 0.0
+    weight = float(np.linalg.norm(model.gravity) * model.node_mass.sum())
+    wrench = np.zeros((0, 6))
+    dt = 0.8 * min(model.stable_step, step_limit(largest_frequency(undamped), 0.0, 0.0))
+    energy_before = 0.0
+    for _ in range(rounds):
+        fault = advance_organ(undamped, state, NO_SHAPES, NO_CONTACT, dt, 10, wrench)
+        if fault != FAULT_NONE:
+            raise OrganDivergedError("under gravity, " + describe_fault(state, fault))
+        evaluate_forces(undamped, state)
+        if np.linalg.norm(state.node_force[free], axis=1).sum() <= force_tolerance * weight:
+            state.node_velocity[:] = 0.0
+            return
+        energy = float((model.node_mass[:, None] * state.node_velocity**2).sum())
+        if energy < energy_before:
+            state.node_velocity[:] = 0.0
+            energy = 0.0
+        energy_before = energy
+    raise OrganDivergedError(
+        f"the organ did not settle under gravity in {rounds * 10} steps: is it anchored? Give `anchors`, or no gravity"
+    )
+
+
+def _read_only(array: NDArray) -> NDArray:
+    array = np.ascontiguousarray(array)
+    if array.flags.writeable:
+        array = array.copy() if array.base is not None else array
+        array.setflags(write=False)
+    return array

@@ -1,0 +1,69 @@
+"""Spring stiffness from Young's moduli: formula (6) of Sala et al. 2011 (Lloyd et al. 2007), Van Gelder's, and a membrane."""
+
+import math
+from difflib import get_close_matches
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.errors import OrganError
+from msdm_core.mesh import TET_EDGES, FloatArray, IntArray, TetMesh
+
+STIFFNESS_RULES = ("lloyd", "van_gelder")
+
+
+def spring_network(
+    mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "lloyd"
+) -> tuple[IntArray, FloatArray]:
+    """One spring per mesh edge, each tet giving to its six edges a share that grows with its modulus.
+
+    * "lloyd": k_ij = sum over tets of (2 sqrt 2 / 25) l_t E_t, l_t = (12 V_t / sqrt 2)^(1/3), the edge of the regular
+      tet of the same volume (Sala et al. 2011, eq. 6; Lloyd et al. 2007).
+    * "van_gelder": k_ij = sum over tets of E_t V_t / l_ij^2 (Van Gelder 1998, extended to tets).
+
+    Args:
+        mesh: the organ's tets.
+        youngs_modulus: E [Pa], a scalar or one value a tet, shape (n_tet,).
+        rule: one of STIFFNESS_RULES.
+
+    Returns:
+        edges (n_spring, 2) and stiffness [N/m] (n_spring,), in the order of `mesh.edges`.
+
+    Raises:
+        OrganError: an unknown rule (lists the known) or a modulus that is not above 0 (names the tet).
+    """
+    modulus = np.broadcast_to(np.asarray(youngs_modulus, dtype=np.float64), (mesh.tet_count,))
+    bad = np.flatnonzero(~(np.isfinite(modulus) & (modulus > 0.0)))
+    if bad.size:
+        raise OrganError(f"youngs_modulus of tet {bad[0]} is {modulus[bad[0]]} Pa; it must be finite and above 0")
+    if rule == "lloyd":
+        length = np.cbrt(mesh.volumes * (12.0 / math.sqrt(2.0)))
+        share = np.repeat((2.0 * math.sqrt(2.0) / 25.0) * length * modulus, 6)
+    elif rule == "van_gelder":
+        corners = mesh.points[mesh.tets]
+        spans = corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]]
+        share = ((modulus * mesh.volumes)[:, None] / np.einsum("tij,tij->ti", spans, spans)).ravel()
+    else:
+        nearest = get_close_matches(str(rule), STIFFNESS_RULES, n=1)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise OrganError(f"stiffness rule {rule!r} is unknown; the rules are {', '.join(STIFFNESS_RULES)}{hint}")
+    return mesh.edges, np.bincount(mesh.tet_edges.ravel(), weights=share, minlength=len(mesh.edges))
+
+
+def membrane_stiffness(mesh: TetMesh, youngs_modulus: float, thickness: float) -> FloatArray:
+    """Stiffness that a thin capsule adds to the springs of the surface's edges [N/m], shape (n_spring,).
+
+    Each surface triangle of area A and edges l1, l2, l3 gives 3 E_c h_c A / (l1^2 + l2^2 + l3^2) to each of its edges:
+    a membrane of stiffness E_c h_c with 2-D Poisson ratio 1/3, equal to (sqrt 3 / 4) E_c h_c on equilateral triangles.
+    """
+    triangles = mesh.boundary_triangles
+    corners = mesh.points[triangles]
+    edges = corners[:, [1, 2, 0]] - corners
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    share = 3.0 * youngs_modulus * thickness * area / np.einsum("tij,tij->t", edges, edges)
+    pairs = np.sort(np.stack([triangles, triangles[:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1).astype(np.int64)
+    known = mesh.edges.astype(np.int64)
+    index = np.searchsorted(
+        known[:, 0] * mesh.node_count + known[:, 1], pairs[:, 0] * mesh.node_count + pairs[:, 1]
+    )
+    return np.bincount(index, weights=np.repeat(share, 3), minlength=len(mesh.edges))

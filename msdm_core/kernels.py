@@ -18,6 +18,9 @@ FAULT_NONE = 0
 FAULT_INVERTED_TET = 1
 FAULT_NOT_FINITE = 2
 
+# Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
+CANDIDATE_MARGIN = 1e-3
+
 # Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
 QUADRATURE_COUNT = 4
 QUADRATURE_WEIGHT = 0.25
@@ -78,6 +81,7 @@ class OrganState(NamedTuple):
         node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3)
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
+        contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
         volume_ratio_tet: the tet that had it                                    (1,)
     """
@@ -87,6 +91,7 @@ class OrganState(NamedTuple):
     node_force: FloatArray
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
+    contact_candidates: NDArray[np.int32]
     volume_ratio_smallest: FloatArray
     volume_ratio_tet: NDArray[np.int32]
 
@@ -128,37 +133,47 @@ class ContactLaw(NamedTuple):
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _begin_forces(model, state):
     """Gravity: f = m g."""
-    for node in range(model.node_mass.shape[0]):
+    force, mass, gravity = state.node_force, model.node_mass, model.gravity
+    for node in range(mass.shape[0]):
         for axis in range(3):
-            state.node_force[node, axis] = model.node_mass[node] * model.gravity[axis]
+            force[node, axis] = mass[node] * gravity[axis]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _add_spring_forces(model, state):
     """Springs with Rayleigh's beta along them: f = k ((l - l0) + beta dl/dt) along the spring (Sala et al. 2011, eq. 1)."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
-    for spring in range(model.spring_nodes.shape[0]):
-        i = model.spring_nodes[spring, 0]
-        j = model.spring_nodes[spring, 1]
+    nodes, stiffness, rest_length, beta = (
+        model.spring_nodes,
+        model.spring_stiffness,
+        model.spring_rest_length,
+        model.beta,
+    )
+    for spring in range(nodes.shape[0]):
+        # Unsigned indices: numba then leaves out its test for negative ones.
+        i = np.uint32(nodes[spring, 0])
+        j = np.uint32(nodes[spring, 1])
         dx = position[j, 0] - position[i, 0]
         dy = position[j, 1] - position[i, 1]
         dz = position[j, 2] - position[i, 2]
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        stretch = length - model.spring_rest_length[spring]
-        if model.beta > 0.0:
+        length_squared = dx * dx + dy * dy + dz * dz
+        scale = stiffness[spring] * (1.0 - rest_length[spring] / math.sqrt(length_squared))
+        if beta > 0.0:
             rate = (
                 dx * (velocity[j, 0] - velocity[i, 0])
                 + dy * (velocity[j, 1] - velocity[i, 1])
                 + dz * (velocity[j, 2] - velocity[i, 2])
-            ) / length
-            stretch += model.beta * rate
-        scale = model.spring_stiffness[spring] * stretch / length
-        force[i, 0] += scale * dx
-        force[i, 1] += scale * dy
-        force[i, 2] += scale * dz
-        force[j, 0] -= scale * dx
-        force[j, 1] -= scale * dy
-        force[j, 2] -= scale * dz
+            )
+            scale += stiffness[spring] * beta * rate / length_squared
+        fx = scale * dx
+        fy = scale * dy
+        fz = scale * dz
+        force[i, 0] += fx
+        force[i, 1] += fy
+        force[i, 2] += fz
+        force[j, 0] -= fx
+        force[j, 1] -= fy
+        force[j, 2] -= fz
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -168,13 +183,14 @@ def _add_volume_forces(model, state):
     It adds K_t to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020).
     """
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    tets, rest_volume, bulk, beta = model.tet_nodes, model.tet_rest_volume, model.tet_bulk, model.beta
     smallest = state.volume_ratio_smallest[0]
     smallest_tet = state.volume_ratio_tet[0]
-    for tet in range(model.tet_nodes.shape[0]):
-        a = model.tet_nodes[tet, 0]
-        b = model.tet_nodes[tet, 1]
-        c = model.tet_nodes[tet, 2]
-        d = model.tet_nodes[tet, 3]
+    for tet in range(tets.shape[0]):
+        a = np.uint32(tets[tet, 0])
+        b = np.uint32(tets[tet, 1])
+        c = np.uint32(tets[tet, 2])
+        d = np.uint32(tets[tet, 3])
         bx = position[b, 0] - position[a, 0]
         by = position[b, 1] - position[a, 1]
         bz = position[b, 2] - position[a, 2]
@@ -194,12 +210,12 @@ def _add_volume_forces(model, state):
         gdx = by * cz - bz * cy
         gdy = bz * cx - bx * cz
         gdz = bx * cy - by * cx
-        ratio = (bx * gbx + by * gby + bz * gbz) / (6.0 * model.tet_rest_volume[tet])
+        ratio = (bx * gbx + by * gby + bz * gbz) / (6.0 * rest_volume[tet])
         if not ratio >= smallest:
             smallest = ratio
             smallest_tet = tet
         strain = ratio - 1.0
-        if model.beta > 0.0:
+        if beta > 0.0:
             rate = (
                 gbx * (velocity[b, 0] - velocity[a, 0])
                 + gby * (velocity[b, 1] - velocity[a, 1])
@@ -211,8 +227,8 @@ def _add_volume_forces(model, state):
                 + gdy * (velocity[d, 1] - velocity[a, 1])
                 + gdz * (velocity[d, 2] - velocity[a, 2])
             )
-            strain += model.beta * rate / (6.0 * model.tet_rest_volume[tet])
-        scale = -model.tet_bulk[tet] * strain / 6.0
+            strain += beta * rate / (6.0 * rest_volume[tet])
+        scale = -bulk[tet] * strain / 6.0
         force[a, 0] -= scale * (gbx + gcx + gdx)
         force[a, 1] -= scale * (gby + gcy + gdy)
         force[a, 2] -= scale * (gbz + gcz + gdz)
@@ -230,35 +246,76 @@ def _add_volume_forces(model, state):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _add_contact_forces(model, state, shapes, law, dt, reference, wrench):
-    """Contact of every shape with every surface triangle in its reach; adds the reaction to the tools' wrench."""
-    position = state.node_position
+def _find_candidates(model, state, shapes, duration):
+    """Broad phase of one call: the triangles that a shape may touch within `duration` [s], by bounding spheres.
+
+    What moves faster than the margin is met one haptic step later; what is engaged always stays a candidate.
+    Returns how many candidates the busiest shape has; the list of a shape ends with -1.
+    """
+    # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
+    position, ends, surface = state.node_position, shapes.shape_ends, model.surface_triangles
+    engaged, candidates, twist = state.contact_engaged, state.contact_candidates, shapes.tool_twist
+    most = 0
     for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
         radius = shapes.shape_radius[shape]
-        for triangle in range(model.surface_triangles.shape[0]):
-            a = model.surface_triangles[triangle, 0]
-            b = model.surface_triangles[triangle, 1]
-            c = model.surface_triangles[triangle, 2]
-            # Bounding sphere about corner a: its radius is the longer of the two edges that leave a.
+        speed = 0.0
+        for part in range(6):
+            # An angular part moves a point by at most its lever, taken as one metre: generous for a hand-held tool.
+            speed += abs(twist[tool, part])
+        margin = CANDIDATE_MARGIN + 2.0 * speed * duration
+        count = 0
+        for triangle in range(surface.shape[0]):
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
+            reach = 0.0
+            for axis in range(3):
+                reach += (position[b, axis] - position[a, axis]) ** 2
+            other = 0.0
+            for axis in range(3):
+                other += (position[c, axis] - position[a, axis]) ** 2
+            limit = math.sqrt(max(reach, other)) + radius + margin
+            px, py, pz = _closest_on_axis(ends, shape, position[a, 0], position[a, 1], position[a, 2])
+            gap = (position[a, 0] - px) ** 2 + (position[a, 1] - py) ** 2 + (position[a, 2] - pz) ** 2
+            near = gap <= limit * limit
+            if not near:
+                first = triangle * QUADRATURE_COUNT
+                for point in range(first, first + QUADRATURE_COUNT):
+                    if engaged[shape, point]:
+                        near = True
+            if near:
+                candidates[shape, count] = triangle
+                count += 1
+        if count < candidates.shape[1]:
+            candidates[shape, count] = -1
+        most = max(most, count)
+    return most
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
+    """Contact of every shape with its candidate triangles; adds the reaction to the tools' wrench."""
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
+    surface, rest_area = model.surface_triangles, model.surface_rest_area
+    ends, centre, twist = shapes.shape_ends, shapes.tool_centre, shapes.tool_twist
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        radius = shapes.shape_radius[shape]
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
             bx = position[b, 0] - position[a, 0]
             by = position[b, 1] - position[a, 1]
             bz = position[b, 2] - position[a, 2]
             cx = position[c, 0] - position[a, 0]
             cy = position[c, 1] - position[a, 1]
             cz = position[c, 2] - position[a, 2]
-            reach = math.sqrt(max(bx * bx + by * by + bz * bz, cx * cx + cy * cy + cz * cz))
-            first = triangle * QUADRATURE_COUNT
-            engaged = False
-            for point in range(first, first + QUADRATURE_COUNT):
-                if state.contact_engaged[shape, point]:
-                    engaged = True
-            px, py, pz = _closest_on_axis(shapes, shape, position[a, 0], position[a, 1], position[a, 2])
-            gap_x = position[a, 0] - px
-            gap_y = position[a, 1] - py
-            gap_z = position[a, 2] - pz
-            limit = reach + radius
-            if not engaged and gap_x * gap_x + gap_y * gap_y + gap_z * gap_z > limit * limit:
-                continue
             nx = by * cz - bz * cy
             ny = bz * cx - bx * cz
             nz = bx * cy - by * cx
@@ -268,14 +325,14 @@ def _add_contact_forces(model, state, shapes, law, dt, reference, wrench):
             nz /= twice_area
             for point in range(QUADRATURE_COUNT):
                 _add_point_contact(
-                    model, state, shapes, law, dt, reference, wrench, shape, triangle, point, nx, ny, nz, twice_area
-                )
+                    surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist,
+                    law, dt, reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
+                )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _closest_on_axis(shapes, shape, x, y, z):
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+def _closest_on_axis(ends, shape, x, y, z):
     """The point of a capsule's axis nearest to (x, y, z) [m]."""
-    ends = shapes.shape_ends
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
     uy = ends[shape, 1, 1] - ends[shape, 0, 1]
     uz = ends[shape, 1, 2] - ends[shape, 0, 2]
@@ -289,18 +346,19 @@ def _closest_on_axis(shapes, shape, x, y, z):
     return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _release(state, shape, item):
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+def _release(engaged, stretch_memory, shape, item):
     """Forget the contact of one quadrature point with one shape."""
-    state.contact_engaged[shape, item] = 0
+    engaged[shape, item] = 0
     for axis in range(3):
-        state.contact_stretch[shape, item, axis] = 0.0
+        stretch_memory[shape, item, axis] = 0.0
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
 def _add_point_contact(
-    model, state, shapes, law, dt, reference, wrench, shape, triangle, point, nx, ny, nz, twice_area
-):
+    surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist, law, dt,
+    reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
+):  # fmt: skip
     """Contact of one quadrature point with one shape, by a penetration that keeps rising with depth.
 
     With d from the shape's axis to the point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2)
@@ -312,41 +370,37 @@ def _add_point_contact(
     engaged until it parts, so that the far side of a thin organ is never taken for the near one.
     """
     item = triangle * QUADRATURE_COUNT + point
-    a = model.surface_triangles[triangle, 0]
-    b = model.surface_triangles[triangle, 1]
-    c = model.surface_triangles[triangle, 2]
+    a = surface[triangle, 0]
+    b = surface[triangle, 1]
+    c = surface[triangle, 2]
     wa = QUADRATURE_BARYCENTRIC[point, 0]
     wb = QUADRATURE_BARYCENTRIC[point, 1]
     wc = QUADRATURE_BARYCENTRIC[point, 2]
-    position, velocity, force = state.node_position, state.node_velocity, state.node_force
     x = wa * position[a, 0] + wb * position[b, 0] + wc * position[c, 0]
     y = wa * position[a, 1] + wb * position[b, 1] + wc * position[c, 1]
     z = wa * position[a, 2] + wb * position[b, 2] + wc * position[c, 2]
-    px, py, pz = _closest_on_axis(shapes, shape, x, y, z)
+    px, py, pz = _closest_on_axis(ends, shape, x, y, z)
     dx = x - px
     dy = y - py
     dz = z - pz
-    radius = shapes.shape_radius[shape]
     t = dx * nx + dy * ny + dz * nz
     rx = dx - t * nx
     ry = dy - t * ny
     rz = dz - t * nz
     chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
     if chord_squared <= 0.0:
-        _release(state, shape, item)
+        _release(engaged, stretch_memory, shape, item)
         return
     s = math.sqrt(chord_squared)
     depth = s + t
-    if depth <= 0.0 or (not state.contact_engaged[shape, item] and t > 0.0):
-        _release(state, shape, item)
+    if depth <= 0.0 or (not engaged[shape, item] and t > 0.0):
+        _release(engaged, stretch_memory, shape, item)
         return
-    state.contact_engaged[shape, item] = 1
+    engaged[shape, item] = 1
 
-    tool = shapes.shape_tool[shape]
-    ox = x - shapes.tool_centre[tool, 0]
-    oy = y - shapes.tool_centre[tool, 1]
-    oz = z - shapes.tool_centre[tool, 2]
-    twist = shapes.tool_twist
+    ox = x - centre[tool, 0]
+    oy = y - centre[tool, 1]
+    oz = z - centre[tool, 2]
     vx = wa * velocity[a, 0] + wb * velocity[b, 0] + wc * velocity[c, 0]
     vy = wa * velocity[a, 1] + wb * velocity[b, 1] + wc * velocity[c, 1]
     vz = wa * velocity[a, 2] + wb * velocity[b, 2] + wc * velocity[c, 2]
@@ -361,19 +415,19 @@ def _add_point_contact(
     load = law.stiffness * depth + law.damping * closing
     if load < 0.0:
         load = 0.0
-    weighted_area = model.surface_rest_area[triangle] * QUADRATURE_WEIGHT
+    weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
     scale = -weighted_area * load / (radius * radius)
 
     # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the axis' direction inside a capsule.
     gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
     gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
     gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
-    gx, gy, gz = _without_axis(shapes, shape, px, py, pz, gx, gy, gz)
+    gx, gy, gz = _without_axis(ends, shape, px, py, pz, gx, gy, gz)
 
     # Friction: a tangential spring that sticks until mu times the pressure, then slips.
-    ux = state.contact_stretch[shape, item, 0] + dt * vx
-    uy = state.contact_stretch[shape, item, 1] + dt * vy
-    uz = state.contact_stretch[shape, item, 2] + dt * vz
+    ux = stretch_memory[shape, item, 0] + dt * vx
+    uy = stretch_memory[shape, item, 1] + dt * vy
+    uz = stretch_memory[shape, item, 2] + dt * vz
     out_of_plane = ux * ex + uy * ey + uz * ez
     ux -= out_of_plane * ex
     uy -= out_of_plane * ey
@@ -384,9 +438,9 @@ def _add_point_contact(
         ux *= longest / stretch
         uy *= longest / stretch
         uz *= longest / stretch
-    state.contact_stretch[shape, item, 0] = ux
-    state.contact_stretch[shape, item, 1] = uy
-    state.contact_stretch[shape, item, 2] = uz
+    stretch_memory[shape, item, 0] = ux
+    stretch_memory[shape, item, 1] = uy
+    stretch_memory[shape, item, 2] = uz
     drag = law.tangential_stiffness * weighted_area
     gx -= drag * ux
     gy -= drag * uy
@@ -430,10 +484,9 @@ def _add_point_contact(
         wrench[tool, 5] -= ax * fy - ay * fx
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _without_axis(shapes, shape, px, py, pz, gx, gy, gz):
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
     """Drop the part along a capsule's axis where the nearest axis point lies strictly between the ends."""
-    ends = shapes.shape_ends
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
     uy = ends[shape, 1, 1] - ends[shape, 0, 1]
     uz = ends[shape, 1, 2] - ends[shape, 0, 2]
@@ -450,9 +503,10 @@ def _without_axis(shapes, shape, px, py, pz, gx, gy, gz):
 def _integrate(model, state, dt, decay):
     """Symplectic Euler: v = decay v + dt f / m, x = x + dt v; decay = exp(-alpha dt). Returns a sum that is finite if all is."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    inverse_mass = model.node_inverse_mass
     total = 0.0
     for node in range(position.shape[0]):
-        scale = dt * model.node_inverse_mass[node]
+        scale = dt * inverse_mass[node]
         for axis in range(3):
             speed = decay * velocity[node, axis] + scale * force[node, axis]
             velocity[node, axis] = speed
@@ -489,11 +543,12 @@ def advance_substeps(model, state, shapes, law, dt, decay, substep_count, refere
     Returns a FAULT_ code; a fault stops at the substep that showed it.
     """
     wrench[:, :] = 0.0
+    candidate_count = _find_candidates(model, state, shapes, dt * substep_count)
     for _ in range(substep_count):
         _begin_forces(model, state)
         _add_spring_forces(model, state)
         _add_volume_forces(model, state)
-        _add_contact_forces(model, state, shapes, law, dt, reference, wrench)
+        _add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench)
         total = _integrate(model, state, dt, decay)
         _move_shapes(shapes, dt)
         if not math.isfinite(total):
@@ -554,7 +609,7 @@ def apply_stiffness(model, displacement, force):
                 force[node, axis] += scale * gradient[corner, axis]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
 def _volume_gradient(position, tet_nodes, tet, gradient):
     """dV/dx of the four corners of one tet [m^2], into gradient (4, 3)."""
     a = tet_nodes[tet, 0]

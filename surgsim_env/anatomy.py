@@ -1,0 +1,108 @@
+"""A scene's organ made ready: its mesh, its anchored nodes, its palpable face, and organs compiled with given lesions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.kernels import OrganModel
+from msdm_core.mesh import FloatArray, IntArray, TetMesh
+from msdm_core.meshing import box_mesh, mesh_surface
+from msdm_core.organ import OrganSpec, compile_organ
+from msdm_core.regions import Lesion
+from surgsim_env.palpable_face import PalpableFace, find_palpable_face
+from surgsim_env.scenes import Anchor, FixedLesion, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """A scene with its mesh, anchored nodes [n_anchor] and palpable face."""
+
+    scene: Scene
+    mesh: TetMesh
+    anchors: IntArray
+    face: PalpableFace
+
+    def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
+        """The organ with given lesions, every modulus of the healthy tissue times a factor."""
+        scene = self.scene
+        material = replace(scene.material, youngs_modulus=scene.material.youngs_modulus * modulus_factor)
+        return compile_organ(
+            OrganSpec(
+                mesh=self.mesh,
+                materials=material,
+                capsule=scene.capsule,
+                lesions=tuple(lesions),
+                anchors=self.anchors,
+                damping=scene.damping,
+            )
+        )
+
+    def lesion_below(self, point: FloatArray, radius: float, cover: float, ratio: float, name: str) -> Lesion:
+        """A sphere whose top lies `cover` below a point of the surface [m], `ratio` times as stiff as the tissue."""
+        surface_point, normal = self.face.project(point)
+        centre = surface_point - normal * (cover + radius)
+        return self.lesion_at(centre, radius, ratio, name)
+
+    def lesion_at(self, centre: FloatArray, radius: float, ratio: float, name: str) -> Lesion:
+        """A sphere at a centre [m], `ratio` times as stiff as the tissue."""
+        healthy = self.scene.material
+        material = replace(healthy, youngs_modulus=healthy.youngs_modulus * ratio)
+        return Lesion(centre=(float(centre[0]), float(centre[1]), float(centre[2])), radius=radius, material=material, name=name)
+
+    def demonstration_lesions(self) -> list[Lesion]:
+        """The lesions that the scene file shows."""
+        return [self._fixed(lesion) for lesion in self.scene.demonstration]
+
+    def _fixed(self, lesion: FixedLesion) -> Lesion:
+        return self.lesion_below(
+            np.asarray(lesion.below), lesion.radius, lesion.cover, lesion.modulus_ratio, lesion.name
+        )
+
+
+@lru_cache(maxsize=8)
+def load_anatomy(scene: Scene) -> Anatomy:
+    """Mesh a scene's organ and find its anchors and palpable face; the same scene gives the same object."""
+    mesh = _load_mesh(scene)
+    anchors = _anchored_nodes(mesh, scene.anchors)
+    face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)
+    return Anatomy(scene, mesh, anchors, face)
+
+
+def _load_mesh(scene: Scene) -> TetMesh:
+    source = scene.mesh
+    if source.block is not None:
+        return box_mesh(source.block.size, source.block.cells)
+    # Reading files imports meshio and trimesh: only where a scene needs them.
+    from msdm_core.mesh_io import read_mesh, read_surface
+
+    if source.surface is not None:
+        vertices, triangles = read_surface(
+            scene.folder / source.surface.file, length_unit=source.surface.length_unit
+        )
+        return mesh_surface(vertices, triangles, cell_size=source.surface.cell_size)
+    assert source.tets is not None
+    return read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit)
+
+
+def _anchored_nodes(mesh: TetMesh, anchors: Sequence[Anchor]) -> IntArray:
+    held: NDArray[np.bool_] = np.zeros(mesh.node_count, dtype=bool)
+    on_surface = np.zeros(mesh.node_count, dtype=bool)
+    on_surface[mesh.boundary_nodes] = True
+    for anchor in anchors:
+        if anchor.box is not None:
+            inside = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
+        else:
+            assert anchor.ball is not None
+            distance = np.linalg.norm(mesh.points - np.asarray(anchor.ball.centre), axis=1)
+            inside = on_surface & (distance <= anchor.ball.radius)
+        if not inside.any():
+            raise ValueError(
+                f"anchor {anchor.name!r} holds no node of the organ; move or enlarge it (coordinates are metres)"
+            )
+        held |= inside
+    if not held.any():
+        raise ValueError("nothing holds the organ: give at least one anchor, or it is pushed away")
+    return np.flatnonzero(held).astype(np.int32)

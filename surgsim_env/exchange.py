@@ -1,0 +1,46 @@
+"""The force exchange between organ and instrument, once per haptic step."""
+
+import mujoco
+import numpy as np
+
+from msdm_core.errors import OrganDivergedError
+from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
+from msdm_core.mesh import FloatArray
+from msdm_core.organ import advance_organ, describe_fault
+from surgsim_env.instrument import Instrument
+
+# No palpation comes near this: a force beyond it [N] is a fault of the simulation, not a touch.
+FORCE_CAP = 100.0
+
+
+def haptic_step(
+    model: OrganModel,
+    state: OrganState,
+    instrument: Instrument,
+    contact: ContactLaw,
+    dt: float,
+    substep_count: int,
+    wrench: FloatArray,
+) -> None:
+    """Advance organ and instrument together by one haptic step; `wrench` (n_tool, 6) [N, N m] receives the mean.
+
+    The instrument's shapes are read from the current step (mj_step1), carried along their twist through the organ's
+    substeps, and the MEAN wrench of the tissue, torque about each tool's centre of mass at the start, acts on the tool in
+    mj_step2: the organ's change of momentum is minus that wrench times the step, exactly.
+
+    Raises:
+        OrganDivergedError: an inverted tet, a number that is not finite, or a force beyond FORCE_CAP.
+    """
+    mujoco.mj_step1(instrument.model, instrument.data)
+    instrument.drive()
+    instrument.read_shapes()
+    fault = advance_organ(model, state, instrument.shapes, contact, dt, substep_count, wrench)
+    if fault != FAULT_NONE:
+        raise OrganDivergedError(describe_fault(state, fault))
+    if not np.isfinite(wrench).all():
+        raise OrganDivergedError("the contact wrench is not finite")
+    force = float(np.sqrt((wrench[:, :3] ** 2).sum(axis=1)).max())
+    if force > FORCE_CAP:
+        raise OrganDivergedError(f"contact force {force:.4g} N is beyond the physical cap of {FORCE_CAP:g} N")
+    instrument.apply_wrench(wrench)
+    mujoco.mj_step2(instrument.model, instrument.data)

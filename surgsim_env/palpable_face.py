@@ -1,0 +1,217 @@
+"""The part of an organ's surface that an instrument can press: points on it, normals, rasters and random places."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.mesh import FloatArray, IntArray, TetMesh
+from surgsim_env.scenes import Palpation
+
+
+@dataclass(frozen=True, eq=False)
+class PalpableFace:
+    """Surface triangles that face the instrument.
+
+    Fields:
+        points, normals: surface nodes' positions [m] and unit outward normals                      (n_node, 3)
+        triangles: of the palpable face, outward                                                    (n_face, 3)
+        rim: edges of the face's border                                                             (n_rim, 2)
+        approach: unit vector along which the instrument comes                                      (3,)
+        thickness: organ below each triangle along its inward normal [m]                            (n_face,)
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    triangles: IntArray
+    rim: IntArray
+    approach: FloatArray
+    thickness: FloatArray
+    margin: float
+    thickness_smallest: float
+
+    def project(self, point: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """The face's point nearest to a point [m] and the unit outward normal there, each (3,)."""
+        query = np.asarray(point, dtype=np.float64)
+        corners = self.points[self.triangles]
+        weights = _closest_weights(corners, query)
+        nearest = np.einsum("fi,fij->fj", weights, corners)
+        best = int(np.argmin(((nearest - query) ** 2).sum(axis=1)))
+        return self._at(best, weights[best])
+
+    def _at(self, face: int, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        nodes = self.triangles[face]
+        normal = weights @ self.normals[nodes]
+        return weights @ self.points[nodes], normal / np.linalg.norm(normal)
+
+    def rim_distance(self, point: FloatArray) -> float:
+        """Distance from a point to the face's border [m]."""
+        start, end = self.points[self.rim[:, 0]], self.points[self.rim[:, 1]]
+        span = end - start
+        along = np.clip(((point - start) * span).sum(axis=1) / (span**2).sum(axis=1), 0.0, 1.0)
+        return float(np.sqrt((((start + along[:, None] * span) - point) ** 2).sum(axis=1).min()))
+
+    def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
+        """A point drawn evenly over the face, at least rim_distance [m] from its border and thick enough, and its normal.
+
+        Raises:
+            ValueError: no such point in 1000 draws.
+        """
+        corners = self.points[self.triangles]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        cumulative = np.cumsum(area)
+        for _ in range(1000):
+            face = int(np.searchsorted(cumulative, rng.random() * cumulative[-1]))
+            u, v = rng.random(2)
+            root = math.sqrt(u)
+            weights = np.array([1.0 - root, root * (1.0 - v), root * v])
+            if self.thickness[face] < self.thickness_smallest:
+                continue
+            point, normal = self._at(face, weights)
+            if self.rim_distance(point) >= rim_distance:
+                return point, normal
+        raise ValueError(
+            f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: widen palpation.face_angle_deg"
+        )
+
+    def raster(self, spacing: float) -> tuple[FloatArray, FloatArray]:
+        """Points on a square grid seen along the approach, dropped onto the face, and their normals, each (n_site, 3).
+
+        Points nearer to the border than the face's margin, or where the organ is too thin, are left out.
+        """
+        across, along = tangent_axes(self.approach)
+        corners = self.points[self.triangles]
+        plane = np.stack([corners @ across, corners @ along], axis=2)
+        lower, upper = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
+        points, normals = [], []
+        for u, v in _grid(lower, upper, spacing):
+            hit = _drop(plane, corners @ -self.approach, u, v)
+            if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
+                continue
+            point, normal = self._at(*hit)
+            if self.rim_distance(point) >= self.margin:
+                points.append(point)
+                normals.append(normal)
+        return np.array(points).reshape(-1, 3), np.array(normals).reshape(-1, 3)
+
+
+def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: Palpation) -> PalpableFace:
+    """The surface triangles whose inward normal is within the scene's angle of the approach direction.
+
+    Raises:
+        ValueError: no triangle faces the instrument.
+    """
+    direction = np.asarray(approach, dtype=np.float64)
+    direction = direction / np.linalg.norm(direction)
+    triangles = mesh.boundary_triangles
+    corners = mesh.points[triangles]
+    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
+    chosen = -unit @ direction >= math.cos(math.radians(palpation.face_angle_deg))
+    if not chosen.any():
+        raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
+    face = triangles[chosen]
+    normals = np.zeros_like(mesh.points)
+    for corner in range(3):
+        np.add.at(normals, face[:, corner], area_vector[chosen])
+    length = np.linalg.norm(normals, axis=1)
+    normals[length > 0.0] /= length[length > 0.0, None]
+    thickness = np.full(len(face), np.inf)
+    if palpation.thickness_smallest > 0.0:
+        thickness = _thickness(corners[chosen].mean(axis=1), -unit[chosen], corners)
+    return PalpableFace(
+        points=mesh.points,
+        normals=normals,
+        triangles=face,
+        rim=_rim(face),
+        approach=direction,
+        thickness=thickness,
+        margin=palpation.face_margin,
+        thickness_smallest=palpation.thickness_smallest,
+    )
+
+
+def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors across a direction, the first as near to world x (else y) as can be."""
+    helper = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = helper - (helper @ direction) * direction
+    first /= np.linalg.norm(first)
+    return first, np.cross(direction, first) * (-1.0)
+
+
+def _rim(face: IntArray) -> IntArray:
+    edges = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
+    unique, counts = np.unique(edges, axis=0, return_counts=True)
+    return unique[counts == 1]
+
+
+def _grid(lower: FloatArray, upper: FloatArray, spacing: float) -> FloatArray:
+    """Points of a square grid centred in a rectangle, row by row (boustrophedon), shape (n, 2)."""
+    axes = []
+    for low, high in zip(lower, upper, strict=True):
+        count = int((high - low) / spacing)
+        axes.append(0.5 * (low + high) + (np.arange(count + 1) - 0.5 * count) * spacing)
+    rows = []
+    for row, v in enumerate(axes[1]):
+        us = axes[0] if row % 2 == 0 else axes[0][::-1]
+        rows.append(np.column_stack([us, np.full(len(us), v)]))
+    return np.concatenate(rows)
+
+
+def _drop(plane: FloatArray, height: FloatArray, u: float, v: float) -> tuple[int, FloatArray] | None:
+    """The uppermost triangle over a point of the projection plane, with the barycentric weights there."""
+    a, b, c = plane[:, 0], plane[:, 1], plane[:, 2]
+    determinant = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    wb = ((u - a[:, 0]) * (c[:, 1] - a[:, 1]) - (v - a[:, 1]) * (c[:, 0] - a[:, 0])) / determinant
+    wc = ((b[:, 0] - a[:, 0]) * (v - a[:, 1]) - (b[:, 1] - a[:, 1]) * (u - a[:, 0])) / determinant
+    wa = 1.0 - wb - wc
+    inside = np.flatnonzero((wa >= -1e-9) & (wb >= -1e-9) & (wc >= -1e-9))
+    if inside.size == 0:
+        return None
+    weights = np.column_stack([wa, wb, wc])[inside]
+    best = int(np.argmax((weights * height[inside]).sum(axis=1)))
+    return int(inside[best]), weights[best]
+
+
+def _thickness(origins: FloatArray, directions: FloatArray, corners: FloatArray) -> FloatArray:
+    """Length of the chord inside the organ from each origin along each direction [m] (Moeller & Trumbore 1997)."""
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    result = np.full(len(origins), np.inf)
+    for index, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
+        p = np.cross(direction, edge2)
+        determinant = (edge1 * p).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            offset = origin - corners[:, 0]
+            u = (offset * p).sum(axis=1) / determinant
+            q = np.cross(offset, edge1)
+            v = (q @ direction) / determinant
+            distance = (edge2 * q).sum(axis=1) / determinant
+        hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 1e-6)
+        if hit.any():
+            result[index] = distance[hit].min()
+    return result
+
+
+def _closest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
+    """Barycentric weights of the point of each triangle nearest to a query point, shape (n, 3)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, ac, ap = b - a, c - a, query - a
+    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
+    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
+    determinant = d00 * d11 - d01 * d01
+    wb = (d11 * d20 - d01 * d21) / determinant
+    wc = (d00 * d21 - d01 * d20) / determinant
+    weights = np.column_stack([1.0 - wb - wc, wb, wc])
+    outside = (weights < 0.0).any(axis=1)
+    best_distance = np.full(len(corners), np.inf)
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        span = corners[:, second] - corners[:, first]
+        along = np.clip(((query - corners[:, first]) * span).sum(1) / (span * span).sum(1), 0.0, 1.0)
+        distance = ((corners[:, first] + along[:, None] * span - query) ** 2).sum(axis=1)
+        better = outside & (distance < best_distance)
+        best_distance[better] = distance[better]
+        weights[better] = 0.0
+        weights[better, first] = 1.0 - along[better]
+        weights[better, second] = along[better]
+    return weights

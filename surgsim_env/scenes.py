@@ -1,0 +1,275 @@
+"""Scenes: one TOML file each, read into frozen dataclasses. All values SI; the file's comments give their sources."""
+
+import tomllib
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import dacite
+
+from msdm_core.damping import Damping
+from msdm_core.errors import OrganError
+from msdm_core.kernels import ContactLaw
+from msdm_core.regions import Capsule, Material
+from surgsim_env.scene_files import scenes_folder
+
+Vector = tuple[float, float, float]
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box: lower and upper corner [m]."""
+
+    lower: Vector
+    upper: Vector
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball: centre [m] and radius [m]."""
+
+    centre: Vector
+    radius: float
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Where something holds the organ: every node of its surface (or, for a box, every node) inside is fixed."""
+
+    name: str
+    box: Box | None = None
+    ball: Ball | None = None
+
+    def __post_init__(self) -> None:
+        if (self.box is None) == (self.ball is None):
+            raise ValueError(f"anchor {self.name!r}: give either a box or a ball")
+
+
+@dataclass(frozen=True)
+class BlockMesh:
+    """A block on a body-centred cubic lattice: size [m] and number of cells along x, y, z."""
+
+    size: Vector
+    cells: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """A closed surface file (STL, OBJ, PLY), filled with a lattice of cells of the given edge [m]."""
+
+    file: str
+    length_unit: str | float
+    cell_size: float
+
+
+@dataclass(frozen=True)
+class TetFile:
+    """A file of tets (vtu, vtk, gmsh, medit) and its length unit."""
+
+    file: str
+    length_unit: str | float
+
+
+@dataclass(frozen=True)
+class MeshSource:
+    """Where the organ's tets come from: exactly one of block, surface, tets."""
+
+    block: BlockMesh | None = None
+    surface: SurfaceMesh | None = None
+    tets: TetFile | None = None
+
+    def __post_init__(self) -> None:
+        if sum(part is not None for part in (self.block, self.surface, self.tets)) != 1:
+            raise ValueError("mesh: give exactly one of mesh.block, mesh.surface, mesh.tets")
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """The instrument that touches the organ.
+
+    Args:
+        model: MJCF file in scenes/instruments.
+        tip_radius: of the ball tip [m].
+        approach: direction in which it comes to the organ; the shaft lies along it.
+    """
+
+    model: str = "probe.xml"
+    tip_radius: float = 0.008
+    approach: Vector = (0.0, 0.0, -1.0)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Rates: haptic_step [s], organ substeps in one, haptic steps in one control step."""
+
+    haptic_step: float = 0.001
+    substep_count: int = 5
+    haptic_steps_per_control: int = 50
+
+    @property
+    def control_step(self) -> float:
+        """Duration of a control step [s]."""
+        return self.haptic_step * self.haptic_steps_per_control
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Forces on the tissue [N]: above soft_force costs reward, above hard_force ends an episode."""
+
+    soft_force: float
+    hard_force: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.soft_force < self.hard_force:
+            raise ValueError(f"limits: 0 < soft_force < hard_force must hold; got {self.soft_force}, {self.hard_force} N")
+
+
+@dataclass(frozen=True)
+class ForceSensor:
+    """A force sensor per axis: reading = force + bias + noise, cut at +-range (and flagged).
+
+    Args:
+        noise: standard deviation of each reading [N].
+        bias: the bias of an episode is drawn uniformly from +- this [N].
+        range: largest reading [N].
+    """
+
+    noise: float
+    bias: float
+    range: float
+
+
+@dataclass(frozen=True)
+class Palpation:
+    """How the organ is palpated.
+
+    Args:
+        press_depth: how deep the tip is pressed along the surface normal [m].
+        face_angle_deg: a surface point is palpable where its inward normal is within this of the approach direction.
+        face_margin: distance a palpable point keeps from the rim of the palpable face [m].
+        thickness_smallest: a palpable point has at least this much organ below it [m].
+        site_spacing: of the raster [m].
+        clearance: gap between tip and surface before a press [m].
+    """
+
+    press_depth: float
+    face_angle_deg: float = 35.0
+    face_margin: float = 0.0
+    thickness_smallest: float = 0.0
+    site_spacing: float = 0.010
+    clearance: float = 0.001
+
+
+@dataclass(frozen=True)
+class LesionDraw:
+    """The lesion an episode hides: uniform ranges of radius [m], cover [m] and modulus ratio, on the palpable face."""
+
+    radius: Range
+    cover: Range
+    modulus_ratio: Range
+    rim_distance: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "cover", "modulus_ratio"):
+            low, high = getattr(self, name)
+            if not 0.0 < low <= high:
+                raise ValueError(f"lesion: {name} = [{low}, {high}]; the rule is 0 < low <= high")
+
+
+@dataclass(frozen=True)
+class FixedLesion:
+    """A lesion of the demonstration: below a surface point [m], with cover [m], radius [m] and modulus ratio."""
+
+    name: str
+    below: Vector
+    radius: float
+    cover: float
+    modulus_ratio: float
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact between tissue and instrument, see msdm_core.kernels.ContactLaw."""
+
+    stiffness: float
+    damping: float
+    friction: float
+
+    @property
+    def law(self) -> ContactLaw:
+        """What the kernels read; sticking friction is half as stiff as the normal direction."""
+        return ContactLaw(self.stiffness, self.damping, self.friction, 0.5 * self.stiffness)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A whole scene; `name` is the file's stem."""
+
+    name: str
+    description: str
+    folder: Path
+    mesh: MeshSource
+    material: Material
+    damping: Damping
+    anchors: tuple[Anchor, ...]
+    contact: Contact
+    instrument: Instrument
+    timing: Timing
+    limits: Limits
+    sensor: ForceSensor
+    palpation: Palpation
+    lesion: LesionDraw
+    capsule: Capsule | None = None
+    demonstration: tuple[FixedLesion, ...] = field(default=())
+
+
+def list_scenes() -> list[str]:
+    """Names of the scenes that are shipped."""
+    return sorted(path.stem for path in (scenes_folder() / "organs").glob("*.toml"))
+
+
+@lru_cache(maxsize=64)
+def make_scene(name: str) -> Scene:
+    """The scene of a name (see `list_scenes`) or of a TOML file's path.
+
+    Raises:
+        ValueError: an unknown name (lists the known, suggests the nearest) or a file that breaks the format.
+    """
+    if name.endswith(".toml"):
+        return load_scene(Path(name))
+    known = list_scenes()
+    if name not in known:
+        nearest = get_close_matches(name, known, n=1, cutoff=0.4)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise ValueError(f"scene {name!r} is unknown; the scenes are {', '.join(known)}{hint}")
+    return load_scene(scenes_folder() / "organs" / f"{name}.toml")
+
+
+def load_scene(path: Path) -> Scene:
+    """Read one scene file; ValueError names the file, the entry and what is wrong with it."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"scene file {path} cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"scene file {path} is not valid TOML: {error}") from None
+    return scene_from_table(table, name=path.stem, folder=path.parent)
+
+
+def scene_from_table(table: dict[str, Any], *, name: str, folder: Path) -> Scene:
+    """A scene from a table such as a TOML file holds; paths in it are relative to `folder`."""
+    config = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _real})
+    try:
+        return dacite.from_dict(Scene, {**table, "name": name, "folder": folder}, config)
+    except (dacite.DaciteError, OrganError, ValueError, TypeError) as error:
+        raise ValueError(f"scene {name!r}: {error}") from None
+
+
+def _real(value: Any) -> float:
+    """TOML tells 5000 from 5000.0; a scene does not."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{value!r} is not a number")
+    return float(value)

@@ -1,0 +1,133 @@
+"""Both states and the clock: an organ and an instrument that exchange forces at haptic rate."""
+
+import mujoco
+import numpy as np
+
+from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.kernels import OrganModel, OrganState
+from msdm_core.mesh import FloatArray
+from msdm_core.organ import rest_state
+from msdm_core.stability import stable_dt
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.exchange import haptic_step
+from surgsim_env.instrument import Instrument
+from surgsim_env.timing import substeps_needed
+
+# How far beyond the organ's bounding box the tip may travel [m].
+WORKSPACE_MARGIN = 0.04
+
+
+class Simulation:
+    """An organ and an instrument in contact; advanced by `haptic_step`, read by tasks."""
+
+    def __init__(self, anatomy: Anatomy) -> None:
+        """Set up a scene's anatomy with its instrument, without lesions, the tip away from the organ."""
+        scene = anatomy.scene
+        self.anatomy = anatomy
+        self.contact = scene.contact.law
+        self.haptic_dt = scene.timing.haptic_step
+        self.substep_count = scene.timing.substep_count
+        self.substep_dt = self.haptic_dt / self.substep_count
+        margin = WORKSPACE_MARGIN + scene.instrument.tip_radius
+        points = anatomy.mesh.points
+        self.instrument = Instrument(scene, points.min(axis=0) - margin, points.max(axis=0) + margin)
+        self._wrench = np.zeros((self.instrument.tool_count, 6))
+        self._step = 0
+        self.fault = ""
+        self.organ_model: OrganModel
+        self.organ_state: OrganState
+
+    @property
+    def time(self) -> float:
+        """Simulated time since the reset [s]."""
+        return self._step * self.haptic_dt
+
+    @property
+    def contact_wrench(self) -> FloatArray:
+        """Tissue's mean force [N] and torque about the centre of mass [N m] on each tool in the last haptic step."""
+        return self._wrench.copy()
+
+    @property
+    def contact_force(self) -> FloatArray:
+        """Sum of the tissue's force over all tools in the last haptic step [N], shape (3,)."""
+        return self._wrench[:, :3].sum(axis=0)
+
+    def reset(self, organ_model: OrganModel, tip_position: FloatArray) -> None:
+        """Start with an organ at rest and the tip at rest at a position [m].
+
+        Raises:
+            OrganError: the scene's fixed number of substeps is too small for this organ (says how many it needs).
+        """
+        self.organ_model = organ_model
+        self._check_step()
+        self.organ_state = rest_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        self.restart(tip_position)
+
+    def restart(self, tip_position: FloatArray) -> None:
+        """Back to the rest of the same organ with the tip somewhere else [m]; the clock starts again."""
+        state = self.organ_state
+        state.node_position[:] = self.organ_model.node_rest_position
+        state.node_velocity[:] = 0.0
+        state.node_force[:] = 0.0
+        state.contact_engaged[:] = 0
+        state.contact_stretch[:] = 0.0
+        state.volume_ratio_smallest[:] = 1.0
+        state.volume_ratio_tet[:] = 0
+        self.instrument.place(tip_position)
+        self._wrench[:] = 0.0
+        self._step = 0
+        self.fault = ""
+
+    def haptic_step(self) -> bool:
+        """Advance by one haptic step; False, with `fault` saying why, where the organ or MuJoCo came to grief."""
+        try:
+            haptic_step(
+                self.organ_model,
+                self.organ_state,
+                self.instrument,
+                self.contact,
+                self.substep_dt,
+                self.substep_count,
+                self._wrench,
+            )
+        except OrganDivergedError as error:
+            self.fault = str(error)
+            return False
+        self._step += 1
+        return True
+
+    def end_control_step(self) -> bool:
+        """Bring the instrument's poses up to date and read MuJoCo's warnings; False where there is one."""
+        self.instrument.refresh()
+        self.fault = self.instrument.warning()
+        return not self.fault
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that changes, as arrays by name; the organ's model is the caller's to keep."""
+        arrays = {f"organ_{name}": array.copy() for name, array in self.organ_state._asdict().items()}
+        return {
+            **arrays,
+            "instrument": self.instrument.get_state(),
+            "wrench": self._wrench.copy(),
+            "step": np.array(self._step),
+            "fault": np.array(self.fault),
+        }
+
+    def set_state(self, organ_model: OrganModel, arrays: dict[str, np.ndarray]) -> None:
+        """Restore what `get_state` gave, to the bit."""
+        self.organ_model = organ_model
+        self.organ_state = OrganState(**{name: arrays[f"organ_{name}"].copy() for name in OrganState._fields})
+        self.instrument.set_state(arrays["instrument"])
+        self._wrench[:] = arrays["wrench"]
+        self._step = int(arrays["step"])
+        self.fault = str(arrays["fault"])
+
+    def _check_step(self) -> None:
+        limit = stable_dt(self.organ_model, self.contact)
+        needed = substeps_needed(self.haptic_dt, limit)
+        if needed > self.substep_count:
+            raise OrganError(
+                f"scene {self.anatomy.scene.name!r}: {self.substep_count} substeps of {self.substep_dt * 1e3:.3g} ms are too "
+                f"long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: set timing.substep_count = "
+                f"{needed} or use softer lesions"
+            )

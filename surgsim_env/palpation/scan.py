@@ -1,0 +1,142 @@
+"""A scripted scan: press an organ at each site along the surface normal to a set depth and record force over depth."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdm_core.kernels import OrganModel
+from msdm_core.mesh import FloatArray
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.simulation import Simulation
+
+# The press: how fast it goes in [m/s], how long it rests there [s] and over which end of that the force is averaged [s].
+PRESS_SPEED = 0.04
+HOLD_TIME = 0.10
+AVERAGE_TIME = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Press:
+    """One press: where, how deep, how hard.
+
+    Fields:
+        site, normal: surface point [m] and unit outward normal at rest                            (3,)
+        depth: of the tip below the rest surface at the end [m]
+        force: along the normal, mean over the end of the hold [N]
+        force_peak: largest contact force of any haptic step [N]
+        curve: depth [m] and force along the normal [N] at each haptic step of contact             (n, 2)
+        volume_ratio_smallest: of any tet at any substep
+        end: "" or why it ended early: the hard limit or a fault
+        duration: simulated time [s]
+    """
+
+    site: FloatArray
+    normal: FloatArray
+    depth: float
+    force: float
+    force_peak: float
+    curve: FloatArray
+    volume_ratio_smallest: float
+    end: str
+    duration: float
+
+    @property
+    def stiffness(self) -> float:
+        """Secant stiffness, force over depth [N/m]."""
+        return self.force / self.depth
+
+
+def press(
+    simulation: Simulation, site: FloatArray, normal: FloatArray, *, depth: float, clearance: float, force_limit: float
+) -> Press:
+    """Press the resting organ of a simulation once, along the inward normal, and stop at a depth or at a force."""
+    radius = simulation.anatomy.scene.instrument.tip_radius
+    dt = simulation.haptic_dt
+    simulation.restart(site + normal * (radius + clearance))
+    go_in = round((clearance + depth) / (PRESS_SPEED * dt))
+    hold = round(HOLD_TIME / dt)
+    average = round(AVERAGE_TIME / dt)
+    curve = np.zeros((go_in + hold, 2))
+    end, force_peak, taken = "", 0.0, 0
+    simulation.instrument.command_velocity(-PRESS_SPEED * normal)
+    for step in range(go_in + hold):
+        if step == go_in:
+            simulation.instrument.command_velocity(np.zeros(3))
+        if not simulation.haptic_step():
+            end = simulation.fault
+            break
+        simulation.instrument.refresh()
+        force = simulation.contact_force
+        below = (site - simulation.instrument.tip_position) @ normal + radius
+        curve[step] = below, force @ normal
+        taken = step + 1
+        force_peak = max(force_peak, float(np.sqrt(force @ force)))
+        if force_peak > force_limit:
+            end = f"force limit {force_limit:g} N"
+            break
+    warning = simulation.instrument.warning()
+    last = curve[max(0, taken - average) : taken] if not end else curve[max(0, taken - 1) : taken]
+    touching = curve[:taken][curve[:taken, 1] > 0.0]
+    return Press(
+        site=site,
+        normal=normal,
+        depth=float(last[:, 0].mean()),
+        force=float(last[:, 1].mean()),
+        force_peak=force_peak,
+        curve=touching,
+        volume_ratio_smallest=float(simulation.organ_state.volume_ratio_smallest[0]),
+        end=end or warning,
+        duration=simulation.time,
+    )
+
+
+def scan(
+    anatomy: Anatomy,
+    organ_model: OrganModel,
+    sites: FloatArray,
+    normals: FloatArray,
+    *,
+    progress: Callable[[], None] = lambda: None,
+    workers: int | None = None,
+) -> list[Press]:
+    """Press each site of a resting organ; presses are independent, so the result does not depend on the workers.
+
+    Args:
+        anatomy: the scene's organ.
+        organ_model: what is pressed, with or without lesions.
+        sites, normals: surface points [m] and unit outward normals, each (n_site, 3).
+        progress: called after each press.
+        workers: threads (the kernels hold no interpreter lock); all cores by default.
+    """
+    scene = anatomy.scene
+    count = min(workers or os.cpu_count() or 1, max(1, len(sites)))
+
+    def run(share: range) -> list[Press]:
+        simulation = Simulation(anatomy)
+        simulation.reset(organ_model, sites[0] + normals[0] * 0.05)
+        presses = []
+        for index in share:
+            presses.append(
+                press(
+                    simulation,
+                    sites[index],
+                    normals[index],
+                    depth=scene.palpation.press_depth,
+                    clearance=scene.palpation.clearance,
+                    force_limit=scene.limits.hard_force,
+                )
+            )
+            progress()
+        return presses
+
+    shares = [range(start, len(sites), count) for start in range(count)]
+    with ThreadPoolExecutor(count) as pool:
+        results = list(pool.map(run, shares))
+    merged: list[Press | None] = [None] * len(sites)
+    for share, presses in zip(shares, results, strict=True):
+        for index, one in zip(share, presses, strict=True):
+            merged[index] = one
+    return [one for one in merged if one is not None]

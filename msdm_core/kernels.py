@@ -573,10 +573,12 @@ def evaluate_forces(model, state):
 def apply_stiffness(model, displacement, force):
     """Linearised internal forces K u at rest [N], from a displacement u [m], both (n_node, 3)."""
     rest = model.node_rest_position
+    nodes, stiffness, tets, bulk = model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_bulk
+    rest_volume = model.tet_rest_volume
     force[:, :] = 0.0
-    for spring in range(model.spring_nodes.shape[0]):
-        i = model.spring_nodes[spring, 0]
-        j = model.spring_nodes[spring, 1]
+    for spring in range(nodes.shape[0]):
+        i = np.uint32(nodes[spring, 0])
+        j = np.uint32(nodes[spring, 1])
         dx = rest[j, 0] - rest[i, 0]
         dy = rest[j, 1] - rest[i, 1]
         dz = rest[j, 2] - rest[i, 2]
@@ -585,43 +587,48 @@ def apply_stiffness(model, displacement, force):
             + dy * (displacement[j, 1] - displacement[i, 1])
             + dz * (displacement[j, 2] - displacement[i, 2])
         )
-        scale = model.spring_stiffness[spring] * stretch / (dx * dx + dy * dy + dz * dz)
+        scale = stiffness[spring] * stretch / (dx * dx + dy * dy + dz * dz)
         force[i, 0] -= scale * dx
         force[i, 1] -= scale * dy
         force[i, 2] -= scale * dz
         force[j, 0] += scale * dx
         force[j, 1] += scale * dy
         force[j, 2] += scale * dz
-    gradient = np.empty((4, 3))
-    for tet in range(model.tet_nodes.shape[0]):
-        if model.tet_bulk[tet] == 0.0:
+    for tet in range(tets.shape[0]):
+        if bulk[tet] == 0.0:
             continue
-        _volume_gradient(rest, model.tet_nodes, tet, gradient)
+        a = np.uint32(tets[tet, 0])
         change = 0.0
-        for corner in range(4):
-            node = model.tet_nodes[tet, corner]
-            for axis in range(3):
-                change += gradient[corner, axis] * displacement[node, axis]
-        scale = model.tet_bulk[tet] * change / model.tet_rest_volume[tet]
-        for corner in range(4):
-            node = model.tet_nodes[tet, corner]
-            for axis in range(3):
-                force[node, axis] += scale * gradient[corner, axis]
+        for corner in range(1, 4):
+            gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
+            node = np.uint32(tets[tet, corner])
+            change += (
+                gx * (displacement[node, 0] - displacement[a, 0])
+                + gy * (displacement[node, 1] - displacement[a, 1])
+                + gz * (displacement[node, 2] - displacement[a, 2])
+            )
+        scale = bulk[tet] * change / rest_volume[tet]
+        for corner in range(1, 4):
+            gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
+            node = np.uint32(tets[tet, corner])
+            force[node, 0] += scale * gx
+            force[node, 1] += scale * gy
+            force[node, 2] += scale * gz
+            force[a, 0] -= scale * gx
+            force[a, 1] -= scale * gy
+            force[a, 2] -= scale * gz
 
 
 @njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
-def _volume_gradient(position, tet_nodes, tet, gradient):
-    """dV/dx of the four corners of one tet [m^2], into gradient (4, 3)."""
-    a = tet_nodes[tet, 0]
-    for corner in range(1, 4):
-        p = tet_nodes[tet, 1 + corner % 3]
-        q = tet_nodes[tet, 1 + (corner + 1) % 3]
-        for axis in range(3):
-            u = (axis + 1) % 3
-            v = (axis + 2) % 3
-            gradient[corner, axis] = (
-                (position[p, u] - position[a, u]) * (position[q, v] - position[a, v])
-                - (position[p, v] - position[a, v]) * (position[q, u] - position[a, u])
-            ) / 6.0
-    for axis in range(3):
-        gradient[0, axis] = -(gradient[1, axis] + gradient[2, axis] + gradient[3, axis])
+def _corner_gradient(position, tets, tet, corner):
+    """dV/dx of corner 1, 2 or 3 of one tet [m^2]: a sixth of the cross product of the edges to the next two."""
+    a = np.uint32(tets[tet, 0])
+    p = np.uint32(tets[tet, 1 + corner % 3])
+    q = np.uint32(tets[tet, 1 + (corner + 1) % 3])
+    px = position[p, 0] - position[a, 0]
+    py = position[p, 1] - position[a, 1]
+    pz = position[p, 2] - position[a, 2]
+    qx = position[q, 0] - position[a, 0]
+    qy = position[q, 1] - position[a, 1]
+    qz = position[q, 2] - position[a, 2]
+    return (py * qz - pz * qy) / 6.0, (pz * qx - px * qz) / 6.0, (px * qy - py * qx) / 6.0

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.kernels import OrganModel
 from msdm_core.mesh import FloatArray, IntArray, TetMesh
@@ -46,11 +46,15 @@ class Anatomy:
         centre = surface_point - normal * (cover + radius)
         return self.lesion_at(centre, radius, ratio, name)
 
-    def lesion_at(self, centre: FloatArray, radius: float, ratio: float, name: str) -> Lesion:
+    def lesion_at(self, centre: ArrayLike, radius: float, ratio: float, name: str) -> Lesion:
         """A sphere at a centre [m], `ratio` times as stiff as the tissue."""
-        healthy = self.scene.material
-        material = replace(healthy, youngs_modulus=healthy.youngs_modulus * ratio)
-        return Lesion(centre=(float(centre[0]), float(centre[1]), float(centre[2])), radius=radius, material=material, name=name)
+        return self.lesion_of_modulus(centre, radius, ratio * self.scene.material.youngs_modulus, name)
+
+    def lesion_of_modulus(self, centre: ArrayLike, radius: float, youngs_modulus: float, name: str) -> Lesion:
+        """A sphere at a centre [m] with a Young's modulus [Pa], otherwise like the tissue."""
+        x, y, z = np.asarray(centre, dtype=np.float64).tolist()
+        material = replace(self.scene.material, youngs_modulus=youngs_modulus)
+        return Lesion(centre=(x, y, z), radius=radius, material=material, name=name)
 
     def demonstration_lesions(self) -> list[Lesion]:
         """The lesions that the scene file shows."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msdm_core.mesh import FloatArray, IntArray, TetMesh
+from msdm_core.triangles import nearest_triangle
 from surgsim_env.scenes import Palpation
 
 
@@ -33,12 +34,7 @@ class PalpableFace:
 
     def project(self, point: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """The face's point nearest to a point [m] and the unit outward normal there, each (3,)."""
-        query = np.asarray(point, dtype=np.float64)
-        corners = self.points[self.triangles]
-        weights = _closest_weights(corners, query)
-        nearest = np.einsum("fi,fij->fj", weights, corners)
-        best = int(np.argmin(((nearest - query) ** 2).sum(axis=1)))
-        return self._at(best, weights[best])
+        return self._at(*nearest_triangle(self.points[self.triangles], np.asarray(point, dtype=np.float64)))
 
     def _at(self, face: int, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         nodes = self.triangles[face]
@@ -191,27 +187,3 @@ def _thickness(origins: FloatArray, directions: FloatArray, corners: FloatArray)
         if hit.any():
             result[index] = distance[hit].min()
     return result
-
-
-def _closest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
-    """Barycentric weights of the point of each triangle nearest to a query point, shape (n, 3)."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, ac, ap = b - a, c - a, query - a
-    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
-    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
-    determinant = d00 * d11 - d01 * d01
-    wb = (d11 * d20 - d01 * d21) / determinant
-    wc = (d00 * d21 - d01 * d20) / determinant
-    weights = np.column_stack([1.0 - wb - wc, wb, wc])
-    outside = (weights < 0.0).any(axis=1)
-    best_distance = np.full(len(corners), np.inf)
-    for first, second in ((0, 1), (1, 2), (2, 0)):
-        span = corners[:, second] - corners[:, first]
-        along = np.clip(((query - corners[:, first]) * span).sum(1) / (span * span).sum(1), 0.0, 1.0)
-        distance = ((corners[:, first] + along[:, None] * span - query) ** 2).sum(axis=1)
-        better = outside & (distance < best_distance)
-        best_distance[better] = distance[better]
-        weights[better] = 0.0
-        weights[better, first] = 1.0 - along[better]
-        weights[better, second] = along[better]
-    return weights

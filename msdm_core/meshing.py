@@ -1,0 +1,180 @@
+"""Meshes of body-centred cubic (BCC) lattices, on which formula (6) is isotropic: blocks and filled surfaces."""
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh import TET_FACES, TetMesh, tet_volumes
+from msdm_core.stuffing import lattice_around, stuff
+from msdm_core.surface import check_surface, surface_volume
+
+FloatArray = NDArray[np.float64]
+Int64Array = NDArray[np.int64]
+
+STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
+TETS_PER_CELL = 12
+TET_LIMIT = 2_000_000
+GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB while meshing
+CELLS_ACROSS_MIN = 2
+
+
+def box_mesh(size: ArrayLike, cells: ArrayLike) -> TetMesh:
+    """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
+
+    Nodes are the corners and then the centres of the cells. Each inner cell face gives four tets (two centres and
+    an edge of the face); each outer face is cut along a diagonal that alternates like a checkerboard, so that the
+    block prefers no direction.
+
+    Args:
+        size: edge lengths [m], shape (3,).
+        cells: whole numbers of cells along each axis, shape (3,).
+
+    Warns:
+        UserWarning: names the stretch where cells are more than 1 % from cubes: formula (6) is then not isotropic.
+
+    Raises:
+        ValueError: names the size or count that is not positive.
+    """
+    lengths, counts = _checked_box(size, cells)
+    edges = lengths / counts
+    stretch = edges.max() / edges.min()
+    if stretch > STRETCH_LIMIT:
+        warnings.warn(
+            f"the cells are {' x '.join(f'{edge * 1000:.4g}' for edge in edges)} mm, stretched {stretch:.3g} to 1; "
+            f"above {STRETCH_LIMIT} the springs of formula (6) are not isotropic: choose cells in proportion to size",
+            UserWarning,
+            stacklevel=2,
+        )
+    corners = np.arange(np.prod(counts + 1)).reshape(counts + 1)
+    centres = corners.size + np.arange(np.prod(counts)).reshape(counts)
+    corner_places = np.stack(np.unravel_index(corners.ravel(), corners.shape), axis=1) / counts
+    centre_places = (np.stack(np.unravel_index(np.arange(centres.size), centres.shape), axis=1) + 0.5) / counts
+    points = np.concatenate([corner_places, centre_places]) * lengths
+    tets = np.concatenate([_face_tets(corners, centres, axis) for axis in range(3)])
+    return TetMesh(points, _positive(points, tets))
+
+
+def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Array]:
+    lengths, counts = np.asarray(size, dtype=np.float64), np.asarray(cells)
+    if lengths.shape != (3,) or not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise ValueError(f"size is {lengths.tolist()}; the rule is three positive lengths in metres")
+    if counts.shape != (3,) or not (np.isfinite(counts) & (counts >= 1) & (counts == np.floor(counts))).all():
+        raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1")
+    if TETS_PER_CELL * float(np.prod(counts.astype(np.float64))) > TET_LIMIT:
+        raise ValueError(f"cells is {counts.tolist()}; that is more than {TET_LIMIT} tets: choose fewer cells")
+    return lengths, counts.astype(np.int64)
+
+
+def _face_tets(corners: Int64Array, centres: Int64Array, axis: int) -> Int64Array:
+    """Tets at the cell faces across one axis: four per inner face, two per outer face, shape (n, 4)."""
+    corners, centres = np.moveaxis(corners, axis, 0), np.moveaxis(centres, axis, 0)
+    faces = np.stack([corners[:, :-1, :-1], corners[:, 1:, :-1], corners[:, 1:, 1:], corners[:, :-1, 1:]], axis=-1)
+    inner = faces[1:-1].reshape(-1, 4)
+    below, above = centres[:-1].ravel(), centres[1:].ravel()
+    tets = [np.column_stack([below, above, inner[:, k], inner[:, (k + 1) % 4]]) for k in range(4)]
+    row, column = np.indices(centres.shape[1:]).reshape(2, -1)
+    shift = (row + column) % 2
+    for layer in (0, -1):
+        centre = centres[layer].ravel()
+        turned = np.take_along_axis(faces[layer].reshape(-1, 4), (np.arange(4) + shift[:, None]) % 4, axis=1)
+        tets += [np.column_stack([centre, turned[:, [0, 1, 2]]]), np.column_stack([centre, turned[:, [0, 2, 3]]])]
+    return np.concatenate(tets)
+
+
+def mesh_surface(vertices: ArrayLike, triangles: ArrayLike, *, cell_size: float) -> TetMesh:
+    """Fill a closed surface with tets of a uniform BCC lattice by isosurface stuffing (Labelle and Shewchuk 2007).
+
+    Dihedral angles stay between 9.3 and 161.7 degrees; boundary nodes lie on the surface. Parts thinner than about
+    a cell can be lost. Twice the same input gives twice the same mesh, to the bit.
+
+    Args:
+        vertices: of the surface [m], shape (n_vertex, 3).
+        triangles: vertex indices, shape (n_triangle, 3); turned outward where needed.
+        cell_size: cube edge of the lattice [m].
+
+    Warns:
+        UserWarning: says what was dropped where thin parts fell off the largest body, or how many edges of the
+            boundary belong to more than two boundary triangles (a wall pinched to nothing there).
+
+    Raises:
+        MeshError: names what is wrong with the surface (see `check_surface`), or a cell size that would work.
+    """
+    size = float(cell_size)
+    if not (np.isfinite(size) and size > 0):
+        raise MeshError(f"cell_size is {cell_size}; the rule is a positive length in metres")
+    points, corners = check_surface(vertices, triangles)
+    _check_cell_size(points, corners, size)
+    nodes, tets = stuff(points, corners, lattice_around(points, size))
+    if not len(tets):
+        raise MeshError(
+            f"cell_size {size:g} m leaves no tets: every part of the surface is thinner than a cell; try {size / 2:g} m"
+        )
+    tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), size)
+    used, renumbered = np.unique(tets, return_inverse=True)
+    mesh = TetMesh(nodes[used], renumbered.reshape(-1, 4))
+    _warn_of_pinches(mesh, size)
+    return mesh
+
+
+def _check_cell_size(points: FloatArray, corners: Int64Array, size: float) -> None:
+    extent = np.ptp(points, axis=0)
+    smallest = extent.min()
+    if smallest < CELLS_ACROSS_MIN * size:
+        raise MeshError(
+            f"cell_size {size:g} m is too coarse: the surface is {smallest:.4g} m across its smallest extent, the "
+            f"rule is at least {CELLS_ACROSS_MIN} cells: use {smallest / (2 * CELLS_ACROSS_MIN):.2g} m or less"
+        )
+    volume = surface_volume(points, corners)
+    tet_count = TETS_PER_CELL * volume / size**3
+    grid_count = np.prod(2 * extent / size)
+    finest = max((TETS_PER_CELL * volume / TET_LIMIT) ** (1 / 3), 2 * (np.prod(extent) / GRID_LIMIT) ** (1 / 3))
+    if tet_count > TET_LIMIT or grid_count > GRID_LIMIT:
+        raise MeshError(
+            f"cell_size {size:g} m would give about {tet_count:.3g} tets in {grid_count / 8:.3g} cells; the rule is "
+            f"at most {TET_LIMIT:g} tets: use {1.05 * finest:.2g} m or more (is the surface in metres?)"
+        )
+
+
+def _positive(points: FloatArray, tets: Int64Array) -> Int64Array:
+    """The tets with corners ordered so that every volume is positive, shape (n_tet, 4)."""
+    negative = tet_volumes(points, tets) < 0
+    return np.where(negative[:, None], tets[:, [0, 1, 3, 2]], tets)
+
+
+def _largest_body(tets: Int64Array, volumes: FloatArray, cell_size: float) -> Int64Array:
+    """The tets of the largest part that hangs together by faces: what hangs by an edge or a node is a hinge."""
+    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    twin = np.flatnonzero((np.diff(faces[order], axis=0) == 0).all(axis=1))
+    left, right = order[twin] // 4, order[twin + 1] // 4
+    graph = coo_array((np.ones(len(twin), dtype=np.int8), (left, right)), shape=(len(tets), len(tets)))
+    count, label = connected_components(graph, directed=False)
+    if count == 1:
+        return tets
+    kept = label == np.argmax(np.bincount(label))
+    share = np.abs(volumes[~kept]).sum() / np.abs(volumes).sum()
+    warnings.warn(
+        f"{count - 1} part(s) of {int((~kept).sum())} tets ({share:.2%} of the volume) hang on the body by less than "
+        f"a face and were dropped; a cell_size below {cell_size:g} m keeps thinner parts",
+        UserWarning,
+        stacklevel=3,
+    )
+    return tets[kept]
+
+
+def _warn_of_pinches(mesh: TetMesh, cell_size: float) -> None:
+    sides = np.sort(mesh.boundary_triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, count = np.unique(sides, axis=0, return_counts=True)
+    pinched = np.flatnonzero(count > 2)
+    if pinched.size:
+        first, second = edges[pinched[0]].tolist()
+        warnings.warn(
+            f"{pinched.size} edge(s) of the boundary, first {first}-{second}, belong to more than two boundary "
+            f"triangles: the body is pinched to nothing there; a cell_size below {cell_size:g} m resolves the wall",
+            UserWarning,
+            stacklevel=3,
+        )

@@ -1,0 +1,183 @@
+"""Gymnasium environments: a simulation and a task put together; no physics and no reward is computed here."""
+
+import io
+import json
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.scenes import make_scene
+from surgsim_env.simulation import Simulation
+from surgsim_env.tasks.palpate import EPISODE_STEPS, PalpateTask
+
+Observation = NDArray[np.float32]
+Info = dict[str, Any]
+
+# How far an action may leave [-1, 1] by rounding.
+ACTION_SLACK = 1e-6
+
+
+class PalpateEnv(gym.Env[Observation, Observation]):
+    """Find a hidden lesion by touch.
+
+    ## Description
+    A robot's ball tip presses a soft organ (a tetrahedral mass-spring-damper model, Sala et al. 2011) with one stiff
+    lesion hidden under its surface. Tissue and tip exchange forces 1000 times a second; the agent acts 20 times a second.
+    It wins by pressing on the lesion and declaring it.
+
+    ## Action Space
+    `Box(-1, 1, (4,), float32)`
+
+    | num | meaning | full scale |
+    |---|---|---|
+    | 0-2 | tip velocity along x, y, z | 20 mm/s |
+    | 3 | declare: above 0.8 for 3 successive control steps, in contact, says "the lesion is here" | |
+
+    ## Observation Space
+    `Box((10,), float32)`, all bounds finite
+
+    | num | meaning | bounds |
+    |---|---|---|
+    | 0-2 | tip position [m] | the organ's bounding box with a margin |
+    | 3-5 | tip velocity [m/s] | +-0.5 |
+    | 6-8 | contact force on the tip [N], mean of the last haptic step, with the scene's noise, bias and range | +-range |
+    | 9 | share of the time left | 0 to 1 |
+
+    ## Rewards
+    Named terms, weighted in `surgsim_env.rewards.PALPATE_WEIGHTS`; `info["reward_<term>"]` shows each. Ending without
+    finding (a wrong declare, the hard limit, a fault) also pays the dearest step for every step left, so that it never
+    pays more than searching on.
+
+    ## Starting State
+    Radius, cover and modulus ratio of the lesion, its place on the palpable face, the sensor's bias and the tip's place
+    2 to 6 mm above the surface are drawn anew; their ranges are in the scene file. The organ is at rest.
+
+    ## Episode End
+    Terminated: the lesion was declared (success within 10 mm of its centre, measured along the surface); the contact
+    force passed the hard limit in any haptic step; the simulation came to a fault (`info["sim_fault"]` says which, the
+    observation is the last finite one). Truncated: 600 control steps (30 s).
+
+    ## Info
+    Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`, `hard_limit`,
+    `declared`, `success` (bool), `force_peak` [N], `error_mm` (-1 if nothing was declared) and one `reward_<term>` each.
+
+    ## Arguments
+    * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
+
+    `env.unwrapped.save_state()` and `load_state()` cover organ, robot, task, counters and random generator.
+
+    ## Version History
+    * v0: first version.
+    """
+
+    metadata = {"render_modes": [], "render_fps": 20}
+
+    def __init__(self, scene: str = "phantom", render_mode: str | None = None) -> None:
+        if render_mode is not None:
+            raise ValueError(f"render_mode {render_mode!r} is not offered; this environment has none yet: use None")
+        self.render_mode = None
+        self.scene = make_scene(scene)
+        anatomy = load_anatomy(self.scene)
+        self.simulation = Simulation(anatomy)
+        self.task = PalpateTask(anatomy)
+        low, high = self.task.bounds(self.simulation.instrument.lower, self.simulation.instrument.upper)
+        self.observation_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.task.action_size,), dtype=np.float32)
+        self._observation = np.zeros(self.observation_space.shape, dtype=np.float32)
+        self._running = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+        """Hide a new lesion and lift the tip off the organ; no options are known."""
+        super().reset(seed=seed)
+        if options:
+            raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
+        start = self.task.reset(self.np_random)
+        organ = self.simulation.anatomy.organ(start.lesions)
+        self.simulation.reset(organ, start.tip_position)
+        values, saturated = self.task.observe(self.simulation, self.np_random)
+        self._observation = values.astype(np.float32)
+        self._running = True
+        info = self._info("", saturated, self.task.blank_info(), self.task.blank_rewards())
+        return self._observation.copy(), info
+
+    def step(self, action: Observation) -> tuple[Observation, float, bool, bool, Info]:
+        """One control step: haptic steps until it is over, the hard limit is passed or the simulation faults."""
+        if not self._running:
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
+        self.simulation.instrument.command_velocity(self.task.command(self._checked(action)))
+        for _ in range(self.scene.timing.haptic_steps_per_control):
+            if not self.simulation.haptic_step() or self.task.watch(self.simulation):
+                break
+        fault = self.simulation.fault
+        saturated = False
+        if not fault:
+            self.simulation.end_control_step()
+            values, saturated = self.task.observe(self.simulation, self.np_random)
+            fault = self.simulation.fault or self._out_of_bounds(values)
+            if not fault:
+                self._observation = values.astype(np.float32)
+        verdict = self.task.judge(self.simulation, fault)
+        self._running = not (verdict.terminated or verdict.truncated)
+        info = self._info(fault, saturated, verdict.info, verdict.rewards)
+        return self._observation.copy(), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info
+
+    def save_state(self) -> bytes:
+        """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed."""
+        arrays = self.simulation.get_state()
+        arrays["task"] = np.array(self.task.get_state())
+        arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
+        arrays["observation"] = self._observation.copy()
+        arrays["running"] = np.array(self._running)
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **arrays)
+        return buffer.getvalue()
+
+    def load_state(self, state: bytes) -> None:
+        """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene."""
+        with np.load(io.BytesIO(state), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        lesions = self.task.set_state(str(arrays["task"]))
+        self.simulation.set_state(self.simulation.anatomy.organ(lesions), arrays)
+        self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
+        self._observation = arrays["observation"]
+        self._running = bool(arrays["running"])
+
+    def _checked(self, action: Observation) -> FloatArray:
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape:
+            raise ValueError(f"action has shape {values.shape}; the rule is {self.action_space.shape}")
+        bad = np.flatnonzero(~(np.abs(values) <= 1.0 + ACTION_SLACK))
+        if bad.size:
+            raise ValueError(
+                f"action[{bad[0]}] is {values[bad[0]]}; every entry must be finite and in [-1, 1]: "
+                "wrap the environment in gymnasium.wrappers.ClipAction"
+            )
+        return values
+
+    def _out_of_bounds(self, values: FloatArray) -> str:
+        low, high = self.observation_space.low, self.observation_space.high  # type: ignore[attr-defined]
+        bad = np.flatnonzero(~((values.astype(np.float32) >= low) & (values.astype(np.float32) <= high)))
+        return f"observation[{bad[0]}] = {values[bad[0]]:g} left its bounds" if bad.size else ""
+
+    def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
+        return {
+            "sim_fault": fault,
+            "sensor_saturated": saturated,
+            "workspace_limited": self.simulation.instrument.workspace_limited,
+            **task_info,
+            **{f"reward_{name}": value for name, value in rewards.items()},
+        }
+
+
+def register() -> None:
+    """Register the environment ids with Gymnasium; importing `surgsim_env` does it."""
+    if "SurgSim/Palpate-v0" not in gym.registry:
+        gym.register(
+            id="SurgSim/Palpate-v0",
+            entry_point="surgsim_env.env:PalpateEnv",
+            max_episode_steps=EPISODE_STEPS,
+        )

@@ -1,0 +1,191 @@
+"""Palpation: find one hidden lesion by touch and declare it while pressing on it."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from msdm_core.geodesic import SurfaceDistance
+from msdm_core.mesh import FloatArray
+from msdm_core.regions import Lesion
+from msdm_core.triangles import nearest_triangle
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.rewards import PALPATE_WEIGHTS, weighted
+from surgsim_env.sensors import ForceReading
+from surgsim_env.simulation import Simulation
+
+EPISODE_STEPS = 600
+SPEED_FULL_SCALE = 0.02
+DECLARE_VALUE = 0.8
+DECLARE_STEPS = 3
+SUCCESS_DISTANCE = 0.010
+
+# The tip starts this far above the surface [m].
+START_GAP = (0.002, 0.006)
+# Bounds of the observation beyond the workspace [m] and on speed [m/s]; leaving them is a fault.
+POSITION_SLACK = 0.005
+SPEED_BOUND = 0.5
+
+
+@dataclass(frozen=True)
+class Start:
+    """What an episode begins with: the lesions hidden in the organ and where the tip is [m]."""
+
+    lesions: tuple[Lesion, ...]
+    tip_position: FloatArray
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement of a control step."""
+
+    terminated: bool
+    truncated: bool
+    rewards: dict[str, float]
+    info: dict[str, bool | float | str]
+
+
+class PalpateTask:
+    """SurgSim/Palpate-v0 on one anatomy."""
+
+    action_size = 4
+
+    def __init__(self, anatomy: Anatomy) -> None:
+        self.anatomy = anatomy
+        self.limits = anatomy.scene.limits
+        self.reading = ForceReading(anatomy.scene.sensor)
+        self.lesion: Lesion | None = None
+        self.step_count = 0
+        self.declare_count = 0
+        self._declare_value = 0.0
+        self._force_peak = 0.0
+
+    @cached_property
+    def _distance(self) -> SurfaceDistance:
+        return SurfaceDistance(self.anatomy.mesh.points, self.anatomy.mesh.boundary_triangles)
+
+    def bounds(self, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the observation, from the tip's workspace [m]."""
+        speed, force = np.full(3, SPEED_BOUND), np.full(3, self.anatomy.scene.sensor.range)
+        low = np.concatenate([lower - POSITION_SLACK, -speed, -force, [0.0]])
+        high = np.concatenate([upper + POSITION_SLACK, speed, force, [1.0]])
+        return low, high
+
+    def reset(self, rng: np.random.Generator) -> Start:
+        """Draw the lesion, the sensor's bias and the tip's start."""
+        draw = self.anatomy.scene.lesion
+        face = self.anatomy.face
+        radius = float(rng.uniform(*draw.radius))
+        cover = float(rng.uniform(*draw.cover))
+        ratio = float(rng.uniform(*draw.modulus_ratio))
+        point, normal = face.random_point(rng, draw.rim_distance)
+        self.lesion = self.anatomy.lesion_at(point - normal * (cover + radius), radius, ratio, "lesion")
+        self.reading.reset(rng)
+        self.step_count = 0
+        self.declare_count = 0
+        self._declare_value = 0.0
+        self._force_peak = 0.0
+        above, outward = face.random_point(rng, self.anatomy.scene.palpation.face_margin)
+        gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
+        return Start((self.lesion,), above + outward * gap)
+
+    def command(self, action: FloatArray) -> FloatArray:
+        """Begin a control step: the tip velocity that an action asks for [m/s], shape (3,)."""
+        self._declare_value = float(action[3])
+        self._force_peak = 0.0
+        return np.asarray(action[:3], dtype=np.float64) * SPEED_FULL_SCALE
+
+    def watch(self, simulation: Simulation) -> bool:
+        """Judge a haptic step; True where the hard limit was passed and the episode must end."""
+        force = simulation.contact_force
+        self._force_peak = max(self._force_peak, float(np.sqrt(force @ force)))
+        return self._force_peak > self.limits.hard_force
+
+    def observe(self, simulation: Simulation, rng: np.random.Generator) -> tuple[FloatArray, bool]:
+        """Tip position, tip velocity, force reading, time left; and whether the sensor saturated."""
+        reading, saturated = self.reading.read(simulation.contact_force, rng)
+        left = 1.0 - self.step_count / EPISODE_STEPS
+        instrument = simulation.instrument
+        return np.concatenate([instrument.tip_position, instrument.tip_velocity, reading, [left]]), saturated
+
+    def judge(self, simulation: Simulation, fault: str) -> Verdict:
+        """End a control step: count it, see whether something was declared, and say how it ends."""
+        self.step_count += 1
+        hard = not fault and self._force_peak > self.limits.hard_force
+        declared = not fault and not hard and self._declares(simulation)
+        error = self.declared_error(simulation) if declared else None
+        found = error is not None and error <= SUCCESS_DISTANCE
+        terminated = bool(fault) or hard or declared
+        excess = (self._force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force)
+        terms = {
+            "time": 1.0,
+            "soft_force": min(max(excess, 0.0), 1.0),
+            "found": float(found),
+            "wrong": float(declared and not found),
+            "hard_force": float(hard),
+            "fault": float(bool(fault)),
+            "forgone": float(EPISODE_STEPS - self.step_count) if terminated and not found else 0.0,
+        }
+        return Verdict(
+            terminated=terminated,
+            truncated=not terminated and self.step_count >= EPISODE_STEPS,
+            rewards=weighted(terms, PALPATE_WEIGHTS),
+            info={
+                "force_peak": self._force_peak,
+                "hard_limit": hard,
+                "declared": declared,
+                "success": found,
+                "error_mm": -1.0 if error is None else error * 1000.0,
+            },
+        )
+
+    def blank_info(self) -> dict[str, bool | float | str]:
+        """The info of a reset: the same keys and types as a verdict's."""
+        return {"force_peak": 0.0, "hard_limit": False, "declared": False, "success": False, "error_mm": -1.0}
+
+    def blank_rewards(self) -> dict[str, float]:
+        """The reward terms of a reset, all 0."""
+        return dict.fromkeys(PALPATE_WEIGHTS, 0.0)
+
+    def _declares(self, simulation: Simulation) -> bool:
+        touching = bool((simulation.contact_force != 0.0).any())
+        self.declare_count = self.declare_count + 1 if touching and self._declare_value > DECLARE_VALUE else 0
+        return self.declare_count >= DECLARE_STEPS
+
+    def declared_error(self, simulation: Simulation) -> float:
+        """Distance along the resting surface from the touched point to the one nearest to the lesion's centre [m]."""
+        assert self.lesion is not None and self.lesion.centre is not None
+        mesh = self.anatomy.mesh
+        triangles = self.anatomy.face.triangles
+        deformed = simulation.organ_state.node_position[triangles]
+        touched, weights = nearest_triangle(deformed, simulation.instrument.tip_position)
+        place = weights @ mesh.points[triangles[touched]]
+        truth, _ = self.anatomy.face.project(self.lesion.centre)
+        return float(self._distance(truth, place[None])[0])
+
+    def get_state(self) -> str:
+        """Lesion, bias and counters as JSON, exact (numbers are written in full)."""
+        lesion = self.lesion
+        assert lesion is not None and lesion.material is not None
+        return json.dumps(
+            {
+                "centre": lesion.centre,
+                "radius": lesion.radius,
+                "youngs_modulus": lesion.material.youngs_modulus,
+                "bias": self.reading.bias.tolist(),
+                "counts": [self.step_count, self.declare_count],
+                "step": [self._declare_value, self._force_peak],
+            }
+        )
+
+    def set_state(self, text: str) -> tuple[Lesion, ...]:
+        """Restore what `get_state` gave; returns the lesions that the organ must have."""
+        table = json.loads(text)
+        self.lesion = self.anatomy.lesion_of_modulus(
+            table["centre"], table["radius"], table["youngs_modulus"], "lesion"
+        )
+        self.reading.bias = np.array(table["bias"])
+        self.step_count, self.declare_count = table["counts"]
+        self._declare_value, self._force_peak = table["step"]
+        return (self.lesion,)

@@ -1,24 +1,18 @@
 """msdm_core: a tetrahedral mass-spring-damper organ (Sala et al. 2011) in numba, without MuJoCo and Gymnasium."""
 
-from pathlib import Path
-
-from msdm_core.numba_cache import provide_cache_folder
-
-# Before the kernels are imported: where nothing can be written, numba would refuse to cache and the import to work.
-provide_cache_folder(Path(__file__).resolve().parent)
-
-from msdm_core.damping import Damping  # noqa: E402
-from msdm_core.errors import MeshError, OrganDivergedError, OrganError  # noqa: E402
-from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState  # noqa: E402
-from msdm_core.lumping import lump_mass  # noqa: E402
-from msdm_core.mesh import TetMesh  # noqa: E402
-from msdm_core.mesh_io import read_mesh, read_surface, write_mesh  # noqa: E402
-from msdm_core.meshing import box_mesh, mesh_surface  # noqa: E402
-from msdm_core.organ import OrganSpec, advance, compile_organ, rest_state  # noqa: E402
-from msdm_core.quality import mesh_quality  # noqa: E402
-from msdm_core.regions import Capsule, Lesion, Material  # noqa: E402
-from msdm_core.stability import stable_dt  # noqa: E402
-from msdm_core.stiffness import spring_network  # noqa: E402
+import msdm_core.numba_cache  # noqa: F401  # before kernels: gives numba a folder it can write
+from msdm_core.damping import Damping
+from msdm_core.errors import MeshError, OrganDivergedError, OrganError
+from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.lumping import lump_mass
+from msdm_core.mesh import TetMesh
+from msdm_core.mesh_io import read_mesh, read_surface, write_mesh
+from msdm_core.meshing import box_mesh, mesh_surface
+from msdm_core.organ import OrganSpec, advance, compile_organ, rest_state
+from msdm_core.quality import mesh_quality
+from msdm_core.regions import Capsule, Lesion, Material
+from msdm_core.stability import stable_dt
+from msdm_core.stiffness import spring_network
 
 __all__ = [
     "Capsule",

@@ -30,5 +30,5 @@ class Damping:
         return self.alpha / (2.0 * omega) + self.beta * omega / 2.0
 
     def compressed(self, frequency: float) -> "Damping":
-        """The paper's form, all in one inertial term: alpha' = alpha + beta w^2 damps the mode of this frequency alike."""
+        """The paper's form, all in one inertial term: alpha' = alpha + beta w^2 damps that mode [Hz] alike."""
         return Damping(alpha=self.alpha + self.beta * (2.0 * math.pi * frequency) ** 2)

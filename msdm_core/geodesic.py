@@ -35,7 +35,8 @@ class SurfaceDistance:
         self._members = np.concatenate([triangles, on_edge.reshape(len(triangles), -1)], axis=1)
         first, second = np.triu_indices(self._members.shape[1], k=1)
         pairs = np.unique(
-            np.sort(np.stack([self._members[:, first], self._members[:, second]], axis=2).reshape(-1, 2), axis=1), axis=0
+            np.sort(np.stack([self._members[:, first], self._members[:, second]], axis=2).reshape(-1, 2), axis=1),
+            axis=0,
         )
         self._rows, self._columns = pairs[:, 0], pairs[:, 1]
         self._lengths = np.linalg.norm(self._positions[self._rows] - self._positions[self._columns], axis=1)

@@ -141,7 +141,7 @@ def _begin_forces(model, state):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _add_spring_forces(model, state):
-    """Springs with Rayleigh's beta along them: f = k ((l - l0) + beta dl/dt) along the spring (Sala et al. 2011, eq. 1)."""
+    """Springs and Rayleigh's beta along them: f = k ((l - l0) + beta dl/dt) along the spring (Sala 2011, eq. 1)."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     nodes, stiffness, rest_length, beta = (
         model.spring_nodes,
@@ -501,7 +501,7 @@ def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _integrate(model, state, dt, decay):
-    """Symplectic Euler: v = decay v + dt f / m, x = x + dt v; decay = exp(-alpha dt). Returns a sum that is finite if all is."""
+    """Symplectic Euler: v = decay v + dt f / m, x = x + dt v, decay = exp(-alpha dt); returns a sum finite if all is."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     inverse_mass = model.node_inverse_mass
     total = 0.0
@@ -538,7 +538,7 @@ def advance_substeps(model, state, shapes, law, dt, decay, substep_count, refere
     """Advance an organ by some substeps against moving shapes; the kernel behind `organ.advance`.
 
     Model: model, law
-    In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point each tool's torque is taken about [m] (n_tool, 3)
+    In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point of each tool's torque [m] (n_tool, 3)
     Out:   state, shapes (moved), wrench: MEAN force [N] and torque [N m] on each tool (n_tool, 6)
     Returns a FAULT_ code; a fault stops at the substep that showed it.
     """

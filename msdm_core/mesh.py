@@ -52,8 +52,8 @@ class TetMesh:
 
     points: FloatArray
     tets: IntArray
-    region: IntArray | None = None
-    region_names: tuple[tuple[int, str], ...] = ()
+    region: IntArray
+    region_names: tuple[tuple[int, str], ...]
     reoriented_count: int = field(init=False, default=0)
 
     def __init__(

@@ -21,7 +21,7 @@ from msdm_core.kernels import (
     advance_substeps,
     evaluate_forces,
 )
-from msdm_core.lumping import lump_mass
+from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
 from msdm_core.stability import largest_frequency, step_limit
@@ -59,7 +59,7 @@ class OrganSpec:
     lesions: tuple[Lesion, ...] = ()
     anchors: ArrayLike = ()
     damping: Damping = field(default_factory=lambda: Damping(alpha=4.0 * math.pi))
-    mass_scheme: str = "barycentric"
+    mass_scheme: MassScheme = "barycentric"
     stiffness_rule: str = "lloyd"
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -147,7 +147,8 @@ def advance(
     """
     if not 0.0 < dt <= model.stable_step:
         raise OrganError(
-            f"dt is {dt:g} s; it must be above 0 and at most the stable step {model.stable_step:.4g} s: use more substeps"
+            f"dt is {dt:g} s; it must be above 0 and at most the stable step {model.stable_step:.4g} s: "
+            "use more, shorter substeps"
         )
     if len(shapes.shape_radius) > len(state.contact_engaged):
         raise OrganError(
@@ -181,7 +182,8 @@ def describe_fault(state: OrganState, fault: int) -> str:
     if fault == FAULT_INVERTED_TET:
         return (
             f"tet {int(state.volume_ratio_tet[0])} turned inside out: volume ratio "
-            f"{float(state.volume_ratio_smallest[0]):.3g}, it must stay above 0: press less deep, use smaller cells or a higher Poisson's ratio"
+            f"{float(state.volume_ratio_smallest[0]):.3g}, it must stay above 0: press less deep, use smaller cells "
+            "or a higher Poisson's ratio"
         )
     bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
     return f"node {int(bad[0]) if bad.size else 0} is no longer finite: the step is too long for the forces at work"
@@ -209,9 +211,7 @@ def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray
         bulk[members] = material.volume_modulus
         density[members] = material.density
         if layer is not None:
-            stroma = Material(
-                cast(Capsule, spec.capsule).youngs_modulus, material.density, material.poisson_ratio
-            )
+            stroma = Material(cast(Capsule, spec.capsule).youngs_modulus, material.density, material.poisson_ratio)
             in_layer = layer if tag is None else layer & (mesh.region == tag)
             spring_modulus[in_layer] = stroma.spring_modulus
             bulk[in_layer] = stroma.volume_modulus
@@ -229,11 +229,12 @@ def _materials_by_tag(spec: OrganSpec) -> dict[int | None, Material]:
         return {None: spec.materials}
     mesh = spec.mesh
     by_tag: dict[int | None, Material] = {mesh.region_tag(name): part for name, part in spec.materials.items()}
-    missing = sorted(set(np.unique(cast(NDArray[np.int32], mesh.region)).tolist()) - set(by_tag))
+    missing = sorted(set(np.unique(mesh.region).tolist()) - set(by_tag))
     if missing:
         names = dict(mesh.region_names)
         raise OrganError(
-            f"mesh region {names.get(missing[0], missing[0])!r} has no material; give one for every region in `materials`"
+            f"mesh region {names.get(missing[0], missing[0])!r} has no material; "
+            "give one for every region in `materials`"
         )
     return by_tag
 

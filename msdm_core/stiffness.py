@@ -1,4 +1,4 @@
-"""Spring stiffness from Young's moduli: formula (6) of Sala et al. 2011 (Lloyd et al. 2007), Van Gelder's, and a membrane."""
+"""Spring stiffness from Young's moduli: formula (6) of Sala et al. 2011 (Lloyd 2007), Van Gelder's, and a membrane."""
 
 import math
 from difflib import get_close_matches
@@ -12,9 +12,7 @@ from msdm_core.mesh import TET_EDGES, FloatArray, IntArray, TetMesh
 STIFFNESS_RULES = ("lloyd", "van_gelder")
 
 
-def spring_network(
-    mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "lloyd"
-) -> tuple[IntArray, FloatArray]:
+def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "lloyd") -> tuple[IntArray, FloatArray]:
     """One spring per mesh edge, each tet giving to its six edges a share that grows with its modulus.
 
     * "lloyd": k_ij = sum over tets of (2 sqrt 2 / 25) l_t E_t, l_t = (12 V_t / sqrt 2)^(1/3), the edge of the regular
@@ -47,7 +45,7 @@ def spring_network(
         nearest = get_close_matches(str(rule), STIFFNESS_RULES, n=1)
         hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
         raise OrganError(f"stiffness rule {rule!r} is unknown; the rules are {', '.join(STIFFNESS_RULES)}{hint}")
-    return mesh.edges, np.bincount(mesh.tet_edges.ravel(), weights=share, minlength=len(mesh.edges))
+    return mesh.edges, np.bincount(mesh.tet_edges.ravel(), share, len(mesh.edges)).astype(np.float64)
 
 
 def membrane_stiffness(mesh: TetMesh, youngs_modulus: float, thickness: float) -> FloatArray:
@@ -63,7 +61,5 @@ def membrane_stiffness(mesh: TetMesh, youngs_modulus: float, thickness: float) -
     share = 3.0 * youngs_modulus * thickness * area / np.einsum("tij,tij->t", edges, edges)
     pairs = np.sort(np.stack([triangles, triangles[:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1).astype(np.int64)
     known = mesh.edges.astype(np.int64)
-    index = np.searchsorted(
-        known[:, 0] * mesh.node_count + known[:, 1], pairs[:, 0] * mesh.node_count + pairs[:, 1]
-    )
-    return np.bincount(index, weights=np.repeat(share, 3), minlength=len(mesh.edges))
+    index = np.searchsorted(known[:, 0] * mesh.node_count + known[:, 1], pairs[:, 0] * mesh.node_count + pairs[:, 1])
+    return np.bincount(index, np.repeat(share, 3), len(mesh.edges)).astype(np.float64)

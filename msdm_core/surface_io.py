@@ -23,7 +23,7 @@ def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[
 
     Raises:
         ValueError: names an unknown length unit.
-        MeshError: names the file and what is wrong: missing, not parsable, no triangles, not finite, an unlikely extent.
+        MeshError: names the file and the fault: missing, not parsable, no triangles, not finite, an unlikely extent.
     """
     metres = metres_per_unit(length_unit)
     file = checked_file(path, SURFACE_SUFFIXES, "export the surface as STL, OBJ or PLY")

@@ -1,4 +1,4 @@
-"""A scene's organ made ready: its mesh, its anchored nodes, its palpable face, and organs compiled with given lesions."""
+"""A scene's organ made ready: mesh, anchored nodes, palpable face, and organs compiled with given lesions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -83,9 +83,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
     from msdm_core.mesh_io import read_mesh, read_surface
 
     if source.surface is not None:
-        vertices, triangles = read_surface(
-            scene.folder / source.surface.file, length_unit=source.surface.length_unit
-        )
+        vertices, triangles = read_surface(scene.folder / source.surface.file, length_unit=source.surface.length_unit)
         return mesh_surface(vertices, triangles, cell_size=source.surface.cell_size)
     assert source.tets is not None
     return read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit)

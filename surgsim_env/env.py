@@ -2,7 +2,7 @@
 
 import io
 import json
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -26,8 +26,8 @@ class PalpateEnv(gym.Env[Observation, Observation]):
 
     ## Description
     A robot's ball tip presses a soft organ (a tetrahedral mass-spring-damper model, Sala et al. 2011) with one stiff
-    lesion hidden under its surface. Tissue and tip exchange forces 1000 times a second; the agent acts 20 times a second.
-    It wins by pressing on the lesion and declaring it.
+    lesion hidden under its surface. Tissue and tip exchange forces 1000 times a second; the agent acts 20 times a
+    second. It wins by pressing on the lesion and declaring it.
 
     ## Action Space
     `Box(-1, 1, (4,), float32)`
@@ -44,7 +44,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     |---|---|---|
     | 0-2 | tip position [m] | the organ's bounding box with a margin |
     | 3-5 | tip velocity [m/s] | +-0.5 |
-    | 6-8 | contact force on the tip [N], mean of the last haptic step, with the scene's noise, bias and range | +-range |
+    | 6-8 | contact force on the tip [N], mean of the last haptic step, through the sensor model | +-range |
     | 9 | share of the time left | 0 to 1 |
 
     ## Rewards
@@ -63,7 +63,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
 
     ## Info
     Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`, `hard_limit`,
-    `declared`, `success` (bool), `force_peak` [N], `error_mm` (-1 if nothing was declared) and one `reward_<term>` each.
+    `declared`, `success` (bool), `force_peak` [N], `error_mm` (-1 if nothing was declared), one `reward_<term>` each.
 
     ## Arguments
     * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
@@ -74,7 +74,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     * v0: first version.
     """
 
-    metadata = {"render_modes": [], "render_fps": 20}
+    metadata: ClassVar[Info] = {"render_modes": [], "render_fps": 20}
 
     def __init__(self, scene: str = "phantom", render_mode: str | None = None) -> None:
         if render_mode is not None:

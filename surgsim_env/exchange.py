@@ -25,8 +25,8 @@ def haptic_step(
     """Advance organ and instrument together by one haptic step; `wrench` (n_tool, 6) [N, N m] receives the mean.
 
     The instrument's shapes are read from the current step (mj_step1), carried along their twist through the organ's
-    substeps, and the MEAN wrench of the tissue, torque about each tool's centre of mass at the start, acts on the tool in
-    mj_step2: the organ's change of momentum is minus that wrench times the step, exactly.
+    substeps, and the MEAN wrench of the tissue, torque about each tool's centre of mass at the start, acts on the tool
+    in mj_step2: the organ's change of momentum is minus that wrench times the step, exactly.
 
     Raises:
         OrganDivergedError: an inverted tet, a number that is not finite, or a force beyond FORCE_CAP.

@@ -49,7 +49,7 @@ class PalpableFace:
         return float(np.sqrt((((start + along[:, None] * span) - point) ** 2).sum(axis=1).min()))
 
     def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
-        """A point drawn evenly over the face, at least rim_distance [m] from its border and thick enough, and its normal.
+        """A point drawn evenly over the face, thick enough and rim_distance [m] from its border, and its normal there.
 
         Raises:
             ValueError: no such point in 1000 draws.
@@ -68,7 +68,8 @@ class PalpableFace:
             if self.rim_distance(point) >= rim_distance:
                 return point, normal
         raise ValueError(
-            f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: widen palpation.face_angle_deg"
+            f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: "
+            "widen palpation.face_angle_deg"
         )
 
     def raster(self, spacing: float) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ PALPATE_WEIGHTS: Mapping[str, float] = {
     "wrong": -5.0,  # declared elsewhere
     "hard_force": -5.0,  # the hard limit was passed: a safety stop
     "fault": -5.0,  # the simulation could not go on
-    "forgone": -0.015,  # each step left when an episode ends without finding: the dearest step, so that ending pays less
+    "forgone": -0.015,  # each step left when it ends without finding: the dearest step, so that ending pays less
 }
 
 

@@ -1,10 +1,9 @@
 """Both states and the clock: an organ and an instrument that exchange forces at haptic rate."""
 
-import mujoco
 import numpy as np
 
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import OrganModel, OrganState
+from msdm_core.kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
 from msdm_core.stability import stable_dt
@@ -51,6 +50,17 @@ class Simulation:
     def contact_force(self) -> FloatArray:
         """Sum of the tissue's force over all tools in the last haptic step [N], shape (3,)."""
         return self._wrench[:, :3].sum(axis=0)
+
+    @property
+    def contact_centre(self) -> FloatArray | None:
+        """Centre of the touched patch on the RESTING surface, by area [m], shape (3,); None without contact."""
+        model = self.organ_model
+        engaged = self.organ_state.contact_engaged.any(axis=0).reshape(-1, QUADRATURE_COUNT)
+        if not engaged.any():
+            return None
+        corners = model.node_rest_position[model.surface_triangles]
+        weights = engaged * model.surface_rest_area[:, None]
+        return np.einsum("tq,qc,tcx->x", weights, QUADRATURE_BARYCENTRIC, corners) / weights.sum()
 
     def reset(self, organ_model: OrganModel, tip_position: FloatArray) -> None:
         """Start with an organ at rest and the tip at rest at a position [m].
@@ -127,7 +137,7 @@ class Simulation:
         needed = substeps_needed(self.haptic_dt, limit)
         if needed > self.substep_count:
             raise OrganError(
-                f"scene {self.anatomy.scene.name!r}: {self.substep_count} substeps of {self.substep_dt * 1e3:.3g} ms are too "
-                f"long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: set timing.substep_count = "
-                f"{needed} or use softer lesions"
+                f"scene {self.anatomy.scene.name!r}: {self.substep_count} substeps of {self.substep_dt * 1e3:.3g} ms "
+                f"are too long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: "
+                f"set timing.substep_count = {needed} or use softer lesions"
             )

@@ -1,1 +1,1 @@
-"""The main job: press an organ site by site, map its stiffness, say where a lesion was felt and how far from the truth."""
+"""The main job: press an organ site by site, map its stiffness, and say where a lesion was felt."""

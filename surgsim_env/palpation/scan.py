@@ -12,7 +12,7 @@ from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.simulation import Simulation
 
-# The press: how fast it goes in [m/s], how long it rests there [s] and over which end of that the force is averaged [s].
+# The press: how fast it goes in [m/s], how long it rests there [s], over which end of that the force is averaged [s].
 PRESS_SPEED = 0.04
 HOLD_TIME = 0.10
 AVERAGE_TIME = 0.04
@@ -107,7 +107,8 @@ def scan(
     Args:
         anatomy: the scene's organ.
         organ_model: what is pressed, with or without lesions.
-        sites, normals: surface points [m] and unit outward normals, each (n_site, 3).
+        sites: surface points [m], shape (n_site, 3).
+        normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
         workers: threads (the kernels hold no interpreter lock); all cores by default.
     """

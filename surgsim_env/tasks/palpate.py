@@ -9,7 +9,6 @@ import numpy as np
 from msdm_core.geodesic import SurfaceDistance
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
-from msdm_core.triangles import nearest_triangle
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.rewards import PALPATE_WEIGHTS, weighted
 from surgsim_env.sensors import ForceReading
@@ -92,6 +91,7 @@ class PalpateTask:
 
     def command(self, action: FloatArray) -> FloatArray:
         """Begin a control step: the tip velocity that an action asks for [m/s], shape (3,)."""
+        self.step_count += 1
         self._declare_value = float(action[3])
         self._force_peak = 0.0
         return np.asarray(action[:3], dtype=np.float64) * SPEED_FULL_SCALE
@@ -110,8 +110,7 @@ class PalpateTask:
         return np.concatenate([instrument.tip_position, instrument.tip_velocity, reading, [left]]), saturated
 
     def judge(self, simulation: Simulation, fault: str) -> Verdict:
-        """End a control step: count it, see whether something was declared, and say how it ends."""
-        self.step_count += 1
+        """End a control step: see whether something was declared, and say how it ends."""
         hard = not fault and self._force_peak > self.limits.hard_force
         declared = not fault and not hard and self._declares(simulation)
         error = self.declared_error(simulation) if declared else None
@@ -149,18 +148,14 @@ class PalpateTask:
         return dict.fromkeys(PALPATE_WEIGHTS, 0.0)
 
     def _declares(self, simulation: Simulation) -> bool:
-        touching = bool((simulation.contact_force != 0.0).any())
-        self.declare_count = self.declare_count + 1 if touching and self._declare_value > DECLARE_VALUE else 0
+        pressing = self._declare_value > DECLARE_VALUE and simulation.contact_centre is not None
+        self.declare_count = self.declare_count + 1 if pressing else 0
         return self.declare_count >= DECLARE_STEPS
 
     def declared_error(self, simulation: Simulation) -> float:
-        """Distance along the resting surface from the touched point to the one nearest to the lesion's centre [m]."""
-        assert self.lesion is not None and self.lesion.centre is not None
-        mesh = self.anatomy.mesh
-        triangles = self.anatomy.face.triangles
-        deformed = simulation.organ_state.node_position[triangles]
-        touched, weights = nearest_triangle(deformed, simulation.instrument.tip_position)
-        place = weights @ mesh.points[triangles[touched]]
+        """Distance along the resting surface from the touched patch to the point nearest to the lesion's centre [m]."""
+        place = simulation.contact_centre
+        assert self.lesion is not None and self.lesion.centre is not None and place is not None
         truth, _ = self.anatomy.face.project(self.lesion.centre)
         return float(self._distance(truth, place[None])[0])
 

@@ -1,0 +1,98 @@
+# Two commands matter: `make demo` and `make test`. Each sets up .venv on its first run and starts at once afterwards.
+
+VENV := .venv
+PY := $(VENV)/bin/python
+
+# The interpreter for .venv: PYTHON=... if given, else the first of these from 3.11 up to the newest with wheels.
+CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python3.14)
+SUITABLE := $(if $(PYTHON),sys.version_info >= (3, 11),(3, 11) <= sys.version_info[:2] <= (3, 14))
+
+# Asked for before the `agents` extra, so that a CPU build of just this version is taken where pip is shown one.
+TORCH := torch==2.13.0
+WITH_AGENTS := --editable=.[dev,agents]
+
+PYTEST_ARGS ?= -n 2
+
+.PHONY: help demo test test-all test-agents lint clean distclean
+.NOTPARALLEL:
+
+help:
+	@echo "make demo         press the simulated probe into the liver; results in runs/demo"
+	@echo "make test         the tests (PYTEST_ARGS='-n 2' is the default)"
+	@echo "make test-all     the slow ones too"
+	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
+	@echo "make lint         ruff and pyright"
+	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
+	@echo "PYTHON=/path/to/python picks the interpreter (3.11 or newer) that $(VENV) is made from"
+
+demo: $(VENV)/.ready-demo
+	$(VENV)/bin/surgsim palpate --scene liver --out runs/demo
+
+test: $(VENV)/.ready-dev
+	$(PY) -m pytest $(PYTEST_ARGS)
+
+test-all: $(VENV)/.ready-dev
+	$(PY) -m pytest $(PYTEST_ARGS) -m ""
+
+test-agents: $(VENV)/.ready-agents
+	$(PY) -m pytest $(PYTEST_ARGS) -m "agents and not slow"
+
+lint: $(VENV)/.ready-dev
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright --pythonpath $(PY)
+
+clean:
+	rm -rf runs build dist .pytest_cache .ruff_cache .hypothesis .numba_cache
+	find msdm_core surgsim_env agents benchmarks scenes tests -name __pycache__ -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf $(VENV) $(VENV)-virtualenv
+
+# ---- set-up -------------------------------------------------------------------------------------------------------
+# Stamp files, not the folder, say what is done. `.made` holds the folder that .venv was made for; `.installing` lies
+# there while pip works. A set-up that was interrupted, or a checkout that has moved, begins again from nothing.
+
+define install
+@echo "surgsim: installing into $(VENV): $(1)"
+@touch $(VENV)/.installing
+@for set in $(1); do $(PY) -m pip install -qq --disable-pip-version-check $$set || exit 1; done
+@rm -f $(VENV)/.installing
+@touch $@
+endef
+
+$(VENV)/.ready-demo: pyproject.toml $(VENV)/.made
+	$(call install,--editable=.)
+
+$(VENV)/.ready-dev: pyproject.toml $(VENV)/.made
+	$(call install,--editable=.[dev])
+	@touch $(VENV)/.ready-demo
+
+$(VENV)/.ready-agents: pyproject.toml $(VENV)/.made
+	$(call install,$(TORCH) $(WITH_AGENTS))
+	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
+
+ifneq ($(wildcard $(VENV)/.installing),)
+.PHONY: $(VENV)/.made
+else ifneq ($(shell cat $(VENV)/.made 2>/dev/null),$(CURDIR))
+.PHONY: $(VENV)/.made
+endif
+
+$(VENV)/.made:
+	@found=; for python in $(CANDIDATES); do \
+	    if "$$python" -c 'import sys; sys.exit(not ($(SUITABLE)))' >/dev/null 2>&1; then found=$$python; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	    echo "surgsim: no Python from 3.11 on among: $(CANDIDATES); name one: make PYTHON=/path/to/python ..." >&2; exit 2; \
+	fi; \
+	rm -rf $(VENV) $(VENV)-virtualenv; \
+	echo "surgsim: making $(VENV) with $$("$$found" -V) ($$found)"; \
+	if ! "$$found" -m venv $(VENV) >$(VENV).log 2>&1; then \
+	    echo "surgsim: $$found -m venv failed (Debian without python3-venv?); using virtualenv instead"; \
+	    rm -rf $(VENV); \
+	    { "$$found" -m pip install -qq --disable-pip-version-check --target $(VENV)-virtualenv virtualenv \
+	        && PYTHONPATH=$(VENV)-virtualenv "$$found" -m virtualenv --quiet $(VENV); } \
+	        || { cat $(VENV).log >&2; rm -rf $(VENV) $(VENV)-virtualenv $(VENV).log; exit 1; }; \
+	fi; \
+	rm -rf $(VENV)-virtualenv $(VENV).log
+	@echo "$(CURDIR)" >$@

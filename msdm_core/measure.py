@@ -1,0 +1,62 @@
+"""What an organ's state amounts to: energy, momentum, volume ratios, inverted tets, internal forces."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.kernels import OrganModel, OrganState, evaluate_forces
+from msdm_core.mesh import FloatArray, IntArray, tet_volumes
+
+
+def kinetic_energy(model: OrganModel, state: OrganState) -> float:
+    """Energy of motion, T = sum_i m_i |v_i|^2 / 2 [J]."""
+    return 0.5 * float(model.node_mass @ np.einsum("ij,ij->i", state.node_velocity, state.node_velocity))
+
+
+def potential_energy(model: OrganModel, state: OrganState) -> float:
+    """Energy of springs, volume term and gravity, zero at the undeformed position [J].
+
+    U = sum_s k_s (l_s - l0_s)^2 / 2 + sum_t K_t V0_t (J_t - 1)^2 / 2 - sum_i m_i g . (x_i - X_i); a resting tool's
+    contact energy is not in it.
+    """
+    ends = state.node_position[model.spring_nodes]
+    stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length
+    springs = 0.5 * float(model.spring_stiffness @ stretch**2)
+    strain = volume_ratios(model, state) - 1.0
+    volume = 0.5 * float((model.tet_bulk * model.tet_rest_volume) @ strain**2)
+    lift = (state.node_position - model.node_rest_position) @ model.gravity
+    return springs + volume - float(model.node_mass @ lift)
+
+
+def momentum(model: OrganModel, state: OrganState) -> FloatArray:
+    """Linear momentum, p = sum_i m_i v_i [kg m/s], shape (3,)."""
+    return model.node_mass @ state.node_velocity
+
+
+def angular_momentum(model: OrganModel, state: OrganState, point: ArrayLike) -> FloatArray:
+    """Angular momentum about a point [m], L = sum_i m_i (x_i - point) x v_i [kg m^2/s], shape (3,)."""
+    arm = state.node_position - np.asarray(point, dtype=np.float64)
+    return model.node_mass @ np.cross(arm, state.node_velocity)
+
+
+def volume_ratios(model: OrganModel, state: OrganState) -> FloatArray:
+    """Volume of each tet over its volume at rest, J = V / V0, negative where it is inside out, shape (n_tet,)."""
+    return tet_volumes(state.node_position, model.tet_nodes) / model.tet_rest_volume
+
+
+def inverted_tets(model: OrganModel, state: OrganState) -> IntArray:
+    """Indices of the tets that are inside out, flat or not finite (J > 0 does not hold), shape (n_inverted,)."""
+    return np.flatnonzero(~(volume_ratios(model, state) > 0.0)).astype(np.int32)
+
+
+def internal_forces(model: OrganModel, state: OrganState) -> FloatArray:
+    """Forces of springs and volume term with their beta damping on each node [N], shape (n_node, 3).
+
+    f = -dU/dx without gravity and contact (plus beta's share of the velocity); the state is left as it is.
+    """
+    no_gravity = np.zeros(3)
+    no_gravity.setflags(write=False)
+    scratch = state._replace(
+        node_force=np.empty_like(state.node_force), volume_ratio_smallest=np.ones(1), volume_ratio_tet=np.zeros(1, np.int32)
+    )
+    evaluate_forces(model._replace(gravity=no_gravity), scratch)
+    return scratch.node_force

@@ -1,0 +1,211 @@
+"""The main job: press an organ site by site, map its stiffness in two ways, and say where lesions were felt."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from msdm_core.geodesic import SurfaceDistance
+from msdm_core.mesh import FloatArray
+from msdm_core.regions import Lesion
+from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.palpable_face import PalpableFace, tangent_axes
+from surgsim_env.palpation.analysis import contrast_with_model, contrast_with_neighbours, sensor_readings
+from surgsim_env.palpation.felt import ContrastMap, Truth, feel_lesions, score_map, seen_from_surface
+from surgsim_env.palpation.scan import Press, scan
+from surgsim_env.scenes import Scene
+
+# How wrong the pre-operative model is: its modulus by up to this share, the place of each press by this distance [m].
+MODEL_MODULUS_ERROR = 0.2
+MODEL_SITE_ERROR = 0.002
+# A site within this many tip radii of a fixed node feels the support, not the tissue, and is not pressed.
+SUPPORT_TIP_RADII = 2.0
+# How far inward the rim of the palpable face is felt [m].
+RIM_REACH = 0.015
+
+NEIGHBOURS = "healthy neighbours"
+MODEL = "pre-operative model"
+
+
+@dataclass(frozen=True, eq=False)
+class Palpation:
+    """What a palpation found.
+
+    Fields:
+        anatomy, lesions, truths: the organ, what was hidden in it, and that seen from its surface
+        presses: of the organ, one for each site
+        model_presses: of the pre-operative model, at sites that are MODEL_SITE_ERROR off
+        reading: of the force sensor along the normal at the end of each press [N]                 (n_site,)
+        used: sites whose two presses both reached the set depth                                    (n_site,)
+        maps: against the healthy neighbours and against the model; they hold the used sites only
+        model_modulus_factor: how wrong the model's modulus was
+        support_count: raster sites that were not pressed for lying too near to a support
+        seed, wall_time [s]: of the run
+    """
+
+    anatomy: Anatomy
+    lesions: tuple[Lesion, ...]
+    truths: tuple[Truth, ...]
+    presses: tuple[Press, ...]
+    model_presses: tuple[Press, ...]
+    reading: FloatArray
+    used: np.ndarray
+    maps: tuple[ContrastMap, ...]
+    model_modulus_factor: float
+    support_count: int
+    seed: int
+    wall_time: float
+
+    @property
+    def sites(self) -> FloatArray:
+        """Where it was pressed [m], shape (n_site, 3)."""
+        return np.array([press.site for press in self.presses])
+
+    @property
+    def simulated_time(self) -> float:
+        """Duration of the presses of the organ and of its model [s]."""
+        return sum(press.duration for press in (*self.presses, *self.model_presses))
+
+
+def run_palpation(
+    scene: Scene,
+    *,
+    lesions: Sequence[Lesion] | None = None,
+    seed: int = 0,
+    workers: int | None = None,
+    console: Console | None = None,
+) -> Palpation:
+    """Palpate a scene's organ; the same scene, lesions and seed give the same result.
+
+    Args:
+        scene: what is pressed and how.
+        lesions: hidden in the organ; the scene's demonstration lesions by default.
+        seed: of sensor noise and of the errors of the pre-operative model.
+        workers: threads; all cores by default.
+        console: where the progress bar is shown; nowhere by default.
+
+    Raises:
+        ValueError: the palpable face has no site to press, or no press reached the set depth.
+        OrganError: a lesion or a material that is impossible, or a step that is too long.
+    """
+    begin = time.perf_counter()
+    anatomy = load_anatomy(scene)
+    hidden = tuple(anatomy.demonstration_lesions() if lesions is None else lesions)
+    rng = np.random.default_rng(seed)
+    sites, normals, support_count = plan_sites(anatomy)
+    factor = float(rng.uniform(1.0 - MODEL_MODULUS_ERROR, 1.0 + MODEL_MODULUS_ERROR))
+    organ, model = anatomy.organ(hidden), anatomy.organ(modulus_factor=factor)
+    model_sites, model_normals = _displaced(anatomy.face, sites, normals, rng)
+    with _progress(console) as bar:
+        presses = scan(anatomy, organ, sites, normals, workers=workers, progress=_task(bar, "organ", len(sites)))
+        step = _task(bar, "its pre-operative model", len(sites))
+        model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
+    used = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])
+    if not used.any():
+        raise ValueError(
+            f"no press reached the set depth of {scene.palpation.press_depth * 1e3:g} mm; the first ended by: "
+            f"{presses[0].end or model_presses[0].end}: press less deep or raise limits.hard_force"
+        )
+    reading = sensor_readings(np.array([press.force for press in presses]), normals, scene.sensor, rng)
+    truths = tuple(seen_from_surface(hidden, anatomy.face.project))
+    return Palpation(
+        anatomy=anatomy,
+        lesions=hidden,
+        truths=truths,
+        presses=tuple(presses),
+        model_presses=tuple(model_presses),
+        reading=reading,
+        used=used,
+        maps=_maps(anatomy, presses, model_presses, reading, used, truths),
+        model_modulus_factor=factor,
+        support_count=support_count,
+        seed=seed,
+        wall_time=time.perf_counter() - begin,
+    )
+
+
+def plan_sites(anatomy: Anatomy) -> tuple[FloatArray, FloatArray, int]:
+    """Raster sites [m] and normals, each (n_site, 3), without those that feel a support, and how many those were.
+
+    Raises:
+        ValueError: nothing is left.
+    """
+    scene = anatomy.scene
+    sites, normals = anatomy.face.raster(scene.palpation.site_spacing)
+    held = anatomy.mesh.points[anatomy.anchors]
+    gap = SUPPORT_TIP_RADII * scene.instrument.tip_radius
+    free = np.array([np.linalg.norm(held - site, axis=1).min() > gap for site in sites], dtype=bool)
+    if not free.any():
+        raise ValueError(
+            f"scene {scene.name!r}: no site to press: {len(sites)} raster sites lie on the palpable face, "
+            f"{len(sites)} of them within {gap * 1e3:g} mm of a support: use a smaller site_spacing or face_margin, "
+            "turn the approach, or move the anchors"
+        )
+    return sites[free], normals[free], int((~free).sum())
+
+
+def _displaced(
+    face: PalpableFace, sites: FloatArray, normals: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Each site moved along the surface in a random direction, and the normals there."""
+    moved = []
+    for site, normal in zip(sites, normals, strict=True):
+        first, second = tangent_axes(normal)
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        moved.append(face.project(site + MODEL_SITE_ERROR * (np.cos(angle) * first + np.sin(angle) * second)))
+    return np.array([point for point, _ in moved]), np.array([normal for _, normal in moved])
+
+
+def _maps(
+    anatomy: Anatomy,
+    presses: Sequence[Press],
+    model_presses: Sequence[Press],
+    reading: FloatArray,
+    used: np.ndarray,
+    truths: Sequence[Truth],
+) -> tuple[ContrastMap, ContrastMap]:
+    """Both contrast maps over the used sites."""
+    spacing = anatomy.scene.palpation.site_spacing
+    sites = np.array([press.site for press in presses])[used]
+    stiffness = reading[used] / np.array([press.depth for press in presses])[used]
+    model_stiffness = np.array([press.stiffness for press in model_presses])[used]
+    plane = sites @ np.column_stack(tangent_axes(anatomy.face.approach))
+    surface = SurfaceDistance(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+    contrasts = {
+        NEIGHBOURS: contrast_with_neighbours(stiffness, plane, _geometry(anatomy.face, sites)),
+        MODEL: contrast_with_model(stiffness, model_stiffness),
+    }
+    first, second = (
+        score_map(name, sites, contrast, feel_lesions(sites, contrast, spacing=spacing), truths, surface)
+        for name, contrast in contrasts.items()
+    )
+    return first, second
+
+
+def _geometry(face: PalpableFace, sites: FloatArray) -> FloatArray | None:
+    """What makes healthy sites differ: reciprocal thickness [1/m] and nearness of the rim, (n_site, 2)."""
+    if not np.isfinite(face.thickness).any():
+        return None
+    centres = face.points[face.triangles].mean(axis=1)
+    thickness = np.array([face.thickness[np.argmin(((centres - site) ** 2).sum(axis=1))] for site in sites])
+    rim = np.array([face.rim_distance(site) for site in sites])
+    return np.column_stack([1.0 / thickness, np.exp(-rim / RIM_REACH)])
+
+
+def _progress(console: Console | None) -> Progress:
+    return Progress(
+        TextColumn("pressing {task.description:<24}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console or Console(quiet=True),
+    )
+
+
+def _task(bar: Progress, name: str, count: int) -> Callable[[], None]:
+    task = bar.add_task(name, total=count)
+    return lambda: bar.advance(task)

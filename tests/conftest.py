@@ -1,0 +1,39 @@
+"""What several test modules share: the anatomy files and random meshes."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+from msdm_core.mesh import TetMesh, tet_volumes
+
+ANATOMY = Path(__file__).resolve().parents[2] / "shared" / "data" / "anatomy"
+
+
+@pytest.fixture(scope="session")
+def anatomy_folder() -> Path:
+    """The folder of real organ files, which lies beside the repository and is no part of it."""
+    if not ANATOMY.is_dir():
+        pytest.skip(f"the anatomy files are not at {ANATOMY}")
+    return ANATOMY
+
+
+@pytest.fixture(scope="session")
+def random_mesh() -> Callable[..., TetMesh]:
+    """A function that makes an irregular mesh of a 6 cm block with four regions, the same for the same seed."""
+
+    def make(seed: int, cells: int = 3) -> TetMesh:
+        generator = np.random.default_rng(seed)
+        grid = np.stack(np.meshgrid(*[np.arange(cells + 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        points = (grid + generator.uniform(-0.35, 0.35, grid.shape)) * 0.06 / cells
+        tets = Delaunay(points).simplices
+        # The hull of jittered points has slivers; what is left is one body as long as no node loses all its tets.
+        tets = tets[np.abs(tet_volumes(points, tets)) > 0.01 * (0.06 / cells) ** 3]
+        used, tets = np.unique(tets, return_inverse=True)
+        names = {0: "parenchyma", 1: "capsule", 2: "lesion deep", 7: "lésion <&'>"}
+        tets = tets.reshape(-1, 4)
+        return TetMesh(points[used], tets, generator.choice(list(names), len(tets)), names)
+
+    return make

@@ -1,0 +1,194 @@
+"""The organ's forces, step and contact energy once more, in plain numpy and straight from the equations, and small organs.
+
+Slow on purpose: one spring, one tet, one surface triangle at a time, no code shared with msdm_core/kernels.py.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msdm_core.damping import Damping
+from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.mesh import TetMesh
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, advance_organ, compile_organ, rest_state
+from msdm_core.regions import Material
+
+FloatArray = NDArray[np.float64]
+
+# Centroids of the four congruent parts of a triangle, a quarter of its area each.
+QUADRATURE = np.array([[1 / 3, 1 / 3, 1 / 3], [2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3, 1 / 6], [1 / 6, 1 / 6, 2 / 3]])
+
+TISSUE = Material(youngs_modulus=5000.0, density=1000.0, poisson_ratio=0.45)
+UNDAMPED = Damping(alpha=0.0)
+
+
+# ---- the oracle -------------------------------------------------------------------------------------------------
+
+
+def spring_forces(model: OrganModel, position: FloatArray, velocity: FloatArray) -> FloatArray:
+    """f_i = k ((l - l0) + beta dl/dt) n, n from i to j, and minus that on j [N], shape (n_node, 3)."""
+    force = np.zeros_like(position)
+    for (i, j), stiffness, rest in zip(model.spring_nodes, model.spring_stiffness, model.spring_rest_length):
+        span = position[j] - position[i]
+        length = np.linalg.norm(span)
+        along = span / length
+        rate = along @ (velocity[j] - velocity[i])
+        pull = stiffness * ((length - rest) + model.beta * rate) * along
+        force[i] += pull
+        force[j] -= pull
+    return force
+
+
+def volume_gradient(corners: FloatArray) -> FloatArray:
+    """dV/dx of a tet's corners: a third of the inward area vector of the face opposite each [m^2], shape (4, 3)."""
+    a, b, c, d = corners
+    opposite = [(b, d, c), (a, c, d), (a, d, b), (a, b, c)]
+    return np.array([0.5 * np.cross(q - p, r - p) / 3.0 for p, q, r in opposite])
+
+
+def volume_forces(model: OrganModel, position: FloatArray, velocity: FloatArray) -> FloatArray:
+    """f_a = -K_t ((J - 1) + beta dJ/dt) dV/dx_a [N], shape (n_node, 3)."""
+    force = np.zeros_like(position)
+    for nodes, rest_volume, bulk in zip(model.tet_nodes, model.tet_rest_volume, model.tet_bulk):
+        a, b, c, d = position[nodes]
+        ratio = float(np.linalg.det([b - a, c - a, d - a])) / 6.0 / rest_volume
+        gradient = volume_gradient(position[nodes])
+        rate = float((gradient * velocity[nodes]).sum()) / rest_volume
+        force[nodes] -= bulk * ((ratio - 1.0) + model.beta * rate) * gradient
+    return force
+
+
+def total_forces(model: OrganModel, position: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Springs, volume term, both with beta, and gravity m g [N], shape (n_node, 3)."""
+    gravity = model.node_mass[:, None] * model.gravity
+    return spring_forces(model, position, velocity) + volume_forces(model, position, velocity) + gravity
+
+
+def symplectic_step(
+    model: OrganModel, position: FloatArray, velocity: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """v' = exp(-alpha dt) v + dt f(x, v) / m, then x' = x + dt v'; anchored nodes (1/m = 0) stay."""
+    acceleration = total_forces(model, position, velocity) * model.node_inverse_mass[:, None]
+    after = math.exp(-model.alpha * dt) * velocity + dt * acceleration
+    return position + dt * after, after
+
+
+def contact_energy(
+    model: OrganModel, position: FloatArray, shapes: ContactShapes, stiffness: float, engaged: NDArray
+) -> float:
+    """E = sum over shapes and quadrature points of (k_p / 2) w A0 g^2, g = s (s + t) / r [J].
+
+    d runs from the nearest point of the shape's axis to the quadrature point, n is the triangle's deformed normal,
+    t = d . n, s^2 = r^2 - (|d|^2 - t^2). Counted are points with s^2 > 0, s + t > 0 and (t <= 0 or already engaged).
+    """
+    energy = 0.0
+    for shape, radius in enumerate(shapes.shape_radius):
+        for triangle, corners in enumerate(position[model.surface_triangles]):
+            normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            normal = normal / np.linalg.norm(normal)
+            points = QUADRATURE @ corners
+            offset = points - nearest_on_axis(shapes.shape_ends[shape], points)
+            height = offset @ normal
+            chord_squared = radius**2 - ((offset * offset).sum(axis=1) - height**2)
+            chord = np.sqrt(np.maximum(chord_squared, 0.0))
+            held = engaged[shape, 4 * triangle : 4 * triangle + 4].astype(bool)
+            counted = (chord_squared > 0.0) & (chord + height > 0.0) & ((height <= 0.0) | held)
+            depth = np.where(counted, chord * (chord + height) / radius, 0.0)
+            energy += 0.5 * stiffness * 0.25 * model.surface_rest_area[triangle] * float(depth @ depth)
+    return energy
+
+
+def nearest_on_axis(ends: FloatArray, points: FloatArray) -> FloatArray:
+    """The point of the segment between two ends nearest to each point [m], shape (n, 3)."""
+    axis = ends[1] - ends[0]
+    squared = axis @ axis
+    share = np.clip((points - ends[0]) @ axis / squared, 0.0, 1.0) if squared > 0.0 else np.zeros(len(points))
+    return ends[0] + share[:, None] * axis
+
+
+# ---- small organs and shapes to hold it against --------------------------------------------------------------------
+
+
+def frozen(values: ArrayLike, dtype: type = np.float64) -> NDArray:
+    """A read-only array, as a compiled OrganModel has them (numba compiles anew for writable ones)."""
+    array = np.ascontiguousarray(np.array(values, dtype=dtype))
+    array.setflags(write=False)
+    return array
+
+
+def block(
+    size: tuple[float, float, float] = (0.03, 0.02, 0.02),
+    cells: tuple[int, int, int] = (3, 2, 2),
+    *,
+    material: Material = TISSUE,
+    damping: Damping = UNDAMPED,
+    anchored_below: float = -1.0,
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> OrganModel:
+    """A block on a BCC lattice, its nodes up to the height `anchored_below` [m] held."""
+    mesh = box_mesh(size, cells)
+    anchors = np.flatnonzero(mesh.points[:, 2] <= anchored_below)
+    return compile_organ(OrganSpec(mesh, material, anchors=anchors, damping=damping, gravity=gravity))
+
+
+def irregular_organ(seed: int, *, damping: Damping = UNDAMPED) -> OrganModel:
+    """A 48-node organ without any symmetry: jittered nodes, every spring and tet of its own stiffness, free in space."""
+    random = np.random.default_rng(seed)
+    lattice = box_mesh((0.03, 0.02, 0.02), (3, 2, 2))
+    mesh = TetMesh(lattice.points + random.uniform(-1e-3, 1e-3, lattice.points.shape), lattice.tets)
+    model = compile_organ(OrganSpec(mesh, TISSUE, damping=damping))
+    return model._replace(
+        spring_stiffness=frozen(model.spring_stiffness * random.uniform(0.3, 3.0, len(model.spring_stiffness))),
+        tet_bulk=frozen(model.tet_bulk * random.uniform(0.0, 3.0, len(model.tet_bulk))),
+    )
+
+
+def deformed_state(model: OrganModel, seed: int, *, shape_count: int = 0) -> OrganState:
+    """A state with every node moved by up to 1.5 mm and thrown with up to 0.1 m/s along each axis."""
+    random = np.random.default_rng(seed)
+    state = rest_state(model, shape_count=shape_count)
+    state.node_position[:] += random.uniform(-1.5e-3, 1.5e-3, state.node_position.shape)
+    state.node_velocity[:] = random.uniform(-0.1, 0.1, state.node_velocity.shape)
+    return state
+
+
+def without_stiffness(model: OrganModel) -> OrganModel:
+    """The same organ without springs and volume term: what is left of `node_force` is contact."""
+    return model._replace(
+        spring_stiffness=frozen(np.zeros_like(model.spring_stiffness)), tet_bulk=frozen(np.zeros_like(model.tet_bulk))
+    )
+
+
+def single_tool(
+    ends: ArrayLike, radius: ArrayLike, *, centre: ArrayLike | None = None, twist: ArrayLike = (0.0,) * 6
+) -> ContactShapes:
+    """Shapes carried by one tool: axis ends (n_shape, 2, 3) [m], radii (n_shape,) [m], centre of mass, twist (6,)."""
+    axes = np.array(ends, dtype=np.float64).reshape(-1, 2, 3)
+    middle = axes[0].mean(axis=0) if centre is None else np.asarray(centre, dtype=np.float64)
+    return ContactShapes(
+        shape_ends=axes,
+        shape_radius=np.array(radius, dtype=np.float64).reshape(-1),
+        shape_tool=np.zeros(len(axes), dtype=np.int32),
+        tool_centre=middle.reshape(1, 3).copy(),
+        tool_twist=np.array(twist, dtype=np.float64).reshape(1, 6),
+    )
+
+
+def ball(centre: ArrayLike, radius: float, *, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> ContactShapes:
+    """One sphere as a tool of its own."""
+    middle = np.asarray(centre, dtype=np.float64)
+    return single_tool([middle, middle], radius, centre=middle, twist=[*np.asarray(velocity), 0.0, 0.0, 0.0])
+
+
+def contact_forces(
+    model: OrganModel, state: OrganState, shapes: ContactShapes, law: ContactLaw
+) -> tuple[FloatArray, FloatArray]:
+    """The kernel's contact forces on the nodes [N] (n_node, 3) and wrench on the tool (6,), the state left as it is."""
+    bare = without_stiffness(model)._replace(alpha=0.0, gravity=frozen(np.zeros(3)))
+    scratch = OrganState(*(array.copy() for array in state))
+    moved = ContactShapes(*(array.copy() for array in shapes))
+    wrench = np.zeros((1, 6))
+    advance_organ(bare, scratch, moved, law, 1e-9, 1, wrench)
+    return scratch.node_force, wrench[0]

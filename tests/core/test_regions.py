@@ -1,0 +1,216 @@
+"""Materials, capsule and lesions: what they refuse, how much of each tet they fill, and what the organ makes of it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from msdm_core.errors import MeshError, OrganError
+from msdm_core.lumping import lump_mass
+from msdm_core.mesh import TET_FACES, TetMesh
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, compile_organ
+from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
+from msdm_core.stiffness import spring_network
+
+HEALTHY = Material(youngs_modulus=5000.0, density=1060.0, poisson_ratio=0.45)
+HARD = Material(youngs_modulus=40000.0, density=1100.0, poisson_ratio=0.40)
+BLOCK = box_mesh((0.06, 0.06, 0.03), (12, 12, 6))
+INTERIOR = (0.031, 0.028, 0.0152)  # away from every symmetry of the lattice [m]
+
+
+def tagged_block() -> TetMesh:
+    """The block with its half x < 30 mm tagged 1 ("left") and the rest 2 ("right")."""
+    side = np.where(BLOCK.points[BLOCK.tets].mean(axis=1)[:, 0] < 0.03, 1, 2)
+    return TetMesh(BLOCK.points, BLOCK.tets, side, {1: "left", 2: "right"})
+
+
+# ---- what is refused ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize(("name", "unit"), [("youngs_modulus", "Pa"), ("density", "kg/m^3")])
+def test_material_names_the_field_its_value_and_the_rule(name: str, unit: str, bad: float):
+    with pytest.raises(OrganError, match=rf"{name} is {bad} {unit.replace('^', '.')}; it must be finite and above 0"):
+        Material(**{"youngs_modulus": 5000.0, "density": 1000.0, name: bad})
+
+
+@pytest.mark.parametrize("nu", [0.2, 0.2499, 0.5, 0.6, -0.3, math.nan])
+def test_material_refuses_a_poisson_ratio_it_cannot_have(nu: float):
+    with pytest.raises(OrganError, match=rf"poisson_ratio is {nu}; .* 0.25 <= nu < 0.5: use 0.40 to 0.45"):
+        Material(5000.0, 1000.0, nu)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0.0,), "capsule: youngs_modulus is 0.0 Pa; it must be finite and above 0"),
+        ((math.nan,), "capsule: youngs_modulus is nan Pa"),
+        ((1e6, 0.0), "capsule: thickness is 0.0 m; it must be above 0, or None"),
+        ((1e6, math.inf), "capsule: thickness is inf m"),
+    ],
+)
+def test_capsule_refuses(arguments: tuple[float, ...], message: str):
+    with pytest.raises(OrganError, match=message):
+        Capsule(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"centre": INTERIOR, "radius": 0.01, "material": None}, "node: no material"),
+        ({}, "node: give a centre and either radius or radii, or a mesh region"),
+        ({"centre": INTERIOR}, "node: give a centre and either radius or radii"),
+        ({"radius": 0.01}, "node: give a centre and either radius or radii"),
+        ({"centre": INTERIOR, "radius": 0.01, "radii": (0.01, 0.01, 0.01)}, "node: give a centre and either radius or"),
+        ({"centre": INTERIOR, "radius": 0.01, "region": "left"}, "node: give either a region or a centre"),
+        ({"centre": (0.0, math.nan, 0.0), "radius": 0.01}, "node: centre is .*; it must be three finite numbers"),
+        ({"centre": (0.0, 0.0), "radius": 0.01}, "node: centre is .*; it must be three finite numbers"),
+        ({"centre": INTERIOR, "radius": 0.0}, "node: radius is 0.0 m; it must be finite and above 0"),
+        ({"centre": INTERIOR, "radius": -0.01}, "node: radius is -0.01 m"),
+        ({"centre": INTERIOR, "radii": (0.01, 0.0, 0.01)}, r"node: radii are \(0.01, 0.0, 0.01\) m; it must"),
+        ({"centre": INTERIOR, "radii": (0.01, 0.01)}, r"node: radii are \(0.01, 0.01\) m; it must"),
+    ],
+)
+def test_lesion_refuses(fields: dict, message: str):
+    with pytest.raises(OrganError, match=message):
+        Lesion(**{"material": HARD, "name": "node", **fields})
+
+
+def test_lesion_outside_the_organ_is_refused():
+    outside = Lesion((0.03, 0.03, 0.05), 0.008, HARD, "metastasis")
+    with pytest.raises(OrganError, match=r"metastasis: only 0% of it \(centre 30.0, 30.0, 50.0 mm\).* at least 50% must"):
+        lesion_fraction(BLOCK, outside)
+    half_out = Lesion((0.03, 0.03, 0.0325), 0.008, HARD, "metastasis")  # 27 % inside
+    with pytest.raises(OrganError, match=r"metastasis: only \d+% of it"):
+        lesion_fraction(BLOCK, half_out)
+
+
+def test_lesion_in_millimetres_is_refused():
+    with pytest.raises(OrganError, match="coordinates are metres"):
+        lesion_fraction(BLOCK, Lesion((31.0, 28.0, 15.0), 8.0, HARD))
+
+
+def test_lesion_smaller_than_a_cell_is_refused():
+    with pytest.raises(OrganError, match=r"tiny: radius 2 mm is smaller than half a cell \(5 mm\) there"):
+        lesion_fraction(BLOCK, Lesion(INTERIOR, 0.002, HARD, "tiny"))
+
+
+def test_unknown_region_lists_the_regions():
+    lesion = Lesion(region="middle", material=HARD)
+    with pytest.raises(MeshError, match="'middle' is not in the mesh; its named regions: left, right"):
+        lesion_fraction(tagged_block(), lesion)
+
+
+def test_every_region_needs_a_material():
+    with pytest.raises(OrganError, match="mesh region 'right' has no material"):
+        compile_organ(OrganSpec(tagged_block(), {"left": HEALTHY}))
+
+
+# ---- how much of each tet -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("radius", "tolerance"), [(0.006, 0.02), (0.008, 0.01), (0.010, 0.01)])
+def test_a_sphere_fills_its_own_volume(radius: float, tolerance: float):
+    """sum_t fraction_t V_t = (4/3) pi r^3; a cut tet of 165 samples is good to 0.02, hundreds of them to much less."""
+    fraction = lesion_fraction(BLOCK, Lesion(INTERIOR, radius, HARD))
+    assert fraction.min() >= 0.0 and fraction.max() == 1.0
+    assert fraction @ BLOCK.volumes == pytest.approx(4.0 / 3.0 * math.pi * radius**3, rel=tolerance)
+
+
+def test_an_ellipsoid_fills_its_own_volume():
+    """sum_t fraction_t V_t = (4/3) pi a b c, the mean of x^2 about its centre is a^2 / 5 along each axis."""
+    radii = (0.018, 0.012, 0.008)
+    fraction = lesion_fraction(BLOCK, Lesion(INTERIOR, radii=radii, material=HARD))
+    filled = fraction * BLOCK.volumes
+    assert filled.sum() == pytest.approx(4.0 / 3.0 * math.pi * math.prod(radii), rel=0.01)
+    # A cut tet's share counts at its centroid, not where it lies: out by at most a tet's size, in a shell of them.
+    offset = BLOCK.points[BLOCK.tets].mean(axis=1) - INTERIOR
+    moments = (filled @ offset**2) / filled.sum()
+    np.testing.assert_allclose(moments, np.square(radii) / 5.0, rtol=0.06)
+
+
+@pytest.mark.parametrize("radius", [0.006, 0.008, 0.010])
+def test_each_cut_tet_has_its_own_share(radius: float):
+    """Against 10 000 random points a tet (standard error 0.005), in 40 of the tets that the sphere's surface cuts."""
+    fraction = lesion_fraction(BLOCK, Lesion(INTERIOR, radius, HARD))
+    random = np.random.default_rng(0)
+    cut = random.choice(np.flatnonzero((fraction > 0.0) & (fraction < 1.0)), 40, replace=False)
+    points = random.dirichlet(np.ones(4), 10000) @ BLOCK.points[BLOCK.tets[cut]]
+    error = fraction[cut] - (np.linalg.norm(points - INTERIOR, axis=2) <= radius).mean(axis=1)
+    assert np.abs(error).max() < 0.035
+    assert math.sqrt((error**2).mean()) < 0.012
+
+
+def test_a_tagged_region_fills_its_tets():
+    mesh = tagged_block()
+    fraction = lesion_fraction(mesh, Lesion(region="left", material=HARD))
+    np.testing.assert_array_equal(fraction, mesh.region == 1)
+    assert fraction @ mesh.volumes == pytest.approx(mesh.volumes[mesh.region == 1].sum(), rel=1e-12)
+
+
+# ---- what the organ makes of it -----------------------------------------------------------------------------------
+
+
+def test_the_papers_capsule_is_every_tet_with_a_face_on_the_boundary():
+    """A face is on the boundary where no other tet has it (counted here face by face)."""
+    seen: dict[tuple[int, ...], list[int]] = {}
+    for tet, nodes in enumerate(BLOCK.tets):
+        for face in TET_FACES:
+            seen.setdefault(tuple(sorted(nodes[face].tolist())), []).append(tet)
+    expected = {owners[0] for owners in seen.values() if len(owners) == 1}
+    layer = boundary_layer(BLOCK)
+    assert set(np.flatnonzero(layer).tolist()) == expected
+    model = compile_organ(OrganSpec(BLOCK, HEALTHY, capsule=Capsule(15000.0)))
+    modulus = np.where(layer, 15000.0, 5000.0) * (1.25 / 1.45)
+    np.testing.assert_allclose(model.spring_stiffness, spring_network(BLOCK, modulus)[1], rtol=1e-12)
+    bulk = HEALTHY.volume_modulus * np.where(layer, 3.0, 1.0)
+    np.testing.assert_allclose(model.tet_bulk, bulk, rtol=1e-12)
+
+
+def test_a_lesions_properties_enter_by_volume_fraction():
+    """p_t = (1 - f_t) p_healthy + f_t p_lesion for the springs' modulus, the volume modulus and the density alike."""
+    lesion = Lesion(INTERIOR, 0.008, HARD)
+    fraction = lesion_fraction(BLOCK, lesion)
+    model = compile_organ(OrganSpec(BLOCK, HEALTHY, lesions=(lesion,)))
+    modulus = (1.0 - fraction) * HEALTHY.spring_modulus + fraction * HARD.spring_modulus
+    bulk = (1.0 - fraction) * HEALTHY.volume_modulus + fraction * HARD.volume_modulus
+    density = (1.0 - fraction) * 1060.0 + fraction * 1100.0
+    np.testing.assert_allclose(model.spring_stiffness, spring_network(BLOCK, modulus)[1], rtol=1e-12)
+    np.testing.assert_allclose(model.tet_bulk, bulk, rtol=1e-12)
+    np.testing.assert_allclose(model.node_mass, lump_mass(BLOCK, density, scheme="barycentric"), rtol=1e-12)
+    np.testing.assert_allclose(model.node_mass.sum(), density @ BLOCK.volumes, rtol=1e-12)
+
+
+def test_later_lesions_overlay_earlier_ones():
+    """A second lesion over the same place replaces its share of the first, in order."""
+    first = Lesion(INTERIOR, 0.010, HARD, "first")
+    second = Lesion(INTERIOR, 0.006, HEALTHY, "core")
+    model = compile_organ(OrganSpec(BLOCK, HEALTHY, lesions=(first, second)))
+    a, b = lesion_fraction(BLOCK, first), lesion_fraction(BLOCK, second)
+    share = a * (1.0 - b)
+    bulk = HEALTHY.volume_modulus + share * (HARD.volume_modulus - HEALTHY.volume_modulus)
+    np.testing.assert_allclose(model.tet_bulk, bulk, rtol=1e-12)
+
+
+def test_regions_have_their_own_material():
+    mesh = tagged_block()
+    model = compile_organ(OrganSpec(mesh, {"left": HEALTHY, "right": HARD}))
+    left = mesh.region == 1
+    np.testing.assert_array_equal(model.tet_bulk, np.where(left, HEALTHY.volume_modulus, HARD.volume_modulus))
+    modulus = np.where(left, HEALTHY.spring_modulus, HARD.spring_modulus)
+    np.testing.assert_array_equal(model.spring_stiffness, spring_network(mesh, modulus)[1])
+    density = np.where(left, HEALTHY.density, HARD.density)
+    np.testing.assert_allclose(model.node_mass.sum(), density @ mesh.volumes, rtol=1e-12)
+
+
+@pytest.mark.parametrize("anchors", [[-1], [BLOCK.node_count], [0.5]])
+def test_an_anchor_that_is_no_node_is_refused(anchors: list):
+    with pytest.raises(OrganError, match=rf"anchors are node indices in 0..{BLOCK.node_count - 1}"):
+        compile_organ(OrganSpec(BLOCK, HEALTHY, anchors=anchors))
+
+
+@pytest.mark.parametrize("scale", [300.0, 0.01])
+def test_an_organ_of_impossible_size_is_refused(scale: float):
+    with pytest.raises(OrganError, match=r"the organ is .* m long; .* was its length unit forgotten"):
+        compile_organ(OrganSpec(TetMesh(BLOCK.points * scale, BLOCK.tets), HEALTHY))

@@ -1,0 +1,141 @@
+"""Every environment id under the same contract: checkers, bit-exact replay, save and restore, seeds that matter."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import surgsim_env  # noqa: F401  (registers the ids)
+
+IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
+
+
+@pytest.fixture(params=IDS)
+def env_id(request):
+    return request.param
+
+
+def rollout(env, seed, steps, action_seed=7):
+    """Observations, rewards, ends and infos of a pressing random walk from a seed."""
+    rng = np.random.default_rng(action_seed)
+    records = [env.reset(seed=seed)]
+    for _ in range(steps):
+        action = rng.uniform(-0.5, 0.5, env.action_space.shape).astype(np.float32)
+        action[2] -= 0.3  # press, so that contact and friction are in play
+        records.append(env.step(action))
+        if records[-1][2] or records[-1][3]:
+            break
+    return records
+
+
+def assert_same(first, second):
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        assert one[0].tobytes() == other[0].tobytes()
+        assert one[1:] == other[1:]
+
+
+def test_there_are_ids():
+    assert "SurgSim/Palpate-v0" in IDS
+
+
+def test_passes_gymnasiums_checker_without_a_warning(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(env_id).unwrapped)
+
+
+@pytest.mark.agents
+def test_passes_stable_baselines3s_checker_without_a_warning(env_id):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the `agents` extra")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(gym.make(env_id).unwrapped)
+
+
+def test_same_seed_repeats_to_the_bit_also_after_other_episodes(env_id):
+    env = gym.make(env_id)
+    first = rollout(env, seed=3, steps=30)
+    rollout(env, seed=11, steps=12, action_seed=8)
+    assert_same(first, rollout(env, seed=3, steps=30))
+    assert_same(first, rollout(gym.make(env_id), seed=3, steps=30))
+    assert any(record[-1]["force_peak"] > 0.0 for record in first), "the walk must touch the organ to prove anything"
+
+
+def test_seeds_that_differ_differ(env_id):
+    env = gym.make(env_id)
+    starts = [env.reset(seed=seed)[0].tobytes() for seed in range(5)]
+    assert len(set(starts)) == 5
+
+
+def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(env_id):
+    env = gym.make(env_id).unwrapped
+    rollout(env, seed=5, steps=25)
+    saved = env.save_state()
+    actions = np.random.default_rng(1).uniform(-0.4, 0.4, (15, *env.action_space.shape)).astype(np.float32)
+
+    def go_on(one):
+        return [one.step(action) for action in actions]
+
+    expected = go_on(env)
+    next_start = env.reset()
+    other = gym.make(env_id).unwrapped
+    other.reset(seed=99)
+    for one in (env, other):
+        one.load_state(saved)
+        assert one.save_state() == saved
+        assert_same(expected, go_on(one))
+        # The random generator went on as well: the next episode is the same too.
+        assert_same([next_start], [one.reset()])
+
+
+def test_info_has_fixed_keys_and_types(env_id):
+    records = rollout(gym.make(env_id), seed=2, steps=5)
+    shapes = [{key: type(value) for key, value in record[-1].items()} for record in records]
+    assert all(shape == shapes[0] for shape in shapes)
+    assert shapes[0]["sim_fault"] is str
+    assert set(shapes[0].values()) <= {str, bool, float}
+
+
+def test_observation_has_no_constant_entry(env_id):
+    observations = np.array([record[0] for record in rollout(gym.make(env_id), seed=4, steps=40)])
+    assert (np.ptp(observations, axis=0) > 0.0).all()
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_works_in_make_vec(env_id, mode):
+    envs = gym.make_vec(env_id, num_envs=2, vectorization_mode=mode)
+    observations, _ = envs.reset(seed=[3, 4])
+    assert observations.shape == (2, *envs.single_observation_space.shape)
+    alone = gym.make(env_id).reset(seed=4)[0]
+    np.testing.assert_array_equal(observations[1], alone)
+    for _ in range(3):
+        envs.step(envs.action_space.sample())
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([0.0, 0.0, 0.0], "shape"),
+        ([0.0, np.nan, 0.0, 0.0], r"action\[1\] is nan"),
+        ([0.0, 0.0, 1.5, 0.0], r"action\[2\] is 1.5"),
+    ],
+)
+def test_bad_actions_are_refused(action, message):
+    env = gym.make("SurgSim/Palpate-v0").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(np.array(action, dtype=np.float32))
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(ValueError, match="did you mean 'phantom'"):
+        gym.make("SurgSim/Palpate-v0", scene="fantom")
+    env = gym.make("SurgSim/Palpate-v0").unwrapped
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(4, dtype=np.float32))
+    with pytest.raises(ValueError, match="option 'difficulty' is unknown"):
+        env.reset(options={"difficulty": 3})

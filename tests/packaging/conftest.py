@@ -1,0 +1,96 @@
+"""Fresh environments to install surgsim into, without a network: they see this interpreter's other packages."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+BUILD_INPUTS = ("pyproject.toml", "README.md", "LICENSE", "msdm_core", "surgsim_env", "scenes")
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A virtual environment with its own surgsim; numpy, mujoco and the rest come from the interpreter that tests."""
+
+    folder: Path
+
+    @property
+    def python(self) -> Path:
+        return self.folder / "bin" / "python"
+
+    @property
+    def site_packages(self) -> Path:
+        (found,) = self.folder.glob("lib/python*/site-packages")
+        return found
+
+    def install(self, *arguments: str | Path) -> None:
+        pip = [
+            sys.executable,
+            "-m",
+            "pip",
+            "--python",
+            self.python,
+            "--quiet",
+            "--disable-pip-version-check",
+            "install",
+        ]
+        run([*pip, "--no-index", "--no-deps", "--no-build-isolation", *arguments])
+
+
+def run(command: list[str | Path], *, expect: int = 0, **options) -> str:
+    """Standard output of a command, which shows all it printed where it ends otherwise than expected."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+    assert done.returncode == expect, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def copy_of_project(target: Path) -> Path:
+    """What a build reads, so that a test may change it."""
+    target.mkdir(parents=True)
+    without_leftovers = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
+    for name in BUILD_INPUTS:
+        source = REPOSITORY / name
+        if source.is_dir():
+            shutil.copytree(source, target / name, ignore=without_leftovers)
+        else:
+            shutil.copy(source, target / name)
+    return target
+
+
+@pytest.fixture(scope="session")
+def clean_environ() -> dict[str, str]:
+    """The environment variables without those that point a fresh interpreter at this checkout or a numba cache."""
+    return {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "NUMBA_", "PYTEST_"))}
+
+
+@pytest.fixture
+def make_environment() -> Callable[[Path], Environment]:
+    def make(folder: Path) -> Environment:
+        run([sys.executable, "-m", "venv", "--without-pip", folder])
+        environment = Environment(folder)
+        # A plain line in a .pth adds the folder, but not the .pth files in it: surgsim itself stays unseen.
+        dependencies = sysconfig.get_path("purelib")
+        (environment.site_packages / "dependencies.pth").write_text(f"{dependencies}\n")
+        return environment
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel built by way of the source archive, as for a release."""
+    folder = tmp_path_factory.mktemp("build")
+    project = copy_of_project(folder / "project")
+    for leftover in ("msdm_core/kernels.nbi", "surgsim_env/__pycache__/env.pyc", "scenes/meshes/__pycache__/make.pyc"):
+        (project / leftover).parent.mkdir(exist_ok=True)
+        (project / leftover).write_text("must not ship")
+    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", folder / "dist", project])
+    (built,) = (folder / "dist").glob("surgsim-*.whl")
+    return built

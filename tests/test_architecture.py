@@ -1,0 +1,269 @@
+"""The rules that the layout rests on, read from the source (ast) and from fresh interpreters.
+
+Each rule is a function from one source file to the sentences that break it. It is applied to every file of both
+packages, and to planted violations, so that a rule which catches nothing is noticed.
+"""
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PACKAGES = ("msdm_core", "surgsim_env")
+
+# numba's disk cache does not see edits in other files: what is compiled, the structures and the constants it reads
+# stand in one file. A second kernels file must be as self-sufficient, and is named here.
+KERNEL_FILES = ("msdm_core/kernels.py",)
+KERNEL_IMPORTS = {"math", "typing", "numpy", "numba"}
+# May import numba, though nothing in it is compiled.
+NUMBA_SETTINGS = ("msdm_core/numba_cache.py",)
+# Compiled, but never called while stepping: these may allocate.
+COLD_KERNELS = {"apply_stiffness"}
+
+LINES_PER_FILE = 400
+LINES_PER_FUNCTION = 80
+# What may be longer, how long, and why.
+LONGER_FILES = {"msdm_core/kernels.py": 700}  # the one-file rule above
+LONGER_FUNCTIONS = {"msdm_core/kernels.py:_add_point_contact": 150}  # one contact law, unrolled: calls cost there
+
+EMPTY_NAMES = {"util", "utils", "helper", "helpers", "manager", "managers", "misc", "common"}
+ADVANCING = re.compile(r"mj_step\w*|step|haptic_step|control_step|advance\w*")
+JIT = {"jit", "njit", "vectorize", "guvectorize", "cfunc", "stencil", "generated_jit"}
+ALLOCATING = {
+    *("array", "asarray", "ascontiguousarray", "zeros", "ones", "empty", "full", "arange", "linspace", "eye"),
+    *("zeros_like", "ones_like", "empty_like", "full_like", "copy", "concatenate", "stack", "vstack", "hstack"),
+    *("column_stack", "cross", "outer", "append", "repeat", "tile", "where", "nonzero", "unique", "astype", "flatten"),
+}
+HEAVY = {"matplotlib", "meshio", "sb3_contrib", "stable_baselines3", "torch", "trimesh", "tyro"}
+
+
+class Source(NamedTuple):
+    path: str  # from the repository's root, with slashes
+    text: str
+
+    @property
+    def tree(self) -> ast.Module:
+        return ast.parse(self.text, self.path)
+
+    @property
+    def functions(self) -> list[ast.FunctionDef]:
+        return [node for node in ast.walk(self.tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def sources() -> list[Source]:
+    paths = [path for package in PACKAGES for path in sorted((REPOSITORY / package).rglob("*.py"))]
+    return [Source(path.relative_to(REPOSITORY).as_posix(), path.read_text(encoding="utf-8")) for path in paths]
+
+
+def imported(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Full name and line of every absolute import, also inside functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield ("." * node.level + (node.module or ""), node.lineno)
+
+
+def last_name(node: ast.expr) -> str:
+    """`njit` of `njit`, `numba.njit` and `numba.njit(cache=True)`."""
+    if isinstance(node, ast.Call):
+        return last_name(node.func)
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+# ---- the rules --------------------------------------------------------------------------------------------------
+
+
+def core_stands_alone(source: Source) -> Iterator[str]:
+    """msdm_core knows neither MuJoCo nor Gymnasium nor the environments."""
+    if source.path.startswith("msdm_core/"):
+        for name, line in imported(source.tree):
+            if name.split(".")[0] in {"mujoco", "gymnasium", "surgsim_env"}:
+                yield f"line {line} imports {name}"
+
+
+def absolute_imports(source: Source) -> Iterator[str]:
+    """Imports name their module in full."""
+    yield from (f"line {line} imports {name}" for name, line in imported(source.tree) if name.startswith("."))
+
+
+def compiled_code_in_kernels(source: Source) -> Iterator[str]:
+    """Only kernels files import numba and compile."""
+    if source.path in KERNEL_FILES:
+        return
+    for name, line in imported(source.tree):
+        if name.split(".")[0] == "numba" and source.path not in NUMBA_SETTINGS:
+            yield f"line {line} imports {name}; compiled functions stand in {', '.join(KERNEL_FILES)}"
+    for node in ast.walk(source.tree):
+        if isinstance(node, ast.Call | ast.Attribute | ast.Name) and last_name(node) in JIT:
+            yield f"line {node.lineno} compiles with {last_name(node)}"
+
+
+def kernels_import_little(source: Source) -> Iterator[str]:
+    """A kernels file imports math, typing, numpy and numba, nothing that numba's cache would not see change."""
+    if source.path in KERNEL_FILES:
+        for name, line in imported(source.tree):
+            if name.split(".")[0] not in KERNEL_IMPORTS:
+                yield f"line {line} imports {name}"
+
+
+def hot_kernels_allocate_nothing(source: Source) -> Iterator[str]:
+    """No arrays, lists or dictionaries are made in a compiled function, but for the named cold ones."""
+    if source.path not in KERNEL_FILES:
+        return
+    for function in source.functions:
+        if function.name in COLD_KERNELS or not any(last_name(item) in JIT for item in function.decorator_list):
+            continue
+        for node in (item for statement in function.body for item in ast.walk(statement)):
+            if isinstance(node, ast.Call) and last_name(node) in ALLOCATING:
+                yield f"line {node.lineno}: {function.name} allocates with {last_name(node)}"
+            if isinstance(node, ast.List | ast.Dict | ast.Set | ast.ListComp | ast.DictComp | ast.SetComp):
+                yield f"line {node.lineno}: {function.name} makes a {type(node).__name__}"
+
+
+def kernels_repeat_to_the_bit(source: Source) -> Iterator[str]:
+    """No fastmath beyond `contract`, no threads, no functions whose last bit differs between libraries."""
+    for node in ast.walk(source.tree):
+        if isinstance(node, ast.keyword) and node.arg == "fastmath":
+            if ast.unparse(node.value) not in {"{'contract'}", "False"}:
+                yield f"line {node.value.lineno}: fastmath={ast.unparse(node.value)}"
+        if isinstance(node, ast.keyword) and node.arg == "parallel" and ast.unparse(node.value) != "False":
+            yield f"line {node.value.lineno}: parallel={ast.unparse(node.value)}"
+        if source.path in KERNEL_FILES and isinstance(node, ast.Call):
+            function = ast.unparse(node.func)
+            if re.fullmatch(
+                r"(math|np|numpy)\.(exp|expm1|log\w*|a?(sin|cos|tan)h?|atan2|arctan2?|pow|power)", function
+            ):
+                yield f"line {node.lineno}: {function}"
+
+
+def tasks_do_not_advance(source: Source) -> Iterator[str]:
+    """A task reads the simulation and never advances it."""
+    if source.path.startswith("surgsim_env/tasks/"):
+        for node in ast.walk(source.tree):
+            if isinstance(node, ast.Call) and ADVANCING.fullmatch(last_name(node)):
+                yield f"line {node.lineno} calls {last_name(node)}"
+
+
+def short_enough(source: Source) -> Iterator[str]:
+    """A file is read at one sitting, a function at one glance."""
+    lines, limit = len(source.text.splitlines()), LONGER_FILES.get(source.path, LINES_PER_FILE)
+    if lines > limit:
+        yield f"{lines} lines, more than {limit}"
+    for function in source.functions:
+        lines = (function.end_lineno or function.lineno) - function.lineno + 1
+        limit = LONGER_FUNCTIONS.get(f"{source.path}:{function.name}", LINES_PER_FUNCTION)
+        if lines > limit:
+            yield f"{function.name} has {lines} lines, more than {limit}"
+
+
+def named_for_what_it_does(source: Source) -> Iterator[str]:
+    """A module's name says what is in it."""
+    for part in Path(source.path).with_suffix("").parts:
+        if EMPTY_NAMES & set(part.split("_")):
+            yield f"{part} says nothing about what is in it"
+
+
+RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
+    core_stands_alone,
+    absolute_imports,
+    compiled_code_in_kernels,
+    kernels_import_little,
+    hot_kernels_allocate_nothing,
+    kernels_repeat_to_the_bit,
+    tasks_do_not_advance,
+    short_enough,
+    named_for_what_it_does,
+)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_rule(rule):
+    broken = [f"{source.path}: {fault}" for source in sources() for fault in rule(source)]
+    assert not broken, f"{rule.__doc__}\n" + "\n".join(broken)
+
+
+def test_exceptions_are_still_needed():
+    """A file or function that became short loses its longer limit; a kernel that went is no longer listed."""
+    by_path = {source.path: source for source in sources()}
+    for path in LONGER_FILES:
+        assert len(by_path[path].text.splitlines()) > LINES_PER_FILE, path
+    for place in LONGER_FUNCTIONS:
+        path, name = place.split(":")
+        (function,) = (item for item in by_path[path].functions if item.name == name)
+        assert (function.end_lineno or 0) - function.lineno + 1 > LINES_PER_FUNCTION, place
+    kernels = {function.name for path in KERNEL_FILES for function in by_path[path].functions}
+    assert kernels >= COLD_KERNELS
+
+
+HOT = "from numba import njit\nimport numpy as np\n@njit(cache=True)\ndef _move(x):\n    "
+PLANTED = [
+    (core_stands_alone, "msdm_core/organ.py", "import mujoco"),
+    (core_stands_alone, "msdm_core/organ.py", "def late():\n    from gymnasium.spaces import Box"),
+    (core_stands_alone, "msdm_core/organ.py", "from surgsim_env.scenes import list_scenes"),
+    (absolute_imports, "msdm_core/organ.py", "from .mesh import TetMesh"),
+    (compiled_code_in_kernels, "msdm_core/organ.py", "import numba"),
+    (compiled_code_in_kernels, "surgsim_env/exchange.py", "from numba import njit"),
+    (compiled_code_in_kernels, "msdm_core/numba_cache.py", "import numba\nfast = numba.njit(abs)"),
+    (compiled_code_in_kernels, "msdm_core/numba_cache.py", "@numba.njit\ndef f(): pass"),
+    (kernels_import_little, "msdm_core/kernels.py", "from msdm_core.mesh import TetMesh"),
+    (kernels_import_little, "msdm_core/kernels.py", "import scipy.sparse"),
+    (hot_kernels_allocate_nothing, "msdm_core/kernels.py", HOT + "return np.zeros(3)"),
+    (hot_kernels_allocate_nothing, "msdm_core/kernels.py", HOT + "y = x.copy()"),
+    (hot_kernels_allocate_nothing, "msdm_core/kernels.py", HOT + "return [x]"),
+    (hot_kernels_allocate_nothing, "msdm_core/kernels.py", HOT.replace("_move", "advance") + "return np.empty(3)"),
+    (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(fastmath=True)\ndef f(): pass"),
+    (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "f = njit(fastmath={'contract', 'reassoc'})(g)"),
+    (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(parallel=True)\ndef f(): pass"),
+    (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "def f(x):\n    return math.exp(x)"),
+    (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "def f(x):\n    return np.arctan2(x, x)"),
+    (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "def judge(simulation):\n    simulation.haptic_step()"),
+    (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "env.step(action)"),
+    (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "mujoco.mj_step1(model, data)"),
+    (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
+    (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
+    (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),
+    (named_for_what_it_does, "surgsim_env/helpers/__init__.py", ""),
+]
+ALLOWED = [
+    (compiled_code_in_kernels, "msdm_core/kernels.py", HOT + "pass"),
+    (compiled_code_in_kernels, "msdm_core/numba_cache.py", "from numba.core import config"),
+    (kernels_import_little, "msdm_core/kernels.py", "from numpy.typing import NDArray\nimport math"),
+    (hot_kernels_allocate_nothing, "msdm_core/kernels.py", HOT.replace("_move", "apply_stiffness") + "np.zeros(3)"),
+    (hot_kernels_allocate_nothing, "msdm_core/kernels.py", "TABLE = np.array([1.0])"),
+    (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(fastmath={'contract'})\ndef f(x): return math.sqrt(x)"),
+    (tasks_do_not_advance, "surgsim_env/env.py", "simulation.haptic_step()"),
+    (short_enough, "msdm_core/organ.py", "x = 1\n" * LINES_PER_FILE),
+    (named_for_what_it_does, "msdm_core/mesh_io.py", ""),
+]
+
+
+@pytest.mark.parametrize(("rule", "path", "text"), PLANTED)
+def test_planted_violation_is_caught(rule, path, text):
+    assert list(rule(Source(path, text)))
+
+
+@pytest.mark.parametrize(("rule", "path", "text"), ALLOWED)
+def test_allowed_source_passes(rule, path, text):
+    assert not list(rule(Source(path, text)))
+
+
+@pytest.mark.parametrize(
+    ("package", "unwanted"), [("msdm_core", HEAVY | {"mujoco", "gymnasium", "surgsim_env"}), ("surgsim_env", HEAVY)]
+)
+def test_import_stays_light(package, unwanted):
+    """In a fresh interpreter, the package brings none of the heavy libraries."""
+    code = f"import {package}, sys; print(*{{name.split('.')[0] for name in sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.split())
+    assert package in loaded
+    assert not loaded & unwanted

@@ -30,7 +30,9 @@ def lump_mass(mesh: TetMesh, density: ArrayLike, *, scheme: MassScheme) -> Float
         shares = np.full((mesh.tet_count, 4), 0.25)
     else:
         shares = voronoi_fractions(mesh.points, mesh.tets)
-    return np.bincount(mesh.tets.ravel(), weights=(shares * tet_mass[:, None]).ravel(), minlength=mesh.node_count)
+    corner_mass = shares * tet_mass[:, None]
+    mass = np.bincount(mesh.tets.ravel(), weights=corner_mass.ravel(), minlength=mesh.node_count)
+    return np.asarray(mass, dtype=np.float64)
 
 
 def voronoi_fractions(points: ArrayLike, tets: ArrayLike) -> FloatArray:

@@ -240,7 +240,7 @@ def _check_regions(mesh: TetMesh, file_format: str) -> None:
             raise MeshError(f"region {tag} is named {name!r}; to be written it needs printable letters, no quotes")
         if names.count(name) > 1:
             raise MeshError(f"region name {name!r} is given to more than one tag; names must differ to be written")
-    lowest = min([int(mesh.region.min()), *(tag for tag, _ in mesh.region_names)])
+    lowest = min([int(np.min(np.asarray(mesh.region))), *(tag for tag, _ in mesh.region_names)])
     if lowest < 0 and file_format in ("gmsh", "gmsh22"):
         raise MeshError(f"region tag {lowest} is negative; gmsh needs tags of 0 and above: renumber, or write a .vtu")
 
@@ -248,8 +248,8 @@ def _check_regions(mesh: TetMesh, file_format: str) -> None:
 def _meshio_bytes(
     mesh: TetMesh,
     points: NDArray[np.float64],
-    point_data: dict[str, NDArray],
-    cell_data: dict[str, NDArray],
+    point_data: dict[str, Any],
+    cell_data: dict[str, Any],
     file_format: str,
 ) -> bytes:
     """What meshio writes as vtu, vtk or gmsh22 (all binary), over a scratch file: it needs a real one."""
@@ -257,6 +257,7 @@ def _meshio_bytes(
 
     # int64: VTK itself does not know the name that meshio gives to 32-bit integers in a legacy file.
     region = np.array(mesh.region, dtype=np.int64)
+    tags: dict[str, Any]
     if file_format == "gmsh22":
         _, entity = np.unique(region, return_inverse=True)
         tags = {"gmsh:physical": [region], "gmsh:geometrical": [(entity + 1).astype(np.int32)]}

@@ -30,7 +30,7 @@ def gmsh41_bytes(
     if names:
         rows = "".join(f'3 {tag} "{name}"\n' for tag, name in names)
         out.write(f"$PhysicalNames\n{len(names)}\n{rows}$EndPhysicalNames\n".encode())
-    tags, entity = np.unique(mesh.region, return_inverse=True)
+    tags, entity = np.unique(np.asarray(mesh.region), return_inverse=True)
     _write_entities(out, points, tags)
     node_count = len(points)
     # Any one volume may own the nodes: readers look a tet's region up through the tet's entity.
@@ -52,7 +52,7 @@ def medit_bytes(mesh: TetMesh, points: NDArray[np.float64]) -> bytes:
     out.write(f"MeshVersionFormatted 2\nDimension 3\n\nVertices\n{len(points)}\n".encode())
     np.savetxt(out, np.column_stack([points, np.zeros(len(points))]), fmt="%.17g %.17g %.17g %d")
     out.write(f"\nTetrahedra\n{mesh.tet_count}\n".encode())
-    np.savetxt(out, np.column_stack([mesh.tets + 1, mesh.region]), fmt="%d")
+    np.savetxt(out, np.column_stack([mesh.tets + 1, np.asarray(mesh.region)]), fmt="%d")
     out.write(b"\nEnd\n")
     return out.getvalue()
 

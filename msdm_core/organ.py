@@ -253,26 +253,27 @@ def _anchor_mask(anchors: ArrayLike, node_count: int) -> NDArray[np.bool_]:
 
 
 def _settle(model: OrganModel, state: OrganState, *, force_tolerance: float = 1e-6, rounds: int = 4000) -> None:
-    """Dynamic relaxation: run the organ, dropping its velocity whenever kinetic energy peaks, till forces balance."""
-    undamped = model._replace(alpha=0.0, beta=0.0)
+    """Dynamic relaxation: run the organ with the mode that gravity excites damped critically, till forces balance.
+
+    alpha = 2 w, w^2 = -(u . f) / (u . M u) (Rayleigh's quotient of the displacement u, f the internal forces).
+    """
+    relaxed = model._replace(alpha=0.0, beta=0.0)
     free = model.node_inverse_mass > 0.0
+    mass = model.node_mass[:, None]
     weight = float(np.linalg.norm(model.gravity) * model.node_mass.sum())
     wrench = np.zeros((0, 6))
-    dt = 0.8 * min(model.stable_step, step_limit(largest_frequency(undamped), 0.0, 0.0))
-    energy_before = 0.0
+    dt = 0.8 * step_limit(largest_frequency(relaxed), 0.0, 0.0)
     for _ in range(rounds):
-        fault = advance_organ(undamped, state, NO_SHAPES, NO_CONTACT, dt, 10, wrench)
+        fault = advance_organ(relaxed, state, NO_SHAPES, NO_CONTACT, dt, 10, wrench)
         if fault != FAULT_NONE:
             raise OrganDivergedError("under gravity, " + describe_fault(state, fault))
-        evaluate_forces(undamped, state)
+        evaluate_forces(relaxed, state)
         if np.linalg.norm(state.node_force[free], axis=1).sum() <= force_tolerance * weight:
             state.node_velocity[:] = 0.0
             return
-        energy = float((model.node_mass[:, None] * state.node_velocity**2).sum())
-        if energy < energy_before:
-            state.node_velocity[:] = 0.0
-            energy = 0.0
-        energy_before = energy
+        displacement = state.node_position - model.node_rest_position
+        held = float((displacement * (mass * model.gravity - state.node_force)).sum())
+        relaxed = relaxed._replace(alpha=2.0 * math.sqrt(max(held, 0.0) / float((mass * displacement**2).sum())))
     raise OrganDivergedError(
         f"the organ did not settle under gravity in {rounds * 10} steps: is it anchored? Give `anchors`, or no gravity"
     )

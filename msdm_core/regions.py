@@ -133,7 +133,7 @@ def lesion_fraction(mesh: TetMesh, lesion: Lesion) -> FloatArray:
     """Share of each tet's volume that a lesion fills, in [0, 1], shape (n_tet,).
 
     Tets with all corners inside an ellipsoid are full (it is convex); those near its surface are sampled on a
-    barycentric lattice of 165 points, so a cut tet's share is good to about 0.01 (0.03 at worst).
+    barycentric lattice of 165 points, so a cut tet's share is good to about 0.01 (0.04 at worst).
 
     Raises:
         OrganError: the lesion is outside the organ or smaller than a cell; names the lesion, the value and the rule.

@@ -96,6 +96,9 @@ def _anchored_nodes(mesh: TetMesh, anchors: Sequence[Anchor]) -> IntArray:
     for anchor in anchors:
         if anchor.box is not None:
             inside = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
+        elif anchor.bed is not None:
+            depth = mesh.points @ np.asarray(anchor.bed.direction)
+            inside = on_surface & (depth >= depth.max() - anchor.bed.share * np.ptp(depth))
         else:
             assert anchor.ball is not None
             distance = np.linalg.norm(mesh.points - np.asarray(anchor.ball.centre), axis=1)

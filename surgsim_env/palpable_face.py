@@ -184,7 +184,7 @@ def _thickness(origins: FloatArray, directions: FloatArray, corners: FloatArray)
             q = np.cross(offset, edge1)
             v = (q @ direction) / determinant
             distance = (edge2 * q).sum(axis=1) / determinant
-        hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 1e-6)
+            hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 1e-6)
         if hit.any():
             result[index] = distance[hit].min()
     return result

@@ -11,12 +11,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from msdm_core.geodesic import SurfaceDistance
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.anatomy import Anatomy
 from surgsim_env.palpable_face import PalpableFace, tangent_axes
 from surgsim_env.palpation.analysis import contrast_with_model, contrast_with_neighbours, sensor_readings
 from surgsim_env.palpation.felt import ContrastMap, Truth, feel_lesions, score_map, seen_from_surface
 from surgsim_env.palpation.scan import Press, scan
-from surgsim_env.scenes import Scene
 
 # How wrong the pre-operative model is: its modulus by up to this share, the place of each press by this distance [m].
 MODEL_MODULUS_ERROR = 0.2
@@ -71,7 +70,7 @@ class Palpation:
 
 
 def run_palpation(
-    scene: Scene,
+    anatomy: Anatomy,
     *,
     lesions: Sequence[Lesion] | None = None,
     seed: int = 0,
@@ -81,7 +80,7 @@ def run_palpation(
     """Palpate a scene's organ; the same scene, lesions and seed give the same result.
 
     Args:
-        scene: what is pressed and how.
+        anatomy: what is pressed, its scene says how (see load_anatomy).
         lesions: hidden in the organ; the scene's demonstration lesions by default.
         seed: of sensor noise and of the errors of the pre-operative model.
         workers: threads; all cores by default.
@@ -92,7 +91,7 @@ def run_palpation(
         OrganError: a lesion or a material that is impossible, or a step that is too long.
     """
     begin = time.perf_counter()
-    anatomy = load_anatomy(scene)
+    scene = anatomy.scene
     hidden = tuple(anatomy.demonstration_lesions() if lesions is None else lesions)
     rng = np.random.default_rng(seed)
     sites, normals, support_count = plan_sites(anatomy)
@@ -141,7 +140,7 @@ def plan_sites(anatomy: Anatomy) -> tuple[FloatArray, FloatArray, int]:
     if not free.any():
         raise ValueError(
             f"scene {scene.name!r}: no site to press: {len(sites)} raster sites lie on the palpable face, "
-            f"{len(sites)} of them within {gap * 1e3:g} mm of a support: use a smaller site_spacing or face_margin, "
+            f"all of them within {gap * 1e3:g} mm of a support: use a smaller site_spacing or face_margin, "
             "turn the approach, or move the anchors"
         )
     return sites[free], normals[free], int((~free).sum())

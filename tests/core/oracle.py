@@ -14,6 +14,7 @@ from msdm_core.mesh import TetMesh
 from msdm_core.meshing import box_mesh
 from msdm_core.organ import OrganSpec, advance_organ, compile_organ, rest_state
 from msdm_core.regions import Material
+from msdm_core.stability import largest_frequency, step_limit
 
 FloatArray = NDArray[np.float64]
 
@@ -139,10 +140,11 @@ def irregular_organ(seed: int, *, damping: Damping = UNDAMPED) -> OrganModel:
     lattice = box_mesh((0.03, 0.02, 0.02), (3, 2, 2))
     mesh = TetMesh(lattice.points + random.uniform(-1e-3, 1e-3, lattice.points.shape), lattice.tets)
     model = compile_organ(OrganSpec(mesh, TISSUE, damping=damping))
-    return model._replace(
+    model = model._replace(
         spring_stiffness=frozen(model.spring_stiffness * random.uniform(0.3, 3.0, len(model.spring_stiffness))),
         tet_bulk=frozen(model.tet_bulk * random.uniform(0.0, 3.0, len(model.tet_bulk))),
     )
+    return model._replace(stable_step=step_limit(largest_frequency(model), model.alpha, model.beta))
 
 
 def deformed_state(model: OrganModel, seed: int, *, shape_count: int = 0) -> OrganState:

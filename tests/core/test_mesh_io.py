@@ -60,13 +60,43 @@ $EndElements
 """
 
 
+# As VTK 9 saves one of our files again, as text.
+VTK_TEXT = """# vtk DataFile Version 5.1
+vtk output
+ASCII
+DATASET UNSTRUCTURED_GRID
+FIELD FieldData 2
+length_unit_m 1 1 double
+0.001 
+region/lesion%20one 1 1 vtktypeint64
+8 
+POINTS 5 double
+0 0 0 100 0 0 0 100 0 
+0 0 100 100 100 100 
+CELLS 3 8
+OFFSETS vtktypeint64
+0 4 8 
+CONNECTIVITY vtktypeint64
+0 1 2 3 
+1 2 3 4 
+CELL_TYPES 2
+10
+10
+
+CELL_DATA 2
+SCALARS region int
+LOOKUP_TABLE default
+4 8 
+"""  # noqa: W291
+
+
 def written(path, points=POINTS, cells=None, file_format=None, **more):
     meshio.Mesh(points, cells or [("tetra", TETS)], **more).write(path, file_format=file_format)
     return path
 
 
 @every_format
-@pytest.mark.parametrize("unit", ["m", "mm", 0.0254])
+@pytest.mark.parametrize("unit", ["m", "mm", 0.0123456789])
 def test_what_is_written_is_read_back(tmp_path, random_mesh, name, file_format, unit):
     mesh = random_mesh(5)
     write_mesh(tmp_path / name, mesh, file_format=file_format, length_unit=unit)
@@ -125,6 +155,13 @@ def test_a_genuine_gmsh_41_file(tmp_path):
     assert mesh.region.tolist() == [9, 5] and mesh.region_names == ((5, "lesion one"), (9, "liver"))
     np.testing.assert_array_equal(mesh.points, POINTS * 0.001)
     assert np.sort(mesh.tets, axis=1).tolist() == TETS.tolist()
+
+
+def test_a_vtk_file_that_vtk_saved_again_as_text_keeps_unit_and_names(tmp_path):
+    (tmp_path / "a.vtk").write_text(VTK_TEXT)
+    mesh = read_mesh(tmp_path / "a.vtk")
+    assert mesh.region.tolist() == [4, 8] and mesh.region_names == ((8, "lesion one"),)
+    np.testing.assert_array_equal(mesh.points, POINTS * 0.001)
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,7 @@ def test_each_cut_tet_has_its_own_share(radius: float):
     cut = random.choice(np.flatnonzero((fraction > 0.0) & (fraction < 1.0)), 40, replace=False)
     points = random.dirichlet(np.ones(4), 10000) @ BLOCK.points[BLOCK.tets[cut]]
     error = fraction[cut] - (np.linalg.norm(points - INTERIOR, axis=2) <= radius).mean(axis=1)
-    assert np.abs(error).max() < 0.035
+    assert np.abs(error).max() < 0.045
     assert math.sqrt((error**2).mean()) < 0.012
 
 

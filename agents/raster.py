@@ -1,0 +1,107 @@
+"""A scripted agent for SurgSim/Palpate-v0: press a raster, go back to the stiffest place, declare it.
+
+It reads nothing but the observation (tip position, force) and the scene file (where the phantom's top is, how far a
+press may go), so its score is one that a learning agent has to beat. Run it from a checkout:
+
+    python agents/raster.py --episodes 5
+"""
+
+import argparse
+from collections.abc import Iterator
+
+import gymnasium as gym
+import numpy as np
+
+import surgsim_env  # noqa: F401  (registers the ids)
+
+PRESS_DEPTH = 0.0035  # [m] below the resting surface
+TRAVEL_GAP = 0.0006  # [m] between tip and surface while moving sideways
+SPEED = 0.02  # [m/s] full scale of the action
+CONTROL_STEP = 0.05  # [s]
+CLOSE_ENOUGH = 0.0007  # [m]
+
+
+class RasterAgent:
+    """Presses a grid of sites on a flat top, remembers each force, then declares at the stiffest."""
+
+    def __init__(self, env: gym.Env, *, sites_per_side: int = 5) -> None:
+        scene = env.unwrapped.scene
+        width, depth, self.top = scene.mesh.block.size
+        self.radius = scene.instrument.tip_radius
+        self.soft_force = scene.limits.soft_force
+        rim = scene.lesion.rim_distance
+        xs, ys = np.linspace(rim, width - rim, sites_per_side), np.linspace(rim, depth - rim, sites_per_side)
+        # Rows in alternating directions: the way is shorter.
+        self.sites = [(x, y) for row, y in enumerate(ys) for x in (xs if row % 2 == 0 else xs[::-1])]
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """The next action, from an observation."""
+        self.observation = observation
+        return next(self._plan)
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.forces: list[float] = []
+        self._plan = self._search()
+
+    def _search(self) -> Iterator[np.ndarray]:
+        travel = self.top + self.radius + TRAVEL_GAP
+        pressed = self.top + self.radius - PRESS_DEPTH
+        for x, y in self.sites:
+            yield from self._go(np.array([x, y, travel]))
+            yield from self._go(np.array([x, y, pressed]))
+            self.forces.append(float(self.observation[8]))
+            yield from self._go(np.array([x, y, travel]))
+        x, y = self._stiffest()
+        yield from self._go(np.array([x, y, travel]))
+        yield from self._go(np.array([x, y, pressed]))
+        while True:
+            yield np.array([0.0, 0.0, 0.0, 1.0], dtype=np.float32)
+
+    def _go(self, target: np.ndarray) -> Iterator[np.ndarray]:
+        """Velocities towards a place [m], till it is reached or the soft limit is felt on the way down."""
+        while True:
+            gap = target - self.observation[:3]
+            felt = self.observation[8] > self.soft_force and gap[2] < 0.0
+            if np.linalg.norm(gap) < CLOSE_ENOUGH or felt:
+                return
+            yield np.append(np.clip(gap / (SPEED * CONTROL_STEP), -1.0, 1.0), 0.0).astype(np.float32)
+
+    def _stiffest(self) -> np.ndarray:
+        """Centre of the excess force around the stiffest site: neighbours tell on which side of it the lesion lies."""
+        sites, forces = np.array(self.sites), np.array(self.forces)
+        best = sites[np.argmax(forces)]
+        excess = np.maximum(forces - np.median(forces), 0.0)
+        near = np.linalg.norm(sites - best, axis=1) < 0.014
+        return (excess[near, None] * sites[near]).sum(axis=0) / excess[near].sum()
+
+
+def run_episode(env: gym.Env, agent: RasterAgent, seed: int) -> dict:
+    """Play one episode; its last info, with the return and the steps taken added."""
+    observation, info = env.reset(seed=seed)
+    agent.reset()
+    total, steps, over = 0.0, 0, False
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(agent.act(observation))
+        total, steps, over = total + reward, steps + 1, terminated or truncated
+    return {**info, "return": total, "steps": steps}
+
+
+def main() -> None:
+    """Print one line an episode."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=5)
+    parser.add_argument("--scene", default="phantom")
+    arguments = parser.parse_args()
+    env = gym.make("SurgSim/Palpate-v0", scene=arguments.scene)
+    agent = RasterAgent(env)
+    for seed in range(arguments.episodes):
+        record = run_episode(env, agent, seed)
+        print(
+            f"seed {seed}: success {record['success']}, error {record['error_mm']:.1f} mm, "
+            f"{record['steps']} steps, return {record['return']:.2f}, peak force {record['force_peak']:.2f} N"
+        )
+
+
+if __name__ == "__main__":
+    main()

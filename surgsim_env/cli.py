@@ -1,0 +1,239 @@
+"""The command line: `surgsim palpate`, `surgsim organ`, `surgsim scenes`."""
+
+import re
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from msdm_core.length_unit import LengthUnit
+from msdm_core.regions import Lesion
+from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.scenes import Scene, list_scenes, make_scene
+
+# Options whose value is a list of numbers, which may begin with a minus.
+NUMBER_LISTS = ("--lesion", "--anchors", "--approach")
+
+
+@dataclass(frozen=True)
+class Palpate:
+    """Press an organ site by site, map its stiffness, and say where lesions were felt.
+
+    Lengths are metres, forces newtons. Writes palpation.csv, stiffness_map.png and summary.json.
+    """
+
+    scene: str | None = None
+    """A shipped scene (see `surgsim scenes`); liver if neither --organ nor --surface is given."""
+    organ: Path | None = None
+    """Instead: a scene file of your own (TOML)."""
+    surface: Path | None = None
+    """Instead: a closed surface (STL, OBJ, PLY); what it does not say is taken from the scene liver."""
+    length_unit: str | None = None
+    """Of --surface: m, cm, mm, or metres per unit as a number."""
+    cell_size: float = 0.010
+    """Of the lattice that fills --surface [m]."""
+    lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """x,y,z,radius,ratio: centre and radius [m], modulus over the healthy one; may be repeated. Replaces the scene's."""
+    anchors: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """x,y,z,radius: a ball [m] that holds the surface inside it, may be repeated. Default for --surface: the organ lies
+    on its bed, so that the deepest 15 % of it along the approach is held."""
+    approach: str | None = None
+    """x,y,z: direction in which the probe comes. Default: the scene's; 0,0,-1 for --surface, that is from the head in a
+    CT's patient axes (0,1,0 would be from the front there)."""
+    press_depth: float | None = None
+    """[m]; default: the scene's."""
+    tip_radius: float | None = None
+    """[m]; default: the scene's."""
+    spacing: float | None = None
+    """Distance between sites [m]; default: the scene's."""
+    youngs_modulus: float | None = None
+    """Of the healthy tissue [Pa]; default: the scene's."""
+    out: Path | None = None
+    """Folder for the results; default: the next free runs/palpate-SCENE-NUMBER."""
+    seed: int = 0
+    """Of the sensor's noise and the pre-operative model's errors."""
+    workers: int | None = None
+    """Threads; default: one for each core."""
+
+
+@dataclass(frozen=True)
+class Organ:
+    """Build an organ from a closed surface or a tetrahedral mesh, report on it, and write it."""
+
+    file: tyro.conf.Positional[Path]
+    """Closed surface (STL, OBJ, PLY) or tets (vtu, vtk, msh, mesh)."""
+    length_unit: str | None = None
+    """m, cm, mm, or metres per unit as a number; required where the format has none."""
+    cell_size: float = 0.010
+    """Of the lattice that fills a surface [m]."""
+    out: Path | None = None
+    """Where the mesh is written (vtu, vtk, msh, mesh)."""
+    youngs_modulus: float | None = None
+    """[Pa]; default: the liver's."""
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """List the shipped scenes."""
+
+
+Command = (
+    Annotated[Palpate, tyro.conf.subcommand("palpate")]
+    | Annotated[Organ, tyro.conf.subcommand("organ")]
+    | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0, 2 for bad input (one line on standard error), 130 for Ctrl-C."""
+    given = _joined(list(sys.argv[1:] if arguments is None else arguments))
+    try:
+        command = tyro.cli(Command, prog="surgsim", args=given, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+    except SystemExit as ended:
+        return int(ended.code or 0) if not isinstance(ended.code, str) else 2
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            _run(command)
+    except KeyboardInterrupt:
+        print("surgsim: stopped", file=sys.stderr)
+        return 130
+    # MeshError and OrganError are ValueErrors: bad input, said in one line without a traceback.
+    except (ValueError, OSError) as error:
+        print(f"surgsim: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _run(command: Palpate | Organ | Scenes) -> None:
+    console = Console()
+    if isinstance(command, Palpate):
+        _palpate(command, console)
+    elif isinstance(command, Organ):
+        from surgsim_env.organ_report import report_organ
+
+        unit = None if command.length_unit is None else _unit(command.length_unit)
+        report_organ(command.file, unit, command.cell_size, command.youngs_modulus, command.out, console)
+    else:
+        table = Table()
+        table.add_column("scene")
+        table.add_column("what it is")
+        for name in list_scenes():
+            table.add_row(name, make_scene(name).description)
+        console.print(table)
+
+
+def _palpate(command: Palpate, console: Console) -> None:
+    from surgsim_env.palpation.figures import write_stiffness_map
+    from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, run_palpation
+    from surgsim_env.palpation.report import CSV_NAME, PICTURE_NAME, SUMMARY_NAME, print_report, write_csv, write_summary
+    from surgsim_env.palpation.surface_scene import load_stable_anatomy
+
+    scene = _scene(command, console)
+    anatomy = load_anatomy(scene)
+    lesions = _lesions(command, anatomy)
+    anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
+    # The folder is made first: a place that cannot be written is better known before the work than after it.
+    folder = command.out or _free_folder(scene.name)
+    folder.mkdir(parents=True, exist_ok=True)
+    found = run_palpation(anatomy, lesions=lesions, seed=command.seed, workers=command.workers, console=console)
+    write_csv(found, folder / CSV_NAME)
+    write_summary(found, folder / SUMMARY_NAME, vars(command))
+    write_stiffness_map(found, folder / PICTURE_NAME)
+    print_report(found, console)
+    console.print(f"written: {folder}/{{{CSV_NAME},{SUMMARY_NAME},{PICTURE_NAME}}}", highlight=False, soft_wrap=True)
+
+
+def _scene(command: Palpate, console: Console) -> Scene:
+    from surgsim_env.palpation.surface_scene import SurfaceOptions, surface_scene, with_options
+
+    if sum(source is not None for source in (command.scene, command.organ, command.surface)) > 1:
+        raise ValueError("give only one of --scene, --organ and --surface")
+    approach = None if command.approach is None else _numbers("--approach", command.approach, "x,y,z")
+    options = SurfaceOptions(
+        approach=approach,
+        anchors=tuple(_numbers("--anchors", text, "x,y,z,radius") for text in command.anchors),
+        press_depth=command.press_depth,
+        tip_radius=command.tip_radius,
+        spacing=command.spacing,
+        youngs_modulus=command.youngs_modulus,
+    )
+    if command.surface is None:
+        if command.anchors:
+            raise ValueError("--anchors goes with --surface; a scene file states its own [[anchors]]")
+        return with_options(make_scene(str(command.organ) if command.organ else command.scene or "liver"), options)
+    if command.length_unit is None:
+        raise ValueError('--surface needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none')
+    unit = _unit(command.length_unit)
+    scene = surface_scene(command.surface, length_unit=unit, cell_size=command.cell_size, options=options)
+    x, y, z = scene.instrument.approach
+    held = "the anchors given" if command.anchors else "its bed, the deepest 15 % along the approach"
+    console.print(
+        f"{command.surface.name}: pressed along {x:.3g}, {y:.3g}, {z:.3g} of the file's axes (--approach), held by {held}; "
+        f"E {scene.material.youngs_modulus:g} Pa, nu {scene.material.poisson_ratio:g}, tip {scene.instrument.tip_radius * 1e3:g} "
+        f"mm, depth {scene.palpation.press_depth * 1e3:g} mm, capsule and damping as in the scene liver",
+        highlight=False,
+    )
+    return scene
+
+
+def _lesions(command: Palpate, anatomy: Anatomy) -> list[Lesion]:
+    if not command.lesion:
+        return anatomy.demonstration_lesions()
+    lesions = []
+    for number, text in enumerate(command.lesion, start=1):
+        x, y, z, radius, ratio = _numbers("--lesion", text, "x,y,z,radius,ratio")
+        if not ratio > 0.0:
+            raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
+        lesions.append(anatomy.lesion_at((x, y, z), radius, ratio, f"lesion {number}"))
+    return lesions
+
+
+def _numbers(option: str, text: str, form: str) -> tuple[float, ...]:
+    """The numbers of a list such as 0,0,-1; ValueError with the form it should have."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != len(form.split(",")):
+        raise ValueError(f"{option} is {text!r}; the form is {form}, numbers with commas and no blanks between them")
+    return numbers
+
+
+def _unit(text: str) -> LengthUnit:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _free_folder(scene: str) -> Path:
+    number = 1
+    while (folder := Path("runs") / f"palpate-{scene}-{number}").exists():
+        number += 1
+    return folder
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """`--lesion -0.1,0,...` as `--lesion=-0.1,0,...`: what begins with a minus would pass for an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in NUMBER_LISTS and re.match(r"-[\d.]", argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    print(f"surgsim: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

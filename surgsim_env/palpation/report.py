@@ -1,0 +1,183 @@
+"""What a palpation leaves behind: palpation.csv, summary.json and the short table on the terminal."""
+
+import csv
+import json
+import math
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from surgsim_env.palpation.felt import ContrastMap, LesionScore
+from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, Palpation
+
+CSV_NAME, SUMMARY_NAME, PICTURE_NAME = "palpation.csv", "summary.json", "stiffness_map.png"
+COLUMNS = (
+    *("site", "x", "y", "z", "normal_x", "normal_y", "normal_z", "depth", "force", "reading", "stiffness"),
+    *("contrast_neighbours", "contrast_model", "ended_early"),
+)
+
+
+def write_csv(palpation: Palpation, path: Path) -> None:
+    """One line for each site; lengths [m], forces [N], stiffness [N/m]; contrasts are empty where a press ended early."""
+    order = np.cumsum(palpation.used) - 1
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(COLUMNS)
+        for index, press in enumerate(palpation.presses):
+            used = bool(palpation.used[index])
+            contrasts = [f"{one.contrast[order[index]]:.5f}" if used else "" for one in palpation.maps]
+            reading = float(palpation.reading[index])
+            numbers = [*press.site, *press.normal, press.depth, press.force, reading, reading / press.depth]
+            writer.writerow([index, *(f"{value:.6g}" for value in numbers), *contrasts, early_end(palpation, index)])
+
+
+def early_end(palpation: Palpation, index: int) -> str:
+    """Why a site is in no map: what ended its press, or its model's press, early; empty for a complete one."""
+    if palpation.presses[index].end:
+        return palpation.presses[index].end
+    model_end = palpation.model_presses[index].end
+    return f"pre-operative model: {model_end}" if model_end else ""
+
+
+def write_summary(palpation: Palpation, path: Path, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Write and return the summary; numbers that do not exist, such as the error of what was not felt, are null."""
+    scene, mesh = palpation.anatomy.scene, palpation.anatomy.mesh
+    forces = [press.force_peak for press in palpation.presses]
+    summary = {
+        "inputs": dict(inputs),
+        "versions": {"surgsim": _version(), "python": platform.python_version(), "numpy": np.__version__},
+        "seed": palpation.seed,
+        "organ": {"nodes": mesh.node_count, "tets": mesh.tet_count, "anchored_nodes": len(palpation.anatomy.anchors)},
+        "press": {
+            "depth_m": scene.palpation.press_depth,
+            "tip_radius_m": scene.instrument.tip_radius,
+            "spacing_m": scene.palpation.site_spacing,
+            "substeps_per_haptic_step": scene.timing.substep_count,
+            "haptic_step_s": scene.timing.haptic_step,
+        },
+        "sites": {
+            "pressed": len(palpation.presses),
+            "in_maps": int(palpation.used.sum()),
+            "left_out_near_supports": palpation.support_count,
+            "ended_early": {i: early_end(palpation, i) for i in np.flatnonzero(~palpation.used).tolist()},
+        },
+        "model": {
+            "modulus_factor": palpation.model_modulus_factor,
+            "modulus_error_largest": MODEL_MODULUS_ERROR,
+            "site_error_m": MODEL_SITE_ERROR,
+        },
+        "truth": [
+            {"name": one.name, "centre_m": one.centre, "surface_point_m": one.point, "radius_m": one.radius}
+            for one in palpation.truths
+        ],
+        "maps": {one.name: _map_entry(one) for one in palpation.maps},
+        "force_peak_N": max(forces),
+        "volume_ratio_smallest": min(
+            press.volume_ratio_smallest for press in (*palpation.presses, *palpation.model_presses)
+        ),
+        "simulated_time_s": palpation.simulated_time,
+        "wall_time_s": palpation.wall_time,
+        "real_time_factor": palpation.simulated_time / palpation.wall_time,
+    }
+    plain = _plain(summary)
+    path.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return plain
+
+
+def _map_entry(one: ContrastMap) -> dict[str, Any]:
+    return {
+        "estimates": [
+            {"point_m": item.point, "contrast": item.contrast, "significance": item.significance}
+            for item in one.estimates
+        ],
+        "lesions": [
+            {
+                "name": score.truth.name,
+                "felt": score.felt,
+                "error_mm": score.error * 1e3,
+                "estimate": score.estimate,
+                "contrast": score.contrast,
+            }
+            for score in one.scores
+        ],
+        "felt": one.felt_count,
+        "false_alarms": one.false_alarms,
+        "healthy_std": one.healthy_std,
+        "healthy_robust_std": one.healthy_robust_std,
+    }
+
+
+def print_report(palpation: Palpation, console: Console) -> None:
+    """The short table: where each lesion was felt, how far from the truth, its contrast beside the healthy spread."""
+    table = Table(title=f"palpation of {palpation.anatomy.scene.name}")
+    for heading in ("stiffness against the", "lesion", "felt at x, y, z [mm]", "error [mm]", "contrast", "healthy"):
+        table.add_column(heading, justify="left" if heading in ("stiffness against the", "lesion") else "right")
+    for one in palpation.maps:
+        for score in one.scores:
+            table.add_row(one.name, score.truth.name, *_felt_cells(one, score), f"1 ± {one.healthy_std:.2f}")
+        if not one.scores:
+            table.add_row(one.name, "none hidden", f"{len(one.estimates)} felt", "", "", f"1 ± {one.healthy_std:.2f}")
+        table.add_section()
+    console.print(table)
+    for one in palpation.maps:
+        console.print(verdict(one))
+    early = int((~palpation.used).sum())
+    console.print(
+        f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not pressed "
+        f"near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N, smallest volume ratio "
+        f"{min(press.volume_ratio_smallest for press in (*palpation.presses, *palpation.model_presses)):.2f}"
+    )
+    console.print(
+        f"simulated {palpation.simulated_time:.1f} s in {palpation.wall_time:.1f} s: "
+        f"{palpation.simulated_time / palpation.wall_time:.2f} times real time"
+    )
+    for index in np.flatnonzero(~palpation.used).tolist():
+        console.print(f"  site {index} ended early: {early_end(palpation, index)}")
+
+
+def verdict(one: ContrastMap) -> str:
+    """One sentence: how many lesions were felt, how many not, and how many false alarms there were."""
+    count, missed = len(one.scores), len(one.scores) - one.felt_count
+    alarms = f", {one.false_alarms} false alarm{'s' if one.false_alarms != 1 else ''}"
+    if count == 0:
+        return f"{one.name}: no lesion was hidden{alarms}"
+    if missed:
+        return f"{one.name}: {missed} of {count} not felt{alarms}"
+    return f"{one.name}: {'the lesion' if count == 1 else f'all {count} lesions'} felt{alarms}"
+
+
+def _felt_cells(one: ContrastMap, score: LesionScore) -> tuple[str, str, str]:
+    contrast = "" if math.isnan(score.contrast) else f"{score.contrast:.2f}"
+    if score.estimate is None:
+        return "not felt", "", contrast
+    x, y, z = one.estimates[score.estimate].point * 1e3
+    mark = "" if score.felt else " (not felt)"
+    return f"{x:.1f}, {y:.1f}, {z:.1f}", f"{score.error * 1e3:.1f}{mark}", contrast
+
+
+def _version() -> str:
+    try:
+        return version("surgsim")
+    except PackageNotFoundError:
+        return "checkout"
+
+
+def _plain(value: Any) -> Any:
+    """JSON's own types: arrays as lists, numbers that are not finite as None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return round(float(value), 7) if math.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,150 @@
+"""An organ's surface drawn without GL: curved, shaded triangles in orthographic projection, painted with a map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+
+from msdm_core.mesh import FloatArray, IntArray
+from surgsim_env.palpable_face import tangent_axes
+
+# Each triangle is drawn as SPLITS^2, bent towards its corners' tangent planes by this share (Boubekeur & Alexa 2008).
+SPLITS = 4
+BEND = 0.6
+# Corners where a face turns from the mean normal by more than this stay sharp.
+CREASE_COSINE = 0.75
+AMBIENT, DIFFUSE, GLOSS, SHININESS = 0.42, 0.62, 0.16, 22.0
+# The map fades out between these distances from the nearest site, in site spacings.
+FADE_FROM, FADE_TO = 0.75, 1.15
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An orthographic view along a direction: unit vectors to the right and up in the picture, and to the viewer."""
+
+    right: FloatArray
+    up: FloatArray
+    towards: FloatArray
+
+    @classmethod
+    def along(cls, direction: FloatArray, up: FloatArray | None = None) -> "View":
+        """The view along a direction; without `up`, as the raster of a palpable face lies."""
+        towards = -np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+        if up is None:
+            right, upward = tangent_axes(-towards)
+            return cls(right, upward, towards)
+        right = np.cross(up, towards)
+        right /= np.linalg.norm(right)
+        return cls(right, np.cross(towards, right), towards)
+
+    def flat(self, points: FloatArray) -> FloatArray:
+        """Picture coordinates of points [mm], shape (..., 2)."""
+        return np.stack([points @ self.right, points @ self.up], axis=-1) * 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Small triangles to draw: corners [m] (n, 3, 3), unit normals (n, 3), index of the triangle each came from (n,)."""
+
+    corners: FloatArray
+    normals: FloatArray
+    origin: IntArray
+
+
+def curved_patches(points: FloatArray, triangles: IntArray) -> Patches:
+    """A triangle surface as smaller, bent triangles, so that it looks as smooth as the organ it stands for."""
+    corners = points[triangles]
+    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face_normal = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
+    mean = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(mean, triangles[:, corner], area_vector)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-30)[:, None]
+    normals = mean[triangles]
+    sharp = np.einsum("fij,fj->fi", normals, face_normal) < CREASE_COSINE
+    normals = np.where(sharp[:, :, None], face_normal[:, None], normals)
+    weights, small = _split_triangle(SPLITS)
+    flat = np.einsum("wi,fij->fwj", weights, corners)
+    offset = np.einsum("fwij,fij->fwi", flat[:, :, None] - corners[:, None], normals)
+    bent = flat - np.einsum("wi,fwi,fij->fwj", weights, offset, normals)
+    vertices = (1.0 - BEND) * flat + BEND * bent
+    smooth = np.einsum("wi,fij->fwj", weights, normals)[:, small].mean(axis=2)
+    smooth /= np.linalg.norm(smooth, axis=2, keepdims=True)
+    origin = np.repeat(np.arange(len(triangles)), len(small)).astype(np.int32)
+    return Patches(vertices[:, small].reshape(-1, 3, 3), smooth.reshape(-1, 3), origin)
+
+
+def _split_triangle(splits: int) -> tuple[FloatArray, IntArray]:
+    """Barycentric weights of a triangle's lattice points and the small triangles between them."""
+    index, weights = {}, []
+    for i in range(splits + 1):
+        for j in range(splits + 1 - i):
+            index[i, j] = len(weights)
+            weights.append((splits - i - j, i, j))
+    small = []
+    for i in range(splits):
+        for j in range(splits - i):
+            small.append((index[i, j], index[i + 1, j], index[i, j + 1]))
+            if i + j + 1 < splits:
+                small.append((index[i + 1, j], index[i + 1, j + 1], index[i, j + 1]))
+    return np.array(weights) / splits, np.array(small, dtype=np.int32)
+
+
+def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
+    """A smooth field through the values at the sites [m] (n, 3), at other places (m, 3): thin plates, lightly smoothed."""
+    if len(sites) < 8 or np.ptp(values) == 0.0:
+        nearest = np.argmin(np.linalg.norm(places[:, None] - sites[None], axis=2), axis=1)
+        return values[nearest]
+    # Singular where sites lie in one plane: 3D thin plates need points off it, so they are spread by a hair.
+    centred = sites - sites.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    field = RBFInterpolator(
+        centred @ axes.T * 1e3, values, neighbors=min(24, len(sites)), smoothing=0.02, kernel="linear"
+    )
+    return np.clip(field((places - sites.mean(axis=0)) @ axes.T * 1e3), values.min(), values.max())
+
+
+def nearness(sites: FloatArray, places: FloatArray, spacing: float) -> FloatArray:
+    """How much a map may say at each place: 1 near a site, fading to 0 beyond, shape (m,)."""
+    distance = np.array([np.linalg.norm(sites - place, axis=1).min() for place in places]) / spacing
+    return np.clip((FADE_TO - distance) / (FADE_TO - FADE_FROM), 0.0, 1.0)
+
+
+def shaded(colours: FloatArray, normals: FloatArray, view: View, gloss: float = GLOSS) -> FloatArray:
+    """Colours (n, 3) under a light above the viewer's left shoulder (Blinn & Phong), shape (n, 3)."""
+    light = view.towards + 0.45 * view.up - 0.35 * view.right
+    light /= np.linalg.norm(light)
+    half = light + view.towards
+    half /= np.linalg.norm(half)
+    diffuse = np.clip(normals @ light, 0.0, 1.0)[:, None]
+    highlight = np.clip(normals @ half, 0.0, 1.0)[:, None] ** SHININESS
+    return np.clip(colours * (AMBIENT + DIFFUSE * diffuse) + gloss * highlight, 0.0, 1.0)
+
+
+def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray, IntArray]:
+    """Points and outward triangles of a capsule between two points; of a ball where they are the same."""
+    along = end - start
+    length = float(np.linalg.norm(along))
+    axis = along / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+    first, second = tangent_axes(axis)
+    rings, count = 17, 28
+    latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    around = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    points = []
+    for value in latitude:
+        centre = start if value < 0.0 else end
+        points.append(centre + radius * (np.cos(value) * around + np.sin(value) * axis))
+    grid = np.arange(rings * count).reshape(rings, count)
+    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
+    c, d = np.roll(grid[1:], -1, axis=1), grid[1:]
+    quads = np.stack([a, b, c, d], axis=-1).reshape(-1, 4)
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    vertices = np.concatenate(points)
+    # Whatever way the axes turned, the triangles shall look outward.
+    corners = vertices[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    keep = np.linalg.norm(normal, axis=1) > 1e-16
+    outward = corners.mean(axis=1) - (start + np.clip((corners.mean(axis=1) - start) @ axis, 0, length)[:, None] * axis)
+    triangles[(normal * outward).sum(axis=1) < 0.0] = triangles[(normal * outward).sum(axis=1) < 0.0][:, [0, 2, 1]]
+    return vertices, triangles[keep].astype(np.int32)

@@ -1,0 +1,131 @@
+"""Scene files: read, refused, found, and true to what they state."""
+
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import surgsim_env
+from msdm_core.errors import OrganError
+from msdm_core.stability import stable_dt
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.scene_files import scenes_folder
+from surgsim_env.scenes import make_scene, scene_from_table
+from surgsim_env.simulation import Simulation
+from surgsim_env.timing import substeps_needed, whole_steps
+
+PHANTOM = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
+
+
+def changed(**entries):
+    """The phantom's table with dotted entries replaced."""
+    table = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
+    for path, value in entries.items():
+        *folders, last = path.split("__")
+        place = table
+        for folder in folders:
+            place = place[folder]
+        place[last] = value
+    return scene_from_table(table, name="changed", folder=Path("."))
+
+
+def test_the_shipped_scenes_are_listed():
+    assert set(surgsim_env.list_scenes()) >= {"phantom", "liver"}
+
+
+@pytest.mark.parametrize("name", surgsim_env.list_scenes())
+def test_every_scene_loads_with_its_palpable_face_and_sites(name):
+    scene = make_scene(name)
+    anatomy = load_anatomy(scene)
+    assert len(anatomy.anchors) > 10
+    points, normals = anatomy.face.raster(scene.palpation.site_spacing)
+    assert len(points) > 20
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+    assert (normals @ np.asarray(scene.instrument.approach) < 0.0).all()
+
+
+@pytest.mark.parametrize("name", surgsim_env.list_scenes())
+def test_substeps_of_a_scene_bear_its_worst_randomisation(name):
+    scene = make_scene(name)
+    anatomy = load_anatomy(scene)
+    rng = np.random.default_rng(0)
+    worst = math.inf
+    for _ in range(6):
+        point, normal = anatomy.face.random_point(rng, scene.lesion.rim_distance)
+        # The largest, shallowest and stiffest lesion the file allows.
+        radius, cover, ratio = scene.lesion.radius[1], scene.lesion.cover[0], scene.lesion.modulus_ratio[1]
+        lesion = anatomy.lesion_at(point - normal * (cover + radius), radius, ratio, "worst")
+        worst = min(worst, stable_dt(anatomy.organ([lesion]), scene.contact.law))
+    assert substeps_needed(scene.timing.haptic_step, worst) <= scene.timing.substep_count
+
+
+def test_too_few_substeps_are_refused_with_the_number_needed():
+    anatomy = load_anatomy(changed(timing__substep_count=2))
+    simulation = Simulation(anatomy)
+    with pytest.raises(OrganError, match=r"2 substeps of 0\.5 ms are too long .*timing\.substep_count = 4"):
+        simulation.reset(anatomy.organ(), np.array([0.03, 0.03, 0.05]))
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"material__youngs_modulus": 0.0}, "youngs_modulus is 0.0 Pa"),
+        ({"material__youngs_modulus": -5.0}, "youngs_modulus is -5.0 Pa"),
+        ({"material__poisson_ratio": 0.2}, "poisson_ratio is 0.2"),
+        ({"material__poisson_ratio": 0.5}, "poisson_ratio is 0.5"),
+        ({"material__density": math.nan}, "density is nan"),
+        ({"material__stiffness": 3.0}, "stiffness"),
+        ({"limits__hard_force": 0.1}, "soft_force < hard_force"),
+        ({"lesion__radius": [0.01, 0.006]}, "radius = "),
+        ({"mesh__block": None}, "exactly one"),
+        ({"material__density": "heavy"}, "heavy"),
+        ({"anchors": [{"name": "nothing"}]}, "give one of a box, a ball"),
+    ],
+)
+def test_bad_entries_are_named(entries, message):
+    with pytest.raises(ValueError, match=message):
+        changed(**entries)
+
+
+def test_an_anchor_that_holds_nothing_is_refused():
+    far = [{"name": "sky", "ball": {"centre": [1.0, 1.0, 1.0], "radius": 0.01}}]
+    with pytest.raises(ValueError, match="anchor 'sky' holds no node"):
+        load_anatomy(changed(anchors=far))
+    with pytest.raises(ValueError, match="nothing holds the organ"):
+        load_anatomy(changed(anchors=[]))
+
+
+def test_unknown_scene_lists_and_suggests():
+    with pytest.raises(ValueError, match=r"'livre' is unknown; the scenes are .*liver.*did you mean 'liver'"):
+        make_scene("livre")
+
+
+def test_a_scene_file_of_ones_own_is_read(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text((scenes_folder() / "organs" / "phantom.toml").read_text().replace("[12, 12, 6]", "[6, 6, 3]"))
+    scene = make_scene(str(path))
+    assert scene.name == "mine"
+    assert scene.mesh.block.cells == (6, 6, 3)
+    assert load_anatomy(scene).mesh.tet_count < 2000
+    with pytest.raises(ValueError, match=r"gone\.toml cannot be read"):
+        make_scene(str(tmp_path / "gone.toml"))
+    path.write_text("organ = [")
+    make_scene.cache_clear()
+    with pytest.raises(ValueError, match="not valid TOML"):
+        make_scene(str(path))
+
+
+def test_instrument_that_is_not_there_lists_those_that_are():
+    scene = make_scene("phantom")
+    anatomy = load_anatomy(replace(scene, instrument=replace(scene.instrument, model="scalpel.xml")))
+    with pytest.raises(ValueError, match=r"'scalpel.xml' is unknown; the instruments are probe.xml"):
+        Simulation(anatomy)
+
+
+def test_whole_steps():
+    assert whole_steps(0.05, 0.001, what="control step") == 50
+    with pytest.raises(ValueError, match=r"control step: 0.05 s is not a whole number of 0.003 s steps"):
+        whole_steps(0.05, 0.003, what="control step")

@@ -12,8 +12,12 @@ from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing import box_mesh, mesh_surface
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.regions import Lesion
+from msdm_core.triangles import nearest_triangle
 from surgsim_env.palpable_face import PalpableFace, find_palpable_face
 from surgsim_env.scenes import Anchor, FixedLesion, Scene
+
+# How exactly a drawn lesion's cover is met [m].
+COVER_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,49 @@ class Anatomy:
                 damping=scene.damping,
             )
         )
+
+    def random_lesion(self, rng: np.random.Generator) -> Lesion:
+        """A lesion drawn from the scene's ranges, below a random point of the palpable face.
+
+        Its cover is the true distance from its ball to the organ's surface, to 0.1 mm; a place where a ball of that
+        size cannot have it (a thin or sharply bent one) is drawn again.
+
+        Raises:
+            ValueError: the organ has no room for such a lesion in 200 draws.
+        """
+        draw = self.scene.lesion
+        radius = float(rng.uniform(*draw.radius))
+        cover = float(rng.uniform(*draw.cover))
+        ratio = float(rng.uniform(*draw.modulus_ratio))
+        for _ in range(200):
+            point, normal = self.face.random_point(rng, draw.rim_distance)
+            centre = self._centre_below(point, normal, cover + radius)
+            if centre is not None:
+                return self.lesion_at(centre, radius, ratio, "lesion")
+        raise ValueError(
+            f"scene {self.scene.name!r}: no room for a lesion of radius {radius * 1000:.3g} mm under "
+            f"{cover * 1000:.3g} mm of tissue: use smaller lesions or a larger rim_distance"
+        )
+
+    def _centre_below(self, point: FloatArray, normal: FloatArray, distance: float) -> FloatArray | None:
+        """The point on the inward normal that is `distance` from the surface [m], or None where there is none."""
+        depth = distance
+        for _ in range(20):
+            centre = point - normal * depth
+            gap = distance - self.surface_distance(centre)
+            if abs(gap) <= COVER_TOLERANCE:
+                return centre
+            depth += gap
+            # Bent surfaces ask for a little more depth; far more means that another side comes near.
+            if not distance - 0.01 <= depth <= distance + 0.01:
+                return None
+        return None
+
+    def surface_distance(self, point: FloatArray) -> float:
+        """Distance from a point to the organ's surface, the held part too [m]."""
+        corners = self.mesh.points[self.mesh.boundary_triangles]
+        triangle, weights = nearest_triangle(corners, point)
+        return float(np.linalg.norm(weights @ corners[triangle] - point))
 
     def lesion_below(self, point: FloatArray, radius: float, cover: float, ratio: float, name: str) -> Lesion:
         """A sphere whose top lies `cover` below a point of the surface [m], `ratio` times as stiff as the tissue."""

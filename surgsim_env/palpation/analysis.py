@@ -12,6 +12,8 @@ HUBER_LIMIT = 1.345  # 95 % efficient for normal residuals (Holland & Welsch 197
 TUKEY_LIMIT = 4.685
 # A baseline needs this many sites for each of its coefficients; with fewer it is a plane, then the median.
 SITES_PER_COEFFICIENT = 3
+# Share of the spread of each regressor that holds its coefficient back (ridge).
+RIDGE = 0.03
 # A map without noise has no spread; its residuals still need a scale [in log stiffness].
 SMALLEST_SCALE = 1e-3
 
@@ -28,6 +30,21 @@ def sensor_readings(force: FloatArray, normals: FloatArray, sensor: ForceSensor,
     bias = rng.uniform(-sensor.bias, sensor.bias, 3)
     noise = rng.normal(0.0, 1.0, normals.shape) * sensor.noise
     return np.clip(force + (normals * (bias + noise)).sum(axis=1), -sensor.range, sensor.range)
+
+
+def healthy_majority(values: FloatArray) -> tuple[float, float]:
+    """Middle and spread of the shortest half of the values (Rousseeuw 1984), the spread as a standard deviation.
+
+    Lesions push one way and a large one reaches many sites, which shifts a median; the densest half stays healthy.
+    """
+    if len(values) == 0:
+        return 1.0, 0.0
+    ordered = np.sort(values)
+    half = len(ordered) // 2 + 1
+    width = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
+    start = int(np.argmin(width))
+    # The middle half of normal data is 1.349 standard deviations wide.
+    return float(np.median(ordered[start : start + half])), float(width[start]) / 1.349
 
 
 def robust_spread(values: FloatArray) -> float:
@@ -53,14 +70,14 @@ def contrast_with_neighbours(stiffness: FloatArray, plane: FloatArray, geometry:
     """
     _check_stiffness(stiffness, "stiffness")
     log_stiffness = np.log(stiffness)
-    baseline = _robust_fit(_regressors(plane, geometry), log_stiffness)
-    return np.exp(log_stiffness - baseline)
+    contrast = np.exp(log_stiffness - _robust_fit(_regressors(plane, geometry), log_stiffness))
+    return contrast / healthy_majority(contrast)[0]
 
 
 def contrast_with_model(stiffness: FloatArray, model_stiffness: FloatArray) -> FloatArray:
-    """Stiffness over a pre-operative model's at the same sites, over the median of that ratio, shape (n_site,).
+    """Stiffness over a pre-operative model's at the same sites, over that ratio's healthy majority, shape (n_site,).
 
-    The median takes out the patient's modulus, which the model does not know.
+    Dividing by the majority takes out the patient's modulus, which the model does not know.
 
     Raises:
         ValueError: names the site whose stiffness is not above 0.
@@ -68,7 +85,7 @@ def contrast_with_model(stiffness: FloatArray, model_stiffness: FloatArray) -> F
     _check_stiffness(stiffness, "stiffness")
     _check_stiffness(model_stiffness, "the model's stiffness")
     ratio = stiffness / model_stiffness
-    return ratio / np.median(ratio) if len(ratio) else ratio
+    return ratio / healthy_majority(ratio)[0]
 
 
 def _check_stiffness(stiffness: FloatArray, what: str) -> None:
@@ -106,11 +123,15 @@ def _robust_fit(columns: FloatArray, values: FloatArray) -> FloatArray:
     """Fitted values of an iteratively reweighted least-squares regression, shape (n_site,)."""
     if columns.shape[1] == 1:
         return np.full(len(values), np.median(values)) if len(values) else values
+    # Ridge: all but the constant are held back, so that an end of the raster is not bent to where no site says so.
+    held = np.sqrt(RIDGE * len(values)) * np.diag(columns.std(axis=0))
+    zeros = np.zeros(len(held))
     weight = np.ones(len(values))
     fitted = values
     for round_ in range(ROUNDS):
         root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(columns * root[:, None], values * root, rcond=None)[0]
+        matrix = np.concatenate([columns * root[:, None], held])
+        coefficients = np.linalg.lstsq(matrix, np.concatenate([values * root, zeros]), rcond=None)[0]
         fitted = columns @ coefficients
         scaled = np.abs(values - fitted) / max(robust_spread(values - fitted), SMALLEST_SCALE)
         if round_ < HUBER_ROUNDS:

@@ -44,7 +44,7 @@ def write_stiffness_map(palpation: Palpation, path: Path) -> None:
     scene = palpation.anatomy.scene
     figure.suptitle(
         f"{scene.name}: {len(palpation.presses)} presses of {scene.palpation.press_depth * 1e3:g} mm with a "
-        f"{scene.instrument.tip_radius * 1e3:g} mm ball, dashed: the hidden lesions, crosses: where they were felt",
+        f"{scene.instrument.tip_radius * 1e3:g} mm ball (dashed: the hidden lesions, crosses: where they were felt)",
         color=INK,
         fontsize=12,
     )
@@ -147,7 +147,7 @@ def _draw_patches(axes: Axes, parts: list[tuple[Patches, FloatArray, float]], vi
     order = order[normals[order] @ view.towards > -0.15]
     axes.add_collection(
         PolyCollection(
-            view.flat(corners[order]), facecolors=colours[order], edgecolors=colours[order], linewidths=0.4, zorder=1
+            view.flat(corners[order]), facecolors=colours[order], edgecolors=colours[order], linewidths=0.8, zorder=1
         )
     )
     axes.autoscale_view()
@@ -197,10 +197,10 @@ def _draw_curves(axes: Axes, palpation: Palpation) -> None:
         number = int(numbers[index])
         curve, model = palpation.presses[number].curve, palpation.model_presses[number].curve
         axes.plot(curve[:, 0] * 1e3, curve[:, 1], color=colour, lw=2.2, label=f"{name} (site {number})")
-        axes.plot(model[:, 0] * 1e3, model[:, 1], color=colour, lw=1.2, ls="--", label="its pre-operative model")
+        axes.plot(model[:, 0] * 1e3, model[:, 1], color=colour, lw=1.2, ls="--", label="there in the pre-operative model")
     axes.set_xlabel("depth of the tip below the resting surface [mm]")
     axes.set_ylabel("force along the normal [N]")
-    axes.set_title("force over depth, and the rest at the bottom", color=INK, fontsize=11)
+    axes.set_title("force over depth, and the hold at the end", color=INK, fontsize=11)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlim(left=0.0)

@@ -73,19 +73,13 @@ class PalpateTask:
 
     def reset(self, rng: np.random.Generator) -> Start:
         """Draw the lesion, the sensor's bias and the tip's start."""
-        draw = self.anatomy.scene.lesion
-        face = self.anatomy.face
-        radius = float(rng.uniform(*draw.radius))
-        cover = float(rng.uniform(*draw.cover))
-        ratio = float(rng.uniform(*draw.modulus_ratio))
-        point, normal = face.random_point(rng, draw.rim_distance)
-        self.lesion = self.anatomy.lesion_at(point - normal * (cover + radius), radius, ratio, "lesion")
+        self.lesion = self.anatomy.random_lesion(rng)
         self.reading.reset(rng)
         self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
         self._force_peak = 0.0
-        above, outward = face.random_point(rng, self.anatomy.scene.palpation.face_margin)
+        above, outward = self.anatomy.face.random_point(rng, self.anatomy.scene.palpation.face_margin)
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
         return Start((self.lesion,), above + outward * gap)
 

@@ -70,6 +70,16 @@ def step(model: OrganModel, state: OrganState, shapes: ContactShapes, law: Conta
     return advance(model, state, dt=dt, substep_count=substeps, shapes=shapes, contact=law)[0]
 
 
+def rises(force: NDArray) -> bool:
+    """Whether a force read every 10 ms rises from the first touch on (within that, the organ's own swing shows).
+
+    Over a node the nearest quadrature point is 1.2 mm to the side: a ball of 8 mm sinks 0.1 mm and more before it
+    meets one.
+    """
+    touched = force[np.flatnonzero(force > 0.0)[0] :]
+    return bool((np.diff(touched[9::10]) > 0.0).all())
+
+
 # ---- presses ------------------------------------------------------------------------------------------------------
 
 
@@ -78,7 +88,6 @@ def step(model: OrganModel, state: OrganState, shapes: ContactShapes, law: Conta
 def test_a_press_to_one_and_a_half_times_the_hard_limit(site: str, hard: bool):
     """Force rises with depth all the way to 1.2 N, no fault, no inverted tet.
 
-    The curve is read every 0.1 mm (10 ms): within it, the organ's own swing (10 Hz, from the first touch) shows.
     """
     scene = phantom().scene
     target = 1.5 * scene.limits.hard_force
@@ -89,8 +98,7 @@ def test_a_press_to_one_and_a_half_times_the_hard_limit(site: str, hard: bool):
         f" smallest V/V0 {pressed.volume_ratio[-1]:.2f}"
     )
     assert pressed.force[-1] >= target
-    rising = pressed.force[9::10]
-    assert (np.diff(rising) > 0.0).all()
+    assert rises(pressed.force)
     assert np.diff(pressed.force).min() > -0.002 * target
     assert pressed.volume_ratio[-1] > 0.2
     assert not inverted_tets(model, pressed.state).size
@@ -141,7 +149,7 @@ def test_a_ball_does_not_tunnel(site: str, radius: float, force: float):
     except OrganDivergedError as error:
         pytest.fail(str(error))
     assert pressed.force[-1] >= force, f"lost at {pressed.force.max():.3f} N, depth {pressed.depth[-1] * 1e3:.1f} mm"
-    assert (np.diff(pressed.force[9::10]) > 0.0).all()
+    assert rises(pressed.force)
 
 
 # ---- a floor: closed forms ----------------------------------------------------------------------------------------
@@ -153,7 +161,7 @@ FLOOR_LAW = ContactLaw(stiffness=2e7, damping=0.0, friction=0.3, tangential_stif
 def floor() -> OrganModel:
     """A plate whose nodes do not move and whose top may be touched: contact and friction by themselves."""
     free = oracle.block((0.02, 0.02, 0.002), (20, 20, 2))
-    return free._replace(node_inverse_mass=oracle.frozen(np.zeros_like(free.node_mass)))
+    return free._replace(node_inverse_mass=oracle.frozen(np.zeros_like(free.node_mass)), stable_step=1.0)
 
 
 def on_floor(depth: float, *, radius: float = 0.008) -> tuple[OrganState, ContactShapes]:
@@ -170,10 +178,10 @@ def move(state: OrganState, shapes: ContactShapes, velocity: ArrayLike, count: i
 
 @pytest.mark.parametrize("depth", [0.2e-3, 0.5e-3, 1e-3])
 def test_a_ball_on_a_floor_feels_the_integrated_pressure(depth: float):
-    """F = (k_p / r^2) int (s + t) s^2 dA with t = d - r, s^2 = r^2 - rho^2, out to s + t = 0, where rho^2 = 2 r d - d^2.
+    """F = int k_p g (s / r) dA = (k_p / r^2) int s^2 (s + t) dA, t = d - r, s^2 = r^2 - rho^2, out to s + t = 0.
 
-    F = 2 pi (k_p / r^2) [r^5 / 5 - t^5... ]: integrated over s from -t to r, rho drho = -s ds. Quadrature points are
-    0.5 mm apart here: 3 % at a contact radius of 2 mm or more.
+    With dA = 2 pi rho drho = -2 pi s ds: F = 2 pi (k_p / r^2) [s^5 / 5 + t s^4 / 4] from s = -t to s = r. Quadrature
+    points are 0.5 mm apart, the contact radius is 1.8 to 3.9 mm.
     """
     radius = 0.008
     t = depth - radius
@@ -196,7 +204,7 @@ def test_sliding_friction_is_mu_times_the_normal_force():
 
 
 def test_sticking_friction_is_a_spring_that_remembers():
-    """Below the limit T = -k_t A u, to the bit at rest and back at zero when the ball is back."""
+    """Below the limit T = -k_t A u: constant at rest, zero again when the ball is back."""
     state, shapes = on_floor(0.5e-3)
     law = FLOOR_LAW._replace(friction=5.0)  # sticks throughout
     out = move(state, shapes, (0.001, 0.0, 0.0), 20, law)  # 20 um
@@ -204,7 +212,7 @@ def test_sticking_friction_is_a_spring_that_remembers():
     np.testing.assert_allclose(slope, slope[0], rtol=0.02)  # linear
     assert slope[0] < 0.0
     held = move(state, shapes, (0.0, 0.0, 0.0), 500, law)
-    np.testing.assert_array_equal(held, np.broadcast_to(held[0], held.shape))  # no creep in 0.5 s
+    np.testing.assert_allclose(held - held[0], 0.0, rtol=0, atol=1e-12 * held[0, 2])  # no creep in 0.5 s
     # The mean over a step that started with the memory of the one before: one step of stretch more.
     assert held[0, 0] == pytest.approx(out[-1, 0], rel=1e-3)
     back = move(state, shapes, (-0.001, 0.0, 0.0), 20, law)
@@ -214,7 +222,8 @@ def test_sticking_friction_is_a_spring_that_remembers():
 def test_sliding_on_tissue():
     """On the phantom too, friction drags by mu N of the pressure, and not at all where mu = 0.
 
-    Pressed 1.5 mm and drawn 6 mm along x; the frictionless twin takes out what ploughing alone pushes back.
+    Pressed 1.5 mm and drawn 6 mm along x; the frictionless twin takes out what ploughing alone pushes back. The ball
+    touches out to a / r = 0.43 rad, where friction lies along its flanks: 1 - (a / r)^2 / 2 = 0.91 of mu N at the rim.
     """
     drag = {}
     for friction in (0.2, 0.0):
@@ -227,7 +236,7 @@ def test_sliding_on_tissue():
         wrench = np.array([step(model, state, shapes, law, 4) for _ in range(600)])[400:]
         drag[friction] = float((wrench[:, 0] / wrench[:, 2]).mean())
     assert abs(drag[0.0]) < 0.05
-    assert drag[0.2] - drag[0.0] == pytest.approx(-0.2, rel=0.05)
+    assert 0.91 * 0.2 < drag[0.0] - drag[0.2] < 0.2
 
 
 def test_sticking_on_tissue_does_not_creep():
@@ -252,7 +261,7 @@ def test_sticking_on_tissue_does_not_creep():
 
 
 def test_the_far_side_of_a_thin_plate_is_not_touched():
-    """A 5 mm ball on a plate of 3 mm reaches through it; only points of the near side are ever engaged."""
+    """A 5 mm ball pressed into a plate of 3 mm: only points of the near side are ever engaged."""
     model = thin_plate()
     near = (model.node_rest_position[model.surface_triangles][:, :, 2] > 0.003 - 1e-9).all(axis=1)
     far = (model.node_rest_position[model.surface_triangles][:, :, 2] < 1e-9).all(axis=1)
@@ -265,9 +274,10 @@ def test_the_far_side_of_a_thin_plate_is_not_touched():
         touched = state.contact_engaged[0].reshape(-1, 4).any(axis=1)
         assert not touched[~near].any()
     assert wrench[2] > 0.01 and touched[near].any()
-    # A far point lies within the ball: it would have been pushed, were depth alone to decide.
-    low = state.node_position[np.unique(model.surface_triangles[far])]
-    assert (np.linalg.norm(low - shapes.shape_ends[0, 0], axis=1) < 0.005).any()
+    # Far points lie below the ball, and along their normal s + t > 0: depth alone would have pushed them.
+    offset = state.node_position[np.unique(model.surface_triangles[far])] - shapes.shape_ends[0, 0]
+    chord = np.sqrt(np.maximum(0.005**2 - (offset[:, :2] ** 2).sum(axis=1), 0.0))
+    assert ((chord > 0.0) & (chord - offset[:, 2] > 0.0)).sum() > 5
 
 
 def thin_plate() -> OrganModel:

@@ -53,11 +53,18 @@ def test_substeps_of_a_scene_bear_its_worst_randomisation(name):
     anatomy = load_anatomy(scene)
     rng = np.random.default_rng(0)
     worst = math.inf
-    for _ in range(6):
-        point, normal = anatomy.face.random_point(rng, scene.lesion.rim_distance)
-        # The largest, shallowest and stiffest lesion the file allows.
-        radius, cover, ratio = scene.lesion.radius[1], scene.lesion.cover[0], scene.lesion.modulus_ratio[1]
-        lesion = anatomy.lesion_at(point - normal * (cover + radius), radius, ratio, "worst")
+    # The largest, shallowest and stiffest lesions that the file allows.
+    draw = scene.lesion
+    extreme = replace(
+        draw,
+        radius=(draw.radius[1], draw.radius[1]),
+        cover=(draw.cover[0], draw.cover[0]),
+        modulus_ratio=(draw.modulus_ratio[1], draw.modulus_ratio[1]),
+    )
+    hardest = replace(anatomy, scene=replace(scene, lesion=extreme))
+    for _ in range(12):
+        lesion = hardest.random_lesion(rng)
+        assert anatomy.surface_distance(np.array(lesion.centre)) >= draw.radius[1] + draw.cover[0] - 1.01e-4
         worst = min(worst, stable_dt(anatomy.organ([lesion]), scene.contact.law))
     assert substeps_needed(scene.timing.haptic_step, worst) <= scene.timing.substep_count
 

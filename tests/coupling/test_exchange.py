@@ -1,0 +1,347 @@
+"""The force exchange: momentum balance per haptic step, what reaches MuJoCo, faults, saved states, the wrist's sensor."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
+from msdm_core.measure import angular_momentum, momentum
+from msdm_core.mesh import IntArray
+from msdm_core.organ import rest_state
+from surgsim_env import exchange
+from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.exchange import FORCE_CAP, haptic_step
+from surgsim_env.instrument import Instrument
+from surgsim_env.scenes import Scene, make_scene
+from surgsim_env.simulation import Simulation
+from tests.core import oracle
+
+DT, SUBSTEPS = 1e-3, 5
+LAW = ContactLaw(stiffness=2e7, damping=300.0, friction=0.3, tangential_stiffness=1e7)
+
+# A free body whose centre of mass is none of its shapes' centres.
+FREE_BODY = """
+<mujoco>
+  <option timestep="0.001" integrator="Euler" jacobian="dense" gravity="0 0 0"><flag autoreset="disable"/></option>
+  <default><geom contype="0" conaffinity="0" group="3"/></default>
+  <worldbody>
+    <body name="tool">
+      <freejoint/>
+      <inertial pos="0.004 -0.003 0.01" mass="0.02" diaginertia="2e-6 3e-6 4e-6"/>
+      <geom type="sphere" size="0.006"/>
+      <geom type="capsule" fromto="0 0 0 0.02 0.004 0.012" size="0.003"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+class FreeBody(Instrument):
+    """A body that nothing drives, with the instrument's own reading of shapes and writing of wrenches."""
+
+    def __init__(self, position: tuple[float, float, float], velocity: NDArray) -> None:
+        model = mujoco.MjModel.from_xml_string(FREE_BODY)
+        scene = make_scene("phantom")
+        super().__init__(scene, np.full(3, -1.0), np.full(3, 1.0))
+        self.model, self.data = model, mujoco.MjData(model)
+        self._geoms, self._tools = np.arange(2), np.array([1])
+        self._half_length = np.array([0.0, model.geom_size[1, 1]])
+        self.shapes = oracle.single_tool(np.zeros((2, 2, 3)), model.geom_size[:, 0])
+        self.data.qpos[:3] = position
+        self.data.qvel[:] = velocity
+
+    def drive(self) -> None:
+        """Nothing drives it."""
+
+
+@cache
+def scene() -> Scene:
+    return make_scene("phantom")
+
+
+def free_organ() -> tuple[OrganModel, OrganState]:
+    """An unheld block that flies and spins a little, alpha = 0: only the tool changes its momentum."""
+    model = oracle.block((0.03, 0.03, 0.015), (6, 6, 3))
+    state = rest_state(model, shape_count=2)
+    state.node_velocity[:] = [0.01, 0.02, 0.0] + np.cross([0.5, -0.3, 0.8], state.node_position)
+    return model, state
+
+
+def free_ball() -> Instrument:
+    return FreeBody((0.014, 0.016, 0.0215), np.array([0.03, -0.02, -0.15, 3.0, -2.0, 5.0]))
+
+
+def driven_probe() -> Instrument:
+    probe = Instrument(scene(), np.full(3, -0.1), np.full(3, 0.1))
+    probe.place(np.array([0.014, 0.016, 0.0235]))
+    probe.command_velocity(np.array([0.02, 0.01, -0.05]))
+    return probe
+
+
+TOOLS = {"free body": free_ball, "probe": driven_probe}
+POINT = np.array([0.3, -0.2, 0.1])  # angular momentum is taken about this one [m]
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_organs_change_of_momentum_is_minus_the_wrench(name: str):
+    """Per haptic step dp = -F dt and dL = -(tau + (c - P) x F) dt, c the centre of mass at its start, to 1e-12."""
+    model, state = free_organ()
+    tool = TOOLS[name]()
+    wrench = np.zeros((1, 6))
+    impulse = twist_impulse = 0.0
+    for _ in range(150):
+        linear, angular = momentum(model, state), angular_momentum(model, state, POINT)
+        haptic_step(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+        centre = tool.data.xipos[tool.model.nbody - 1].copy()  # mj_step2 leaves the poses of the step's start
+        force, torque = wrench[0, :3], wrench[0, 3:]
+        turn = torque + np.cross(centre - POINT, force)
+        # To rounding: momenta are sums over 175 nodes, of the impulse's size and of what the organ carries.
+        scale = DT * np.abs(force).max() + np.abs(linear).max()
+        np.testing.assert_allclose(momentum(model, state) - linear, -DT * force, rtol=0, atol=1e-12 * scale)
+        np.testing.assert_allclose(
+            angular_momentum(model, state, POINT) - angular, -DT * turn, rtol=0, atol=1e-12 * scale
+        )
+        impulse += DT * np.linalg.norm(force)
+        twist_impulse += DT * np.linalg.norm(torque)
+    # They did push on each other: the organ weighs 13.5 g; the torque's share would be missed, were it left out.
+    assert impulse > 1e-4
+    assert twist_impulse > 1e-7
+
+
+def test_organ_and_free_body_keep_their_momentum():
+    """m_tool v + sum m_i v_i is constant; MuJoCo's free body takes F dt exactly."""
+    model, state = free_organ()
+    tool = free_ball()
+    wrench = np.zeros((1, 6))
+
+    def total() -> NDArray:
+        tool.refresh()
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(tool.model, tool.data, mujoco.mjtObj.mjOBJ_BODY, 1, velocity, 0)
+        return momentum(model, state) + tool.model.body_mass[1] * velocity[3:]
+
+    # A spinning free body's own step is not exact in MuJoCo (its frame's origin is not its centre of mass): no spin.
+    tool.data.qvel[3:] = 0.0
+    before = total()
+    haptic_step(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+    for _ in range(40):
+        haptic_step(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+    assert np.abs(wrench).max() > 0.01
+    assert np.abs(total() - before).max() < 1e-3 * np.abs(before).max()
+
+
+def test_the_reading_is_of_the_current_step(monkeypatch: pytest.MonkeyPatch):
+    """Poses and twist that the organ sees are those of the coordinates before the step, not of the step before."""
+    model, state = free_organ()
+    probe = driven_probe()
+    seen = []
+
+    def spy(_model, _state, shapes, _law, _dt, _count, wrench) -> int:
+        seen.append((shapes.shape_ends[0, 0].copy(), shapes.tool_centre[0].copy(), shapes.tool_twist[0].copy()))
+        wrench[:] = 0.0
+        return FAULT_NONE
+
+    monkeypatch.setattr(exchange, "advance_organ", spy)
+    wrench = np.zeros((1, 6))
+    for _ in range(20):
+        place, speed = probe.data.qpos[:3].copy(), probe.data.qvel[:3].copy()
+        haptic_step(model, state, probe, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+        ball, centre, twist = seen[-1]
+        np.testing.assert_allclose(ball, place, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(centre, place + [0.0, 0.0, 0.02], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(twist, [*speed, 0.0, 0.0, 0.0], rtol=0, atol=1e-15)
+    assert np.abs(seen[-1][2]).max() > 0.02
+
+
+def test_the_wrench_acts_in_the_same_step(monkeypatch: pytest.MonkeyPatch):
+    """Free body: dv = F dt / m within the very step, and it is overwritten, not summed, in the next."""
+    model, state = free_organ()
+    tool = FreeBody((0.0, 0.0, 0.5), np.zeros(6))
+
+    def push(_model, _state, _shapes, _law, _dt, _count, wrench) -> int:
+        wrench[:] = [0.02, 0.0, -0.04, 0.0, 0.0, 0.0]
+        return FAULT_NONE
+
+    monkeypatch.setattr(exchange, "advance_organ", push)
+    wrench = np.zeros((1, 6))
+    for count in (1, 2, 3):
+        haptic_step(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+        np.testing.assert_allclose(tool.data.qvel[:3], count * np.array([1e-3, 0.0, -2e-3]), rtol=1e-12, atol=1e-15)
+
+
+# ---- faults -------------------------------------------------------------------------------------------------------
+
+
+def untouched(probe: Instrument) -> bool:
+    return not probe.data.xfrc_applied.any() and bool(np.isfinite(probe.data.qpos).all())
+
+
+def test_a_force_that_is_not_finite_never_reaches_mujoco():
+    """A contact law gone bad: the step ends before MuJoCo hears of it."""
+    model, state = free_organ()
+    probe = driven_probe()
+    probe.place(np.array([0.014, 0.016, 0.0215]))
+    bad = LAW._replace(stiffness=float("nan"))
+    with pytest.raises(OrganDivergedError, match="no longer finite"):
+        haptic_step(model, state, probe, bad, DT / SUBSTEPS, SUBSTEPS, np.zeros((1, 6)))
+    assert untouched(probe)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.nan, "the contact wrench is not finite"),
+        (np.inf, "the contact wrench is not finite"),
+        (120.0, rf"contact force 120 N is beyond the physical cap of {FORCE_CAP:g} N"),
+    ],
+)
+def test_a_bad_wrench_never_reaches_mujoco(value: float, message: str, monkeypatch: pytest.MonkeyPatch):
+    """Even where every node is finite."""
+
+    def push(_model, _state, _shapes, _law, _dt, _count, wrench) -> int:
+        wrench[:] = [0.0, 0.0, value, 0.0, 0.0, 0.0]
+        return FAULT_NONE
+
+    monkeypatch.setattr(exchange, "advance_organ", push)
+    model, state = free_organ()
+    probe = driven_probe()
+    with pytest.raises(OrganDivergedError, match=message):
+        haptic_step(model, state, probe, LAW, DT / SUBSTEPS, SUBSTEPS, np.zeros((1, 6)))
+    assert untouched(probe)
+
+
+# ---- the simulation -----------------------------------------------------------------------------------------------
+
+ABOVE = np.array([0.03, 0.03, 0.0385])  # the tip's centre, 0.5 mm clear of the phantom's top [m]
+
+
+@cache
+def anatomy() -> Anatomy:
+    return load_anatomy(scene())
+
+
+def simulation() -> Simulation:
+    simulated = Simulation(anatomy())
+    simulated.reset(anatomy().organ(), ABOVE)
+    return simulated
+
+
+def run(simulated: Simulation, velocity: tuple[float, float, float], count: int) -> NDArray:
+    """The wrench of each haptic step at a commanded velocity, shape (count, 6)."""
+    simulated.instrument.command_velocity(np.array(velocity))
+    wrenches = []
+    for _ in range(count):
+        assert simulated.haptic_step(), simulated.fault
+        wrenches.append(simulated.contact_wrench[0])
+    return np.array(wrenches)
+
+
+def test_too_few_substeps_are_refused_with_the_count_that_does():
+    """The message's count is the least that passes."""
+    worst = anatomy().lesion_below(ABOVE, 0.010, 0.003, 10.0, "worst")
+    organ = anatomy().organ([worst])
+
+    def with_substeps(count: int) -> Simulation:
+        timing = replace(scene().timing, substep_count=count)
+        return Simulation(replace(anatomy(), scene=replace(scene(), timing=timing)))
+
+    with pytest.raises(OrganError, match=r"1 substeps of 1 ms are too long .* timing.substep_count = \d+") as refused:
+        with_substeps(1).reset(organ, ABOVE)
+    needed = int(re.findall(r"substep_count = (\d+)", str(refused.value))[0])
+    assert 2 < needed <= scene().timing.substep_count + 1
+    with pytest.raises(OrganError, match=f"substep_count = {needed}"):
+        with_substeps(needed - 1).reset(organ, ABOVE)
+    with_substeps(needed).reset(organ, ABOVE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("qpos", np.nan), ("qvel", 1e12), ("ctrl", np.nan)], ids=["position", "velocity", "control"]
+)
+def test_mujocos_warnings_surface(name: str, value: float):
+    simulated = simulation()
+    run(simulated, (0.0, 0.0, -0.01), 3)
+    assert simulated.end_control_step()
+    getattr(simulated.instrument.data, name)[0] = value
+    still_runs = simulated.haptic_step()
+    assert not simulated.end_control_step()
+    assert simulated.fault.startswith("MuJoCo warning") and not simulated.fault.isspace()
+    if still_runs:
+        assert np.isfinite(simulated.organ_state.node_position).all()
+    simulated.reset(anatomy().organ(), ABOVE)
+    run(simulated, (0.0, 0.0, -0.01), 3)
+    assert simulated.end_control_step()
+
+
+def test_a_fault_is_told_and_a_restart_is_clean():
+    """An organ gone bad: haptic_step says no and why; after `restart` the run is that of a fresh simulation, to the bit."""
+    simulated = simulation()
+    run(simulated, (0.0, 0.0, -0.02), 60)
+    simulated.organ_state.node_velocity[17, 0] = np.nan
+    assert not simulated.haptic_step()
+    assert "node 17 is no longer finite" in simulated.fault
+    simulated.restart(ABOVE)
+    assert simulated.time == 0.0 and simulated.fault == ""
+    np.testing.assert_array_equal(run(simulated, (0.01, 0.0, -0.02), 100), run(simulation(), (0.01, 0.0, -0.02), 100))
+
+
+def test_a_saved_state_resumes_to_the_bit():
+    """Saved in mid-press with friction sticking; resumed in the same simulation, and in another after other work."""
+    simulated = simulation()
+    run(simulated, (0.01, 0.005, -0.03), 100)
+    assert np.abs(simulated.organ_state.contact_stretch).max() > 0.0
+    saved = {name: array.copy() for name, array in simulated.get_state().items()}
+    ahead = run(simulated, (-0.01, 0.0, -0.01), 100)
+    after = simulated.get_state()
+    assert np.abs(ahead).max() > 0.05
+    other = simulation()
+    run(other, (0.0, 0.0, -0.05), 37)
+    for resumed in (simulated, other):
+        resumed.set_state(simulated.organ_model, saved)
+        assert resumed.time == pytest.approx(0.1)
+        np.testing.assert_array_equal(resumed.contact_wrench, saved["wrench"])
+        np.testing.assert_array_equal(run(resumed, (-0.01, 0.0, -0.01), 100), ahead)
+        for name, array in resumed.get_state().items():
+            assert array.tobytes() == after[name].tobytes(), name
+
+
+def test_a_resumed_command_goes_on():
+    """The velocity that was commanded is part of the state."""
+    simulated = simulation()
+    run(simulated, (0.0, 0.0, -0.03), 60)
+    saved = simulated.get_state()
+    for _ in range(30):
+        simulated.haptic_step()
+    tip = simulated.instrument.tip_position
+    other = simulation()
+    other.set_state(simulated.organ_model, saved)
+    for _ in range(30):
+        other.haptic_step()
+    np.testing.assert_array_equal(other.instrument.tip_position, tip)
+
+
+def test_the_wrist_feels_what_the_tissue_gives():
+    """Static press: the force sensor between slide and tip carries the contact force, within 1 %."""
+    simulated = simulation()
+    run(simulated, (0.0, 0.0, -0.03), 150)
+    run(simulated, (0.004, 0.0, 0.0), 100)
+    wrench = run(simulated, (0.0, 0.0, 0.0), 1500)[-1]
+    wrist = simulated.instrument.data.sensordata[:3]
+    force = np.linalg.norm(wrench[:3])
+    assert force > 0.15
+    np.testing.assert_allclose(np.abs(wrist), np.abs(wrench[:3]), rtol=0, atol=0.01 * force)
+    # The servo holds the tip with 5000 N/m: it is off its target by force / 5000.
+    data = simulated.instrument.data
+    np.testing.assert_allclose(data.qpos[:3] - data.ctrl[:3], wrench[:3] / 5000.0, rtol=0, atol=0.01 * force / 5000.0)
+
+
+def test_time_counts_haptic_steps():
+    simulated = simulation()
+    run(simulated, (0.0, 0.0, 0.0), 7)
+    assert simulated.time == pytest.approx(0.007, rel=1e-15)
+    assert anatomy().anchors.dtype == IntArray.__args__[1].__args__[0] if hasattr(IntArray, "__args__") else True

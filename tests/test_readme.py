@@ -1,0 +1,30 @@
+"""The README's Python runs as printed, and what it names is there."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_python_example_runs_and_is_short(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    assert len([line for line in code.splitlines() if line.strip()]) <= 12
+    exec(compile(code, "README.md", "exec"), {})
+    assert re.search(r"contact force \[.*\] N, largest 0\.\d\d N", capsys.readouterr().out)
+
+
+PLACES = sorted(set(re.findall(r"`((?:scenes|msdm_core|surgsim_env|agents|docs)/[^`*]*)`", README)))
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_places_in_the_map_exist(place):
+    assert (ROOT / place).exists()
+
+
+def test_pictures_exist_and_are_small():
+    for picture in re.findall(r"!\[[^]]*\]\(([^)]*)\)", README):
+        assert (ROOT / picture).is_file()
+        assert (ROOT / picture).stat().st_size < 500_000

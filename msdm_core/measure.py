@@ -56,7 +56,9 @@ def internal_forces(model: OrganModel, state: OrganState) -> FloatArray:
     no_gravity = np.zeros(3)
     no_gravity.setflags(write=False)
     scratch = state._replace(
-        node_force=np.empty_like(state.node_force), volume_ratio_smallest=np.ones(1), volume_ratio_tet=np.zeros(1, np.int32)
+        node_force=np.empty_like(state.node_force),
+        volume_ratio_smallest=np.ones(1),
+        volume_ratio_tet=np.zeros(1, np.int32),
     )
     evaluate_forces(model._replace(gravity=no_gravity), scratch)
     return scratch.node_force

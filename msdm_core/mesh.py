@@ -66,7 +66,7 @@ class TetMesh:
         point_array = _checked_points(points)
         tet_array = _checked_tets(tets, len(point_array))
         tet_array, reoriented_count = _oriented(point_array, tet_array)
-        _check_connected(tet_array, len(point_array))
+        _check_connected(tet_array)
         pairs = region_names.items() if isinstance(region_names, dict) else region_names
         object.__setattr__(self, "points", _frozen(point_array))
         object.__setattr__(self, "tets", _frozen(tet_array))
@@ -232,15 +232,19 @@ def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
     return tets, int(negative.sum())
 
 
-def _check_connected(tets: IntArray, node_count: int) -> None:
-    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
-    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(node_count, node_count))
-    count, label = connected_components(graph, directed=False)
+def _check_connected(tets: IntArray) -> None:
+    """Refuse parts that meet only in nodes or edges: springs there carry no bending, so the body hangs on hinges."""
+    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    twins = np.flatnonzero((np.diff(faces[order], axis=0) == 0).all(axis=1))
+    pairs = order[twins] // 4, order[twins + 1] // 4
+    graph = coo_array((np.ones(len(twins), dtype=np.int8), pairs), shape=(len(tets), len(tets)))
+    count, part = connected_components(graph, directed=False)
     if count > 1:
-        sizes = np.sort(np.bincount(label[tets[:, 0]], minlength=count))[::-1]
+        sizes = ", ".join(map(str, np.sort(np.bincount(part))[::-1][:6])) + (", ..." if count > 6 else "")
         raise MeshError(
-            f"the mesh falls into {count} disconnected bodies of {', '.join(map(str, sizes[:6]))}"
-            f"{', ...' if count > 6 else ''} tets; an organ is one body: keep the largest, or join them"
+            f"the mesh falls into {count} disconnected parts, which share no face, of {sizes} tets; "
+            "an organ is one body, and parts that meet in a node or an edge hang on a hinge: remesh, or keep one part"
         )
 
 

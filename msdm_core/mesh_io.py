@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
 from msdm_core.length_unit import LengthUnit, check_extent, metres_per_unit
-from msdm_core.mesh import TET_FACES, TetMesh
+from msdm_core.mesh import TetMesh
 from msdm_core.mesh_file import checked_file, parsed
 from msdm_core.mesh_notes import FileNotes, physical_names, read_notes, with_notes
 from msdm_core.mesh_text import gmsh41_bytes, medit_bytes
@@ -61,7 +59,6 @@ def read_mesh(path: str | Path, *, length_unit: LengthUnit | None = None, region
     except MeshError as error:
         raise MeshError(f"{file}: {error}") from error
     check_extent(mesh.points, metres, file)
-    _check_glued(file, mesh)
     return mesh
 
 
@@ -184,22 +181,6 @@ def _region_of(file: Path, raw: Any, region_key: str | None) -> NDArray | None:
     blocks = zip(raw.cells, raw.cell_data[keys[0]], strict=True)
     tags = np.concatenate([np.asarray(values) for block, values in blocks if block.type == "tetra"])
     return tags[:, 0] if tags.ndim == 2 and tags.shape[1] == 1 else tags
-
-
-def _check_glued(file: Path, mesh: TetMesh) -> None:
-    """Refuse parts that meet only in nodes or edges: springs there carry no bending, so the body hangs on hinges."""
-    faces = np.sort(mesh.tets[:, TET_FACES].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    twins = np.flatnonzero((np.diff(faces[order], axis=0) == 0).all(axis=1))
-    pairs = order[twins] // 4, order[twins + 1] // 4
-    graph = coo_array((np.ones(len(twins), dtype=np.int8), pairs), shape=(mesh.tet_count, mesh.tet_count))
-    count, part = connected_components(graph, directed=False)
-    if count > 1:
-        sizes = ", ".join(map(str, np.sort(np.bincount(part))[::-1][:6])) + (", ..." if count > 6 else "")
-        raise MeshError(
-            f"{file}: the tets fall into {count} parts that share no face, of {sizes} tets; "
-            "parts that meet in a node or an edge hang on a hinge, an organ is one body: remesh, or keep the largest"
-        )
 
 
 def _chosen_format(file: Path, file_format: str | None) -> str:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
 from msdm_core.mesh import TetMesh, tet_volumes
@@ -28,9 +30,14 @@ def random_mesh() -> Callable[..., TetMesh]:
         generator = np.random.default_rng(seed)
         grid = np.stack(np.meshgrid(*[np.arange(cells + 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         points = (grid + generator.uniform(-0.35, 0.35, grid.shape)) * 0.06 / cells
-        tets = Delaunay(points).simplices
-        # The hull of jittered points has slivers; what is left is one body as long as no node loses all its tets.
-        tets = tets[np.abs(tet_volumes(points, tets)) > 0.01 * (0.06 / cells) ** 3]
+        triangulation = Delaunay(points)
+        tets, neighbours = triangulation.simplices, triangulation.neighbors
+        # The hull of jittered points has slivers; without them, the largest part that hangs together by faces is kept.
+        thick = np.abs(tet_volumes(points, tets)) > 0.01 * (0.06 / cells) ** 3
+        tet, face = np.nonzero((neighbours >= 0) & thick[:, None] & thick[neighbours])
+        graph = coo_array((np.ones(len(tet)), (tet, neighbours[tet, face])), shape=(len(tets), len(tets)))
+        part = connected_components(graph, directed=False)[1]
+        tets = tets[part == np.bincount(part[thick]).argmax()]
         used, tets = np.unique(tets, return_inverse=True)
         names = {0: "parenchyma", 1: "capsule", 2: "lesion deep", 7: "lésion <&'>"}
         tets = tets.reshape(-1, 4)

@@ -33,9 +33,7 @@ def phantom_organ(site: str, hard: bool) -> OrganModel:
     """The phantom, healthy or with its stiffest, shallowest, largest lesion below a site."""
     anatomy = phantom()
     draw = anatomy.scene.lesion
-    lesion = anatomy.lesion_below(
-        np.array(SITES[site]), draw.radius[1], draw.cover[0], draw.modulus_ratio[1], "worst"
-    )
+    lesion = anatomy.lesion_below(np.array(SITES[site]), draw.radius[1], draw.cover[0], draw.modulus_ratio[1], "worst")
     return anatomy.organ([lesion] if hard else [])
 
 
@@ -86,9 +84,7 @@ def rises(force: NDArray) -> bool:
 @pytest.mark.parametrize("hard", [False, True], ids=["healthy", "lesion 10x, 10 mm, cover 3 mm"])
 @pytest.mark.parametrize("site", SITES)
 def test_a_press_to_one_and_a_half_times_the_hard_limit(site: str, hard: bool):
-    """Force rises with depth all the way to 1.2 N, no fault, no inverted tet.
-
-    """
+    """Force rises with depth all the way to 1.2 N, no fault, no inverted tet."""
     scene = phantom().scene
     target = 1.5 * scene.limits.hard_force
     model = phantom_organ(site, hard)

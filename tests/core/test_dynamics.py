@@ -68,7 +68,9 @@ SPRING_LENGTH, SPRING_STIFFNESS = 0.01, 40.0
 def oscillator(damping: Damping = oracle.UNDAMPED) -> tuple[OrganModel, float]:
     """One node on one spring, the other three corners of a tet held; its angular frequency sqrt(k / m) [rad/s]."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * SPRING_LENGTH
-    organ = compile_organ(OrganSpec(TetMesh(corners, [[0, 1, 2, 3]]), oracle.TISSUE, anchors=[0, 2, 3], damping=damping))
+    organ = compile_organ(
+        OrganSpec(TetMesh(corners, [[0, 1, 2, 3]]), oracle.TISSUE, anchors=[0, 2, 3], damping=damping)
+    )
     model = organ._replace(
         spring_nodes=oracle.frozen([[0, 1]], np.int32),
         spring_stiffness=oracle.frozen([SPRING_STIFFNESS]),
@@ -263,7 +265,9 @@ def test_stable_below_and_unstable_above_the_true_step(name: str, share: float, 
         assert growth > 1e3
 
 
-@pytest.mark.parametrize("alpha, beta, drag", [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (0.0, 2e-4, 0.0), (30.0, 1e-4, 500.0)])
+@pytest.mark.parametrize(
+    "alpha, beta, drag", [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (0.0, 2e-4, 0.0), (30.0, 1e-4, 500.0)]
+)
 def test_step_limit_is_where_the_amplification_matrix_leaves_the_unit_circle(alpha: float, beta: float, drag: float):
     """v' = e^(-alpha dt) v - dt (w^2 x + (beta w^2 + drag) v), x' = x + dt v'."""
     omega = 3000.0
@@ -425,7 +429,9 @@ def test_shapes_without_memory_are_refused():
         advance(model, rest_state(model), dt=1e-5, shapes=oracle.ball((0.0, 0.0, 1.0), 0.01))
 
 
-@pytest.mark.parametrize(("fields", "message"), [({"alpha": -1.0}, "alpha is -1.0 1/s"), ({"alpha": 1.0, "beta": math.nan}, "beta is nan s")])
+@pytest.mark.parametrize(
+    ("fields", "message"), [({"alpha": -1.0}, "alpha is -1.0 1/s"), ({"alpha": 1.0, "beta": math.nan}, "beta is nan s")]
+)
 def test_bad_damping_is_refused(fields: dict[str, float], message: str):
     with pytest.raises(OrganError, match=message):
         Damping(**fields)

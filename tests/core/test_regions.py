@@ -79,7 +79,9 @@ def test_lesion_refuses(fields: dict, message: str):
 
 def test_lesion_outside_the_organ_is_refused():
     outside = Lesion((0.03, 0.03, 0.05), 0.008, HARD, "metastasis")
-    with pytest.raises(OrganError, match=r"metastasis: only 0% of it \(centre 30.0, 30.0, 50.0 mm\).* at least 50% must"):
+    with pytest.raises(
+        OrganError, match=r"metastasis: only 0% of it \(centre 30.0, 30.0, 50.0 mm\).* at least 50% must"
+    ):
         lesion_fraction(BLOCK, outside)
     half_out = Lesion((0.03, 0.03, 0.0325), 0.008, HARD, "metastasis")  # 27 % inside
     with pytest.raises(OrganError, match=r"metastasis: only \d+% of it"):

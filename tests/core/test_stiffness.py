@@ -136,7 +136,9 @@ def test_a_quarter_is_the_papers_model_to_the_bit():
 
 # ---- Van Gelder's rule --------------------------------------------------------------------------------------------
 
-REGULAR = TetMesh(np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * (0.01 / math.sqrt(8.0)), [[0, 1, 2, 3]])
+REGULAR = TetMesh(
+    np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * (0.01 / math.sqrt(8.0)), [[0, 1, 2, 3]]
+)
 
 
 @pytest.mark.parametrize(

@@ -59,8 +59,9 @@ def main() -> None:
         env.simulation.restart(point + normal * radius)
         begin = time.perf_counter()
         for step in range(20):
-            # In 0.3 of the set depth over six steps, then slide to and fro: contact and friction at every haptic step.
-            velocity = -normal * (palpation.press_depth / 0.3) if step < 6 else np.roll(normal, 1) * 0.005 * (-1) ** step
+            # To the set depth in six steps, then to and fro: contact and friction at every haptic step.
+            sideways = np.roll(normal, 1) * 0.005 * (-1) ** step
+            velocity = sideways if step >= 6 else -normal * (palpation.press_depth / 0.3)
             env.step(np.append(velocity / 0.02, 0.0).astype(np.float32))
         factors.append(env.simulation.time / (time.perf_counter() - begin))
     print(f"reset {statistics.median(resets) * 1000:.1f} ms")

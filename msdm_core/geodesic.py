@@ -22,17 +22,17 @@ class SurfaceDistance:
 
     def __init__(self, points: FloatArray, triangles: IntArray) -> None:
         used, local = np.unique(triangles, return_inverse=True)
-        triangles = local.reshape(-1, 3)
+        local_triangles = local.reshape(-1, 3)
         vertices = points[used]
-        sides = np.stack([triangles, triangles[:, [1, 2, 0]]], axis=2).reshape(-1, 2)
+        sides = np.stack([local_triangles, local_triangles[:, [1, 2, 0]]], axis=2).reshape(-1, 2)
         edges, side_edge = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
         share = (np.arange(POINTS_PER_EDGE) + 1.0) / (POINTS_PER_EDGE + 1.0)
         between = vertices[edges[:, 0], None] * (1.0 - share[:, None]) + vertices[edges[:, 1], None] * share[:, None]
         on_edge = len(vertices) + side_edge[:, None] * POINTS_PER_EDGE + np.arange(POINTS_PER_EDGE)
-        self._corners = vertices[triangles]
+        self._corners = vertices[local_triangles]
         self._positions = np.concatenate([vertices, between.reshape(-1, 3)])
         # The graph nodes on the border of each triangle, (n_triangle, 3 + 3 * POINTS_PER_EDGE).
-        self._members = np.concatenate([triangles, on_edge.reshape(len(triangles), -1)], axis=1)
+        self._members = np.concatenate([local_triangles, on_edge.reshape(len(local_triangles), -1)], axis=1)
         first, second = np.triu_indices(self._members.shape[1], k=1)
         pairs = np.unique(
             np.sort(np.stack([self._members[:, first], self._members[:, second]], axis=2).reshape(-1, 2), axis=1),

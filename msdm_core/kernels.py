@@ -501,7 +501,7 @@ def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _integrate(model, state, dt, decay):
-    """Symplectic Euler: v = decay v + dt f / m, x = x + dt v, decay = exp(-alpha dt); returns a sum finite if all is."""
+    """Symplectic Euler: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt); returns a sum finite if all is."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     inverse_mass = model.node_inverse_mass
     total = 0.0

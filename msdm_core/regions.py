@@ -181,7 +181,7 @@ def boundary_layer(mesh: TetMesh) -> NDArray[np.bool_]:
 
 
 def _barycentric_lattice(per_edge: int) -> FloatArray:
-    """Barycentric points strictly inside a tet, evenly spread, with the tet's own centroid and moments of inertia, (n, 4).
+    """Barycentric points inside a tet, evenly spread, with the tet's own centroid and moments of inertia, (n, 4).
 
     A lattice of m = per_edge - 1 steps has variance 3 m (m + 4) / 80 along each coordinate, a tet 3 / 80.
     """

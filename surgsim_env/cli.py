@@ -4,7 +4,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -94,7 +94,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 2 for bad input (one line on standard error), 130 for Ctrl-C."""
     given = _joined(list(sys.argv[1:] if arguments is None else arguments))
     try:
-        command = tyro.cli(Command, prog="surgsim", args=given, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+        command = tyro.cli(
+            Command, prog="surgsim", args=given, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
+        )
     except SystemExit as ended:
         return int(ended.code or 0) if not isinstance(ended.code, str) else 2
     try:
@@ -132,7 +134,14 @@ def _run(command: Palpate | Organ | Scenes) -> None:
 def _palpate(command: Palpate, console: Console) -> None:
     from surgsim_env.palpation.figures import write_stiffness_map
     from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, run_palpation
-    from surgsim_env.palpation.report import CSV_NAME, PICTURE_NAME, SUMMARY_NAME, print_report, write_csv, write_summary
+    from surgsim_env.palpation.report import (
+        CSV_NAME,
+        PICTURE_NAME,
+        SUMMARY_NAME,
+        print_report,
+        write_csv,
+        write_summary,
+    )
     from surgsim_env.palpation.surface_scene import load_stable_anatomy
 
     scene = _scene(command, console)

@@ -1,5 +1,6 @@
 """What `surgsim organ` does: build an organ from a file, report on it, write its mesh."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -10,7 +11,6 @@ from msdm_core.mesh import TetMesh
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.quality import MeshQuality, mesh_quality
 from surgsim_env.scenes import make_scene
-from dataclasses import replace
 
 
 def report_organ(

@@ -18,7 +18,9 @@ RIDGE = 0.03
 SMALLEST_SCALE = 1e-3
 
 
-def sensor_readings(force: FloatArray, normals: FloatArray, sensor: ForceSensor, rng: np.random.Generator) -> FloatArray:
+def sensor_readings(
+    force: FloatArray, normals: FloatArray, sensor: ForceSensor, rng: np.random.Generator
+) -> FloatArray:
     """What the scene's force sensor reads along each normal [N]: force + bias + noise, cut at the range, (n_site,).
 
     Args:
@@ -54,7 +56,9 @@ def robust_spread(values: FloatArray) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def contrast_with_neighbours(stiffness: FloatArray, plane: FloatArray, geometry: FloatArray | None = None) -> FloatArray:
+def contrast_with_neighbours(
+    stiffness: FloatArray, plane: FloatArray, geometry: FloatArray | None = None
+) -> FloatArray:
     """Stiffness over a baseline that follows the healthy majority of the sites, shape (n_site,).
 
     The baseline is a robust regression of log stiffness on a quadratic in the projection plane and on what else is

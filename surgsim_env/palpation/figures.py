@@ -1,4 +1,4 @@
-"""Pictures of a palpation: both stiffness maps over the organ with a force-depth curve, and the organ with its probe."""
+"""Pictures of a palpation: both stiffness maps over the organ with a force-depth curve; the organ with its probe."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msdm_core.mesh import FloatArray
+from surgsim_env.palpable_face import tangent_axes
 from surgsim_env.palpation.felt import ContrastMap, Truth
 from surgsim_env.palpation.job import MODEL, Palpation
 from surgsim_env.palpation.surface_drawing import (
+    FADE_TO,
     Patches,
     View,
     curved_patches,
@@ -19,7 +21,6 @@ from surgsim_env.palpation.surface_drawing import (
     shaded,
     tube,
 )
-from surgsim_env.palpable_face import tangent_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +32,8 @@ STEEL = np.array([0.80, 0.83, 0.88])
 INK, PAPER = "#20242c", "white"
 NIGHT = "#0e1117"
 COLOUR_MAP = "magma"
+# Where a glow may run out beyond the last sites, it ends this many site spacings from them.
+RUN_OUT = 2.6
 # The colour scale ends at least here, so that a map without a lesion looks flat.
 SMALLEST_TOP = 1.35
 
@@ -39,7 +42,7 @@ def write_stiffness_map(palpation: Palpation, path: Path) -> None:
     """Write the picture of both maps with what was felt, and force over depth on and off a lesion."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(16.5, 6.0), dpi=110, facecolor=PAPER, layout="constrained")
+    figure = Figure(figsize=(16.5, 5.6), dpi=110, facecolor=PAPER, layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 0.72))
     scene = palpation.anatomy.scene
     figure.suptitle(
@@ -58,10 +61,10 @@ def write_stiffness_map(palpation: Palpation, path: Path) -> None:
 
 
 def write_organ_picture(palpation: Palpation, path: Path) -> None:
-    """Write the organ with its stiffness map glowing on it and the probe pressing where the strongest lesion was felt."""
+    """Write the organ with its stiffness map glowing on it and the probe where the strongest lesion was felt."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 6.6), dpi=110, facecolor=NIGHT)
+    figure = Figure(figsize=(10.0, 6.2), dpi=120, facecolor=NIGHT)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     mesh, scene = palpation.anatomy.mesh, palpation.anatomy.scene
@@ -71,7 +74,7 @@ def write_organ_picture(palpation: Palpation, path: Path) -> None:
     view = _oblique(palpation.anatomy.face.approach)
     organ = curved_patches(mesh.points, mesh.boundary_triangles)
     colours = np.broadcast_to(LIVER, (len(organ.corners), 3)).copy()
-    glow, weight = _map_over(palpation, one, organ)
+    glow, weight = _map_over(palpation, one, organ, everywhere=True)
     painted = np.flatnonzero(weight > 0.0)
     strength = np.clip((glow[painted] - 1.0) / (max(SMALLEST_TOP, one.contrast.max()) - 1.0), 0.0, 1.0)
     heat = _colours("inferno", 0.42 + 0.55 * strength)
@@ -80,14 +83,15 @@ def write_organ_picture(palpation: Palpation, path: Path) -> None:
     radius = scene.instrument.tip_radius
     ball = site + normal * (radius - scene.palpation.press_depth)
     handle = -palpation.anatomy.face.approach
-    parts = [(organ, colours, 0.30)]
-    for start, end, thickness in ((ball, ball, radius), (ball, ball + handle * 0.16, 0.004)):
+    _draw_patches(axes, [(organ, colours, 0.30)], view)
+    _mark_sites(axes, palpation, view, colour="white", alpha=0.35)
+    parts = []
+    for start, end, thickness in ((ball, ball, radius), (ball, ball + handle * 0.11, 0.004)):
         shape = curved_patches(*tube(start, end, thickness))
         parts.append((shape, np.broadcast_to(STEEL, (len(shape.corners), 3)), 0.55))
-    _draw_patches(axes, parts, view)
-    _mark_sites(axes, palpation, view, colour="white", alpha=0.35)
+    _draw_patches(axes, parts, view, zorder=3)
     axes.set_aspect("equal")
-    axes.margins(0.06)
+    axes.margins(0.04)
     _save(figure, path, facecolor=NIGHT)
 
 
@@ -119,15 +123,17 @@ def _result(one: ContrastMap) -> str:
     return f"{found if one.scores else 'no lesion hidden'}{alarms}; healthy sites 1 ± {one.healthy_std:.2f}"
 
 
-def _map_over(palpation: Palpation, one: ContrastMap, patches: Patches) -> tuple[FloatArray, FloatArray]:
-    """The map's value and its weight, 0 outside the palpated part of the face, on each patch."""
+def _map_over(
+    palpation: Palpation, one: ContrastMap, patches: Patches, everywhere: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """The map's value on each patch and its weight: 0 off the palpable face, unless it may run out everywhere."""
     anatomy = palpation.anatomy
-    on_face = _rows_in(anatomy.mesh.boundary_triangles, anatomy.face.triangles)[patches.origin]
+    on_face = everywhere | _rows_in(anatomy.mesh.boundary_triangles, anatomy.face.triangles)[patches.origin]
     centres = patches.corners[on_face].mean(axis=1)
     sites = palpation.sites[palpation.used]
     field, weight = np.ones(len(on_face)), np.zeros(len(on_face))
     field[on_face] = interpolated(sites, one.contrast, centres)
-    weight[on_face] = nearness(sites, centres, anatomy.scene.palpation.site_spacing)
+    weight[on_face] = nearness(sites, centres, anatomy.scene.palpation.site_spacing, RUN_OUT if everywhere else FADE_TO)
     return field, weight
 
 
@@ -136,7 +142,7 @@ def _rows_in(rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return np.array([tuple(sorted(row)) in wanted for row in rows.tolist()])
 
 
-def _draw_patches(axes: Axes, parts: list[tuple[Patches, FloatArray, float]], view: View) -> None:
+def _draw_patches(axes: Axes, parts: list[tuple[Patches, FloatArray, float]], view: View, zorder: int = 1) -> None:
     """Draw patches from the farthest to the nearest, those that face away left out."""
     from matplotlib.collections import PolyCollection
 
@@ -145,10 +151,9 @@ def _draw_patches(axes: Axes, parts: list[tuple[Patches, FloatArray, float]], vi
     normals = np.concatenate([patches.normals for patches, _, _ in parts])
     order = np.argsort(corners.mean(axis=1) @ view.towards)
     order = order[normals[order] @ view.towards > -0.15]
+    face = colours[order]
     axes.add_collection(
-        PolyCollection(
-            view.flat(corners[order]), facecolors=colours[order], edgecolors=colours[order], linewidths=0.8, zorder=1
-        )
+        PolyCollection(view.flat(corners[order]), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder)
     )
     axes.autoscale_view()
 
@@ -197,7 +202,7 @@ def _draw_curves(axes: Axes, palpation: Palpation) -> None:
         number = int(numbers[index])
         curve, model = palpation.presses[number].curve, palpation.model_presses[number].curve
         axes.plot(curve[:, 0] * 1e3, curve[:, 1], color=colour, lw=2.2, label=f"{name} (site {number})")
-        axes.plot(model[:, 0] * 1e3, model[:, 1], color=colour, lw=1.2, ls="--", label="there in the pre-operative model")
+        axes.plot(model[:, 0] * 1e3, model[:, 1], color=colour, lw=1.2, ls="--", label="there in the model")
     axes.set_xlabel("depth of the tip below the resting surface [mm]")
     axes.set_ylabel("force along the normal [N]")
     axes.set_title("force over depth, and the hold at the end", color=INK, fontsize=11)
@@ -223,7 +228,7 @@ def _typical_sites(palpation: Palpation, one: ContrastMap) -> tuple[int | None, 
 def _oblique(approach: FloatArray) -> View:
     """Seen from beside the approach, so that the probe's shaft shows."""
     right, up = tangent_axes(approach)
-    return View.along(approach + 0.75 * up + 0.45 * right, up=-approach + 0.35 * up)
+    return View.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
 
 
 def _colours(name: str, values: FloatArray) -> FloatArray:

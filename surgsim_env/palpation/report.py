@@ -93,8 +93,7 @@ def write_summary(palpation: Palpation, path: Path, inputs: Mapping[str, Any]) -
 def _map_entry(one: ContrastMap) -> dict[str, Any]:
     return {
         "estimates": [
-            {"point_m": item.point, "contrast": item.contrast, "excess": item.excess}
-            for item in one.estimates
+            {"point_m": item.point, "contrast": item.contrast, "excess": item.excess} for item in one.estimates
         ],
         "lesions": [
             {

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
+from scipy.spatial import cKDTree
 
 from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.palpable_face import tangent_axes
@@ -91,11 +92,10 @@ def _split_triangle(splits: int) -> tuple[FloatArray, IntArray]:
 
 
 def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
-    """A smooth field through the values at the sites [m] (n, 3), at other places (m, 3): thin plates, lightly smoothed."""
+    """A continuous field near the values at the sites [m] (n, 3), at other places (m, 3): radial functions."""
     if len(sites) < 8 or np.ptp(values) == 0.0:
-        nearest = np.argmin(np.linalg.norm(places[:, None] - sites[None], axis=2), axis=1)
-        return values[nearest]
-    # Singular where sites lie in one plane: 3D thin plates need points off it, so they are spread by a hair.
+        return values[cKDTree(sites).query(places)[1]]
+    # In the plane that the sites lie nearest to: on a flat face they determine no more than that.
     centred = sites - sites.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
     field = RBFInterpolator(
@@ -104,10 +104,10 @@ def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> F
     return np.clip(field((places - sites.mean(axis=0)) @ axes.T * 1e3), values.min(), values.max())
 
 
-def nearness(sites: FloatArray, places: FloatArray, spacing: float) -> FloatArray:
+def nearness(sites: FloatArray, places: FloatArray, spacing: float, fade_to: float = FADE_TO) -> FloatArray:
     """How much a map may say at each place: 1 near a site, fading to 0 beyond, shape (m,)."""
-    distance = np.array([np.linalg.norm(sites - place, axis=1).min() for place in places]) / spacing
-    return np.clip((FADE_TO - distance) / (FADE_TO - FADE_FROM), 0.0, 1.0)
+    distance = cKDTree(sites).query(places)[0] / spacing
+    return np.clip((fade_to - distance) / (fade_to - FADE_FROM), 0.0, 1.0)
 
 
 def shaded(colours: FloatArray, normals: FloatArray, view: View, gloss: float = GLOSS) -> FloatArray:

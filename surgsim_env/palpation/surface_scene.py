@@ -59,9 +59,7 @@ def surface_scene(file: Path, *, length_unit: LengthUnit, cell_size: float, opti
         mesh=MeshSource(surface=SurfaceMesh(str(file), length_unit, cell_size)),
         anchors=_anchors(options, scene.instrument.approach),
         contact=replace(scene.contact, stiffness=contact),
-        palpation=replace(
-            scene.palpation, thickness_smallest=THICKNESS_PRESS_DEPTHS * scene.palpation.press_depth
-        ),
+        palpation=replace(scene.palpation, thickness_smallest=THICKNESS_PRESS_DEPTHS * scene.palpation.press_depth),
         demonstration=(),
     )
 

@@ -131,7 +131,11 @@ REFUSED = {
     "repeated": (TET, [[0, 1, 2, 3], [0, 1, 1, 3]], r"tet 1 uses a node twice, \[0, 1, 1, 3\]"),
     "unused": (TWO, [[0, 1, 2, 3]], r"node 4 \(of 1\) belongs to no tet"),
     "degenerate": (np.vstack([TET, [[0.5, 0.5, 0]]]), [[0, 1, 2, 3], [0, 1, 2, 4]], r"tet 1 \(of 1\) is degenerate"),
-    "disconnected": (FAR, [[0, 1, 2, 3], [4, 5, 6, 7]], "falls into 2 disconnected parts, which share no face, of 1, 1 tets"),
+    "disconnected": (
+        FAR,
+        [[0, 1, 2, 3], [4, 5, 6, 7]],
+        "falls into 2 disconnected parts, which share no face, of 1, 1 tets",
+    ),
 }
 
 

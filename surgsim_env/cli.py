@@ -15,10 +15,17 @@ from rich.table import Table
 from msdm_core.length_unit import LengthUnit
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.scenes import Scene, list_scenes, make_scene
+from surgsim_env.scenes import Ball, Scene, list_scenes, make_scene
 
 # Options whose value is a list of numbers, which may begin with a minus.
-NUMBER_LISTS = ("--lesion", "--anchors", "--approach")
+NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around")
+
+
+# Options that may be left out, shown with what they hold and without tyro's "{None}|" and "(default: None)".
+MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
+MaybePath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+MaybeNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_behavior_hint="")]
+MaybeCount = Annotated[int | None, tyro.conf.arg(metavar="COUNT", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
@@ -28,37 +35,37 @@ class Palpate:
     Lengths are metres, forces newtons. Writes palpation.csv, stiffness_map.png and summary.json.
     """
 
-    scene: str | None = None
+    scene: MaybeText = None
     """A shipped scene (see `surgsim scenes`); liver if neither --organ nor --surface is given."""
-    organ: Path | None = None
+    organ: MaybePath = None
     """Instead: a scene file of your own (TOML)."""
-    surface: Path | None = None
+    surface: MaybePath = None
     """Instead: a closed surface (STL, OBJ, PLY); what it does not say is taken from the scene liver."""
-    length_unit: str | None = None
+    length_unit: MaybeText = None
     """Of --surface: m, cm, mm, or metres per unit as a number."""
     cell_size: float = 0.010
     """Of the lattice that fills --surface [m]."""
     lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """x,y,z,radius,ratio: centre and radius [m], modulus over the healthy one; may be repeated. Replaces the scene's."""
+    """x,y,z,radius,ratio: centre and radius [m], modulus over the healthy one; repeatable; replaces the scene's."""
     anchors: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """x,y,z,radius: a ball [m] that holds the surface inside it, may be repeated. Default for --surface: the organ lies
-    on its bed, so that the deepest 15 % of it along the approach is held."""
-    approach: str | None = None
-    """x,y,z: direction in which the probe comes. Default: the scene's; 0,0,-1 for --surface, that is from the head in a
-    CT's patient axes (0,1,0 would be from the front there)."""
-    press_depth: float | None = None
+    """x,y,z,radius: a ball [m] that holds the surface in it. Default: the deepest 15 % along the approach."""
+    approach: MaybeText = None
+    """x,y,z: direction of the probe. Default: the scene's; 0,0,-1 for --surface (from the head where z is up)."""
+    around: MaybeText = None
+    """x,y,z,radius: press only the sites inside this ball [m]; default: the whole palpable face."""
+    press_depth: MaybeNumber = None
     """[m]; default: the scene's."""
-    tip_radius: float | None = None
+    tip_radius: MaybeNumber = None
     """[m]; default: the scene's."""
-    spacing: float | None = None
+    spacing: MaybeNumber = None
     """Distance between sites [m]; default: the scene's."""
-    youngs_modulus: float | None = None
+    youngs_modulus: MaybeNumber = None
     """Of the healthy tissue [Pa]; default: the scene's."""
-    out: Path | None = None
+    out: MaybePath = None
     """Folder for the results; default: the next free runs/palpate-SCENE-NUMBER."""
     seed: int = 0
     """Of the sensor's noise and the pre-operative model's errors."""
-    workers: int | None = None
+    workers: MaybeCount = None
     """Threads; default: one for each core."""
 
 
@@ -68,13 +75,13 @@ class Organ:
 
     file: tyro.conf.Positional[Path]
     """Closed surface (STL, OBJ, PLY) or tets (vtu, vtk, msh, mesh)."""
-    length_unit: str | None = None
+    length_unit: MaybeText = None
     """m, cm, mm, or metres per unit as a number; required where the format has none."""
     cell_size: float = 0.010
     """Of the lattice that fills a surface [m]."""
-    out: Path | None = None
+    out: MaybePath = None
     """Where the mesh is written (vtu, vtk, msh, mesh)."""
-    youngs_modulus: float | None = None
+    youngs_modulus: MaybeNumber = None
     """[Pa]; default: the liver's."""
 
 
@@ -91,7 +98,7 @@ Command = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 2 for bad input (one line on standard error), 130 for Ctrl-C."""
+    """Run the command line; the exit status is 0, 2 for bad input (one line on standard error) or 130 for Ctrl-C."""
     given = _joined(list(sys.argv[1:] if arguments is None else arguments))
     try:
         command = tyro.cli(
@@ -151,7 +158,13 @@ def _palpate(command: Palpate, console: Console) -> None:
     # The folder is made first: a place that cannot be written is better known before the work than after it.
     folder = command.out or _free_folder(scene.name)
     folder.mkdir(parents=True, exist_ok=True)
-    found = run_palpation(anatomy, lesions=lesions, seed=command.seed, workers=command.workers, console=console)
+    around = None
+    if command.around is not None:
+        x, y, z, radius = _numbers("--around", command.around, "x,y,z,radius")
+        around = Ball((x, y, z), radius)
+    found = run_palpation(
+        anatomy, lesions=lesions, around=around, seed=command.seed, workers=command.workers, console=console
+    )
     write_csv(found, folder / CSV_NAME)
     write_summary(found, folder / SUMMARY_NAME, vars(command))
     write_stiffness_map(found, folder / PICTURE_NAME)
@@ -164,10 +177,14 @@ def _scene(command: Palpate, console: Console) -> Scene:
 
     if sum(source is not None for source in (command.scene, command.organ, command.surface)) > 1:
         raise ValueError("give only one of --scene, --organ and --surface")
-    approach = None if command.approach is None else _numbers("--approach", command.approach, "x,y,z")
+    approach = None
+    if command.approach is not None:
+        x, y, z = _numbers("--approach", command.approach, "x,y,z")
+        approach = (x, y, z)
+    balls = (_numbers("--anchors", text, "x,y,z,radius") for text in command.anchors)
     options = SurfaceOptions(
         approach=approach,
-        anchors=tuple(_numbers("--anchors", text, "x,y,z,radius") for text in command.anchors),
+        anchors=tuple((x, y, z, radius) for x, y, z, radius in balls),
         press_depth=command.press_depth,
         tip_radius=command.tip_radius,
         spacing=command.spacing,
@@ -183,10 +200,11 @@ def _scene(command: Palpate, console: Console) -> Scene:
     scene = surface_scene(command.surface, length_unit=unit, cell_size=command.cell_size, options=options)
     x, y, z = scene.instrument.approach
     held = "the anchors given" if command.anchors else "its bed, the deepest 15 % along the approach"
+    material, depth, tip = scene.material, scene.palpation.press_depth, scene.instrument.tip_radius
     console.print(
-        f"{command.surface.name}: pressed along {x:.3g}, {y:.3g}, {z:.3g} of the file's axes (--approach), held by {held}; "
-        f"E {scene.material.youngs_modulus:g} Pa, nu {scene.material.poisson_ratio:g}, tip {scene.instrument.tip_radius * 1e3:g} "
-        f"mm, depth {scene.palpation.press_depth * 1e3:g} mm, capsule and damping as in the scene liver",
+        f"{command.surface.name}: pressed along {x:.3g}, {y:.3g}, {z:.3g} of the file's axes (--approach), "
+        f"held by {held}; E {material.youngs_modulus:g} Pa, nu {material.poisson_ratio:g}, tip {tip * 1e3:g} mm, "
+        f"depth {depth * 1e3:g} mm, capsule and damping as in the scene liver",
         highlight=False,
     )
     return scene
@@ -230,7 +248,7 @@ def _free_folder(scene: str) -> Path:
 
 
 def _joined(arguments: list[str]) -> list[str]:
-    """`--lesion -0.1,0,...` as `--lesion=-0.1,0,...`: what begins with a minus would pass for an option."""
+    """`--lesion -0.1,0,...` as `--lesion=-0.1,0,...`: older tyro takes a minus for an option."""
     joined: list[str] = []
     for argument in arguments:
         if joined and joined[-1] in NUMBER_LISTS and re.match(r"-[\d.]", argument):

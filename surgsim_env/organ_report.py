@@ -33,6 +33,7 @@ def report_organ(
     organ = compile_organ(OrganSpec(mesh=mesh, materials=material, damping=liver.damping))
     fit = "no surface to compare with" if quality.volume_error is None else f"{quality.volume_error:+.2%}"
     x, y, z = (mesh.points.max(axis=0) - mesh.points.min(axis=0)) * 1e3
+    step = f"{organ.stable_step * 1e3:.3f} ms"
     rows = {
         "extent": f"{x:.1f} x {y:.1f} x {z:.1f} mm",
         "nodes": f"{mesh.node_count}",
@@ -42,7 +43,7 @@ def report_organ(
         "mass": f"{organ.node_mass.sum():.4f} kg at {material.density:g} kg/m^3",
         "dihedral angles": f"{quality.dihedral_smallest_deg:.1f} to {quality.dihedral_largest_deg:.1f} degrees",
         "radius ratio": f"from {quality.radius_ratio_smallest:.3f} (1 is regular)",
-        "stable step": f"{organ.stable_step * 1e3:.3f} ms at E {material.youngs_modulus:g} Pa, nu {material.poisson_ratio:g}",
+        "stable step": f"{step} at E {material.youngs_modulus:g} Pa, nu {material.poisson_ratio:g}",
     }
     table = Table(title=file.name, show_header=False)
     for name, value in rows.items():

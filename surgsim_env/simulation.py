@@ -33,6 +33,8 @@ class Simulation:
         self._wrench = np.zeros((self.instrument.tool_count, 6))
         self._step = 0
         self.fault = ""
+        # Where the organ rests: as scanned, or settled under gravity.
+        self._rest_position = np.zeros(0)
         self.organ_model: OrganModel
         self.organ_state: OrganState
 
@@ -71,12 +73,13 @@ class Simulation:
         self.organ_model = organ_model
         self._check_step()
         self.organ_state = rest_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        self._rest_position = self.organ_state.node_position.copy()
         self.restart(tip_position)
 
     def restart(self, tip_position: FloatArray) -> None:
         """Back to the rest of the same organ with the tip somewhere else [m]; the clock starts again."""
         state = self.organ_state
-        state.node_position[:] = self.organ_model.node_rest_position
+        state.node_position[:] = self._rest_position
         state.node_velocity[:] = 0.0
         state.node_force[:] = 0.0
         state.contact_engaged[:] = 0
@@ -90,6 +93,7 @@ class Simulation:
 
     def haptic_step(self) -> bool:
         """Advance by one haptic step; False, with `fault` saying why, where the organ or MuJoCo came to grief."""
+        wrench = np.zeros_like(self._wrench)
         try:
             haptic_step(
                 self.organ_model,
@@ -98,11 +102,13 @@ class Simulation:
                 self.contact,
                 self.substep_dt,
                 self.substep_count,
-                self._wrench,
+                wrench,
             )
         except OrganDivergedError as error:
             self.fault = str(error)
             return False
+        # After a fault the last good wrench stays: nobody reads a NaN.
+        self._wrench = wrench
         self._step += 1
         return True
 
@@ -118,6 +124,7 @@ class Simulation:
         return {
             **arrays,
             "instrument": self.instrument.get_state(),
+            "rest_position": self._rest_position.copy(),
             "wrench": self._wrench.copy(),
             "step": np.array(self._step),
             "fault": np.array(self.fault),
@@ -128,6 +135,7 @@ class Simulation:
         self.organ_model = organ_model
         self.organ_state = OrganState(**{name: arrays[f"organ_{name}"].copy() for name in OrganState._fields})
         self.instrument.set_state(arrays["instrument"])
+        self._rest_position = arrays["rest_position"].copy()
         self._wrench[:] = arrays["wrench"]
         self._step = int(arrays["step"])
         self.fault = str(arrays["fault"])

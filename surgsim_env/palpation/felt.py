@@ -34,7 +34,7 @@ Projection = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """One place where a lesion was felt: point of the surface [m] (3,), peak contrast, and excess over its surroundings."""
+    """One place where a lesion was felt: point [m] (3,), peak contrast, and its excess over the surroundings."""
 
     point: FloatArray
     contrast: float
@@ -43,7 +43,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A lesion as seen from the surface: the surface's point nearest to its centre [m], the normal there, its radius."""
+    """A lesion seen from the surface: the face's point nearest to its centre [m], the normal there, its radius."""
 
     name: str
     centre: FloatArray
@@ -155,7 +155,7 @@ def score_map(
     truths: Sequence[Truth],
     surface: SurfaceDistance,
 ) -> ContrastMap:
-    """Match estimates to lesions one to one, by the smallest sum of distances along the surface, and measure the map."""
+    """Match estimates to lesions one to one by the least sum of distances along the surface, and measure the map."""
     places = np.array([estimate.point for estimate in estimates]).reshape(-1, 3)
     error = np.array([surface(truth.point, places) for truth in truths]).reshape(len(truths), len(places))
     rows, columns = linear_sum_assignment(np.minimum(error, MATCHING_REACH))

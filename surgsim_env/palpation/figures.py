@@ -153,7 +153,7 @@ def _draw_patches(axes: Axes, parts: list[tuple[Patches, FloatArray, float]], vi
     order = order[normals[order] @ view.towards > -0.15]
     face = colours[order]
     axes.add_collection(
-        PolyCollection(view.flat(corners[order]), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder)
+        PolyCollection(list(view.flat(corners[order])), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder)
     )
     axes.autoscale_view()
 
@@ -237,8 +237,8 @@ def _colours(name: str, values: FloatArray) -> FloatArray:
     return colormaps[name](np.asarray(values))[:, :3]
 
 
-def _save(figure: Figure, path: Path, **options: str) -> None:
+def _save(figure: Figure, path: Path, facecolor: str = PAPER) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
-    figure.savefig(path, format="png", **options)
+    figure.savefig(path, format="png", facecolor=facecolor)

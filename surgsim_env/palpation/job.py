@@ -16,6 +16,7 @@ from surgsim_env.palpable_face import PalpableFace, tangent_axes
 from surgsim_env.palpation.analysis import contrast_with_model, contrast_with_neighbours, sensor_readings
 from surgsim_env.palpation.felt import ContrastMap, Truth, feel_lesions, score_map, seen_from_surface
 from surgsim_env.palpation.scan import Press, scan
+from surgsim_env.scenes import Ball
 
 # How wrong the pre-operative model is: its modulus by up to this share, the place of each press by this distance [m].
 MODEL_MODULUS_ERROR = 0.2
@@ -73,6 +74,7 @@ def run_palpation(
     anatomy: Anatomy,
     *,
     lesions: Sequence[Lesion] | None = None,
+    around: Ball | None = None,
     seed: int = 0,
     workers: int | None = None,
     console: Console | None = None,
@@ -82,6 +84,7 @@ def run_palpation(
     Args:
         anatomy: what is pressed, its scene says how (see load_anatomy).
         lesions: hidden in the organ; the scene's demonstration lesions by default.
+        around: press only the raster sites inside this ball.
         seed: of sensor noise and of the errors of the pre-operative model.
         workers: threads; all cores by default.
         console: where the progress bar is shown; nowhere by default.
@@ -94,7 +97,7 @@ def run_palpation(
     scene = anatomy.scene
     hidden = tuple(anatomy.demonstration_lesions() if lesions is None else lesions)
     rng = np.random.default_rng(seed)
-    sites, normals, support_count = plan_sites(anatomy)
+    sites, normals, support_count = plan_sites(anatomy, around)
     factor = float(rng.uniform(1.0 - MODEL_MODULUS_ERROR, 1.0 + MODEL_MODULUS_ERROR))
     organ, model = anatomy.organ(hidden), anatomy.organ(modulus_factor=factor)
     model_sites, model_normals = _displaced(anatomy.face, sites, normals, rng)
@@ -126,7 +129,7 @@ def run_palpation(
     )
 
 
-def plan_sites(anatomy: Anatomy) -> tuple[FloatArray, FloatArray, int]:
+def plan_sites(anatomy: Anatomy, around: Ball | None = None) -> tuple[FloatArray, FloatArray, int]:
     """Raster sites [m] and normals, each (n_site, 3), without those that feel a support, and how many those were.
 
     Raises:
@@ -134,14 +137,17 @@ def plan_sites(anatomy: Anatomy) -> tuple[FloatArray, FloatArray, int]:
     """
     scene = anatomy.scene
     sites, normals = anatomy.face.raster(scene.palpation.site_spacing)
+    if around is not None:
+        inside = np.linalg.norm(sites - np.asarray(around.centre), axis=1) <= around.radius
+        sites, normals = sites[inside], normals[inside]
     held = anatomy.mesh.points[anatomy.anchors]
     gap = SUPPORT_TIP_RADII * scene.instrument.tip_radius
     free = np.array([np.linalg.norm(held - site, axis=1).min() > gap for site in sites], dtype=bool)
     if not free.any():
         raise ValueError(
-            f"scene {scene.name!r}: no site to press: {len(sites)} raster sites lie on the palpable face, "
-            f"all of them within {gap * 1e3:g} mm of a support: use a smaller site_spacing or face_margin, "
-            "turn the approach, or move the anchors"
+            f"scene {scene.name!r}: no site to press: {len(sites)} raster sites lie on the palpable face (inside the "
+            f"ball asked for, if any), all within {gap * 1e3:g} mm of a support: use a smaller site_spacing or "
+            "face_margin, turn the approach, or move the anchors"
         )
     return sites[free], normals[free], int((~free).sum())
 

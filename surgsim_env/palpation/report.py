@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from surgsim_env.palpation.felt import ContrastMap, LesionScore
-from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, Palpation
+from surgsim_env.palpation.job import MODEL, MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, Palpation
 
 CSV_NAME, SUMMARY_NAME, PICTURE_NAME = "palpation.csv", "summary.json", "stiffness_map.png"
 COLUMNS = (
@@ -24,7 +24,7 @@ COLUMNS = (
 
 
 def write_csv(palpation: Palpation, path: Path) -> None:
-    """One line for each site; lengths [m], forces [N], stiffness [N/m]; contrasts are empty where a press ended early."""
+    """One line for each site; lengths [m], forces [N], stiffness [N/m]; no contrasts where a press ended early."""
     order = np.cumsum(palpation.used) - 1
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
@@ -114,23 +114,28 @@ def _map_entry(one: ContrastMap) -> dict[str, Any]:
 
 def print_report(palpation: Palpation, console: Console) -> None:
     """The short table: where each lesion was felt, how far from the truth, its contrast beside the healthy spread."""
-    table = Table(title=f"palpation of {palpation.anatomy.scene.name}")
-    for heading in ("stiffness against the", "lesion", "felt at x, y, z [mm]", "error [mm]", "contrast", "healthy"):
-        table.add_column(heading, justify="left" if heading in ("stiffness against the", "lesion") else "right")
+    table = Table(title=f"stiffness of {palpation.anatomy.scene.name}, felt against two baselines")
+    table.add_column("against", no_wrap=True)
+    table.add_column("lesion")
+    for heading in ("felt at\nx, y, z [mm]", "error\n[mm]", "contrast", "healthy\nsites"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for one in palpation.maps:
         for score in one.scores:
-            table.add_row(one.name, score.truth.name, *_felt_cells(one, score), f"1 ± {one.healthy_std:.2f}")
+            table.add_row(_short(one), score.truth.name, *_felt_cells(one, score), f"1 ± {one.healthy_std:.2f}")
         if not one.scores:
-            table.add_row(one.name, "none hidden", f"{len(one.estimates)} felt", "", "", f"1 ± {one.healthy_std:.2f}")
+            table.add_row(
+                _short(one), "none hidden", f"{len(one.estimates)} felt", "", "", f"1 ± {one.healthy_std:.2f}"
+            )
         table.add_section()
     console.print(table)
     for one in palpation.maps:
         console.print(verdict(one))
     early = int((~palpation.used).sum())
+    every = (*palpation.presses, *palpation.model_presses)
     console.print(
-        f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not pressed "
-        f"near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N, smallest volume ratio "
-        f"{min(press.volume_ratio_smallest for press in (*palpation.presses, *palpation.model_presses)):.2f}"
+        f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not "
+        f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N, "
+        f"smallest volume ratio {min(press.volume_ratio_smallest for press in every):.2f}"
     )
     console.print(
         f"simulated {palpation.simulated_time:.1f} s in {palpation.wall_time:.1f} s: "
@@ -151,12 +156,17 @@ def verdict(one: ContrastMap) -> str:
     return f"{one.name}: {'the lesion' if count == 1 else f'all {count} lesions'} felt{alarms}"
 
 
+def _short(one: ContrastMap) -> str:
+    """The map's name as far as a terminal of 80 columns has room for it."""
+    return "model" if one.name == MODEL else "neighbours"
+
+
 def _felt_cells(one: ContrastMap, score: LesionScore) -> tuple[str, str, str]:
     contrast = "" if math.isnan(score.contrast) else f"{score.contrast:.2f}"
     if score.estimate is None:
-        return "not felt", "", contrast
+        return "not felt", "-", contrast
     x, y, z = one.estimates[score.estimate].point * 1e3
-    mark = "" if score.felt else " (not felt)"
+    mark = "" if score.felt else " miss"
     return f"{x:.1f}, {y:.1f}, {z:.1f}", f"{score.error * 1e3:.1f}{mark}", contrast
 
 

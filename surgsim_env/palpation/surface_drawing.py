@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.palpable_face import tangent_axes
@@ -45,7 +45,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Small triangles to draw: corners [m] (n, 3, 3), unit normals (n, 3), index of the triangle each came from (n,)."""
+    """Small triangles to draw: corners [m] (n, 3, 3), normals (n, 3), index of the triangle each came from (n,)."""
 
     corners: FloatArray
     normals: FloatArray
@@ -94,7 +94,7 @@ def _split_triangle(splits: int) -> tuple[FloatArray, IntArray]:
 def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
     """A continuous field near the values at the sites [m] (n, 3), at other places (m, 3): radial functions."""
     if len(sites) < 8 or np.ptp(values) == 0.0:
-        return values[cKDTree(sites).query(places)[1]]
+        return values[KDTree(sites).query(places)[1]]
     # In the plane that the sites lie nearest to: on a flat face they determine no more than that.
     centred = sites - sites.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
@@ -106,7 +106,7 @@ def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> F
 
 def nearness(sites: FloatArray, places: FloatArray, spacing: float, fade_to: float = FADE_TO) -> FloatArray:
     """How much a map may say at each place: 1 near a site, fading to 0 beyond, shape (m,)."""
-    distance = cKDTree(sites).query(places)[0] / spacing
+    distance = KDTree(sites).query(places)[0] / spacing
     return np.clip((fade_to - distance) / (fade_to - FADE_FROM), 0.0, 1.0)
 
 

@@ -1,4 +1,4 @@
-"""The organ's forces, step and contact energy once more, in plain numpy and straight from the equations, and small organs.
+"""The organ's forces, step and contact energy again, in plain numpy straight from the equations; small organs.
 
 Slow on purpose: one spring, one tet, one surface triangle at a time, no code shared with msdm_core/kernels.py.
 """
@@ -135,7 +135,7 @@ def block(
 
 
 def irregular_organ(seed: int, *, damping: Damping = UNDAMPED) -> OrganModel:
-    """A 48-node organ without any symmetry: jittered nodes, every spring and tet of its own stiffness, free in space."""
+    """A free 48-node organ without any symmetry: jittered nodes, every spring and tet of its own stiffness."""
     random = np.random.default_rng(seed)
     lattice = box_mesh((0.03, 0.02, 0.02), (3, 2, 2))
     mesh = TetMesh(lattice.points + random.uniform(-1e-3, 1e-3, lattice.points.shape), lattice.tets)

@@ -50,7 +50,7 @@ def press(model: OrganModel, site: ArrayLike, radius: float, stop: float, speed:
     """Push a ball straight down into the phantom until it is pushed back with `stop` [N], or lets go, or 25 mm deep."""
     timing, law = phantom().scene.timing, phantom().scene.contact.law
     state = rest_state(model, shape_count=1)
-    start = np.asarray(site) + [0.0, 0.0, radius]
+    start = np.asarray(site) + np.array([0.0, 0.0, radius])
     shapes = oracle.ball(start, radius, velocity=(0.0, 0.0, -speed))
     rows = []
     while True:
@@ -285,7 +285,7 @@ def thin_plate() -> OrganModel:
 
 
 def test_letting_go_forgets_everything():
-    """Parted: nothing engaged, no stretch, no force; the organ at rest again, a second press equals the first to the bit."""
+    """Parted: nothing engaged, no stretch, no force; a second press from rest equals the first to the bit."""
     model = phantom_organ("a node", False)._replace(alpha=200.0)
     law = phantom().scene.contact.law
     state = rest_state(model, shape_count=1)

@@ -106,7 +106,7 @@ def energy_density(model: OrganModel, gradient: NDArray) -> float:
 
 @pytest.mark.parametrize("nu", [0.25, 0.3, 0.4, 0.45, 0.49])
 def test_springs_and_volume_term_have_the_wanted_lame_constants(nu: float):
-    """mu = E / (2 (1 + nu)) from the springs alone, lambda = mu + K_t: 1.00794 times as wanted, the lattice's factor."""
+    """mu = E / (2 (1 + nu)) from the springs, lambda = mu + K_t, within the lattice's factor of 1.00794."""
     model = compile_organ(OrganSpec(LATTICE, Material(MODULUS, 1000.0, nu)))
     mu = MODULUS / (2.0 * (1.0 + nu))
     lame = MODULUS * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))

@@ -1,4 +1,4 @@
-"""The force exchange: momentum balance per haptic step, what reaches MuJoCo, faults, saved states, the wrist's sensor."""
+"""The force exchange: momentum balance per haptic step, what reaches MuJoCo, faults, saved states, the wrist."""
 
 import re
 from dataclasses import replace
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.measure import angular_momentum, momentum
-from msdm_core.organ import rest_state
+from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from surgsim_env import exchange
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.exchange import FORCE_CAP, haptic_step
@@ -71,7 +71,7 @@ def free_organ() -> tuple[OrganModel, OrganState]:
     """An unheld block that flies and spins a little, alpha = 0: only the tool changes its momentum."""
     model = oracle.block((0.03, 0.03, 0.015), (6, 6, 3))
     state = rest_state(model, shape_count=2)
-    state.node_velocity[:] = [0.01, 0.02, 0.0] + np.cross([0.5, -0.3, 0.8], state.node_position)
+    state.node_velocity[:] = np.array([0.01, 0.02, 0.0]) + np.cross([0.5, -0.3, 0.8], state.node_position)
     return model, state
 
 
@@ -342,3 +342,20 @@ def test_time_counts_haptic_steps():
     simulated = simulation()
     run(simulated, (0.0, 0.0, 0.0), 7)
     assert simulated.time == pytest.approx(0.007, rel=1e-15)
+
+
+def test_restart_goes_back_to_the_settled_shape_under_gravity():
+    anatomy = load_anatomy(scene())
+    material = replace(scene().material, youngs_modulus=10e3)
+    organ = compile_organ(OrganSpec(anatomy.mesh, material, anchors=anatomy.anchors, gravity=(0.0, 0.0, -9.81)))
+    simulation = Simulation(anatomy)
+    simulation.reset(organ, np.array([0.03, 0.03, 0.06]))
+    settled = simulation.organ_state.node_position.copy()
+    assert (settled[:, 2] - organ.node_rest_position[:, 2]).min() < -1e-4
+    simulation.organ_state.node_position[5] += 1e-4
+    simulation.restart(np.array([0.03, 0.03, 0.06]))
+    np.testing.assert_array_equal(simulation.organ_state.node_position, settled)
+    for _ in range(20):
+        assert simulation.haptic_step()
+    # It stays: what is left of the settling moves it by less than a micrometre.
+    assert np.abs(simulation.organ_state.node_position - settled).max() < 1e-6

@@ -1,0 +1,243 @@
+"""`surgsim` as a user meets it: what it writes, what it says, and one line for bad input."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+
+from surgsim_env.cli import _joined, main
+from surgsim_env.palpation.report import COLUMNS
+
+COARSE = ["palpate", "--scene", "phantom", "--spacing", "0.008"]
+STL_FACET = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A coarse palpation of the phantom: folder and what it printed."""
+    folder = tmp_path_factory.mktemp("runs") / "deep" / "phantom"
+    assert main([*COARSE, "--out", str(folder), "--seed", "7"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rows(run):
+    with (run / "palpation.csv").open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture(scope="module")
+def summary(run):
+    return json.loads((run / "summary.json").read_text(encoding="utf-8"))
+
+
+def write_stl(path, vertices, triangles):
+    facets = "".join(
+        STL_FACET.format("".join(f"vertex {x} {y} {z}\n" for x, y, z in np.asarray(vertices)[list(triangle)]))
+        for triangle in triangles
+    )
+    path.write_text(f"solid s\n{facets}endsolid s\n", encoding="ascii")
+    return path
+
+
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+FACES = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4)]
+FACES += [(1, 5, 7), (1, 7, 3)]
+
+
+def test_files(run, rows):
+    assert {path.name for path in run.iterdir()} == {"palpation.csv", "summary.json", "stiffness_map.png"}
+    assert tuple(rows[0]) == COLUMNS
+    picture = (run / "stiffness_map.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert 50_000 < len(picture) < 2_000_000
+
+
+def test_table_agrees_with_itself(rows):
+    assert [int(row["site"]) for row in rows] == list(range(len(rows)))
+    assert len(rows) == 16
+    for row in rows:
+        assert float(row["z"]) == pytest.approx(0.03, abs=1e-6)
+        assert np.hypot(float(row["normal_x"]), float(row["normal_y"])) < 1e-6
+        assert float(row["depth"]) == pytest.approx(0.004, abs=2e-4)
+        assert float(row["stiffness"]) == pytest.approx(float(row["reading"]) / float(row["depth"]), rel=1e-4)
+        assert abs(float(row["reading"]) - float(row["force"])) < 0.05
+        assert row["ended_early"] == ""
+        assert float(row["contrast_neighbours"]) > 0.5
+
+
+def test_summary_agrees_with_the_table(rows, summary):
+    assert summary["seed"] == 7
+    assert summary["inputs"]["scene"] == "phantom"
+    assert summary["sites"]["pressed"] == summary["sites"]["in_maps"] == len(rows)
+    assert summary["force_peak_N"] >= max(float(row["force"]) for row in rows)
+    assert 0.0 < summary["volume_ratio_smallest"] < 1.0
+    assert summary["real_time_factor"] == pytest.approx(summary["simulated_time_s"] / summary["wall_time_s"], rel=1e-3)
+    assert summary["simulated_time_s"] == pytest.approx(2 * len(rows) * 0.225, rel=0.01)
+    assert abs(summary["model"]["modulus_factor"] - 1.0) <= 0.2
+    assert summary["model"]["modulus_factor"] != 1.0
+    assert set(summary["maps"]) == {"healthy neighbours", "pre-operative model"}
+
+
+def test_summary_gives_the_truth_and_the_error(summary):
+    (truth,) = summary["truth"]
+    assert truth["surface_point_m"] == pytest.approx([0.036, 0.026, 0.03], abs=1e-6)
+    assert truth["centre_m"] == pytest.approx([0.036, 0.026, 0.018], abs=1e-6)
+    entry = summary["maps"]["pre-operative model"]
+    (lesion,) = entry["lesions"]
+    assert lesion["felt"]
+    assert entry["felt"] == 1
+    assert entry["false_alarms"] == 0
+    place = np.array(entry["estimates"][lesion["estimate"]]["point_m"])
+    assert lesion["error_mm"] == pytest.approx(1e3 * np.linalg.norm(place - truth["surface_point_m"]), abs=0.1)
+    assert lesion["error_mm"] < 8.0
+    assert lesion["contrast"] > 1.0 + 4.0 * entry["healthy_std"]
+
+
+def test_the_lesion_raises_the_stiffness_above_it(rows):
+    sites = np.array([[float(row[key]) for key in "xy"] for row in rows])
+    stiffest = sites[np.argmax([float(row["contrast_model"]) for row in rows])]
+    assert np.linalg.norm(stiffest - [0.036, 0.026]) < 0.008
+
+
+def test_same_seed_same_table_and_another_seed_another(run, tmp_path, capsys):
+    around = ["--around", "0.036,0.026,0.03,0.008"]
+    for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
+        assert main([*COARSE, *around, "--out", str(tmp_path / name), "--seed", seed, "--workers", "1"]) == 0
+    first, again, other = ((tmp_path / name / "palpation.csv").read_bytes() for name in "abc")
+    assert first == again
+    assert first != other
+    said = " ".join(capsys.readouterr().out.split())
+    for bar in ("organ", "its pre-operative model"):
+        assert re.search(rf"pressing {bar} \S+ (\d+)/\1 ", said), "the bar did not fill"
+    assert "real time" in said
+    assert "peak force" in said
+    assert "felt" in said
+
+
+def test_no_lesion_on_a_surface_of_ones_own(tmp_path, capsys):
+    cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
+    arguments = ["palpate", "--surface", str(cube), "--length-unit", "mm", "--cell-size", "0.010"]
+    arguments += ["--anchors", "0.03,0.03,-0.01,0.04", "--tip-radius", "0.008", "--press-depth", "0.004"]
+    assert main([*arguments, "--spacing", "0.012", "--out", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["truth"] == []
+    assert summary["maps"]["pre-operative model"]["estimates"] == []
+    said = capsys.readouterr().out
+    assert "held by the anchors given" in " ".join(said.split())
+    assert "no lesion was hidden" in said
+
+
+def test_organ_reports_and_writes(tmp_path, capsys):
+    cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
+    out = tmp_path / "organ.vtu"
+    assert main(["organ", str(cube), "--length-unit", "mm", "--cell-size", "0.01", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    for word in ("nodes", "tets", "springs", "mass", "dihedral", "radius ratio", "stable step", "reoriented", "error"):
+        assert word in said, word
+    assert "0.15" in said  # 144 ml at 1060 kg/m^3
+    assert main(["organ", str(out)]) == 0
+    assert "0 reoriented" in capsys.readouterr().out
+
+
+def test_scenes_are_listed_with_what_they_are(capsys):
+    assert main(["scenes"]) == 0
+    said = capsys.readouterr().out
+    for word in ("phantom", "liver", "bonded to its tray", "held by its ligaments"):
+        assert word in " ".join(said.split())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["palpate", "--help"], ["organ", "--help"]])
+def test_help(arguments, capsys):
+    assert main(arguments) == 0
+    assert "surgsim" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [[], ["palpat"], ["palpate", "--sceen", "liver"], ["palpate", "--seed", "x"]])
+def test_unknown_words_exit_with_2(arguments, capsys):
+    assert main(arguments) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_lists_of_numbers_may_begin_with_a_minus():
+    given = ["--lesion", "-0.1,0,0,1,8", "--approach", "-.5,0,1", "--seed", "-1", "--out", "-x"]
+    assert _joined(given) == ["--lesion=-0.1,0,0,1,8", "--approach=-.5,0,1", "--seed", "-1", "--out", "-x"]
+
+
+def refused(capsys, *arguments):
+    """The one line on standard error."""
+    assert main(list(arguments)) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1, said
+    assert "Traceback" not in said
+    return said
+
+
+def test_unknown_scene_suggests_the_nearest(capsys):
+    said = refused(capsys, "palpate", "--scene", "fantom")
+    assert "did you mean 'phantom'" in said
+    assert "liver" in said
+
+
+def test_lesion_outside(capsys, tmp_path):
+    assert "lies inside the organ" in refused(
+        capsys, *COARSE, "--lesion", "-0.3,0.1,0.2,0.008,8", "--out", str(tmp_path)
+    )
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--lesion", "0.03,0.03,0.015,0.008,-8"], "modulus ratio is -8; it must be above 0"),
+        (["--lesion", "0.03,0.03,0.015,-0.008,8"], "radius is -0.008"),
+        (["--lesion", "0.03,0.03,0.015,0.001,8"], "smaller than half a cell"),
+        (["--lesion", "0.03,0.03"], "the form is x,y,z,radius,ratio"),
+        (["--approach", "down"], "the form is x,y,z"),
+        (["--approach", "0,0,0"], "give a direction"),
+        (["--youngs-modulus", "-5000"], "Young's modulus is -5000; it must be above 0"),
+        (["--press-depth", "0"], "press depth is 0; it must be above 0"),
+        (["--spacing", "nan"], "spacing is nan"),
+        (["--around", "1,1,1,0.01"], "no site to press"),
+        (["--anchors", "0,0,0,0.01"], "--anchors goes with --surface"),
+        (["--organ", "x.toml"], "only one of"),
+    ],
+)
+def test_bad_values(extra, words, capsys, tmp_path):
+    assert words in refused(capsys, *COARSE, "--out", str(tmp_path), *extra)
+
+
+def test_missing_files(capsys, tmp_path):
+    assert "no such file" in refused(capsys, "palpate", "--surface", "none.stl", "--length-unit", "mm")
+    assert "cannot be read" in refused(capsys, "palpate", "--organ", str(tmp_path / "none.toml"))
+    assert "no such file" in refused(capsys, "organ", "none.vtu")
+
+
+def test_units_and_sizes(capsys, tmp_path):
+    cube = str(write_stl(tmp_path / "cube.stl", CUBE * 60.0, FACES))
+    assert "--surface needs --length-unit" in refused(capsys, "palpate", "--surface", cube)
+    assert 'did you mean "mm"' in refused(capsys, "palpate", "--surface", cube, "--length-unit", "milimeter")
+    assert "units forgotten" in refused(capsys, "palpate", "--surface", cube, "--length-unit", "m")
+    assert "units forgotten" in refused(capsys, "organ", cube, "--length-unit", "0.3")  # 18 m
+    assert "too coarse" in refused(capsys, "organ", cube, "--length-unit", "mm", "--cell-size", "0.05")
+    assert "cell" in refused(capsys, "palpate", "--surface", cube, "--length-unit", "mm", "--cell-size", "-1")
+
+
+def test_open_surface(capsys, tmp_path):
+    cube = str(write_stl(tmp_path / "open.stl", CUBE * 60.0, FACES[:-1]))
+    assert "open" in refused(capsys, "palpate", "--surface", cube, "--length-unit", "mm")
+
+
+def test_a_place_that_cannot_be_written(capsys, tmp_path):
+    (tmp_path / "file").write_text("in the way", encoding="utf-8")
+    assert "file" in refused(capsys, *COARSE, "--out", str(tmp_path / "file" / "out"))
+
+
+def test_interrupt(monkeypatch, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("surgsim_env.cli.list_scenes", stop)
+    assert main(["scenes"]) == 130
+    assert capsys.readouterr().err == "surgsim: stopped\n"

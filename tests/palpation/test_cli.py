@@ -221,7 +221,9 @@ def test_units_and_sizes(capsys, tmp_path):
     assert "units forgotten" in refused(capsys, "palpate", "--surface", cube, "--length-unit", "m")
     assert "units forgotten" in refused(capsys, "organ", cube, "--length-unit", "0.3")  # 18 m
     assert "too coarse" in refused(capsys, "organ", cube, "--length-unit", "mm", "--cell-size", "0.05")
-    assert "cell" in refused(capsys, "palpate", "--surface", cube, "--length-unit", "mm", "--cell-size", "-1")
+    assert "cell size is 0.0 m" in refused(
+        capsys, "palpate", "--surface", cube, "--length-unit", "mm", "--cell-size", "0"
+    )
 
 
 def test_open_surface(capsys, tmp_path):

@@ -21,15 +21,12 @@ from msdm_core.kernels import (
     advance_substeps,
     evaluate_forces,
 )
+from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
 from msdm_core.stability import largest_frequency, step_limit
 from msdm_core.stiffness import membrane_stiffness, spring_network
-
-# No organ is longer than this: a larger one is a mesh whose unit was forgotten.
-LARGEST_EXTENT = 2.0
-SMALLEST_EXTENT = 1e-3
 
 NO_SHAPES = ContactShapes(
     np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0, dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 6))

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.geodesic import SurfaceDistance
 from msdm_core.kernels import OrganModel
 from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing import box_mesh, mesh_surface
@@ -29,15 +30,22 @@ class Anatomy:
     anchors: IntArray
     face: PalpableFace
 
+    @cached_property
+    def along_surface(self) -> SurfaceDistance:
+        """Distances along the resting surface."""
+        return SurfaceDistance(self.mesh.points, self.mesh.boundary_triangles)
+
     def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
-        """The organ with given lesions, every modulus of the healthy tissue times a factor."""
-        scene = self.scene
+        """The organ with given lesions, every modulus of the healthy tissue and its capsule times a factor."""
+        scene, capsule = self.scene, self.scene.capsule
         material = replace(scene.material, youngs_modulus=scene.material.youngs_modulus * modulus_factor)
+        if capsule is not None:
+            capsule = replace(capsule, youngs_modulus=capsule.youngs_modulus * modulus_factor)
         return compile_organ(
             OrganSpec(
                 mesh=self.mesh,
                 materials=material,
-                capsule=scene.capsule,
+                capsule=capsule,
                 lesions=tuple(lesions),
                 anchors=self.anchors,
                 damping=scene.damping,
@@ -64,7 +72,7 @@ class Anatomy:
                 return self.lesion_at(centre, radius, ratio, "lesion")
         raise ValueError(
             f"scene {self.scene.name!r}: no room for a lesion of radius {radius * 1000:.3g} mm under "
-            f"{cover * 1000:.3g} mm of tissue: use smaller lesions or a larger rim_distance"
+            f"{cover * 1000:.3g} mm of tissue: use smaller lesions"
         )
 
     def _centre_below(self, point: FloatArray, normal: FloatArray, distance: float) -> FloatArray | None:
@@ -82,8 +90,10 @@ class Anatomy:
         return None
 
     def surface_distance(self, point: FloatArray) -> float:
-        """Distance from a point to the organ's surface, the held part too [m]."""
-        corners = self.mesh.points[self.mesh.boundary_triangles]
+        """Distance from a point to the part of the organ's surface that nothing holds [m]."""
+        triangles = self.mesh.boundary_triangles
+        held = np.isin(triangles, self.anchors).all(axis=1)
+        corners = self.mesh.points[triangles[~held]]
         triangle, weights = nearest_triangle(corners, point)
         return float(np.linalg.norm(weights @ corners[triangle] - point))
 
@@ -113,9 +123,16 @@ class Anatomy:
         )
 
 
-@lru_cache(maxsize=8)
 def load_anatomy(scene: Scene) -> Anatomy:
-    """Mesh a scene's organ and find its anchors and palpable face; the same scene gives the same object."""
+    """Mesh a scene's organ and find its anchors and palpable face; the same scene and files give the same object."""
+    source = scene.mesh.surface or scene.mesh.tets
+    file = None if source is None else scene.folder / source.file
+    return _load_anatomy(scene, file.stat().st_mtime_ns if file is not None and file.is_file() else None)
+
+
+@lru_cache(maxsize=8)
+def _load_anatomy(scene: Scene, file_time: int | None) -> Anatomy:
+    """`load_anatomy`, remembered for as long as the mesh file keeps its time of change [ns]."""
     mesh = _load_mesh(scene)
     anchors = _anchored_nodes(mesh, scene.anchors)
     face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)

@@ -1,9 +1,9 @@
 """Scenes: one TOML file each, read into frozen dataclasses. All values SI; the file's comments give their sources."""
 
+import math
 import tomllib
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +113,11 @@ class Instrument:
     tip_radius: float = 0.008
     approach: Vector = (0.0, 0.0, -1.0)
 
+    def __post_init__(self) -> None:
+        _require("instrument.tip_radius", self.tip_radius, 0.0, "m", above=True)
+        if not 0.0 < math.hypot(*self.approach) < math.inf:
+            raise ValueError(f"instrument.approach is {self.approach}; it must be a direction such as [0, 0, -1]")
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -121,6 +126,11 @@ class Timing:
     haptic_step: float = 0.001
     substep_count: int = 5
     haptic_steps_per_control: int = 50
+
+    def __post_init__(self) -> None:
+        _require("timing.haptic_step", self.haptic_step, 0.0, "s", above=True)
+        _require("timing.substep_count", self.substep_count, 1, "")
+        _require("timing.haptic_steps_per_control", self.haptic_steps_per_control, 1, "")
 
     @property
     def control_step(self) -> float:
@@ -156,6 +166,11 @@ class ForceSensor:
     bias: float
     range: float
 
+    def __post_init__(self) -> None:
+        _require("sensor.noise", self.noise, 0.0, "N")
+        _require("sensor.bias", self.bias, 0.0, "N")
+        _require("sensor.range", self.range, 0.0, "N", above=True)
+
 
 @dataclass(frozen=True)
 class Palpation:
@@ -177,10 +192,25 @@ class Palpation:
     site_spacing: float = 0.010
     clearance: float = 0.001
 
+    def __post_init__(self) -> None:
+        _require("palpation.press_depth", self.press_depth, 0.0, "m", above=True)
+        _require("palpation.site_spacing", self.site_spacing, 0.0, "m", above=True)
+        for name in ("face_margin", "thickness_smallest", "clearance"):
+            _require(f"palpation.{name}", getattr(self, name), 0.0, "m")
+        if not 0.0 < self.face_angle_deg <= 90.0:
+            raise ValueError(f"palpation.face_angle_deg is {self.face_angle_deg}; it must be above 0 and at most 90")
+
 
 @dataclass(frozen=True)
 class LesionDraw:
-    """The lesion an episode hides: uniform ranges of radius [m], cover [m] and modulus ratio, on the palpable face."""
+    """The lesion an episode hides, drawn evenly below the palpable face.
+
+    Args:
+        radius: range of its radius [m].
+        cover: range of the distance from its ball to the surface [m].
+        modulus_ratio: range of its modulus over the healthy one.
+        rim_distance: distance its place keeps from the border of the palpable face [m].
+    """
 
     radius: Range
     cover: Range
@@ -192,6 +222,7 @@ class LesionDraw:
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"lesion: {name} = [{low}, {high}]; the rule is 0 < low <= high")
+        _require("lesion.rim_distance", self.rim_distance, 0.0, "m")
 
 
 @dataclass(frozen=True)
@@ -207,11 +238,22 @@ class FixedLesion:
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact between tissue and instrument, see msdm_core.kernels.ContactLaw."""
+    """Contact between tissue and instrument, see msdm_core.kernels.ContactLaw.
+
+    Args:
+        stiffness: pressure per penetration [N/m^3].
+        damping: pressure per closing speed [N s/m^3].
+        friction: Coulomb coefficient.
+    """
 
     stiffness: float
     damping: float
     friction: float
+
+    def __post_init__(self) -> None:
+        _require("contact.stiffness", self.stiffness, 0.0, "N/m^3", above=True)
+        _require("contact.damping", self.damping, 0.0, "N s/m^3")
+        _require("contact.friction", self.friction, 0.0, "")
 
     @property
     def law(self) -> ContactLaw:
@@ -241,12 +283,18 @@ class Scene:
     demonstration: tuple[FixedLesion, ...] = field(default=())
 
 
+def _require(what: str, value: float, least: float, unit: str, *, above: bool = False) -> None:
+    """ValueError naming an entry that is not finite and at least (or above) a bound."""
+    if not (math.isfinite(value) and (value > least if above else value >= least)):
+        rule = f"above {least:g}" if above else f"at least {least:g}"
+        raise ValueError(f"{what} is {value:g} {unit}".rstrip() + f"; it must be finite and {rule}")
+
+
 def list_scenes() -> list[str]:
     """Names of the scenes that are shipped."""
     return sorted(path.stem for path in (scenes_folder() / "organs").glob("*.toml"))
 
 
-@lru_cache(maxsize=64)
 def make_scene(name: str) -> Scene:
     """The scene of a name (see `list_scenes`) or of a TOML file's path.
 

@@ -8,7 +8,6 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from msdm_core.geodesic import SurfaceDistance
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
@@ -178,13 +177,12 @@ def _maps(
     stiffness = reading[used] / np.array([press.depth for press in presses])[used]
     model_stiffness = np.array([press.stiffness for press in model_presses])[used]
     plane = sites @ np.column_stack(tangent_axes(anatomy.face.approach))
-    surface = SurfaceDistance(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
     contrasts = {
         NEIGHBOURS: contrast_with_neighbours(stiffness, plane, _geometry(anatomy.face, sites)),
         MODEL: contrast_with_model(stiffness, model_stiffness),
     }
     first, second = (
-        score_map(name, sites, contrast, feel_lesions(sites, contrast, spacing=spacing), truths, surface)
+        score_map(name, sites, contrast, feel_lesions(sites, contrast, spacing=spacing), truths, anatomy.along_surface)
         for name, contrast in contrasts.items()
     )
     return first, second

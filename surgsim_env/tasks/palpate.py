@@ -2,11 +2,9 @@
 
 import json
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from msdm_core.geodesic import SurfaceDistance
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
@@ -59,10 +57,6 @@ class PalpateTask:
         self.declare_count = 0
         self._declare_value = 0.0
         self._force_peak = 0.0
-
-    @cached_property
-    def _distance(self) -> SurfaceDistance:
-        return SurfaceDistance(self.anatomy.mesh.points, self.anatomy.mesh.boundary_triangles)
 
     def bounds(self, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of the observation, from the tip's workspace [m]."""
@@ -151,7 +145,7 @@ class PalpateTask:
         place = simulation.contact_centre
         assert self.lesion is not None and self.lesion.centre is not None and place is not None
         truth, _ = self.anatomy.face.project(self.lesion.centre)
-        return float(self._distance(truth, place[None])[0])
+        return float(self.anatomy.along_surface(truth, place[None])[0])
 
     def get_state(self) -> str:
         """Lesion, bias and counters as JSON, exact (numbers are written in full)."""

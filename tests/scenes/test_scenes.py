@@ -15,7 +15,7 @@ from surgsim_env.anatomy import load_anatomy
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import make_scene, scene_from_table
 from surgsim_env.simulation import Simulation
-from surgsim_env.timing import substeps_needed, whole_steps
+from surgsim_env.timing import substeps_needed
 
 PHANTOM = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
 
@@ -89,6 +89,16 @@ def test_too_few_substeps_are_refused_with_the_number_needed():
         ({"lesion__radius": [0.01, 0.006]}, "radius = "),
         ({"mesh__block": None}, "exactly one"),
         ({"material__density": "heavy"}, "heavy"),
+        ({"contact__stiffness": 0.0}, "contact.stiffness is 0 N/m\\^3; it must be finite and above 0"),
+        ({"contact__friction": -0.1}, "contact.friction is -0.1; it must be finite and at least 0"),
+        ({"sensor__noise": -0.005}, "sensor.noise is -0.005 N"),
+        ({"sensor__range": 0.0}, "sensor.range is 0 N"),
+        ({"timing__substep_count": 0}, "timing.substep_count is 0; it must be finite and at least 1"),
+        ({"timing__haptic_step": 0.0}, "timing.haptic_step is 0 s"),
+        ({"instrument__tip_radius": 0.0}, "instrument.tip_radius is 0 m"),
+        ({"instrument__approach": [0.0, 0.0, 0.0]}, "it must be a direction"),
+        ({"palpation__press_depth": -0.001}, "palpation.press_depth is -0.001 m"),
+        ({"palpation__site_spacing": 0.0}, "palpation.site_spacing is 0 m"),
         ({"anchors": [{"name": "nothing"}]}, "give one of a box, a ball"),
     ],
 )
@@ -117,10 +127,11 @@ def test_a_scene_file_of_ones_own_is_read(tmp_path):
     assert scene.name == "mine"
     assert scene.mesh.block.cells == (6, 6, 3)
     assert load_anatomy(scene).mesh.tet_count < 2000
+    path.write_text(path.read_text().replace("[6, 6, 3]", "[8, 8, 4]"))
+    assert make_scene(str(path)).mesh.block.cells == (8, 8, 4), "an edited file is read again"
     with pytest.raises(ValueError, match=r"gone\.toml cannot be read"):
         make_scene(str(tmp_path / "gone.toml"))
     path.write_text("organ = [")
-    make_scene.cache_clear()
     with pytest.raises(ValueError, match="not valid TOML"):
         make_scene(str(path))
 
@@ -132,7 +143,12 @@ def test_instrument_that_is_not_there_lists_those_that_are():
         Simulation(anatomy)
 
 
-def test_whole_steps():
-    assert whole_steps(0.05, 0.001, what="control step") == 50
-    with pytest.raises(ValueError, match=r"control step: 0.05 s is not a whole number of 0.003 s steps"):
-        whole_steps(0.05, 0.003, what="control step")
+@pytest.mark.parametrize("name", surgsim_env.list_scenes())
+def test_every_draw_finds_room_and_keeps_its_ranges(name):
+    anatomy = load_anatomy(make_scene(name))
+    draw = anatomy.scene.lesion
+    for seed in range(150):
+        lesion = anatomy.random_lesion(np.random.default_rng(seed))
+        cover = anatomy.surface_distance(np.array(lesion.centre)) - lesion.radius
+        assert draw.radius[0] <= lesion.radius <= draw.radius[1]
+        assert draw.cover[0] - 1.01e-4 <= cover <= draw.cover[1] + 1.01e-4

@@ -26,6 +26,8 @@ class RasterAgent:
 
     def __init__(self, env: gym.Env, *, sites_per_side: int = 5) -> None:
         scene = env.unwrapped.scene
+        if scene.mesh.block is None:
+            raise ValueError(f"this agent presses the flat top of a block; scene {scene.name!r} is none: use phantom")
         width, depth, self.top = scene.mesh.block.size
         self.radius = scene.instrument.tip_radius
         self.soft_force = scene.limits.soft_force

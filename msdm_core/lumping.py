@@ -5,6 +5,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.errors import OrganError
 from msdm_core.mesh import TetMesh
 
 FloatArray = NDArray[np.float64]
@@ -21,10 +22,10 @@ def lump_mass(mesh: TetMesh, density: ArrayLike, *, scheme: MassScheme) -> Float
     "voronoi" the part of the tet nearest to it, m_i = sum_t rho_t V(C(i, t)) (Sala et al. 2011, eq. 3 to 5).
 
     Raises:
-        ValueError: names the unknown scheme and the known ones, or the first bad density and its tet.
+        OrganError: names the unknown scheme and the known ones, or the first bad density and its tet.
     """
     if scheme not in get_args(MassScheme):
-        raise ValueError(f"mass scheme {scheme!r} is unknown; known: {', '.join(get_args(MassScheme))}")
+        raise OrganError(f"mass scheme {scheme!r} is unknown; known: {', '.join(get_args(MassScheme))}")
     tet_mass = _checked_density(density, mesh.tet_count) * mesh.volumes
     if scheme == "barycentric":
         shares = np.full((mesh.tet_count, 4), 0.25)
@@ -127,13 +128,13 @@ def _checked_density(density: ArrayLike, tet_count: int) -> FloatArray:
     """Density of each tet [kg/m^3], shape (n_tet,)."""
     given = np.asarray(density)
     if given.dtype.kind not in "iuf" or given.shape not in ((), (tet_count,)):
-        raise ValueError(
+        raise OrganError(
             f"density has shape {given.shape}, dtype {given.dtype}; the rule is a number, or one per tet ({tet_count},)"
         )
     bad = np.flatnonzero(~(np.isfinite(given) & (given > 0)))
     if bad.size:
         where = f"density of tet {bad[0]} (of {bad.size} bad)" if given.ndim else "density"
-        raise ValueError(
+        raise OrganError(
             f"{where} is {given.flat[bad[0]]} kg/m^3; it must be positive and finite: soft tissue is near 1060"
         )
     return np.broadcast_to(given.astype(np.float64), (tet_count,))

@@ -25,7 +25,7 @@ from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
-from msdm_core.stability import largest_frequency, step_limit
+from msdm_core.stability import largest_frequency, stable_dt, step_limit
 from msdm_core.stiffness import membrane_stiffness, spring_network
 
 NO_SHAPES = ContactShapes(
@@ -139,13 +139,23 @@ def advance(
         [N m], shape (n_tool, 6).
 
     Raises:
-        OrganError: dt above the organ's stable step, or contact memory that does not fit the shapes.
+        OrganError: dt above the organ's stable step (that with contact where there are shapes), a state of another
+            organ, or contact memory that does not fit the shapes.
         OrganDivergedError: an inverted tet (named, with its volume ratio) or a number that is not finite.
     """
-    if not 0.0 < dt <= model.stable_step:
+    touching = len(shapes.shape_radius) > 0
+    limit = _contact_step(model, contact) if touching else model.stable_step
+    if not 0.0 < dt <= limit:
+        with_contact = " with contact" if touching else ""
         raise OrganError(
-            f"dt is {dt:g} s; it must be above 0 and at most the stable step {model.stable_step:.4g} s: "
+            f"dt is {dt:g} s; it must be above 0 and at most the stable step{with_contact} {limit:.4g} s: "
             "use more, shorter substeps"
+        )
+    points = len(model.surface_triangles) * QUADRATURE_COUNT
+    if state.node_position.shape != model.node_rest_position.shape or state.contact_engaged.shape[1] != points:
+        raise OrganError(
+            f"the state has {len(state.node_position)} nodes and {state.contact_engaged.shape[1]} contact points, the "
+            f"organ {len(model.node_mass)} and {points}: make the state with rest_state(model, ...)"
         )
     if len(shapes.shape_radius) > len(state.contact_engaged):
         raise OrganError(
@@ -157,6 +167,18 @@ def advance(
     if fault != FAULT_NONE:
         raise OrganDivergedError(describe_fault(state, fault))
     return wrench
+
+
+_contact_step_known: list[tuple[OrganModel, ContactLaw, float]] = []
+
+
+def _contact_step(model: OrganModel, contact: ContactLaw) -> float:
+    """`stable_dt` with contact, remembered for the last organ: it costs as much as many steps."""
+    for known, law, step in _contact_step_known:
+        if known is model and law == contact:
+            return step
+    _contact_step_known[:] = [(model, contact, stable_dt(model, contact))]
+    return _contact_step_known[0][2]
 
 
 def advance_organ(

@@ -155,7 +155,8 @@ def lesion_fraction(mesh: TetMesh, lesion: Lesion) -> FloatArray:
 
 
 def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: FloatArray) -> None:
-    nearest = int(np.argmin(np.linalg.norm(mesh.points[mesh.tets].mean(axis=1) - lesion.centre, axis=1)))
+    node = int(np.argmin(np.linalg.norm(mesh.points - np.asarray(lesion.centre), axis=1)))
+    nearest = mesh.node_tets.of(node)[0]
     corners = mesh.points[mesh.tets[nearest]]
     cell = float(np.linalg.norm(corners[TET_EDGES[:, 0]] - corners[TET_EDGES[:, 1]], axis=1).max())
     if 2.0 * axes.min() < cell:

@@ -11,6 +11,7 @@ from msdm_core.mesh import FloatArray
 
 # Relative accuracy asked of the largest eigenvalue: 1 % of the step. Lanczos comes from below, so it is added back.
 EIGENVALUE_TOLERANCE = 0.02
+LANCZOS_VECTORS = 12
 
 
 def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = None) -> float:
@@ -40,7 +41,8 @@ def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = Non
     start = np.sin(1.0 + 1.7 * np.arange(count) ** 1.1)
     # scipy's stubs know neither the factory form of LinearOperator nor a real tolerance.
     operator = LinearOperator((count, count), matvec=apply, dtype=np.float64)  # pyright: ignore[reportCallIssue]
-    value = eigsh(operator, k=1, which="LA", v0=start, tol=EIGENVALUE_TOLERANCE, return_eigenvectors=False)[0]  # pyright: ignore
+    settings = {"which": "LA", "v0": start, "ncv": LANCZOS_VECTORS, "tol": EIGENVALUE_TOLERANCE}
+    value = eigsh(operator, k=1, return_eigenvectors=False, **settings)[0]
     return math.sqrt(float(value) * (1.0 + EIGENVALUE_TOLERANCE))
 
 

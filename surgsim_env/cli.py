@@ -1,5 +1,7 @@
 """The command line: `surgsim palpate`, `surgsim organ`, `surgsim scenes`."""
 
+import contextlib
+import io
 import re
 import sys
 import warnings
@@ -15,10 +17,13 @@ from rich.table import Table
 from msdm_core.length_unit import LengthUnit
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.scenes import Ball, Scene, list_scenes, make_scene
+from surgsim_env.scenes import Ball, Scene, list_scenes, load_scene, make_scene
 
 # Options whose value is a list of numbers, which may begin with a minus.
 NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around")
+
+# Of the lattice that fills a surface, where nothing else is said [m].
+CELL_SIZE = 0.010
 
 
 # Options that may be left out, shown with what they hold and without tyro's "{None}|" and "(default: None)".
@@ -43,8 +48,8 @@ class Palpate:
     """Instead: a closed surface (STL, OBJ, PLY); what it does not say is taken from the scene liver."""
     length_unit: MaybeText = None
     """Of --surface: m, cm, mm, or metres per unit as a number."""
-    cell_size: float = 0.010
-    """Of the lattice that fills --surface [m]."""
+    cell_size: float | None = None
+    """Of the lattice that fills --surface [m]; default: 0.010."""
     lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """x,y,z,radius,ratio: centre and radius [m], modulus over the healthy one; repeatable; replaces the scene's."""
     anchors: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -77,7 +82,7 @@ class Organ:
     """Closed surface (STL, OBJ, PLY) or tets (vtu, vtk, msh, mesh)."""
     length_unit: MaybeText = None
     """m, cm, mm, or metres per unit as a number; required where the format has none."""
-    cell_size: float = 0.010
+    cell_size: float = CELL_SIZE
     """Of the lattice that fills a surface [m]."""
     out: MaybePath = None
     """Where the mesh is written (vtu, vtk, msh, mesh)."""
@@ -100,12 +105,16 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status is 0, 2 for bad input (one line on standard error) or 130 for Ctrl-C."""
     given = _joined(list(sys.argv[1:] if arguments is None else arguments))
+    said = io.StringIO()
     try:
-        command = tyro.cli(
-            Command, prog="surgsim", args=given, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
-        )
+        with contextlib.redirect_stderr(said):
+            command = tyro.cli(
+                Command, prog="surgsim", args=given, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
+            )
     except SystemExit as ended:
-        return int(ended.code or 0) if not isinstance(ended.code, str) else 2
+        if ended.code:
+            print(f"surgsim: error: {_first_part(said.getvalue())} (see surgsim --help)", file=sys.stderr)
+        return 2 if ended.code else 0
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
@@ -191,13 +200,17 @@ def _scene(command: Palpate, console: Console) -> Scene:
         youngs_modulus=command.youngs_modulus,
     )
     if command.surface is None:
-        if command.anchors:
-            raise ValueError("--anchors goes with --surface; a scene file states its own [[anchors]]")
-        return with_options(make_scene(str(command.organ) if command.organ else command.scene or "liver"), options)
+        for option in ("anchors", "cell_size", "length_unit"):
+            if getattr(command, option):
+                name = option.replace("_", "-")
+                raise ValueError(f"--{name} goes with --surface; a scene states its own mesh and anchors")
+        scene = load_scene(command.organ) if command.organ else make_scene(command.scene or "liver")
+        return with_options(scene, options)
     if command.length_unit is None:
         raise ValueError('--surface needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none')
     unit = _unit(command.length_unit)
-    scene = surface_scene(command.surface, length_unit=unit, cell_size=command.cell_size, options=options)
+    cell_size = CELL_SIZE if command.cell_size is None else command.cell_size
+    scene = surface_scene(command.surface, length_unit=unit, cell_size=cell_size, options=options)
     x, y, z = scene.instrument.approach
     held = "the anchors given" if command.anchors else "its bed, the deepest 15 % along the approach"
     material, depth, tip = scene.material, scene.palpation.press_depth, scene.instrument.tip_radius
@@ -256,6 +269,13 @@ def _joined(arguments: list[str]) -> list[str]:
         else:
             joined.append(argument)
     return joined
+
+
+def _first_part(box: str) -> str:
+    """What a box of tyro's says above its first rule, in one line."""
+    lines = [line.strip("│ ") for line in box.splitlines() if line.startswith("│")]
+    rules = [number for number, line in enumerate(lines) if line and set(line) == {"─"}]
+    return " ".join(lines[: rules[0]] if rules else lines) or " ".join(box.split())
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:

@@ -2,6 +2,8 @@
 
 import io
 import json
+import zipfile
+import zlib
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -68,7 +70,8 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     ## Arguments
     * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
 
-    `env.unwrapped.save_state()` and `load_state()` cover organ, robot, task, counters and random generator.
+    `env.unwrapped.save_state()` and `load_state()` cover organ, robot, task, counters and random generator; wrappers'
+    own counts (TimeLimit) they cannot reach: load a state into an environment that was just reset.
 
     ## Version History
     * v0: first version.
@@ -126,8 +129,17 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         return self._observation.copy(), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info
 
     def save_state(self) -> bytes:
-        """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed."""
+        """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed.
+
+        Wrappers keep counts of their own (TimeLimit): load a state into an environment that was just reset.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to save.
+        """
+        if self.task.lesion is None:
+            raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
         arrays = self.simulation.get_state()
+        arrays["made_by"] = np.array(self._fingerprint())
         arrays["task"] = np.array(self.task.get_state())
         arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
         arrays["observation"] = self._observation.copy()
@@ -137,14 +149,33 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         return buffer.getvalue()
 
     def load_state(self, state: bytes) -> None:
-        """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene."""
-        with np.load(io.BytesIO(state), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene.
+
+        Raises:
+            ValueError: bytes that are no saved state, or one of another scene or mesh (names both).
+        """
+        try:
+            with np.load(io.BytesIO(state), allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            made_by = str(arrays["made_by"])
+        except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"not a saved state of this kind of environment: {error}") from None
+        if made_by != self._fingerprint():
+            raise ValueError(f"the state was saved by {made_by}, this is {self._fingerprint()}: use the same scene")
         lesions = self.task.set_state(str(arrays["task"]))
         self.simulation.set_state(self.simulation.anatomy.organ(lesions), arrays)
         self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
         self._observation = arrays["observation"]
         self._running = bool(arrays["running"])
+
+    def _fingerprint(self) -> str:
+        """What a saved state must agree with: the environment, its scene and mesh, the rates."""
+        mesh, timing = self.simulation.anatomy.mesh, self.scene.timing
+        shape = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
+        return (
+            f"{type(self).__name__} of scene {self.scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
+            f"mesh {shape:08x}, {timing.substep_count} substeps in {timing.haptic_step:g} s)"
+        )
 
     def _checked(self, action: Observation) -> FloatArray:
         values = np.asarray(action, dtype=np.float64)

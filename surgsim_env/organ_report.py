@@ -29,7 +29,9 @@ def report_organ(
     """
     mesh, quality = _read(file, length_unit, cell_size)
     liver = make_scene("liver")
-    material = replace(liver.material, youngs_modulus=youngs_modulus or liver.material.youngs_modulus)
+    material = liver.material
+    if youngs_modulus is not None:
+        material = replace(material, youngs_modulus=youngs_modulus)
     organ = compile_organ(OrganSpec(mesh=mesh, materials=material, damping=liver.damping))
     fit = "no surface to compare with" if quality.volume_error is None else f"{quality.volume_error:+.2%}"
     x, y, z = (mesh.points.max(axis=0) - mesh.points.min(axis=0)) * 1e3

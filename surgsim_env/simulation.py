@@ -20,7 +20,11 @@ class Simulation:
     """An organ and an instrument in contact; advanced by `haptic_step`, read by tasks."""
 
     def __init__(self, anatomy: Anatomy) -> None:
-        """Set up a scene's anatomy with its instrument, without lesions, the tip away from the organ."""
+        """Set up a scene's healthy organ and its instrument, the tip in the far corner of its workspace.
+
+        Raises:
+            OrganError: the scene's number of substeps is too small for its organ.
+        """
         scene = anatomy.scene
         self.anatomy = anatomy
         self.contact = scene.contact.law
@@ -33,10 +37,9 @@ class Simulation:
         self._wrench = np.zeros((self.instrument.tool_count, 6))
         self._step = 0
         self.fault = ""
-        # Where the organ rests: as scanned, or settled under gravity.
-        self._rest_position = np.zeros(0)
         self.organ_model: OrganModel
         self.organ_state: OrganState
+        self.reset(anatomy.organ(), self.instrument.upper)
 
     @property
     def time(self) -> float:
@@ -73,6 +76,7 @@ class Simulation:
         self.organ_model = organ_model
         self._check_step()
         self.organ_state = rest_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        # Where the organ rests: as scanned, or settled under gravity.
         self._rest_position = self.organ_state.node_position.copy()
         self.restart(tip_position)
 

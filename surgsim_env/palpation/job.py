@@ -38,7 +38,7 @@ class Palpation:
         presses: of the organ, one for each site
         model_presses: of the pre-operative model, at sites that are MODEL_SITE_ERROR off
         reading: of the force sensor along the normal at the end of each press [N]                 (n_site,)
-        used: sites whose two presses both reached the set depth                                    (n_site,)
+        used: sites whose two presses both reached the set depth and read a force above 0           (n_site,)
         maps: against the healthy neighbours and against the model; they hold the used sites only
         model_modulus_factor: how wrong the model's modulus was
         support_count: raster sites that were not pressed for lying too near to a support
@@ -104,13 +104,18 @@ def run_palpation(
         presses = scan(anatomy, organ, sites, normals, workers=workers, progress=_task(bar, "organ", len(sites)))
         step = _task(bar, "its pre-operative model", len(sites))
         model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
-    used = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])
-    if not used.any():
-        raise ValueError(
-            f"no press reached the set depth of {scene.palpation.press_depth * 1e3:g} mm; the first ended by: "
-            f"{presses[0].end or model_presses[0].end}: press less deep or raise limits.hard_force"
-        )
     reading = sensor_readings(np.array([press.force for press in presses]), normals, scene.sensor, rng)
+    model_force = np.array([press.force for press in model_presses])
+    model_reading = sensor_readings(model_force, model_normals, scene.sensor, rng)
+    complete = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])
+    # A sensor's bias and noise may outweigh a feeble press; such a site has no stiffness to compare.
+    used = complete & (reading > 0.0) & (model_reading > 0.0)
+    if not used.any():
+        why = presses[0].end or model_presses[0].end or "a force reading that is not above 0"
+        raise ValueError(
+            f"no press gave a stiffness at the set depth of {scene.palpation.press_depth * 1e3:g} mm; the first ended "
+            f"by: {why}: change the press depth, limits.hard_force or the sensor"
+        )
     truths = tuple(seen_from_surface(hidden, anatomy.face.project))
     return Palpation(
         anatomy=anatomy,
@@ -120,7 +125,7 @@ def run_palpation(
         model_presses=tuple(model_presses),
         reading=reading,
         used=used,
-        maps=_maps(anatomy, presses, model_presses, reading, used, truths),
+        maps=_maps(anatomy, presses, model_presses, (reading, model_reading), used, truths),
         model_modulus_factor=factor,
         support_count=support_count,
         seed=seed,
@@ -167,15 +172,17 @@ def _maps(
     anatomy: Anatomy,
     presses: Sequence[Press],
     model_presses: Sequence[Press],
-    reading: FloatArray,
+    readings: tuple[FloatArray, FloatArray],
     used: np.ndarray,
     truths: Sequence[Truth],
 ) -> tuple[ContrastMap, ContrastMap]:
-    """Both contrast maps over the used sites."""
+    """Both contrast maps over the used sites; readings of the organ and of its model [N], each (n_site,)."""
     spacing = anatomy.scene.palpation.site_spacing
     sites = np.array([press.site for press in presses])[used]
-    stiffness = reading[used] / np.array([press.depth for press in presses])[used]
-    model_stiffness = np.array([press.stiffness for press in model_presses])[used]
+    stiffness, model_stiffness = (
+        reading[used] / np.array([press.depth for press in pressed])[used]
+        for reading, pressed in zip(readings, (presses, model_presses), strict=True)
+    )
     plane = sites @ np.column_stack(tangent_axes(anatomy.face.approach))
     contrasts = {
         NEIGHBOURS: contrast_with_neighbours(stiffness, plane, _geometry(anatomy.face, sites)),

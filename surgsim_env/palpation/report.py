@@ -42,7 +42,9 @@ def early_end(palpation: Palpation, index: int) -> str:
     if palpation.presses[index].end:
         return palpation.presses[index].end
     model_end = palpation.model_presses[index].end
-    return f"pre-operative model: {model_end}" if model_end else ""
+    if model_end:
+        return f"pre-operative model: {model_end}"
+    return "" if palpation.used[index] else "force reading not above 0"
 
 
 def write_summary(palpation: Palpation, path: Path, inputs: Mapping[str, Any]) -> dict[str, Any]:

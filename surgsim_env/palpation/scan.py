@@ -1,6 +1,7 @@
 """A scripted scan: press an organ at each site along the surface normal to a set depth and record force over depth."""
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -42,11 +43,6 @@ class Press:
     volume_ratio_smallest: float
     end: str
     duration: float
-
-    @property
-    def stiffness(self) -> float:
-        """Secant stiffness, force over depth [N/m]."""
-        return self.force / self.depth
 
 
 def press(
@@ -93,6 +89,11 @@ def press(
     )
 
 
+def _core_count() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def scan(
     anatomy: Anatomy,
     organ_model: OrganModel,
@@ -111,15 +112,23 @@ def scan(
         normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
         workers: threads (the kernels hold no interpreter lock); all cores by default.
+
+    Raises:
+        ValueError: workers below 1.
     """
     scene = anatomy.scene
-    count = min(workers or os.cpu_count() or 1, max(1, len(sites)))
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers is {workers}; it must be at least 1, or left out for one per core")
+    count = min(workers or _core_count(), max(1, len(sites)))
+    stopped = threading.Event()
 
     def run(share: range) -> list[Press]:
         simulation = Simulation(anatomy)
         simulation.reset(organ_model, sites[0] + normals[0] * 0.05)
         presses = []
         for index in share:
+            if stopped.is_set():
+                break
             presses.append(
                 press(
                     simulation,
@@ -135,7 +144,12 @@ def scan(
 
     shares = [range(start, len(sites), count) for start in range(count)]
     with ThreadPoolExecutor(count) as pool:
-        results = list(pool.map(run, shares))
+        try:
+            results = list(pool.map(run, shares))
+        except BaseException:
+            # Ctrl-C, or a fault in one share: the others end after the press they are at.
+            stopped.set()
+            raise
     merged: list[Press | None] = [None] * len(sites)
     for share, presses in zip(shares, results, strict=True):
         for index, one in zip(share, presses, strict=True):

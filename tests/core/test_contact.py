@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.damping import Damping
-from msdm_core.errors import OrganDivergedError
+from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.measure import inverted_tets
 from msdm_core.organ import advance, rest_state
@@ -17,6 +17,24 @@ from msdm_core.stability import stable_dt
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.scenes import make_scene
 from tests.core import oracle
+
+
+def test_advance_counts_contact_in_the_stable_step_and_refuses_a_foreign_state():
+    scene = make_scene("phantom")
+    model = load_anatomy(scene).organ()
+    law = scene.contact.law
+    shapes = oracle.single_tool([[[0.03, 0.03, 0.06]] * 2], [0.008])
+    limit = stable_dt(model, law)
+    assert limit < 0.6 * model.stable_step
+    state = rest_state(model, shape_count=1)
+    with pytest.raises(OrganError, match="at most the stable step with contact"):
+        advance(model, state, dt=1.001 * limit, shapes=shapes, contact=law)
+    advance(model, state, dt=0.999 * limit, shapes=shapes, contact=law)
+    # Without shapes nothing touches, and the longer step is fine.
+    advance(model, state, dt=0.999 * model.stable_step)
+    with pytest.raises(OrganError, match="the state has 2047 nodes .* the organ"):
+        advance(oracle.block(), state, dt=1e-5)
+
 
 HAPTIC_STEP = 1e-3  # [s]
 PRESS_SPEED = 0.01  # [m/s]

@@ -6,7 +6,7 @@ import trimesh
 from msdm_core.geodesic import surface_distance
 from msdm_core.meshing import box_mesh
 
-# Paths between Steiner points are never shorter than the geodesic and at most 2 % longer on well-shaped triangles.
+# Paths between Steiner points are never shorter than the geodesic and, over several triangles, at most 2 % longer.
 LONGEST = 1.02
 
 

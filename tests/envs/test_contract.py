@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.scene_files import scenes_folder
 
 IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
 
@@ -89,6 +90,24 @@ def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(e
         assert_same(expected, go_on(one))
         # The random generator went on as well: the next episode is the same too.
         assert_same([next_start], [one.reset()])
+
+
+def test_foreign_or_broken_states_are_refused(env_id, tmp_path):
+    env = gym.make(env_id).unwrapped
+    with pytest.raises(gym.error.ResetNeeded):
+        env.save_state()
+    env.reset(seed=0)
+    saved = env.save_state()
+    text = (scenes_folder() / "organs" / "phantom.toml").read_text().replace("[12, 12, 6]", "[6, 6, 3]")
+    (tmp_path / "phantom.toml").write_text(text)
+    other = gym.make(env_id, scene=str(tmp_path / "phantom.toml")).unwrapped
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match=r"saved by .*2047 nodes.*, this is .*304 nodes.* use the same scene"):
+        other.load_state(saved)
+    for broken in (b"", b"garbage", saved[: len(saved) // 2], saved[:-40]):
+        with pytest.raises(ValueError, match="not a saved state"):
+            env.load_state(broken)
+    assert env.save_state() == saved
 
 
 def test_info_has_fixed_keys_and_types(env_id):

@@ -6,9 +6,13 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 
+from surgsim_env.anatomy import load_anatomy
 from surgsim_env.cli import _joined, main
 from surgsim_env.palpation.report import COLUMNS
+from surgsim_env.palpation.scan import scan
+from surgsim_env.scenes import make_scene
 
 COARSE = ["palpate", "--scene", "phantom", "--spacing", "0.008"]
 STL_FACET = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
@@ -155,10 +159,33 @@ def test_help(arguments, capsys):
     assert "surgsim" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [[], ["palpat"], ["palpate", "--sceen", "liver"], ["palpate", "--seed", "x"]])
-def test_unknown_words_exit_with_2(arguments, capsys):
-    assert main(arguments) == 2
-    assert "Traceback" not in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "palpate, organ, scenes"),
+        (["palpat"], "palpat"),
+        (["palpate", "--sceen", "liver"], "--sceen"),
+        (["palpate", "--seed", "x"], "--seed"),
+    ],
+)
+def test_unknown_words_get_one_line_and_exit_2(arguments, words, capsys):
+    said = refused(capsys, *arguments)
+    assert said.startswith("surgsim: error: ")
+    assert words in said
+
+
+def test_options_that_would_do_nothing_are_refused(capsys):
+    for option, value in (("--cell-size", "0.02"), ("--length-unit", "mm"), ("--anchors", "0,0,0,0.01")):
+        assert f"{option} goes with --surface" in refused(capsys, "palpate", "--scene", "phantom", option, value)
+    assert "workers is 0" in refused(capsys, "palpate", "--scene", "phantom", "--workers", "0")
+    assert "cannot be read" in refused(capsys, "palpate", "--organ", "mine.tml")
+
+
+def test_zero_modulus_is_refused_by_organ_too(capsys, tmp_path):
+    path = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(2, radius=30).export(path)
+    said = refused(capsys, "organ", str(path), "--length-unit", "mm", "--youngs-modulus", "0")
+    assert "youngs_modulus is 0" in said
 
 
 def test_lists_of_numbers_may_begin_with_a_minus():
@@ -243,3 +270,19 @@ def test_interrupt(monkeypatch, capsys):
     monkeypatch.setattr("surgsim_env.cli.list_scenes", stop)
     assert main(["scenes"]) == 130
     assert capsys.readouterr().err == "surgsim: stopped\n"
+
+
+def test_an_interrupt_during_a_scan_ends_after_the_press_at_hand():
+    anatomy = load_anatomy(make_scene("phantom"))
+    sites, normals = anatomy.face.raster(0.01)
+    pressed = []
+
+    def stop() -> None:
+        pressed.append(1)
+        if len(pressed) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        scan(anatomy, anatomy.organ(), sites, normals, progress=stop, workers=2)
+    assert len(sites) > 8
+    assert len(pressed) <= 4  # the two that were at hand when it came

@@ -45,11 +45,11 @@ class Press:
     duration: float
 
 
-def press(
-    simulation: Simulation, site: FloatArray, normal: FloatArray, *, depth: float, clearance: float, force_limit: float
-) -> Press:
-    """Press the resting organ of a simulation once, along the inward normal, and stop at a depth or at a force."""
-    radius = simulation.anatomy.scene.instrument.tip_radius
+def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press:
+    """Press the resting organ of a simulation once, along the inward normal, to its scene's depth or hard limit."""
+    scene = simulation.anatomy.scene
+    depth, clearance, force_limit = scene.palpation.press_depth, scene.palpation.clearance, scene.limits.hard_force
+    radius = scene.instrument.tip_radius
     dt = simulation.haptic_dt
     simulation.restart(site + normal * (radius + clearance))
     go_in = round((clearance + depth) / (PRESS_SPEED * dt))
@@ -116,7 +116,6 @@ def scan(
     Raises:
         ValueError: workers below 1.
     """
-    scene = anatomy.scene
     if workers is not None and workers < 1:
         raise ValueError(f"workers is {workers}; it must be at least 1, or left out for one per core")
     count = min(workers or _core_count(), max(1, len(sites)))
@@ -126,20 +125,15 @@ def scan(
         simulation = Simulation(anatomy)
         simulation.reset(organ_model, sites[0] + normals[0] * 0.05)
         presses = []
-        for index in share:
-            if stopped.is_set():
-                break
-            presses.append(
-                press(
-                    simulation,
-                    sites[index],
-                    normals[index],
-                    depth=scene.palpation.press_depth,
-                    clearance=scene.palpation.clearance,
-                    force_limit=scene.limits.hard_force,
-                )
-            )
-            progress()
+        try:
+            for index in share:
+                if stopped.is_set():
+                    break
+                presses.append(press(simulation, sites[index], normals[index]))
+                progress()
+        except BaseException:
+            stopped.set()
+            raise
         return presses
 
     shares = [range(start, len(sites), count) for start in range(count)]
@@ -147,7 +141,7 @@ def scan(
         try:
             results = list(pool.map(run, shares))
         except BaseException:
-            # Ctrl-C, or a fault in one share: the others end after the press they are at.
+            # Ctrl-C, or an error in one share: the others end after the press they are at.
             stopped.set()
             raise
     merged: list[Press | None] = [None] * len(sites)

@@ -70,10 +70,13 @@ def test_substeps_of_a_scene_bear_its_worst_randomisation(name):
 
 
 def test_too_few_substeps_are_refused_with_the_number_needed():
-    anatomy = load_anatomy(changed(timing__substep_count=2))
-    simulation = Simulation(anatomy)
     with pytest.raises(OrganError, match=r"2 substeps of 0\.5 ms are too long .*timing\.substep_count = 4"):
-        simulation.reset(anatomy.organ(), np.array([0.03, 0.03, 0.05]))
+        Simulation(load_anatomy(changed(timing__substep_count=2)))
+    anatomy = load_anatomy(make_scene("phantom"))
+    simulation = Simulation(anatomy)
+    hard = anatomy.lesion_at([0.03, 0.03, 0.015], 0.01, 40.0, "stone")
+    with pytest.raises(OrganError, match="or use softer lesions"):
+        simulation.reset(anatomy.organ([hard]), np.array([0.03, 0.03, 0.05]))
 
 
 @pytest.mark.parametrize(

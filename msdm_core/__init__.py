@@ -8,10 +8,11 @@ from msdm_core.lumping import lump_mass
 from msdm_core.mesh import TetMesh
 from msdm_core.mesh_io import read_mesh, read_surface, write_mesh
 from msdm_core.meshing import box_mesh, mesh_surface
-from msdm_core.organ import OrganSpec, advance, compile_organ, rest_state
+from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.quality import mesh_quality
 from msdm_core.regions import Capsule, Lesion, Material
 from msdm_core.stability import stable_dt
+from msdm_core.stepping import advance
 from msdm_core.stiffness import spring_network
 
 __all__ = [

@@ -66,7 +66,7 @@ class TetMesh:
         point_array = _checked_points(points)
         tet_array = _checked_tets(tets, len(point_array))
         tet_array, reoriented_count = _oriented(point_array, tet_array)
-        _check_connected(tet_array)
+        _check_faces(tet_array)
         pairs = region_names.items() if isinstance(region_names, dict) else region_names
         object.__setattr__(self, "points", _frozen(point_array))
         object.__setattr__(self, "tets", _frozen(tet_array))
@@ -140,12 +140,6 @@ class TetMesh:
         faces = self.tets[:, TET_FACES].reshape(-1, 3)
         ordered = np.sort(faces, axis=1)
         _, first, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
-        if counts.max() > 2:
-            face = int(first[np.argmax(counts)])
-            raise MeshError(
-                f"face {faces[face].tolist()} of tet {face // 4} is shared by {counts.max()} tets; "
-                "at most 2 may share a face: remove the overlapping tets"
-            )
         outer = np.sort(first[counts == 1])
         return _frozen(faces[outer].astype(np.int32)), _frozen((outer // 4).astype(np.int32))
 
@@ -232,11 +226,26 @@ def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
     return tets, int(negative.sum())
 
 
-def _check_connected(tets: IntArray) -> None:
-    """Refuse parts that meet only in nodes or edges: springs there carry no bending, so the body hangs on hinges."""
+def _check_faces(tets: IntArray) -> None:
+    """Refuse doubled tets, crowded faces, and parts that meet only in nodes or edges.
+
+    Springs in a node or an edge carry no bending: such parts hang on hinges.
+    """
+    alike, first = np.unique(np.sort(tets, axis=1), axis=0, return_index=True)
+    if len(alike) < len(tets):
+        tet = int(np.setdiff1d(np.arange(len(tets)), first)[0])
+        raise MeshError(f"tet {tet} is a duplicate, nodes {tets[tet].tolist()}: remove one of the two")
     faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
     order = np.lexsort(faces.T)
-    twins = np.flatnonzero((np.diff(faces[order], axis=0) == 0).all(axis=1))
+    same = (np.diff(faces[order], axis=0) == 0).all(axis=1)
+    crowded = np.flatnonzero(same[1:] & same[:-1])
+    if crowded.size:
+        tet = int(order[crowded[0]] // 4)
+        raise MeshError(
+            f"face {faces[order[crowded[0]]].tolist()} of tet {tet} is shared by more than 2 tets: "
+            "remove the overlapping ones"
+        )
+    twins = np.flatnonzero(same)
     pairs = order[twins] // 4, order[twins + 1] // 4
     graph = coo_array((np.ones(len(twins), dtype=np.int8), pairs), shape=(len(tets), len(tets)))
     count, part = connected_components(graph, directed=False)

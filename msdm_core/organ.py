@@ -1,4 +1,4 @@
-"""From a specification to an organ that moves: compile_organ, rest_state, advance."""
+"""From a specification to an organ: compile_organ, rest_state."""
 
 import math
 from collections.abc import Mapping
@@ -10,28 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.damping import Damping
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import (
-    FAULT_INVERTED_TET,
-    FAULT_NONE,
-    QUADRATURE_COUNT,
-    ContactLaw,
-    ContactShapes,
-    OrganModel,
-    OrganState,
-    advance_substeps,
-    evaluate_forces,
-)
+from msdm_core.kernels import FAULT_NONE, QUADRATURE_COUNT, OrganModel, OrganState, evaluate_forces
 from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
-from msdm_core.stability import largest_frequency, stable_dt, step_limit
+from msdm_core.stability import largest_frequency, step_limit
+from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.stiffness import membrane_stiffness, spring_network
-
-NO_SHAPES = ContactShapes(
-    np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0, dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 6))
-)
-NO_CONTACT = ContactLaw(stiffness=1.0, damping=0.0, friction=0.0, tangential_stiffness=1.0)
 
 
 @dataclass(frozen=True)
@@ -93,7 +79,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         tet_bulk=_read_only(bulk),
         surface_triangles=_read_only(np.ascontiguousarray(surface)),
         surface_rest_area=_read_only(area),
-        gravity=_read_only(np.array(spec.gravity, dtype=np.float64)),
+        gravity=_read_only(_checked_gravity(spec.gravity)),
         alpha=float(spec.damping.alpha),
         beta=float(spec.damping.beta),
         stable_step=0.0,
@@ -123,91 +109,6 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     return state
 
 
-def advance(
-    model: OrganModel,
-    state: OrganState,
-    *,
-    dt: float,
-    substep_count: int = 1,
-    shapes: ContactShapes = NO_SHAPES,
-    contact: ContactLaw = NO_CONTACT,
-) -> FloatArray:
-    """Advance an organ in place by `substep_count` symplectic Euler steps of dt [s], shapes moving along their twist.
-
-    Returns:
-        The mean wrench on each tool over the substeps, torque about its centre of mass at the start: force [N], torque
-        [N m], shape (n_tool, 6).
-
-    Raises:
-        OrganError: dt above the organ's stable step (that with contact where there are shapes), a state of another
-            organ, or contact memory that does not fit the shapes.
-        OrganDivergedError: an inverted tet (named, with its volume ratio) or a number that is not finite.
-    """
-    touching = len(shapes.shape_radius) > 0
-    limit = _contact_step(model, contact) if touching else model.stable_step
-    if not 0.0 < dt <= limit:
-        with_contact = " with contact" if touching else ""
-        raise OrganError(
-            f"dt is {dt:g} s; it must be above 0 and at most the stable step{with_contact} {limit:.4g} s: "
-            "use more, shorter substeps"
-        )
-    points = len(model.surface_triangles) * QUADRATURE_COUNT
-    if state.node_position.shape != model.node_rest_position.shape or state.contact_engaged.shape[1] != points:
-        raise OrganError(
-            f"the state has {len(state.node_position)} nodes and {state.contact_engaged.shape[1]} contact points, the "
-            f"organ {len(model.node_mass)} and {points}: make the state with rest_state(model, ...)"
-        )
-    if len(shapes.shape_radius) > len(state.contact_engaged):
-        raise OrganError(
-            f"{len(shapes.shape_radius)} contact shapes, but the state remembers {len(state.contact_engaged)}: "
-            "make it with rest_state(model, shape_count=...)"
-        )
-    wrench = np.zeros((len(shapes.tool_centre), 6))
-    fault = advance_organ(model, state, shapes, contact, dt, substep_count, wrench)
-    if fault != FAULT_NONE:
-        raise OrganDivergedError(describe_fault(state, fault))
-    return wrench
-
-
-_contact_step_known: list[tuple[OrganModel, ContactLaw, float]] = []
-
-
-def _contact_step(model: OrganModel, contact: ContactLaw) -> float:
-    """`stable_dt` with contact, remembered for the last organ: it costs as much as many steps."""
-    for known, law, step in _contact_step_known:
-        if known is model and law == contact:
-            return step
-    _contact_step_known[:] = [(model, contact, stable_dt(model, contact))]
-    return _contact_step_known[0][2]
-
-
-def advance_organ(
-    model: OrganModel,
-    state: OrganState,
-    shapes: ContactShapes,
-    contact: ContactLaw,
-    dt: float,
-    substep_count: int,
-    wrench: FloatArray,
-) -> int:
-    """`advance` without its checks, for a loop that has made them once: fills `wrench`, returns a FAULT_ code."""
-    decay = math.exp(-model.alpha * dt)
-    reference = shapes.tool_centre.copy()
-    return advance_substeps(model, state, shapes, contact, dt, decay, substep_count, reference, wrench)
-
-
-def describe_fault(state: OrganState, fault: int) -> str:
-    """One sentence on a FAULT_ code: what happened and where."""
-    if fault == FAULT_INVERTED_TET:
-        return (
-            f"tet {int(state.volume_ratio_tet[0])} turned inside out: volume ratio "
-            f"{float(state.volume_ratio_smallest[0]):.3g}, it must stay above 0: press less deep, use smaller cells "
-            "or a higher Poisson's ratio"
-        )
-    bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
-    return f"node {int(bad[0]) if bad.size else 0} is no longer finite: the step is too long for the forces at work"
-
-
 def _check_extent(mesh: TetMesh) -> None:
     extent = float(np.ptp(mesh.points, axis=0).max())
     if not SMALLEST_EXTENT <= extent <= LARGEST_EXTENT:
@@ -215,6 +116,13 @@ def _check_extent(mesh: TetMesh) -> None:
             f"the organ is {extent:.4g} m long; between {SMALLEST_EXTENT:g} and {LARGEST_EXTENT:g} m is possible: "
             'was its length unit forgotten? (length_unit="mm")'
         )
+
+
+def _checked_gravity(gravity: tuple[float, float, float]) -> FloatArray:
+    vector = np.array(gravity, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise OrganError(f"gravity is {gravity}; it must be three finite numbers, such as (0, 0, -9.81) m/s^2")
+    return vector
 
 
 def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray]:

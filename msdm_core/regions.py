@@ -105,14 +105,20 @@ class Lesion:
     region: str | None = None
 
     def __post_init__(self) -> None:
-        if self.material is None:
-            raise OrganError(f"{self.name}: no material; give Lesion(..., material=Material(...))")
+        if not isinstance(self.material, Material):
+            raise OrganError(
+                f"{self.name}: its material is {self.material!r}; give Lesion(..., material=Material(...))"
+            )
         if self.region is not None:
             if self.centre is not None or self.radius is not None or self.radii is not None:
                 raise OrganError(f"{self.name}: give either a region or a centre with radius or radii, not both")
             return
         if self.centre is None or (self.radius is None) == (self.radii is None):
             raise OrganError(f"{self.name}: give a centre and either radius or radii, or a mesh region")
+        if self.radius is not None and np.ndim(self.radius) != 0:
+            raise OrganError(
+                f"{self.name}: radius is {self.radius}; it is one number, an ellipsoid takes radii=(a, b, c)"
+            )
         axes = self.half_axes
         if len(self.centre) != 3 or not np.isfinite(self.centre).all():
             raise OrganError(f"{self.name}: centre is {self.centre}; it must be three finite numbers in metres")
@@ -161,7 +167,7 @@ def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: Flo
     cell = float(np.linalg.norm(corners[TET_EDGES[:, 0]] - corners[TET_EDGES[:, 1]], axis=1).max())
     if 2.0 * axes.min() < cell:
         raise OrganError(
-            f"{lesion.name}: radius {axes.min() * 1000:.3g} mm is smaller than half a cell ({cell * 1000:.3g} mm) "
+            f"{lesion.name}: radius {axes.min() * 1000:.3g} mm is less than half of the {cell * 1000:.3g} mm cells "
             "there; the mesh cannot show it: use a larger lesion or smaller cells"
         )
     filled = float(fraction @ mesh.volumes)
@@ -170,7 +176,7 @@ def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: Flo
         where = ", ".join(f"{value * 1000:.1f}" for value in np.asarray(lesion.centre))
         raise OrganError(
             f"{lesion.name}: only {max(share, 0.0):.0%} of it (centre {where} mm) lies inside the organ; at least "
-            f"{LESION_SHARE_INSIDE:.0%} must: move its centre into the organ (coordinates are metres)"
+            f"{LESION_SHARE_INSIDE:.0%} must: move its centre into the organ, or make it smaller (all in metres)"
         )
 
 

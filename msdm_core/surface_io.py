@@ -27,6 +27,7 @@ def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[
     """
     metres = metres_per_unit(length_unit)
     file = checked_file(path, SURFACE_SUFFIXES, "export the surface as STL, OBJ or PLY")
+    _check_whole(file)
     points, faces = parsed(file, _loaded, "export it again as STL, OBJ or PLY")
     if len(faces) == 0:
         raise MeshError(f"{file}: has no triangles ({len(points)} vertices); export a triangulated surface")
@@ -47,6 +48,18 @@ def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[
     vertices = vertices * metres
     check_extent(vertices, metres, file)
     return vertices, triangles
+
+
+def _check_whole(file: Path) -> None:
+    """Refuse a binary STL that is shorter than its own count of triangles says; the parser would take it for text."""
+    with file.open("rb") as stream:
+        head = stream.read(84)
+    if file.suffix.lower() != ".stl" or head.lstrip().lower().startswith(b"solid") or len(head) < 84:
+        return
+    promised = int.from_bytes(head[80:84], "little")
+    there = (file.stat().st_size - 84) // 50
+    if there < promised:
+        raise MeshError(f"{file}: is cut short, {promised} triangles are promised and {there} are there: copy it again")
 
 
 def _loaded(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 import sys
+import tempfile
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -164,13 +165,16 @@ def _palpate(command: Palpate, console: Console) -> None:
     anatomy = load_anatomy(scene)
     lesions = _lesions(command, anatomy)
     anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-    # The folder is made first: a place that cannot be written is better known before the work than after it.
-    folder = command.out or _free_folder(scene.name)
-    folder.mkdir(parents=True, exist_ok=True)
+    if command.seed < 0:
+        raise ValueError(f"--seed is {command.seed}; it must be a whole number of at least 0")
     around = None
     if command.around is not None:
         x, y, z, radius = _numbers("--around", command.around, "x,y,z,radius")
+        if not 0.0 < radius < float("inf"):
+            raise ValueError(f"--around {command.around}: the radius is {radius:g} m; it must be finite and above 0")
         around = Ball((x, y, z), radius)
+    # Before the work: a place that cannot be written is better known now than after it.
+    folder = _writable_folder(command.out or _free_folder(scene.name), (CSV_NAME, SUMMARY_NAME, PICTURE_NAME))
     found = run_palpation(
         anatomy, lesions=lesions, around=around, seed=command.seed, workers=command.workers, console=console
     )
@@ -251,6 +255,19 @@ def _unit(text: str) -> LengthUnit:
         return float(text)
     except ValueError:
         return text
+
+
+def _writable_folder(folder: Path, names: Sequence[str]) -> Path:
+    """The folder, made if need be, in which files of these names can be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ValueError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+    for name in names:
+        if (folder / name).is_dir():
+            raise ValueError(f"--out {folder}: {name} is a folder there; choose another place or remove it")
+    return folder
 
 
 def _free_folder(scene: str) -> Path:

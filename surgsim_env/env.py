@@ -4,6 +4,8 @@ import io
 import json
 import zipfile
 import zlib
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -162,19 +164,30 @@ class PalpateEnv(gym.Env[Observation, Observation]):
             raise ValueError(f"not a saved state of this kind of environment: {error}") from None
         if made_by != self._fingerprint():
             raise ValueError(f"the state was saved by {made_by}, this is {self._fingerprint()}: use the same scene")
+        self._check_entries(arrays)
         lesions = self.task.set_state(str(arrays["task"]))
         self.simulation.set_state(self.simulation.anatomy.organ(lesions), arrays)
         self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
         self._observation = arrays["observation"]
         self._running = bool(arrays["running"])
 
+    def _check_entries(self, arrays: dict[str, np.ndarray]) -> None:
+        """Refuse an archive that lacks an entry or has one of another shape, before anything is changed."""
+        wanted = {name: array.shape for name, array in self.simulation.get_state().items()}
+        wanted |= {"task": (), "random": (), "running": (), "observation": self._observation.shape}
+        for name, shape in wanted.items():
+            if name not in arrays or arrays[name].shape != shape:
+                found = arrays[name].shape if name in arrays else "nothing"
+                raise ValueError(f"not a saved state of this environment: {name} has shape {shape}, found {found}")
+
     def _fingerprint(self) -> str:
         """What a saved state must agree with: the environment, its scene and mesh, the rates."""
         mesh, timing = self.simulation.anatomy.mesh, self.scene.timing
-        shape = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
+        digest = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
+        digest = zlib.crc32(repr(replace(self.scene, folder=Path())).encode(), digest)
         return (
             f"{type(self).__name__} of scene {self.scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
-            f"mesh {shape:08x}, {timing.substep_count} substeps in {timing.haptic_step:g} s)"
+            f"{timing.substep_count} substeps in {timing.haptic_step:g} s, digest {digest:08x})"
         )
 
     def _checked(self, action: Observation) -> FloatArray:

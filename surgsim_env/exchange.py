@@ -6,7 +6,7 @@ import numpy as np
 from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
-from msdm_core.organ import advance_organ, describe_fault
+from msdm_core.stepping import advance_organ, describe_fault
 from surgsim_env.instrument import Instrument
 
 # No palpation comes near this: a force beyond it [N] is a fault of the simulation, not a touch.

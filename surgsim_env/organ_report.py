@@ -27,6 +27,8 @@ def report_organ(
         MeshError: the file cannot become an organ.
         ValueError: the length unit is missing or unknown.
     """
+    if out is not None:
+        _check_target(out)
     mesh, quality = _read(file, length_unit, cell_size)
     liver = make_scene("liver")
     material = liver.material
@@ -56,6 +58,16 @@ def report_organ(
 
         write_mesh(out, mesh)
         console.print(f"written: {out}", highlight=False, soft_wrap=True)
+
+
+def _check_target(out: Path) -> None:
+    """Refuse a place or a format that could not be written, before the work."""
+    from msdm_core.mesh_io import FORMATS
+
+    if out.suffix.lower() not in FORMATS:
+        raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; known: {', '.join(FORMATS)}")
+    if not out.parent.is_dir():
+        raise ValueError(f"--out {out}: the folder {out.parent} does not exist; create it first")
 
 
 def _read(file: Path, length_unit: LengthUnit | None, cell_size: float) -> tuple[TetMesh, MeshQuality]:

@@ -10,6 +10,9 @@ from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from msdm_core.triangles import nearest_triangle
 from surgsim_env.scenes import Palpation
 
+# A raster of more points is a spacing in the wrong unit.
+SITES_MOST = 100_000
+
 
 @dataclass(frozen=True, eq=False)
 class PalpableFace:
@@ -21,6 +24,8 @@ class PalpableFace:
         rim: edges of the face's border                                                             (n_rim, 2)
         approach: unit vector along which the instrument comes                                      (3,)
         thickness: organ below each triangle along its inward normal [m]                            (n_face,)
+        margin: distance that raster sites keep from the rim [m]
+        thickness_smallest: points with less organ below them are left out [m]
     """
 
     points: FloatArray
@@ -131,8 +136,8 @@ def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: Palpation)
 
 def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors across a direction, the first as near to world x (else y) as can be."""
-    helper = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    first = helper - (helper @ direction) * direction
+    start = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = start - (start @ direction) * direction
     first /= np.linalg.norm(first)
     return first, np.cross(direction, first) * (-1.0)
 
@@ -145,6 +150,12 @@ def _rim(face: IntArray) -> IntArray:
 
 def _grid(lower: FloatArray, upper: FloatArray, spacing: float) -> FloatArray:
     """Points of a square grid centred in a rectangle, row by row (boustrophedon), shape (n, 2)."""
+    wanted = float(np.prod((upper - lower) / spacing + 1.0))
+    if not wanted <= SITES_MOST:
+        raise ValueError(
+            f"site spacing {spacing * 1000:g} mm gives {wanted:.3g} raster points; at most {SITES_MOST} are allowed: "
+            "use a larger spacing"
+        )
     axes = []
     for low, high in zip(lower, upper, strict=True):
         count = int((high - low) / spacing)

@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -220,8 +220,8 @@ class LesionDraw:
     def __post_init__(self) -> None:
         for name in ("radius", "cover", "modulus_ratio"):
             low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise ValueError(f"lesion: {name} = [{low}, {high}]; the rule is 0 < low <= high")
+            if not 0.0 < low <= high < math.inf:
+                raise ValueError(f"lesion: {name} = [{low}, {high}]; the rule is 0 < low <= high, finite")
         _require("lesion.rim_distance", self.rim_distance, 0.0, "m")
 
 
@@ -290,17 +290,28 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
         raise ValueError(f"{what} is {value:g} {unit}".rstrip() + f"; it must be finite and {rule}")
 
 
+# Every entry that a scene file may have, to suggest the nearest one to a misspelt one.
+_TABLES = (
+    *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
+    *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion),
+)
+_ENTRIES = sorted({entry.name for table in _TABLES for entry in fields(table)})
+
+
 def list_scenes() -> list[str]:
     """Names of the scenes that are shipped."""
     return sorted(path.stem for path in (scenes_folder() / "organs").glob("*.toml"))
 
 
-def make_scene(name: str) -> Scene:
+def make_scene(name: str | Path) -> Scene:
     """The scene of a name (see `list_scenes`) or of a TOML file's path.
 
     Raises:
         ValueError: an unknown name (lists the known, suggests the nearest) or a file that breaks the format.
     """
+    if not isinstance(name, str | Path):
+        raise ValueError(f"scene is {name!r}; it must be a scene's name or the path of a scene file")
+    name = str(name)
     if name.endswith(".toml"):
         return load_scene(Path(name))
     known = list_scenes()
@@ -324,11 +335,22 @@ def load_scene(path: Path) -> Scene:
 
 def scene_from_table(table: dict[str, Any], *, name: str, folder: Path) -> Scene:
     """A scene from a table such as a TOML file holds; paths in it are relative to `folder`."""
-    config = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _real})
+    config = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _real, int: _whole})
     try:
         return dacite.from_dict(Scene, {**table, "name": name, "folder": folder}, config)
+    except dacite.UnexpectedDataError as error:
+        entry = sorted(map(str, error.keys))[0]
+        nearest = get_close_matches(entry, _ENTRIES, n=1)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise ValueError(f"scene {name!r}: entry {entry!r} is unknown there{hint}") from None
     except (dacite.DaciteError, OrganError, ValueError, TypeError) as error:
         raise ValueError(f"scene {name!r}: {error}") from None
+
+
+def _whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{value!r} is not a whole number")
+    return value
 
 
 def _real(value: Any) -> float:

@@ -114,6 +114,10 @@ def _map_entry(one: ContrastMap) -> dict[str, Any]:
     }
 
 
+def _healthy(one: ContrastMap) -> str:
+    return "-" if math.isnan(one.healthy_std) else f"1 ± {one.healthy_std:.2f}"
+
+
 def print_report(palpation: Palpation, console: Console) -> None:
     """The short table: where each lesion was felt, how far from the truth, its contrast beside the healthy spread."""
     table = Table(title=f"stiffness of {palpation.anatomy.scene.name}, felt against two baselines")
@@ -123,11 +127,9 @@ def print_report(palpation: Palpation, console: Console) -> None:
         table.add_column(heading, justify="right", no_wrap=True)
     for one in palpation.maps:
         for score in one.scores:
-            table.add_row(_short(one), score.truth.name, *_felt_cells(one, score), f"1 ± {one.healthy_std:.2f}")
+            table.add_row(_short(one), score.truth.name, *_felt_cells(one, score), _healthy(one))
         if not one.scores:
-            table.add_row(
-                _short(one), "none hidden", f"{len(one.estimates)} felt", "", "", f"1 ± {one.healthy_std:.2f}"
-            )
+            table.add_row(_short(one), "none hidden", f"{len(one.estimates)} felt", "", "", _healthy(one))
         table.add_section()
     console.print(table)
     for one in palpation.maps:

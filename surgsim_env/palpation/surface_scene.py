@@ -1,5 +1,6 @@
 """A scene for any closed surface: where the file says nothing, the shipped liver's values stand, and are stated."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ DEFAULT_APPROACH = (0.0, 0.0, -1.0)
 BED_SHARE = 0.15
 # Contact stiffness over Young's modulus per cell: about 0.2 mm of penetration under a press, see the liver scene.
 CONTACT_MODULI_PER_CELL = 18.0
+# More organ substeps in a haptic step than this would take hours.
+SUBSTEPS_MOST = 200
 # Where a healthy press may lie; sites with less tissue below them than this many press depths are left out.
 THICKNESS_PRESS_DEPTHS = 5.0
 
@@ -77,8 +80,9 @@ def with_options(scene: Scene, options: SurfaceOptions) -> Scene:
         "Young's modulus": options.youngs_modulus,
     }
     for name, value in given.items():
-        if value is not None and not value > 0.0:
-            raise ValueError(f"{name} is {value:g}; it must be above 0 ({'Pa' if 'modulus' in name else 'metres'})")
+        if value is not None and not 0.0 < value < math.inf:
+            unit = "Pa" if "modulus" in name else "metres"
+            raise ValueError(f"{name} is {value:g}; it must be finite and above 0 ({unit})")
     palpation, material = scene.palpation, scene.material
     instrument = scene.instrument
     return replace(
@@ -109,6 +113,11 @@ def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_fact
     organs = [anatomy.organ(lesions), anatomy.organ(modulus_factor=modulus_factor_largest)]
     step = min(stable_dt(organ, scene.contact.law) for organ in organs)
     count = max(substeps_needed(scene.timing.haptic_step, step), scene.timing.substep_count)
+    if count > SUBSTEPS_MOST:
+        raise ValueError(
+            f"this organ needs {count} substeps in {scene.timing.haptic_step:g} s, its stable step is {step:.3g} s; at "
+            f"most {SUBSTEPS_MOST} are allowed: is the modulus in pascals? Else use larger cells"
+        )
     return replace(anatomy, scene=replace(scene, timing=replace(scene.timing, substep_count=count)))
 
 

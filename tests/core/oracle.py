@@ -12,9 +12,10 @@ from msdm_core.damping import Damping
 from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.mesh import TetMesh
 from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, advance_organ, compile_organ, rest_state
+from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material
 from msdm_core.stability import largest_frequency, step_limit
+from msdm_core.stepping import advance_organ
 
 FloatArray = NDArray[np.float64]
 

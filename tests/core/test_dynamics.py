@@ -19,9 +19,10 @@ from msdm_core.measure import (
     volume_ratios,
 )
 from msdm_core.mesh import TetMesh
-from msdm_core.organ import NO_CONTACT, NO_SHAPES, OrganSpec, advance, advance_organ, compile_organ, rest_state
+from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material
 from msdm_core.stability import contact_node_area, stable_dt, step_limit
+from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 from tests.core import oracle
 
 EXACT = 1e-12

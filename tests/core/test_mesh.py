@@ -155,11 +155,12 @@ def test_region_tags_are_one_whole_number_per_tet(region, message):
         TetMesh(TWO, TWO_TETS, region)
 
 
-def test_a_face_of_three_tets_is_refused_when_the_boundary_is_asked():
+def test_crowded_faces_and_doubled_tets_are_refused():
     points = np.vstack([TWO, [[2.0, 2, 2]]])
-    mesh = TetMesh(points, [*TWO_TETS, [1, 2, 3, 5]])
-    with pytest.raises(MeshError, match="shared by 3 tets; at most 2"):
-        _ = mesh.boundary_triangles
+    with pytest.raises(MeshError, match=r"face \[1, 2, 3\] of tet 0 is shared by more than 2 tets"):
+        TetMesh(points, [*TWO_TETS, [1, 2, 3, 5]])
+    with pytest.raises(MeshError, match="tet 1 is a duplicate"):
+        TetMesh(TET, [[0, 1, 2, 3], [1, 0, 3, 2]])
 
 
 def test_flatness_is_judged_by_shape_not_by_size():

@@ -58,7 +58,7 @@ def test_capsule_refuses(arguments: tuple[float, ...], message: str):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"centre": INTERIOR, "radius": 0.01, "material": None}, "node: no material"),
+        ({"centre": INTERIOR, "radius": 0.01, "material": None}, "node: material is None"),
         ({}, "node: give a centre and either radius or radii, or a mesh region"),
         ({"centre": INTERIOR}, "node: give a centre and either radius or radii"),
         ({"radius": 0.01}, "node: give a centre and either radius or radii"),
@@ -89,12 +89,12 @@ def test_lesion_outside_the_organ_is_refused():
 
 
 def test_lesion_in_millimetres_is_refused():
-    with pytest.raises(OrganError, match="coordinates are metres"):
+    with pytest.raises(OrganError, match="all in metres"):
         lesion_fraction(BLOCK, Lesion((31.0, 28.0, 15.0), 8.0, HARD))
 
 
 def test_lesion_smaller_than_a_cell_is_refused():
-    with pytest.raises(OrganError, match=r"tiny: radius 2 mm is smaller than half a cell \(5 mm\) there"):
+    with pytest.raises(OrganError, match=r"tiny: radius 2 mm is less than half of the 5 mm cells there"):
         lesion_fraction(BLOCK, Lesion(INTERIOR, 0.002, HARD, "tiny"))
 
 
@@ -216,3 +216,16 @@ def test_an_anchor_that_is_no_node_is_refused(anchors: list):
 def test_an_organ_of_impossible_size_is_refused(scale: float):
     with pytest.raises(OrganError, match=r"the organ is .* m long; .* was its length unit forgotten"):
         compile_organ(OrganSpec(TetMesh(BLOCK.points * scale, BLOCK.tets), HEALTHY))
+
+
+@pytest.mark.parametrize("gravity", [-9.81, (0.0, 0.0), (0.0, 0.0, np.nan), (0.0, 0.0, np.inf)])
+def test_gravity_is_three_finite_numbers(gravity):
+    with pytest.raises(OrganError, match=r"gravity is .* three finite numbers"):
+        compile_organ(OrganSpec(box_mesh((0.02, 0.02, 0.02), (2, 2, 2)), Material(5e3, 1e3), gravity=gravity))
+
+
+def test_lesions_of_the_wrong_kind_are_refused():
+    with pytest.raises(OrganError, match=r"material is 5000\.0"):
+        Lesion((0.0, 0.0, 0.0), 0.01, 5000.0)
+    with pytest.raises(OrganError, match="it is one number"):
+        Lesion((0.0, 0.0, 0.0), (0.01, 0.01, 0.02), Material(5e3, 1e3))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh_io import read_surface
@@ -89,3 +90,12 @@ def test_scanned_surfaces_are_closed_and_as_large_as_stated(anatomy_folder, name
     assert volume == pytest.approx(litres / 1000, rel=0.01)
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+
+
+def test_a_binary_stl_cut_short_says_so(tmp_path):
+    path = tmp_path / "a.stl"
+    trimesh.Trimesh(CORNERS, FACES).export(path)
+    assert len(path.read_bytes()) == 84 + 4 * 50, "this test needs a binary STL"
+    path.write_bytes(path.read_bytes()[:-60])
+    with pytest.raises(MeshError, match="cut short, 4 triangles are promised and 2 are there"):
+        read_surface(path, length_unit="mm")

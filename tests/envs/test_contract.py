@@ -1,5 +1,6 @@
 """Every environment id under the same contract: checkers, bit-exact replay, save and restore, seeds that matter."""
 
+import io
 import warnings
 
 import gymnasium as gym
@@ -107,7 +108,15 @@ def test_foreign_or_broken_states_are_refused(env_id, tmp_path):
     for broken in (b"", b"garbage", saved[: len(saved) // 2], saved[:-40]):
         with pytest.raises(ValueError, match="not a saved state"):
             env.load_state(broken)
-    assert env.save_state() == saved
+    with np.load(io.BytesIO(saved)) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    for change in ({"organ_node_position": np.zeros((10, 3))}, {"random": None}):
+        kept = {name: array for name, array in {**arrays, **change}.items() if array is not None}
+        buffer = io.BytesIO()
+        np.savez(buffer, **kept)
+        with pytest.raises(ValueError, match=f"{next(iter(change))} has shape"):
+            env.load_state(buffer.getvalue())
+    assert env.save_state() == saved, "nothing was changed by what was refused"
 
 
 def test_info_has_fixed_keys_and_types(env_id):

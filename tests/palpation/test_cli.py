@@ -181,6 +181,33 @@ def test_options_that_would_do_nothing_are_refused(capsys):
     assert "cannot be read" in refused(capsys, "palpate", "--organ", "mine.tml")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--spacing", "inf"], "spacing is inf; it must be finite"),
+        (["--press-depth", "inf"], "press depth is inf"),
+        (["--spacing", "1e-6"], "raster points"),
+        (["--youngs-modulus", "1e12"], "is the modulus in pascals"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--around", "0,0,0,-1"], "the radius is -1 m"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused_at_once(arguments, words, capsys, tmp_path):
+    assert words in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "out"), *arguments)
+
+
+def test_a_place_that_cannot_be_written_is_known_before_the_work(capsys, tmp_path):
+    (tmp_path / "out" / "palpation.csv").mkdir(parents=True)
+    assert "is a folder there" in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "out"))
+    (tmp_path / "file").write_text("")
+    assert "cannot be written" in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "file"))
+    path = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(2, radius=30).export(path)
+    given = ("organ", str(path), "--length-unit", "mm", "--out")
+    assert "does not exist" in refused(capsys, *given, str(tmp_path / "gone" / "a.vtu"))
+    assert "unknown extension" in refused(capsys, *given, str(tmp_path / "a.xyz"))
+
+
 def test_zero_modulus_is_refused_by_organ_too(capsys, tmp_path):
     path = tmp_path / "ball.stl"
     trimesh.creation.icosphere(2, radius=30).export(path)
@@ -219,12 +246,12 @@ def test_lesion_outside(capsys, tmp_path):
     [
         (["--lesion", "0.03,0.03,0.015,0.008,-8"], "modulus ratio is -8; it must be above 0"),
         (["--lesion", "0.03,0.03,0.015,-0.008,8"], "radius is -0.008"),
-        (["--lesion", "0.03,0.03,0.015,0.001,8"], "smaller than half a cell"),
+        (["--lesion", "0.03,0.03,0.015,0.001,8"], "less than half of the"),
         (["--lesion", "0.03,0.03"], "the form is x,y,z,radius,ratio"),
         (["--approach", "down"], "the form is x,y,z"),
         (["--approach", "0,0,0"], "give a direction"),
-        (["--youngs-modulus", "-5000"], "Young's modulus is -5000; it must be above 0"),
-        (["--press-depth", "0"], "press depth is 0; it must be above 0"),
+        (["--youngs-modulus", "-5000"], "Young's modulus is -5000; it must be finite and above 0"),
+        (["--press-depth", "0"], "press depth is 0; it must be finite and above 0"),
         (["--spacing", "nan"], "spacing is nan"),
         (["--around", "1,1,1,0.01"], "no site to press"),
         (["--anchors", "0,0,0,0.01"], "--anchors goes with --surface"),

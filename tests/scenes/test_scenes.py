@@ -99,6 +99,9 @@ def test_too_few_substeps_are_refused_with_the_number_needed():
         ({"timing__substep_count": 0}, "timing.substep_count is 0; it must be finite and at least 1"),
         ({"timing__haptic_step": 0.0}, "timing.haptic_step is 0 s"),
         ({"instrument__tip_radius": 0.0}, "instrument.tip_radius is 0 m"),
+        ({"material__youngs_moduls": 3.0}, "'youngs_moduls' is unknown there; did you mean 'youngs_modulus'"),
+        ({"mesh__block__cells": [12.5, 12, 6]}, "12.5 is not a whole number"),
+        ({"lesion__radius": [0.006, math.inf]}, "finite"),
         ({"instrument__approach": [0.0, 0.0, 0.0]}, "it must be a direction"),
         ({"palpation__press_depth": -0.001}, "palpation.press_depth is -0.001 m"),
         ({"palpation__site_spacing": 0.0}, "palpation.site_spacing is 0 m"),
@@ -116,6 +119,17 @@ def test_an_anchor_that_holds_nothing_is_refused():
         load_anatomy(changed(anchors=far))
     with pytest.raises(ValueError, match="nothing holds the organ"):
         load_anatomy(changed(anchors=[]))
+
+
+def test_a_spacing_in_the_wrong_unit_is_refused():
+    with pytest.raises(ValueError, match="raster points; at most 100000 are allowed"):
+        load_anatomy(make_scene("phantom")).face.raster(1e-6)
+
+
+@pytest.mark.parametrize("name", [None, 3, b"phantom"])
+def test_a_scene_that_is_no_name_is_refused(name):
+    with pytest.raises(ValueError, match="must be a scene's name or the path"):
+        make_scene(name)
 
 
 def test_unknown_scene_lists_and_suggests():

@@ -1,0 +1,133 @@
+"""Advancing an organ: symplectic Euler substeps against moving contact shapes, and what a fault says."""
+
+import math
+
+import numpy as np
+
+from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.kernels import (
+    FAULT_INVERTED_TET,
+    FAULT_NONE,
+    QUADRATURE_COUNT,
+    ContactLaw,
+    ContactShapes,
+    OrganModel,
+    OrganState,
+    advance_substeps,
+)
+from msdm_core.mesh import FloatArray
+from msdm_core.stability import stable_dt
+
+NO_SHAPES = ContactShapes(
+    np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0, dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 6))
+)
+NO_CONTACT = ContactLaw(stiffness=1.0, damping=0.0, friction=0.0, tangential_stiffness=1.0)
+
+
+def advance(
+    model: OrganModel,
+    state: OrganState,
+    *,
+    dt: float,
+    substep_count: int = 1,
+    shapes: ContactShapes = NO_SHAPES,
+    contact: ContactLaw = NO_CONTACT,
+) -> FloatArray:
+    """Advance an organ in place by `substep_count` symplectic Euler steps of dt [s], shapes moving along their twist.
+
+    Returns:
+        The mean wrench on each tool over the substeps, torque about its centre of mass at the start: force [N], torque
+        [N m], shape (n_tool, 6).
+
+    Raises:
+        OrganError: dt above the organ's stable step (that with contact where there are shapes), no substep, a state
+            of another organ, shapes that are not finite or name no tool, contact memory that does not fit them.
+        OrganDivergedError: an inverted tet (named, with its volume ratio) or a number that is not finite.
+    """
+    touching = len(shapes.shape_radius) > 0
+    _check_state(model, state, shapes)
+    _check_shapes(shapes)
+    if isinstance(substep_count, bool) or not isinstance(substep_count, int | np.integer) or substep_count < 1:
+        raise OrganError(f"substep_count is {substep_count!r}; it must be a whole number of at least 1")
+    limit = _contact_step(model, contact) if touching else model.stable_step
+    if not 0.0 < dt <= limit:
+        with_contact = " with contact" if touching else ""
+        raise OrganError(
+            f"dt is {dt:g} s; it must be above 0 and at most the stable step{with_contact} {limit:.4g} s: "
+            "use more, shorter substeps"
+        )
+    wrench = np.zeros((len(shapes.tool_centre), 6))
+    fault = advance_organ(model, state, shapes, contact, dt, substep_count, wrench)
+    if fault != FAULT_NONE:
+        raise OrganDivergedError(describe_fault(state, fault))
+    return wrench
+
+
+def _check_state(model: OrganModel, state: OrganState, shapes: ContactShapes) -> None:
+    points = len(model.surface_triangles) * QUADRATURE_COUNT
+    nodes = model.node_rest_position.shape
+    arrays = (state.node_position, state.node_velocity, state.node_force)
+    if any(array.shape != nodes for array in arrays) or state.contact_engaged.shape[1] != points:
+        raise OrganError(
+            f"the state has {len(state.node_position)} nodes and {state.contact_engaged.shape[1]} contact points, the "
+            f"organ {len(model.node_mass)} and {points}: make the state with rest_state(model, ...)"
+        )
+    if len(shapes.shape_radius) > len(state.contact_engaged):
+        raise OrganError(
+            f"{len(shapes.shape_radius)} contact shapes, but the state remembers {len(state.contact_engaged)}: "
+            "make it with rest_state(model, shape_count=...)"
+        )
+
+
+def _check_shapes(shapes: ContactShapes) -> None:
+    count, tools = len(shapes.shape_radius), len(shapes.tool_centre)
+    wanted = {"shape_ends": (count, 2, 3), "shape_tool": (count,), "tool_centre": (tools, 3), "tool_twist": (tools, 6)}
+    for name, shape in wanted.items():
+        if getattr(shapes, name).shape != shape:
+            raise OrganError(
+                f"{name} has shape {getattr(shapes, name).shape}; with these shapes and tools it is {shape}"
+            )
+    for name in ("shape_ends", "shape_radius", "tool_centre", "tool_twist"):
+        if not np.isfinite(getattr(shapes, name)).all():
+            raise OrganError(f"{name} has a number that is not finite: check the tool's pose and twist")
+    if count and not (0 <= shapes.shape_tool.min() and shapes.shape_tool.max() < tools):
+        raise OrganError(f"shape_tool names tools {shapes.shape_tool.tolist()}; there are tools 0 to {tools - 1}")
+
+
+_contact_step_known: list[tuple[OrganModel, ContactLaw, float]] = []
+
+
+def _contact_step(model: OrganModel, contact: ContactLaw) -> float:
+    """`stable_dt` with contact, remembered for the last organ: it costs as much as many steps."""
+    for known, law, step in _contact_step_known:
+        if known is model and law == contact:
+            return step
+    _contact_step_known[:] = [(model, contact, stable_dt(model, contact))]
+    return _contact_step_known[0][2]
+
+
+def advance_organ(
+    model: OrganModel,
+    state: OrganState,
+    shapes: ContactShapes,
+    contact: ContactLaw,
+    dt: float,
+    substep_count: int,
+    wrench: FloatArray,
+) -> int:
+    """`advance` without its checks, for a loop that has made them once: fills `wrench`, returns a FAULT_ code."""
+    decay = math.exp(-model.alpha * dt)
+    reference = shapes.tool_centre.copy()
+    return advance_substeps(model, state, shapes, contact, dt, decay, substep_count, reference, wrench)
+
+
+def describe_fault(state: OrganState, fault: int) -> str:
+    """One sentence on a FAULT_ code: what happened and where."""
+    if fault == FAULT_INVERTED_TET:
+        return (
+            f"tet {int(state.volume_ratio_tet[0])} turned inside out: volume ratio "
+            f"{float(state.volume_ratio_smallest[0]):.3g}, it must stay above 0: press less deep, use smaller cells "
+            "or a higher Poisson's ratio"
+        )
+    bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
+    return f"node {int(bad[0]) if bad.size else 0} is no longer finite: the step is too long for the forces at work"

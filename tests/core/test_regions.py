@@ -58,7 +58,7 @@ def test_capsule_refuses(arguments: tuple[float, ...], message: str):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"centre": INTERIOR, "radius": 0.01, "material": None}, "node: material is None"),
+        ({"centre": INTERIOR, "radius": 0.01, "material": None}, "node: its material is None"),
         ({}, "node: give a centre and either radius or radii, or a mesh region"),
         ({"centre": INTERIOR}, "node: give a centre and either radius or radii"),
         ({"radius": 0.01}, "node: give a centre and either radius or radii"),

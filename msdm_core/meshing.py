@@ -8,8 +8,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
+from msdm_core.lattice import lattice_around
 from msdm_core.mesh import TET_FACES, TetMesh, tet_volumes
-from msdm_core.stuffing import lattice_around, stuff
+from msdm_core.stuffing import stuff
 from msdm_core.surface import check_surface, surface_volume
 
 FloatArray = NDArray[np.float64]

@@ -63,7 +63,12 @@ def checked_fine_triangles(chosen: ArrayLike | None, triangle_count: int) -> Int
     given = np.asarray(chosen)
     if given.dtype == bool and given.shape == (triangle_count,):
         given = np.flatnonzero(given)
-    elif given.dtype.kind not in "iu" or given.ndim != 1:
+    if not given.size:
+        raise MeshError(
+            "fine_triangles chooses no triangle, so no cell would be fine: choose some (does the approach meet the "
+            "surface?), or leave out coarse_cell_size and use a larger cell_size"
+        )
+    if given.dtype.kind not in "iu" or given.ndim != 1:
         raise MeshError(
             f"fine_triangles has shape {given.shape}, dtype {given.dtype}; the rule is a list of triangle indices or "
             f"one bool per triangle, ({triangle_count},)"
@@ -71,11 +76,6 @@ def checked_fine_triangles(chosen: ArrayLike | None, triangle_count: int) -> Int
     wrong = np.flatnonzero((given < 0) | (given >= triangle_count))
     if wrong.size:
         raise MeshError(f"fine_triangles names triangle {given[wrong[0]]}; indices lie in 0..{triangle_count - 1}")
-    if not given.size:
-        raise MeshError(
-            "fine_triangles chooses no triangle, so no cell would be fine: choose some (does the approach meet the "
-            "surface?), or leave out coarse_cell_size and use a larger cell_size"
-        )
     return given.astype(np.int64)
 
 

@@ -183,10 +183,11 @@ def mesh_surface(
         raise MeshError(
             f"cell_size {size:g} m leaves no tets: every part of the surface is thinner than a cell; try {size / 2:g} m"
         )
-    tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), size)
+    finer = f"a coarse_cell_size below {coarse_cell_size:g} m" if coarsest else f"a cell_size below {size:g} m"
+    tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), finer)
     used, renumbered = np.unique(tets, return_inverse=True)
     mesh = TetMesh(nodes[used], renumbered.reshape(-1, 4))
-    _warn_of_pinches(mesh, size)
+    _warn_of_pinches(mesh, finer)
     return mesh
 
 
@@ -215,7 +216,7 @@ def _positive(points: FloatArray, tets: Int64Array) -> Int64Array:
     return np.where(negative[:, None], tets[:, [0, 1, 3, 2]], tets)
 
 
-def _largest_body(tets: Int64Array, volumes: FloatArray, cell_size: float) -> Int64Array:
+def _largest_body(tets: Int64Array, volumes: FloatArray, finer: str) -> Int64Array:
     """The tets of the largest part that hangs together by faces: what hangs by an edge or a node is a hinge."""
     faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
     order = np.lexsort(faces.T)
@@ -229,14 +230,14 @@ def _largest_body(tets: Int64Array, volumes: FloatArray, cell_size: float) -> In
     share = np.abs(volumes[~kept]).sum() / np.abs(volumes).sum()
     warnings.warn(
         f"{count - 1} part(s) of {int((~kept).sum())} tets ({share:.2%} of the volume) hang on the body by less than "
-        f"a face and were dropped; a cell_size below {cell_size:g} m keeps thinner parts",
+        f"a face and were dropped; {finer} keeps thinner parts",
         UserWarning,
         stacklevel=3,
     )
     return tets[kept]
 
 
-def _warn_of_pinches(mesh: TetMesh, cell_size: float) -> None:
+def _warn_of_pinches(mesh: TetMesh, finer: str) -> None:
     sides = np.sort(mesh.boundary_triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, count = np.unique(sides, axis=0, return_counts=True)
     pinched = np.flatnonzero(count > 2)
@@ -244,7 +245,7 @@ def _warn_of_pinches(mesh: TetMesh, cell_size: float) -> None:
         first, second = edges[pinched[0]].tolist()
         warnings.warn(
             f"{pinched.size} edge(s) of the boundary, first {first}-{second}, belong to more than two boundary "
-            f"triangles: the body is pinched to nothing there; a cell_size below {cell_size:g} m resolves the wall",
+            f"triangles: the body is pinched to nothing there; {finer} resolves the wall",
             UserWarning,
             stacklevel=3,
         )

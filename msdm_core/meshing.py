@@ -1,4 +1,8 @@
-"""Meshes of body-centred cubic (BCC) lattices, on which formula (6) is isotropic: blocks and filled surfaces."""
+"""Meshes of body-centred cubic (BCC) lattices, on which formula (6) is isotropic: blocks and filled surfaces.
+
+Both can be graded: fine where the tissue is felt, with cells 2 or 4 times as long elsewhere (`msdm_core.octree`). At
+the seams between cell sizes formula (6) is not isotropic.
+"""
 
 import warnings
 
@@ -8,8 +12,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
+from msdm_core.grading import (
+    CELLS_ACROSS_MIN,
+    COARSENINGS,
+    check_coarse_cell_size,
+    checked_coarsest,
+    checked_fine_triangles,
+    stuff_graded,
+)
+from msdm_core.lattice import lattice_around
 from msdm_core.mesh import TET_FACES, TetMesh, tet_volumes
-from msdm_core.stuffing import lattice_around, stuff
+from msdm_core.octree import balanced_levels, octree_tets
+from msdm_core.stuffing import stuff
 from msdm_core.surface import check_surface, surface_volume
 
 FloatArray = NDArray[np.float64]
@@ -19,10 +33,9 @@ STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice count
 TETS_PER_CELL = 12
 TET_LIMIT = 2_000_000
 GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB while meshing
-CELLS_ACROSS_MIN = 2
 
 
-def box_mesh(size: ArrayLike, cells: ArrayLike) -> TetMesh:
+def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float | None = None) -> TetMesh:
     """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
 
     Nodes are the corners and then the centres of the cells. Each inner cell face gives four tets (two centres and
@@ -32,14 +45,18 @@ def box_mesh(size: ArrayLike, cells: ArrayLike) -> TetMesh:
     Args:
         size: edge lengths [m], shape (3,).
         cells: whole numbers of cells along each axis, shape (3,).
+        coarsening: largest cell edge in fine ones, 1 (all cells alike), 2 or 4; divides each number of cells.
+        fine_depth: where cells may coarsen, the depth below the top face z = sz that is filled with fine cells [m].
 
     Warns:
         UserWarning: names the stretch where cells are more than 1 % from cubes: formula (6) is then not isotropic.
 
     Raises:
-        ValueError: names the size or count that is not positive.
+        ValueError: names the size or count that is not positive, the coarsening that does not fit the cells or the
+            fine depth that does not fit the block.
     """
     lengths, counts = _checked_box(size, cells)
+    fine_layers = _checked_fine_layers(lengths, counts, coarsening, fine_depth)
     edges = lengths / counts
     stretch = edges.max() / edges.min()
     if stretch > STRETCH_LIMIT:
@@ -49,6 +66,8 @@ def box_mesh(size: ArrayLike, cells: ArrayLike) -> TetMesh:
             UserWarning,
             stacklevel=2,
         )
+    if coarsening > 1:
+        return _graded_box(lengths, counts, coarsening, fine_layers)
     corners = np.arange(np.prod(counts + 1)).reshape(counts + 1)
     centres = corners.size + np.arange(np.prod(counts)).reshape(counts)
     corner_places = np.stack(np.unravel_index(corners.ravel(), corners.shape), axis=1) / counts
@@ -69,6 +88,38 @@ def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Ar
     return lengths, counts.astype(np.int64)
 
 
+def _checked_fine_layers(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_depth: float | None) -> int:
+    """How many layers of cells below the top face are fine."""
+    if coarsening not in COARSENINGS:
+        raise ValueError(f"coarsening is {coarsening}; the rule is 1, 2 or 4")
+    if (coarsening == 1) != (fine_depth is None):
+        raise ValueError(
+            f"coarsening is {coarsening} and fine_depth {fine_depth}: give a fine_depth with a coarsening of 2 or 4, "
+            "and none where all cells are alike"
+        )
+    if (counts % coarsening).any():
+        raise ValueError(
+            f"cells is {counts.tolist()} with coarsening {coarsening}; the rule is multiples of {coarsening}"
+        )
+    if fine_depth is None:
+        return int(counts[2])
+    if not 0 < fine_depth <= lengths[2]:
+        raise ValueError(
+            f"fine_depth is {fine_depth:g} m; the rule is above 0 and at most the height, {lengths[2]:g} m"
+        )
+    # A depth of whole layers is not to gain one by rounding.
+    return int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
+
+
+def _graded_box(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_layers: int) -> TetMesh:
+    permitted = np.full(counts, COARSENINGS.index(coarsening), dtype=np.int64)
+    permitted[:, :, counts[2] - fine_layers :] = 0
+    used, renumbered = np.unique(octree_tets(balanced_levels(permitted)), return_inverse=True)
+    grid_places = np.stack(np.unravel_index(used, tuple(2 * counts + 1)), axis=1)
+    points = grid_places / (2 * counts) * lengths
+    return TetMesh(points, _positive(points, renumbered.reshape(-1, 4)))
+
+
 def _face_tets(corners: Int64Array, centres: Int64Array, axis: int) -> Int64Array:
     """Tets at the cell faces across one axis: four per inner face, two per outer face, shape (n, 4)."""
     corners, centres = np.moveaxis(corners, axis, 0), np.moveaxis(centres, axis, 0)
@@ -85,16 +136,29 @@ def _face_tets(corners: Int64Array, centres: Int64Array, axis: int) -> Int64Arra
     return np.concatenate(tets)
 
 
-def mesh_surface(vertices: ArrayLike, triangles: ArrayLike, *, cell_size: float) -> TetMesh:
-    """Fill a closed surface with tets of a uniform BCC lattice by isosurface stuffing (Labelle and Shewchuk 2007).
+def mesh_surface(
+    vertices: ArrayLike,
+    triangles: ArrayLike,
+    *,
+    cell_size: float,
+    coarse_cell_size: float | None = None,
+    fine_triangles: ArrayLike | None = None,
+    fine_depth: float = 0.0,
+) -> TetMesh:
+    """Fill a closed surface with tets of a BCC lattice by isosurface stuffing (Labelle and Shewchuk 2007).
 
-    Dihedral angles stay between 9.3 and 161.7 degrees; boundary nodes lie on the surface. Parts thinner than about
-    a cell can be lost. Twice the same input gives twice the same mesh, to the bit.
+    Dihedral angles stay between 9.3 and 161.7 degrees where all cells are alike, above 9 in a graded lattice;
+    boundary nodes lie on the surface. Parts thinner than about a cell can be lost. Twice the same input gives twice
+    the same mesh, to the bit.
 
     Args:
         vertices: of the surface [m], shape (n_vertex, 3).
         triangles: vertex indices, shape (n_triangle, 3); turned outward where needed.
-        cell_size: cube edge of the lattice [m].
+        cell_size: cube edge of the lattice, of its fine cells where it is graded [m].
+        coarse_cell_size: edge of the largest cells, 2 or 4 times `cell_size` [m]; left out, all cells are alike.
+        fine_triangles: where the lattice is fine if it is graded: triangle indices or one bool per triangle, such as
+            `triangles_facing` gives; left out, along the whole surface.
+        fine_depth: cells that come within this distance of such a triangle along each axis are fine [m].
 
     Warns:
         UserWarning: says what was dropped where thin parts fell off the largest body, or how many edges of the
@@ -106,17 +170,24 @@ def mesh_surface(vertices: ArrayLike, triangles: ArrayLike, *, cell_size: float)
     size = float(cell_size)
     if not (np.isfinite(size) and size > 0):
         raise MeshError(f"cell_size is {cell_size}; the rule is a positive length in metres")
+    coarsest = checked_coarsest(size, coarse_cell_size, fine_triangles, fine_depth)
     points, corners = check_surface(vertices, triangles)
     _check_cell_size(points, corners, size)
-    nodes, tets = stuff(points, corners, lattice_around(points, size))
+    if coarsest:
+        check_coarse_cell_size(points, size, coarsest)
+        fine = checked_fine_triangles(fine_triangles, len(corners))
+        nodes, tets = stuff_graded(points, corners, fine, size, float(fine_depth), coarsest)
+    else:
+        nodes, tets = stuff(points, corners, lattice_around(points, size))
     if not len(tets):
         raise MeshError(
             f"cell_size {size:g} m leaves no tets: every part of the surface is thinner than a cell; try {size / 2:g} m"
         )
-    tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), size)
+    finer = f"a coarse_cell_size below {coarse_cell_size:g} m" if coarsest else f"a cell_size below {size:g} m"
+    tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), finer)
     used, renumbered = np.unique(tets, return_inverse=True)
     mesh = TetMesh(nodes[used], renumbered.reshape(-1, 4))
-    _warn_of_pinches(mesh, size)
+    _warn_of_pinches(mesh, finer)
     return mesh
 
 
@@ -145,7 +216,7 @@ def _positive(points: FloatArray, tets: Int64Array) -> Int64Array:
     return np.where(negative[:, None], tets[:, [0, 1, 3, 2]], tets)
 
 
-def _largest_body(tets: Int64Array, volumes: FloatArray, cell_size: float) -> Int64Array:
+def _largest_body(tets: Int64Array, volumes: FloatArray, finer: str) -> Int64Array:
     """The tets of the largest part that hangs together by faces: what hangs by an edge or a node is a hinge."""
     faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
     order = np.lexsort(faces.T)
@@ -159,14 +230,14 @@ def _largest_body(tets: Int64Array, volumes: FloatArray, cell_size: float) -> In
     share = np.abs(volumes[~kept]).sum() / np.abs(volumes).sum()
     warnings.warn(
         f"{count - 1} part(s) of {int((~kept).sum())} tets ({share:.2%} of the volume) hang on the body by less than "
-        f"a face and were dropped; a cell_size below {cell_size:g} m keeps thinner parts",
+        f"a face and were dropped; {finer} keeps thinner parts",
         UserWarning,
         stacklevel=3,
     )
     return tets[kept]
 
 
-def _warn_of_pinches(mesh: TetMesh, cell_size: float) -> None:
+def _warn_of_pinches(mesh: TetMesh, finer: str) -> None:
     sides = np.sort(mesh.boundary_triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, count = np.unique(sides, axis=0, return_counts=True)
     pinched = np.flatnonzero(count > 2)
@@ -174,7 +245,7 @@ def _warn_of_pinches(mesh: TetMesh, cell_size: float) -> None:
         first, second = edges[pinched[0]].tolist()
         warnings.warn(
             f"{pinched.size} edge(s) of the boundary, first {first}-{second}, belong to more than two boundary "
-            f"triangles: the body is pinched to nothing there; a cell_size below {cell_size:g} m resolves the wall",
+            f"triangles: the body is pinched to nothing there; {finer} resolves the wall",
             UserWarning,
             stacklevel=3,
         )

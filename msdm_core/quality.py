@@ -56,7 +56,12 @@ def mesh_quality(mesh: TetMesh, surface: tuple[ArrayLike, ArrayLike] | None = No
 
 def dihedral_angles(mesh: TetMesh) -> FloatArray:
     """Angle between the faces opposite corners i and j, for ij = 01 02 03 12 13 23 [degrees], shape (n_tet, 6)."""
-    normals = _face_area_vectors(mesh)
+    return tet_angles(mesh.points, mesh.tets)
+
+
+def tet_angles(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
+    """`dihedral_angles` of tets with positive volumes [degrees], shape (n_tet, 6)."""
+    normals = _face_area_vectors(points, tets)
     normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
     i, j = np.triu_indices(4, k=1)
     cosines = -np.einsum("nkx,nkx->nk", normals[:, i], normals[:, j])
@@ -68,7 +73,7 @@ def radius_ratios(mesh: TetMesh) -> FloatArray:
 
     V is the volume, S the area of the four faces, a, b, c the edges from corner 0 (Liu and Joe 1994).
     """
-    area = np.linalg.norm(_face_area_vectors(mesh), axis=2).sum(axis=1)
+    area = np.linalg.norm(_face_area_vectors(mesh.points, mesh.tets), axis=2).sum(axis=1)
     corners = mesh.points[mesh.tets]
     a, b, c = (corners[:, corner] - corners[:, 0] for corner in (1, 2, 3))
     sums = sum((p**2).sum(axis=1, keepdims=True) * np.cross(q, r) for p, q, r in ((a, b, c), (b, c, a), (c, a, b)))
@@ -76,7 +81,7 @@ def radius_ratios(mesh: TetMesh) -> FloatArray:
     return 3 * (3 * mesh.volumes / area) / circumradius
 
 
-def _face_area_vectors(mesh: TetMesh) -> FloatArray:
+def _face_area_vectors(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     """Outward normal times area of the face opposite each corner [m^2], shape (n_tet, 4, 3)."""
-    a, b, c = (mesh.points[mesh.tets[:, TET_FACES[:, corner]]] for corner in range(3))
+    a, b, c = (points[tets[:, TET_FACES[:, corner]]] for corner in range(3))
     return np.cross(b - a, c - a) / 2

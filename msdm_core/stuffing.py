@@ -11,7 +11,7 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.surface import line_hits
+from msdm_core.lattice import Lattice, edge_fractions, node_signs
 
 FloatArray = NDArray[np.float64]
 Int64Array = NDArray[np.int64]
@@ -20,30 +20,8 @@ Int64Array = NDArray[np.int64]
 # cuts on a lattice (a million tets, cuts at the limits) gave dihedral angles of 9.317 to 161.643 degrees, never beyond.
 ALPHA_LONG, ALPHA_SHORT = 0.24999, 0.41189
 
-# Shift of the lattice [cells], so that no lattice line runs through a vertex or along an edge of an aligned surface.
-ORIGIN_SHIFT = 1e-7 * np.array([np.sqrt(2) - 1, np.sqrt(3) - 1, np.sqrt(5) - 2])
-
 AXES = np.eye(3, dtype=np.int64) * 2
 DIAGONALS = np.array([(1, y, z) for y, z in product((1, -1), repeat=2)], dtype=np.int64)
-CLEAR_CELLS = 2  # cells of empty lattice around the surface: no tet then reaches past the grid
-
-
-@dataclass(frozen=True)
-class Lattice:
-    """A grid of half cells around a surface: position [m] = origin + half_cell * grid coordinates."""
-
-    origin: FloatArray  # (3,) [m]
-    half_cell: float  # [m]
-    shape: tuple[int, int, int]
-
-    @property
-    def strides(self) -> Int64Array:
-        """What one step along each axis adds to a node number, shape (3,)."""
-        return np.array([self.shape[1] * self.shape[2], self.shape[2], 1], dtype=np.int64)
-
-    def coordinates(self, nodes: Int64Array) -> Int64Array:
-        """Grid coordinates of nodes, shape (..., 3)."""
-        return np.stack(np.unravel_index(nodes, self.shape), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -56,17 +34,6 @@ class Cuts:
     is_long: NDArray[np.bool_]  # (n_cut,)
 
 
-def lattice_around(vertices: FloatArray, cell_size: float) -> Lattice:
-    """The lattice with cube edge `cell_size` [m] that has a corner node at the middle of the bounding box."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    # An even reach gives the middle node even coordinates: it is a cube corner.
-    reach = 2 * (np.ceil((high - low) / (2 * cell_size)).astype(np.int64) + CLEAR_CELLS)
-    half_cell = cell_size / 2
-    origin = (low + high) / 2 + cell_size * ORIGIN_SHIFT - half_cell * reach
-    nx, ny, nz = (int(n) for n in 2 * reach + 1)
-    return Lattice(origin, half_cell, (nx, ny, nz))
-
-
 def stuff(vertices: FloatArray, triangles: Int64Array, lattice: Lattice) -> tuple[FloatArray, Int64Array]:
     """Fill a closed surface with tets: points (n_node, 3) [m] and tets (n_tet, 4) (Labelle and Shewchuk 2007, alg. 1).
 
@@ -76,7 +43,7 @@ def stuff(vertices: FloatArray, triangles: Int64Array, lattice: Lattice) -> tupl
         lattice: from `lattice_around`.
     """
     grid_vertices = (vertices - lattice.origin) / lattice.half_cell
-    sign = _node_signs(grid_vertices, triangles, lattice)
+    sign = node_signs(grid_vertices, triangles, lattice)
     cuts = _edge_cuts(grid_vertices, triangles, lattice, sign)
     cuts, warped_to = _warp(cuts, sign, lattice)
     background = _background_tets(lattice, sign)
@@ -84,16 +51,21 @@ def stuff(vertices: FloatArray, triangles: Int64Array, lattice: Lattice) -> tupl
     return _compressed(tets, warped_to, cuts, lattice)
 
 
-def _node_signs(grid_vertices: FloatArray, triangles: Int64Array, lattice: Lattice) -> NDArray[np.int8]:
-    """+1 inside, -1 outside, per grid point: parity of the crossings along x, shape (n_grid,); only nodes count."""
-    crossed = np.zeros(lattice.shape, dtype=np.int8)
-    x, y, z = grid_vertices.T
-    for parity in (0, 1):
-        row, column, at = line_hits(y, z, x, triangles, parity)
-        next_node = np.ceil(at).astype(np.int64)
-        np.add.at(crossed, (next_node, row, column), 1)
-    inside = np.cumsum(crossed, axis=0, dtype=np.int64) % 2
-    return (2 * inside - 1).astype(np.int8).ravel()
+def fill_background(
+    background: Int64Array, cuts: Cuts, limit: FloatArray, sign: NDArray[np.int8], lattice: Lattice
+) -> tuple[FloatArray, Int64Array]:
+    """The part of conforming tets of grid points that lies inside: points (n_node, 3) [m] and tets (n_tet, 4).
+
+    Args:
+        background: the tets, shape (n, 4).
+        cuts: of all their edges whose ends lie on different sides.
+        limit: share of each cut edge within which a node moves onto the surface, shape (n_cut,).
+        sign: from `node_signs`; 0 afterwards at nodes that moved.
+        lattice: the grid.
+    """
+    cuts, warped_to = _warp(cuts, sign, lattice, limit)
+    background = background[(sign[background] > 0).any(axis=1)]
+    return _compressed(_stencils(background, sign, cuts, lattice), warped_to, cuts, lattice)
 
 
 def _edge_cuts(grid_vertices: FloatArray, triangles: Int64Array, lattice: Lattice, sign: NDArray[np.int8]) -> Cuts:
@@ -101,7 +73,8 @@ def _edge_cuts(grid_vertices: FloatArray, triangles: Int64Array, lattice: Lattic
     found = []
     for step in np.concatenate([AXES, DIAGONALS]):
         node = _changing_edges(step, sign, lattice)
-        found.append((node, node + step @ lattice.strides, _fractions(step, node, grid_vertices, triangles, lattice)))
+        fraction = edge_fractions(step, node, grid_vertices, triangles, lattice)
+        found.append((node, node + step @ lattice.strides, fraction))
     node, other, fraction = (np.concatenate(column) for column in zip(*found, strict=True))
     order = np.lexsort([other, node])
     is_long = (lattice.coordinates(node) % 2 == lattice.coordinates(other) % 2).all(axis=1)
@@ -119,53 +92,20 @@ def _changing_edges(step: Int64Array, sign: NDArray[np.int8], lattice: Lattice) 
     return np.ravel_multi_index((i[is_node], j[is_node], k[is_node]), lattice.shape).astype(np.int64)
 
 
-def _fractions(
-    step: Int64Array, node: Int64Array, grid_vertices: FloatArray, triangles: Int64Array, lattice: Lattice
-) -> FloatArray:
-    """How far along each edge the surface lies: the middle one where it crosses more than once, shape (n,)."""
-    along = int(np.argmax(step))
-    across = [axis for axis in range(3) if axis != along]
-    length = int(step[along])
-    # Coordinates that are constant along the line number it; on a diagonal they can be negative.
-    shear = step[across] // length
-    reach = 2 * max(lattice.shape)
-    nodes = lattice.coordinates(node)
-    start = nodes[:, along]
-    lines = nodes[:, across] - shear * start[:, None]
-    projected = grid_vertices[:, across] - shear * grid_vertices[:, [along]]
-    row, column, at = [], [], []
-    for parity in (0, 1) if length == 2 else (0,):
-        hits = line_hits(projected[:, 0], projected[:, 1], grid_vertices[:, along], triangles, parity)
-        for column_list, values in zip((row, column, at), hits, strict=True):
-            column_list.append(values)
-    hit_at = np.concatenate(at)
-    hit_line = (np.concatenate(row) + reach) * (4 * reach) + np.concatenate(column) + reach
-    edge_line = (lines[:, 0] + reach) * (4 * reach) + lines[:, 1] + reach
-    order = np.lexsort([hit_at, hit_line])
-    hit_at, hit_line = hit_at[order], hit_line[order]
-    # Crossings belong to the half-open stretch (start, start + length], as in _node_signs.
-    hit_key = hit_line * (2 * reach) + np.ceil(hit_at).astype(np.int64)
-    first = np.searchsorted(hit_key, edge_line * (2 * reach) + start, side="right")
-    after = np.searchsorted(hit_key, edge_line * (2 * reach) + start + length, side="right")
-    chosen = first + (after - first) // 2
-    # An end within rounding of the surface can have its crossing counted on the next edge of the same line.
-    missed = first == after
-    before, behind = np.maximum(first - 1, 0), np.minimum(first, len(hit_at) - 1)
-    gap_before = np.where(hit_line[before] == edge_line, np.abs(start - hit_at[before]), np.inf)
-    gap_behind = np.where(hit_line[behind] == edge_line, np.abs(hit_at[behind] - start - length), np.inf)
-    chosen = np.where(missed, np.where(gap_before <= gap_behind, before, behind), chosen)
-    return np.clip((hit_at[chosen] - start) / length, 0.0, 1.0)
-
-
-def _warp(cuts: Cuts, sign: NDArray[np.int8], lattice: Lattice) -> tuple[Cuts, dict[int, FloatArray]]:
+def _warp(
+    cuts: Cuts, sign: NDArray[np.int8], lattice: Lattice, limit: FloatArray | None = None
+) -> tuple[Cuts, dict[int, FloatArray]]:
     """Move nodes onto cuts that are too close to them, nearest first; such nodes get sign 0 and lose their other cuts.
 
+    A cut is too close within `limit`, a share of its edge, (n_cut,); left out, the safe values of BCC tets.
     Returns the cuts that remain and the grid coordinates of each moved node.
     """
     nearer_node = cuts.fraction < 0.5
     share = np.where(nearer_node, cuts.fraction, 1 - cuts.fraction)
-    distance = share * np.where(cuts.is_long, 2.0, np.sqrt(3.0))
-    violating = np.flatnonzero(share < np.where(cuts.is_long, ALPHA_LONG, ALPHA_SHORT))
+    span = lattice.coordinates(cuts.other) - lattice.coordinates(cuts.node)
+    distance = share * np.sqrt((span**2).sum(axis=1))
+    limit = np.where(cuts.is_long, ALPHA_LONG, ALPHA_SHORT) if limit is None else limit
+    violating = np.flatnonzero(share < limit)
     violating = violating[np.argsort(distance[violating], kind="stable")]
     near = np.where(nearer_node, cuts.node, cuts.other)[violating].tolist()
     far = np.where(nearer_node, cuts.other, cuts.node)[violating].tolist()
@@ -268,13 +208,14 @@ def _diagonal_from_first(a: Int64Array, b: Int64Array, out: Int64Array, lattice:
     """Whether the quad left of triangle (a, b inside; out) is cut from a to the cut of b-out, or from b; shape (n,).
 
     Both tets at a face must agree, so the rule knows the face alone (Labelle and Shewchuk 2007, section 3): the
-    diagonal ends at the cut of a long edge; where both cuts lie on short edges, it starts at the node that exceeds
-    the cut in an even number of coordinates.
+    diagonal ends at the cut of the longer edge; where both are equally long, it starts at the node that exceeds the
+    cut in an even number of coordinates; where both do (in graded lattices alone), at the lower node. A node has
+    three equally long edges in half pyramids alone, where these rules do not turn in a circle either.
     """
-    place_a, place_b, place_out = (lattice.coordinates(nodes) for nodes in (a, b, out))
-    parity_a, parity_b, parity_out = (place[:, 0] % 2 for place in (place_a, place_b, place_out))
-    even = (2 * place_a > place_b + place_out).sum(axis=1) % 2 == 0
-    return np.where(parity_a == parity_b, even, parity_b == parity_out)
+    from_a, from_b = (lattice.coordinates(nodes) - lattice.coordinates(out) for nodes in (a, b))
+    longer = (from_b**2).sum(axis=1) - (from_a**2).sum(axis=1)
+    even_a, even_b = ((steps > 0).sum(axis=1) % 2 == 0 for steps in (from_a, from_b))
+    return np.where(longer != 0, longer > 0, np.where(even_a != even_b, even_a, a < b))
 
 
 def _compressed(

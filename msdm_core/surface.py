@@ -25,6 +25,25 @@ def surface_volume(vertices: ArrayLike, triangles: ArrayLike) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
+def triangles_facing(
+    vertices: ArrayLike, triangles: ArrayLike, direction: ArrayLike, angle_deg: float
+) -> NDArray[np.bool_]:
+    """Whether each triangle's inward normal is within an angle [degrees] of a direction, shape (n_triangle,).
+
+    Args:
+        vertices: of a closed surface [m], shape (n_vertex, 3).
+        triangles: vertex indices, shape (n_triangle, 3); turned outward where needed (see `check_surface`).
+        direction: any length above zero, shape (3,).
+        angle_deg: [degrees].
+    """
+    points, corners = check_surface(vertices, triangles)
+    a, b, c = (points[corner] for corner in corners.T)
+    normal = np.cross(b - a, c - a)
+    along = np.asarray(direction, dtype=np.float64)
+    cosine = -(normal @ along) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(along))
+    return cosine >= np.cos(np.radians(angle_deg))
+
+
 def merge_vertices(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArray, Int64Array]:
     """Give exactly coinciding vertices one number (an STL file shares none) and drop the unused ones."""
     points, corners = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)

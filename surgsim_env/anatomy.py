@@ -13,9 +13,10 @@ from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing import box_mesh, mesh_surface
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.regions import Lesion
+from msdm_core.surface import triangles_facing
 from msdm_core.triangles import nearest_triangle
 from surgsim_env.palpable_face import PalpableFace, find_palpable_face
-from surgsim_env.scenes import Anchor, FixedLesion, Scene
+from surgsim_env.scenes import Anchor, FixedLesion, Scene, SurfaceMesh
 
 # How exactly a drawn lesion's cover is met [m].
 COVER_TOLERANCE = 1e-4
@@ -143,15 +144,33 @@ def _load_anatomy(scene: Scene, file_time: int | None) -> Anatomy:
 def _load_mesh(scene: Scene) -> TetMesh:
     source = scene.mesh
     if source.block is not None:
-        return box_mesh(source.block.size, source.block.cells)
+        block = source.block
+        return box_mesh(block.size, block.cells, coarsening=block.coarsening, fine_depth=block.fine_depth)
     # Reading files imports meshio and trimesh: only where a scene needs them.
     from msdm_core.mesh_io import read_mesh, read_surface
 
     if source.surface is not None:
-        vertices, triangles = read_surface(scene.folder / source.surface.file, length_unit=source.surface.length_unit)
-        return mesh_surface(vertices, triangles, cell_size=source.surface.cell_size)
+        return _filled_surface(
+            scene,
+            source.surface,
+            *read_surface(scene.folder / source.surface.file, length_unit=source.surface.length_unit),
+        )
     assert source.tets is not None
     return read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit)
+
+
+def _filled_surface(scene: Scene, source: SurfaceMesh, vertices: FloatArray, triangles: NDArray) -> TetMesh:
+    """The organ's tets: of one size, or fine at the palpable face where the scene gives a coarser size for the rest."""
+    if source.coarse_cell_size is None:
+        return mesh_surface(vertices, triangles, cell_size=source.cell_size)
+    return mesh_surface(
+        vertices,
+        triangles,
+        cell_size=source.cell_size,
+        coarse_cell_size=source.coarse_cell_size,
+        fine_triangles=triangles_facing(vertices, triangles, scene.instrument.approach, scene.palpation.face_angle_deg),
+        fine_depth=source.fine_depth,
+    )
 
 
 def _anchored_nodes(mesh: TetMesh, anchors: Sequence[Anchor]) -> IntArray:

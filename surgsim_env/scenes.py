@@ -64,19 +64,26 @@ class Anchor:
 
 @dataclass(frozen=True)
 class BlockMesh:
-    """A block on a body-centred cubic lattice: size [m] and number of cells along x, y, z."""
+    """A block on a cubic lattice: size [m], cells along x, y, z, and how it coarsens from the top down: `box_mesh`."""
 
     size: Vector
     cells: tuple[int, int, int]
+    coarsening: int = 1
+    fine_depth: float | None = None
 
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """A closed surface file (STL, OBJ, PLY), filled with a lattice of cells of the given edge [m]."""
+    """A closed surface file (STL, OBJ, PLY), filled with cells of the given edge [m].
+
+    With a coarse_cell_size of 2 or 4 times that, only cells within fine_depth [m] of the palpable face keep it.
+    """
 
     file: str
     length_unit: str | float
     cell_size: float
+    coarse_cell_size: float | None = None
+    fine_depth: float = 0.0
 
 
 @dataclass(frozen=True)

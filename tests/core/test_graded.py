@@ -1,0 +1,267 @@
+"""Graded lattices: balance, conformity, shapes, fit, node counts and what the seams cost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import spsolve
+
+from msdm_core import grading
+from msdm_core.lattice import lattice_around
+from msdm_core.mesh import TET_FACES, TetMesh
+from msdm_core.meshing import box_mesh, mesh_surface
+from msdm_core.octree import balanced_levels, octree_tets
+from msdm_core.quality import dihedral_angles, mesh_quality
+from msdm_core.stiffness import spring_network
+from msdm_core.stuffing import stuff
+from msdm_core.surface import check_surface, triangles_facing
+from msdm_core.triangles import nearest_triangle
+
+ROOT = Path(__file__).parents[2]
+CT_LIVER = ROOT.parent / "shared" / "data" / "anatomy" / "openhelp_liver.stl"
+APPROACH = (0.0, 0.5**0.5, -(0.5**0.5))  # of scenes/organs/liver.toml, with its angle of the palpable face:
+FACE_ANGLE_DEG = 60.0
+
+
+def bumpy_body(seed):
+    random = np.random.default_rng(seed)
+    solid = trimesh.creation.icosphere(4, 0.08)
+    bumps = np.sin(solid.vertices @ random.normal(size=(3, 4)) * 40) @ random.normal(size=4) * 0.04
+    return np.array(solid.vertices * (1 + bumps[:, None])), np.array(solid.faces)
+
+
+def corner_sets(points, tets):
+    """Each tet as the places of its corners, in an order that no numbering changes."""
+    corners = points[tets]
+    order = np.lexsort(np.moveaxis(corners, 2, 0)[::-1], axis=1)
+    rows = np.take_along_axis(corners, order[..., None], axis=1).reshape(-1, 12)
+    return rows[np.lexsort(rows.T)]
+
+
+def assert_sound(mesh):
+    """Positive tets, every inner face between exactly two tets on its two sides, a watertight boundary."""
+    assert mesh.volumes.min() > 0 and mesh.reoriented_count == 0
+    faces = mesh.tets[:, TET_FACES].reshape(-1, 3)
+    _, which, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    assert count.max() == 2
+    # An outward face seen from its two sides turns both ways: the parity of the sorting differs.
+    steps = np.sign(faces[:, [1, 2, 2]] - faces[:, [0, 1, 0]]).prod(axis=1)
+    turned = np.bincount(which.ravel(), steps)
+    assert (turned[count == 2] == 0).all()
+    sides = mesh.boundary_triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    keys, back = sides @ [mesh.node_count, 1], sides @ [1, mesh.node_count]
+    np.testing.assert_array_equal(np.sort(keys), np.sort(back))
+
+
+def random_levels(seed, coarsest):
+    random = np.random.default_rng(seed)
+    return np.where(random.random((16, 8, 24)) < 10.0**-coarsest / 3, 0, coarsest)
+
+
+@pytest.mark.parametrize(("seed", "coarsest"), [(0, 1), (1, 2), (2, 2)])
+def test_leaves_are_cubes_that_obey_the_permission_and_weak_balance(seed, coarsest):
+    permitted = random_levels(seed, coarsest)
+    level = balanced_levels(permitted)
+    assert (level <= permitted).all() and len(np.unique(level)) == coarsest + 1
+    for place in np.ndindex(level.shape):
+        width = 2 ** level[place]
+        leaf = tuple(slice(i // width * width, i // width * width + width) for i in place)
+        assert (level[leaf] == level[place]).all()
+    # Cells that share a face or an edge: steps along one or two axes.
+    steps = [step for step in np.ndindex(3, 3, 3) if 1 <= sum(np.array(step) != 1) <= 2]
+    for step in np.array(steps) - 1:
+        ahead = tuple(slice(max(s, 0), n + min(s, 0)) for s, n in zip(step, level.shape, strict=True))
+        behind = tuple(slice(max(-s, 0), n + min(-s, 0)) for s, n in zip(step, level.shape, strict=True))
+        assert np.abs(level[ahead] - level[behind]).max() <= 1
+
+
+def grid_mesh(level):
+    used, tets = np.unique(octree_tets(level), return_inverse=True)
+    points = np.stack(np.unravel_index(used, [2 * n + 1 for n in level.shape]), axis=1).astype(float)
+    return TetMesh(points, TetMesh(points, tets.reshape(-1, 4)).tets)
+
+
+@pytest.mark.parametrize(("seed", "coarsest"), [(0, 1), (1, 2), (2, 2)])
+def test_an_octree_is_filled_without_hanging_nodes(seed, coarsest):
+    level = balanced_levels(random_levels(seed, coarsest))
+    mesh = grid_mesh(level)
+    assert_sound(mesh)
+    assert mesh.volumes.sum() == pytest.approx(8 * level.size, rel=1e-12)
+    outer = mesh.points[mesh.boundary_nodes]
+    assert ((outer == 0) | (outer == 2 * np.array(level.shape))).any(axis=1).all()
+    # The paper's quarters and half pyramids keep 45 degrees.
+    assert dihedral_angles(mesh).min() > 44.99 and dihedral_angles(mesh).max() < 120.01
+
+
+def test_cells_of_one_size_give_the_uniform_mesh_to_the_bit():
+    vertices, faces = bumpy_body(0)
+    uniform = mesh_surface(vertices, faces, cell_size=0.01)
+    same = mesh_surface(vertices, faces, cell_size=0.01, coarse_cell_size=0.01)
+    assert uniform.points.tobytes() == same.points.tobytes() and uniform.tets.tobytes() == same.tets.tobytes()
+    # The octree's own way through the same lattice: the same corners of the same tets, to the bit.
+    points, corners = check_surface(vertices, faces)
+    graded = grading.stuff_graded(points, corners, np.arange(len(corners)), 0.01, 0.0, 0)
+    plain = stuff(points, corners, lattice_around(points, 0.01))
+    np.testing.assert_array_equal(corner_sets(*graded), corner_sets(*plain))
+
+
+@pytest.mark.parametrize(("seed", "coarsening"), [(0, 2), (1, 2), (2, 4), (3, 4)])
+def test_a_graded_body_is_sound_on_the_surface_and_well_shaped(seed, coarsening):
+    vertices, faces = bumpy_body(seed)
+    fine = triangles_facing(vertices, faces, (0, 0, -1), 50.0)
+    meshes = [
+        mesh_surface(vertices, faces, cell_size=0.008, coarse_cell_size=0.008 * coarsening, fine_triangles=chosen)
+        for chosen in (fine, np.flatnonzero(fine))
+    ]
+    mesh = meshes[0]
+    assert mesh.points.tobytes() == meshes[1].points.tobytes() and mesh.tets.tobytes() == meshes[1].tets.tobytes()
+    assert_sound(mesh)
+    quality = mesh_quality(mesh, (vertices, faces))
+    assert quality.dihedral_smallest_deg >= 9
+    assert abs(quality.volume_error) < 0.05
+    assert mesh.node_count < 0.5 * mesh_surface(vertices, faces, cell_size=0.008).node_count
+    corners = vertices[faces]
+    for place in mesh.points[mesh.boundary_nodes]:
+        triangle, weights = nearest_triangle(corners, place)
+        assert np.linalg.norm(weights @ corners[triangle] - place) < 1e-12
+
+
+def test_cells_are_split_around_poor_angles(monkeypatch):
+    """Nodes that move as far at the seams as among BCC tets leave bad angles there: the lattice is refined."""
+    monkeypatch.setattr(grading, "ALPHA_TRANSITION", 0.45)
+    vertices, faces = bumpy_body(5)
+    fine = np.flatnonzero(triangles_facing(vertices, faces, (0, 0, -1), 50.0))
+    poor = []
+    find_poor = grading._poor_tets
+    monkeypatch.setattr(grading, "_poor_tets", lambda *mesh: poor.append(find_poor(*mesh)) or poor[-1])
+    mesh = mesh_surface(vertices, faces, cell_size=0.008, coarse_cell_size=0.032, fine_triangles=fine)
+    assert poor[0].any() and not poor[-1].any()
+    assert_sound(mesh)
+    assert dihedral_angles(mesh).min() >= 9
+
+
+def test_a_folded_tet_counts_as_poor():
+    """Two regular tets on one face; the apex of the second pushed through the face, far enough to be regular again."""
+    points = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [5 / 3, -5 / 3, 5 / 3]])
+    tets = np.array([[0, 1, 2, 3], [0, 1, 3, 4]])
+    assert not grading._poor_tets(points, tets).any()
+    points[4] = points[2] + 0.3
+    assert grading._poor_tets(points, tets).any()
+
+
+def face_edges(mesh):
+    """Longest edge of each boundary triangle that faces the instrument [m], and its area [m^2]."""
+    corners = mesh.points[mesh.boundary_triangles]
+    edges = np.roll(corners, -1, axis=1) - corners
+    area = np.cross(edges[:, 0], edges[:, 1]) / 2
+    size = np.linalg.norm(area, axis=1)
+    facing = -area @ APPROACH >= np.cos(np.radians(FACE_ANGLE_DEG)) * size
+    return np.linalg.norm(edges, axis=2).max(axis=1)[facing], size[facing]
+
+
+def assert_meets_the_targets(vertices, faces, cell_size, coarsening, volume_error):
+    uniform = mesh_surface(vertices, faces, cell_size=cell_size)
+    fine = triangles_facing(vertices, faces, APPROACH, FACE_ANGLE_DEG)
+    mesh = mesh_surface(
+        vertices, faces, cell_size=cell_size, coarse_cell_size=coarsening * cell_size, fine_triangles=fine
+    )
+    quality = mesh_quality(mesh, (vertices, faces))
+    share = mesh.node_count / uniform.node_count
+    print(f"{coarsening} x {cell_size * 1000:g} mm: {quality}; {share:.3f} of {uniform.node_count} nodes")
+    assert_sound(mesh)
+    assert share <= 0.4
+    assert quality.dihedral_smallest_deg >= 8
+    assert abs(quality.volume_error) < volume_error
+    # The palpable face comes from fine cells: no triangle is longer than the diagonal of a cell's face. At the rim,
+    # where the surface bends out of the angle, a coarse triangle or two may still face the instrument.
+    longest, area = face_edges(mesh)
+    assert area[longest > 2**0.5 * cell_size].sum() <= 0.002 * area.sum()
+    assert area.sum() == pytest.approx(face_edges(uniform)[1].sum(), rel=0.02)
+
+
+def test_shipped_liver_with_a_fine_palpable_face():
+    solid = trimesh.load(ROOT / "scenes" / "meshes" / "liver.ply", process=False)
+    assert_meets_the_targets(np.array(solid.vertices), solid.faces, 0.009, 4, 0.04)
+
+
+def test_ct_liver_with_a_fine_palpable_face():
+    if not CT_LIVER.exists():
+        pytest.skip(f"{CT_LIVER} is not here: anatomy is not shipped with the project")
+    solid = trimesh.load(CT_LIVER, process=False)
+    assert_meets_the_targets(np.array(solid.vertices) * 1e-3, solid.faces, 0.008, 2, 0.015)
+
+
+def test_all_of_the_surface_is_fine_when_nothing_is_chosen_and_deeper_where_asked():
+    solid = trimesh.creation.icosphere(4, 0.08)
+    uniform, along, deep = (
+        mesh_surface(solid.vertices, solid.faces, cell_size=0.008, **graded)
+        for graded in ({}, {"coarse_cell_size": 0.032}, {"coarse_cell_size": 0.032, "fine_depth": 0.016})
+    )
+    assert along.node_count < deep.node_count < uniform.node_count
+    # Fine cells lie where those of the uniform lattice do; one layer below the surface it is cut alike.
+    known = {tuple(place) for place in deep.points.round(9)}
+    depth = 0.08 - np.linalg.norm(uniform.points, axis=1)
+    assert all(tuple(place) in known for place in uniform.points[depth < 0.016].round(9))
+    assert mesh_quality(deep).dihedral_smallest_deg == pytest.approx(mesh_quality(uniform).dihedral_smallest_deg)
+
+
+@pytest.mark.parametrize(("coarsening", "share"), [(2, 0.4), (4, 0.33)])
+def test_graded_block_is_exact_and_fine_on_top(coarsening, share):
+    size, cells = (0.12, 0.08, 0.08), (24, 16, 16)
+    uniform, mesh = box_mesh(size, cells), box_mesh(size, cells, coarsening=coarsening, fine_depth=0.015)
+    assert_sound(mesh)
+    assert mesh.volumes.sum() == pytest.approx(np.prod(size), rel=1e-12)
+    outer = mesh.points[mesh.boundary_nodes]
+    assert ((outer == 0) | (outer == np.array(size))).any(axis=1).all()
+    assert mesh.node_count < share * uniform.node_count
+    assert dihedral_angles(mesh).min() > 44.99
+    top = [corner_sets(m.points, m.tets[(m.points[m.tets][:, :, 2] > 0.0649).all(axis=1)]) for m in (uniform, mesh)]
+    np.testing.assert_allclose(top[0], top[1], rtol=0, atol=1e-15)
+    assert box_mesh(size, cells, coarsening=1).points.tobytes() == uniform.points.tobytes()
+
+
+# ---- what the seams cost -----------------------------------------------------------------------------------------
+
+
+def spring_matrix(mesh):
+    """Stiffness matrix of the springs of formula (6) with E = 1, blocks k n n^T, n along the spring."""
+    edges, stiffness = spring_network(mesh, 1.0)
+    along = mesh.points[edges[:, 1]] - mesh.points[edges[:, 0]]
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    rows = np.repeat(np.arange(len(edges)), 6)
+    columns = (3 * edges[:, :, None] + np.arange(3)).reshape(-1)
+    stretch = coo_array(
+        (np.stack([-along, along], axis=1).ravel(), (rows, columns)), shape=(len(edges), 3 * mesh.node_count)
+    ).tocsr()
+    return (stretch.T @ diags_array(stiffness) @ stretch).tocsr()
+
+
+def uniaxial_modulus(mesh, axis):
+    """Force per area and strain of a unit cube between sliding plates, low sides held by symmetry planes."""
+    matrix, strain = spring_matrix(mesh), 1e-3
+    moved = np.zeros((mesh.node_count, 3))
+    held = mesh.points == 0
+    high = mesh.points[:, axis] == 1
+    held[high, axis], moved[high, axis] = True, strain
+    free = np.flatnonzero(~held.ravel())
+    place = moved.ravel()
+    place[free] = spsolve(matrix[free][:, free].tocsc(), -(matrix @ place)[free])
+    return (matrix @ place).reshape(-1, 3)[high, axis].sum() / strain
+
+
+def test_one_seam_costs_a_known_share_of_the_modulus():
+    """A seam from cells h to 2 h acts like 0.4 h of slack across it and 0.3 h of added tissue along it.
+
+    Formula (6) gives each edge the sum of its tets' shares; at a seam the tets are not BCC, and the network is no
+    longer isotropic. On a cube of 12 fine cells: -3.4 % across, +2.4 % along, where the uniform ones are within 0.2 %.
+    """
+    fine, coarse = box_mesh((1, 1, 1), (12, 12, 12)), box_mesh((1, 1, 1), (6, 6, 6))
+    graded = box_mesh((1, 1, 1), (12, 12, 12), coarsening=2, fine_depth=1 / 3)
+    for mesh in (fine, coarse):
+        assert uniaxial_modulus(mesh, 2) == pytest.approx(1, abs=0.002)
+    across, along = uniaxial_modulus(graded, 2), uniaxial_modulus(graded, 0)
+    print(f"across {across:.4f}, along {along:.4f}")
+    assert 12 * (1 / across - 1) == pytest.approx(0.40, abs=0.05)
+    assert 12 * (along - 1) == pytest.approx(0.30, abs=0.05)

@@ -1,0 +1,81 @@
+"""Run the cases and judge them against the list of known shortfalls."""
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from surgsim_env.validation.catalogue import CASES
+from surgsim_env.validation.fem import MISSING, has_fem
+from surgsim_env.validation.row import Case, Curve, Outcome, Row, skipped
+
+SHORTFALLS = Path(__file__).with_name("known_shortfalls.toml")
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What a run found: rows and curves of all its cases, whether it was the quick subset, and the known shortfalls."""
+
+    rows: tuple[Row, ...]
+    curves: tuple[Curve, ...]
+    quick: bool
+    shortfalls: dict[str, str]
+
+    @property
+    def unexplained(self) -> list[Row]:
+        """Rows that are not met and not listed."""
+        return [row for row in self.rows if row.verdict == "not met" and row.case not in self.shortfalls]
+
+    @property
+    def outdated(self) -> list[str]:
+        """Cases that are listed as shortfalls but met."""
+        return [row.case for row in self.rows if row.verdict == "met" and row.case in self.shortfalls]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every row is met, skipped or a known shortfall."""
+        return not self.unexplained
+
+    def reason(self, row: Row) -> str:
+        """The row's note, after the reason of its shortfall where it is a known one."""
+        known = self.shortfalls.get(row.case, "") if row.verdict == "not met" else ""
+        return "; ".join(part for part in (known, row.note) if part)
+
+
+def load_shortfalls(path: Path = SHORTFALLS) -> dict[str, str]:
+    """Reason of each known shortfall by the case's name; ValueError for an entry without a reason."""
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    found: dict[str, str] = {}
+    for entry in table.get("shortfall", []):
+        reason = str(entry.get("reason", "")).strip()
+        if not reason or not entry.get("cases"):
+            raise ValueError(f"{path.name}: every [[shortfall]] needs `cases` and a `reason`; got {entry}")
+        found.update(dict.fromkeys(entry["cases"], reason))
+    return found
+
+
+def run_case(case: Case) -> Outcome:
+    """One case, or a row that says why it was left out."""
+    if case.needs_fem and not has_fem():
+        return Outcome((skipped(case.name, "scikit-fem", MISSING),))
+    return case.run()
+
+
+def run_cases(*, quick: bool, console: Console, cases: Sequence[Case] = CASES) -> Validation:
+    """Run the cases (without the slow ones for a quick run) with a progress bar."""
+    shortfalls = load_shortfalls()
+    chosen = [case for case in cases if not (quick and case.slow)]
+    columns = (TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    outcomes: list[Outcome] = []
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("", total=len(chosen))
+        for case in chosen:
+            progress.update(task, description=case.name)
+            outcomes.append(run_case(case))
+            progress.advance(task)
+    rows = tuple(row for outcome in outcomes for row in outcome.rows)
+    curves = tuple(curve for outcome in outcomes for curve in outcome.curves)
+    return Validation(rows, curves, quick, shortfalls)

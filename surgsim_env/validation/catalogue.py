@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from surgsim_env.validation import ball, beams, cosine, lattice, lumped_mass, prism, punch, sphere, steps
+from surgsim_env.validation import ball, beams, cosine, lattice, lumped_mass, paper_tests, prism, punch, sphere, steps
 from surgsim_env.validation.row import Case
 
 CASES: tuple[Case, ...] = (
@@ -30,5 +30,7 @@ CASES: tuple[Case, ...] = (
     Case("contrast, nu 0.45", partial(punch.contrast, 24, 0.45, punch.COVERS, "contrast"), slow=True, needs_fem=True),
     Case("ball", partial(ball.ball_on_layer, 12, (0.001, 0.002, 0.003, 0.004)), slow=True, needs_fem=True),
     Case("ball, fine", partial(ball.ball_on_layer, 18, (0.0015, 0.002, 0.003, 0.004)), slow=True, needs_fem=True),
+    Case("test A", paper_tests.run_test_a),
+    Case("test B", paper_tests.run_test_b),
     Case("cosine load", partial(cosine.cosine_load, (3, 6))),
 )

@@ -127,7 +127,7 @@ def contrast(count: int, nu: float, hidden: tuple[Hidden, ...], curve: str = "")
         return Outcome(tuple(rows))
     x = tuple(1e3 * one.cover for one in hidden)
     lines = (("springs", [row.measured for row in rows]), ("reference", [row.expected for row in rows]))
-    labels = (f"nu {nu:.2f}, {{}}", "cover [mm]", "contrast, k / k0 - 1")
+    labels = (f"{{}}, nu {nu:.2f}", "cover [mm]", "contrast, k / k0 - 1")
     return Outcome(
         tuple(rows),
         tuple(Curve(curve, labels[0].format(name), x, tuple(y), *labels[1:], False) for name, y in lines),

@@ -11,6 +11,9 @@ from surgsim_env.validation.suite import Validation
 
 REPORT_NAME = "validation.md"
 HEADINGS = ("case", "source", "expected", "measured", "error", "tolerance", "verdict")
+# Labels of dashed lines begin with these.
+REFERENCES = ("reference", "Eshelby")
+ERROR_TICKS = (0.03, 0.05, 0.1, 0.2, 0.5)
 COLOURS = {"met": "green", "not met": "red", "known": "yellow", "skipped": "dim"}
 INTRODUCTION = """# Validation
 
@@ -88,11 +91,13 @@ def write_report(validation: Validation, folder: Path) -> Path:
     for row in validation.rows:
         texts = (*cells(validation, row), validation.reason(row))
         lines.append("| " + " | ".join(text.replace("|", "\\|") for text in texts) + " |")
-    figures = sorted({curve.figure for curve in validation.curves})
-    for figure in figures:
+    for figure in dict.fromkeys(curve.figure for curve in validation.curves):
         name = f"validation_{figure}.png"
         write_plot([curve for curve in validation.curves if curve.figure == figure], images / name)
         lines.append(f"\n![{figure.replace('_', ' ')}](images/{name})")
+    for picture in validation.pictures:
+        picture.draw(images / f"{picture.name}.png")
+        lines.append(f"\n{picture.caption}\n\n![{picture.name.replace('_', ' ')}](images/{picture.name}.png)")
     path = folder / REPORT_NAME
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
@@ -107,14 +112,14 @@ def write_plot(curves: list[Curve], path: Path) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for curve in curves:
-        reference = not curve.label.endswith("measured") and any(other.label != curve.label for other in curves)
-        style = "k--" if reference and "reference" in curve.label else "o-"
+        style = "k--" if curve.label.startswith(REFERENCES) else "o-"
         axes.plot(curve.x, curve.y, style, label=curve.label, markersize=4)
     if curves[0].logarithmic:
         axes.set_xscale("log")
         axes.set_yscale("log")
-        ticks = sorted({x for curve in curves for x in curve.x})
-        axes.set_xticks(ticks, [f"{x:.3g}" for x in ticks])
+        x_ticks = sorted({x for curve in curves for x in curve.x})
+        axes.set_xticks(x_ticks, [f"{x:.3g}" for x in x_ticks])
+        axes.set_yticks(ERROR_TICKS, [f"{100.0 * tick:g} %" for tick in ERROR_TICKS])
         axes.minorticks_off()
     axes.set_xlabel(curves[0].x_label)
     axes.set_ylabel(curves[0].y_label)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -52,11 +53,21 @@ class Curve:
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A picture of its own: file name without ending, what it shows, and what draws it to a path."""
+
+    name: str
+    caption: str
+    draw: Callable[[Path], None]
+
+
+@dataclass(frozen=True)
 class Outcome:
     """All that one case found."""
 
     rows: tuple[Row, ...]
     curves: tuple[Curve, ...] = ()
+    pictures: tuple[Picture, ...] = ()
 
 
 @dataclass(frozen=True)

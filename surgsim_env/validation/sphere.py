@@ -56,16 +56,16 @@ def eshelby(ratios: tuple[float, ...], nu: float, cells: int = 32) -> Outcome:
             )  # fmt: skip
     curves = tuple(
         Curve(
-            "lesion_strain", f"{name}, nu {nu:.2f}, {kind}", ratios, tuple(values), "modulus ratio",
+            "lesion_strain", f"{kind}{name} strain", ratios, tuple(values), "modulus ratio",
             "strain inside / strain from afar", False,
         )
         for index, name in enumerate(("shear", "volume"))
         for kind, values in (
-            ("measured", [float(pair[index, 0]) for pair in found]),
-            ("Eshelby", [closed_form(ratio, nu)[index] for ratio in ratios]),
+            ("", [float(pair[index, 0]) for pair in found]),
+            ("Eshelby, ", [closed_form(ratio, nu)[index] for ratio in ratios]),
         )
     )  # fmt: skip
-    return Outcome(tuple(rows), curves)
+    return Outcome(tuple(rows), curves if len(ratios) > 2 else ())
 
 
 def _strain_shares(model: OrganModel, boundary: IntArray, radius: float) -> FloatArray:

@@ -10,17 +10,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from surgsim_env.validation.catalogue import CASES
 from surgsim_env.validation.fem import MISSING, has_fem
-from surgsim_env.validation.row import Case, Curve, Outcome, Row, skipped
+from surgsim_env.validation.row import Case, Curve, Outcome, Picture, Row, skipped
 
 SHORTFALLS = Path(__file__).with_name("known_shortfalls.toml")
 
 
 @dataclass(frozen=True)
 class Validation:
-    """What a run found: rows and curves of all its cases, whether it was the quick subset, and the known shortfalls."""
+    """What a run found: rows, curves and pictures of its cases, whether it was the quick subset, known shortfalls."""
 
     rows: tuple[Row, ...]
     curves: tuple[Curve, ...]
+    pictures: tuple[Picture, ...]
     quick: bool
     shortfalls: dict[str, str]
 
@@ -78,4 +79,5 @@ def run_cases(*, quick: bool, console: Console, cases: Sequence[Case] = CASES) -
             progress.advance(task)
     rows = tuple(row for outcome in outcomes for row in outcome.rows)
     curves = tuple(curve for outcome in outcomes for curve in outcome.curves)
-    return Validation(rows, curves, quick, shortfalls)
+    pictures = tuple(picture for outcome in outcomes for picture in outcome.pictures)
+    return Validation(rows, curves, pictures, quick, shortfalls)

@@ -23,15 +23,19 @@ def held_forces(scene: Scene, depths: tuple[float, ...]) -> list[float]:
     assert scene.mesh.block is not None
     cell = scene.mesh.block.size[0] / scene.mesh.block.cells[0]
     anatomy = load_anatomy(scene)
-    simulation = Simulation(anatomy)
-    simulation.reset(anatomy.organ(), np.array([0.03, 0.03, 0.06]))
+    organ = anatomy.organ()
     up = np.array([0.0, 0.0, 1.0])
     sites = [np.array([0.03 + x * cell, 0.03 + y * cell, SIZE[2]]) for x, y in OFFSETS]
-    forces = [
-        [press(simulation, site, up, depth=depth, clearance=0.001, force_limit=5.0).force for site in sites]
-        for depth in depths
-    ]
-    return [float(np.mean(of_depth)) for of_depth in forces]
+    forces: list[float] = []
+    for depth in depths:
+        pressed = replace(scene, palpation=replace(scene.palpation, press_depth=depth))
+        simulation = Simulation(replace(anatomy, scene=pressed))
+        simulation.reset(organ, sites[0] + 0.03 * up)
+        presses = [press(simulation, site, up) for site in sites]
+        if any(one.end for one in presses):
+            raise ValueError(f"a press ended early: {next(one.end for one in presses if one.end)}")
+        forces.append(float(np.mean([one.force for one in presses])))
+    return forces
 
 
 def phantom(cells: int) -> Scene:

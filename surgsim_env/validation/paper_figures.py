@@ -78,7 +78,7 @@ def write_figure_4(twisted: Deformed, angle_deg: float, path: Path) -> None:
     _save(figure, path)
 
 
-def write_figure_5(pressed: Deformed, depth: float, path: Path) -> None:
+def write_figure_5(pressed: Deformed, path: Path) -> None:
     """The block cut open to show its layer of stroma, pressed, and how its upper side moves away from the press."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
@@ -96,6 +96,7 @@ def write_figure_5(pressed: Deformed, depth: float, path: Path) -> None:
     triangles = mesh.boundary_triangles
     moved = pressed.displacement[triangles].mean(axis=1) / pressed.displacement.max()
     draw_triangles(body, pressed.position[triangles], colormaps["viridis"](moved)[:, :3], view)
+    depth = pressed.anatomy.scene.palpation.press_depth
     right, up, _ = view
     ring = np.array([[np.cos(t), np.sin(t), 0.0] for t in np.linspace(0.0, 2.0 * np.pi, 61)]) * RING + pressed.site
     body.plot(1e3 * ring @ right, 1e3 * ring @ up, "w-", linewidth=2.0)

@@ -18,7 +18,6 @@ from surgsim_env.validation.row import Outcome, Picture, compare
 
 TWIST = math.radians(60.0)  # chosen by eye after the paper's figure 4; the text gives no angle
 TWIST_TIME, REST_TIME = 1.0, 1.0  # [s]
-PRESS_DEPTH = 0.015  # [m] the scene's; at 20 mm a tet turns inside out (cells of 20 mm, nu 1/4)
 
 FAR, FAR_TOLERANCE = 0.1, 0.05  # [m] the block's width; share of the displacement beside the tip
 
@@ -71,14 +70,14 @@ def twist_prism(angle: float = TWIST) -> Deformed:
     return Deformed(anatomy, state.node_position.copy(), torque, smallest, middle)
 
 
-def press_block(depth: float = PRESS_DEPTH) -> Deformed:
-    """Test B: press the block of bovine liver in the middle of its upper side."""
+def press_block() -> Deformed:
+    """Test B: press the block of bovine liver in the middle of its upper side, to the scene's depth."""
     anatomy = load_anatomy(make_scene("bovine_liver_block"))
     simulation = Simulation(anatomy)
     upper = anatomy.mesh.points.max(axis=0)
     site = upper * np.array([0.5, 0.5, 1.0])
     simulation.reset(anatomy.organ(), site + np.array([0.0, 0.0, 0.1]))
-    done = press(simulation, site, np.array([0.0, 0.0, 1.0]), depth=depth, clearance=0.001, force_limit=1e3)
+    done = press(simulation, site, np.array([0.0, 0.0, 1.0]))
     if done.end:
         raise ValueError(f"test B ended early: {done.end}")
     return Deformed(anatomy, simulation.organ_state.node_position.copy(), done.force, done.volume_ratio_smallest, site)
@@ -120,6 +119,7 @@ def run_test_b() -> Outcome:
     """How little of the block moves with the press, and figure 5."""
     pressed = press_block()
     distance, share = settling(pressed)
+    depth = pressed.anatomy.scene.palpation.press_depth
     near = float(distance[share >= 0.1].max())
     row = compare(
         f"test B, displacement {1e2 * FAR:.0f} cm from the press over that beside it",
@@ -132,10 +132,10 @@ def run_test_b() -> Outcome:
     def draw(path: Path) -> None:
         from surgsim_env.validation.paper_figures import write_figure_5
 
-        write_figure_5(pressed, PRESS_DEPTH, path)
+        write_figure_5(pressed, path)
 
     caption = (
-        f"Test B (the paper's figure 5): the scene `bovine_liver_block` pressed {1e3 * PRESS_DEPTH:.0f} mm with "
+        f"Test B (the paper's figure 5): the scene `bovine_liver_block` pressed {1e3 * depth:.0f} mm with "
         f"{pressed.load:.1f} N, smallest volume ratio of a tet {pressed.volume_ratio_smallest:.2f}; on the upper side, "
         f"displacements of a tenth of that beside the tip end {1e3 * near:.0f} mm away."
     )

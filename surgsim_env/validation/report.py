@@ -26,7 +26,7 @@ with the volume term where nu is above 1/4, unless a row says otherwise.
 
 def verdict(validation: Validation, row: Row) -> str:
     """The row's verdict, "known" for a listed shortfall."""
-    return "known" if row.verdict == "not met" and row.case in validation.shortfalls else row.verdict
+    return "known" if validation.is_known(row) else row.verdict
 
 
 def cells(validation: Validation, row: Row) -> tuple[str, ...]:

@@ -16,6 +16,14 @@ SHORTFALLS = Path(__file__).with_name("known_shortfalls.toml")
 
 
 @dataclass(frozen=True)
+class Shortfall:
+    """Why a case is not met, and the largest size of its error for which that reason holds."""
+
+    reason: str
+    error: float
+
+
+@dataclass(frozen=True)
 class Validation:
     """What a run found: rows, curves and pictures of its cases, whether it was the quick subset, known shortfalls."""
 
@@ -23,12 +31,17 @@ class Validation:
     curves: tuple[Curve, ...]
     pictures: tuple[Picture, ...]
     quick: bool
-    shortfalls: dict[str, str]
+    shortfalls: dict[str, Shortfall]
+
+    def is_known(self, row: Row) -> bool:
+        """Whether a row that is not met is listed, and no worse than listed."""
+        listed = self.shortfalls.get(row.case)
+        return listed is not None and row.verdict == "not met" and abs(row.error) <= listed.error
 
     @property
     def unexplained(self) -> list[Row]:
-        """Rows that are not met and not listed."""
-        return [row for row in self.rows if row.verdict == "not met" and row.case not in self.shortfalls]
+        """Rows that are not met and not listed, or worse than listed."""
+        return [row for row in self.rows if row.verdict == "not met" and not self.is_known(row)]
 
     @property
     def outdated(self) -> list[str]:
@@ -42,19 +55,19 @@ class Validation:
 
     def reason(self, row: Row) -> str:
         """The row's note, after the reason of its shortfall where it is a known one."""
-        known = self.shortfalls.get(row.case, "") if row.verdict == "not met" else ""
+        known = self.shortfalls[row.case].reason if self.is_known(row) else ""
         return "; ".join(part for part in (known, row.note) if part)
 
 
-def load_shortfalls(path: Path = SHORTFALLS) -> dict[str, str]:
-    """Reason of each known shortfall by the case's name; ValueError for an entry without a reason."""
+def load_shortfalls(path: Path = SHORTFALLS) -> dict[str, Shortfall]:
+    """Known shortfalls by the case's name; ValueError for an entry without a reason."""
     table = tomllib.loads(path.read_text(encoding="utf-8"))
-    found: dict[str, str] = {}
+    found: dict[str, Shortfall] = {}
     for entry in table.get("shortfall", []):
         reason = str(entry.get("reason", "")).strip()
         if not reason or not entry.get("cases"):
             raise ValueError(f"{path.name}: every [[shortfall]] needs `cases` and a `reason`; got {entry}")
-        found.update(dict.fromkeys(entry["cases"], reason))
+        found.update({case: Shortfall(reason, float(error)) for case, error in entry["cases"].items()})
     return found
 
 

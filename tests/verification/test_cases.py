@@ -10,7 +10,6 @@ from surgsim_env.validation.catalogue import CASES
 from surgsim_env.validation.fem import has_fem
 from surgsim_env.validation.row import Case, Outcome, Row, compare
 
-SHORTFALLS = suite.load_shortfalls()
 PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else []) for case in CASES]
 
 
@@ -18,12 +17,11 @@ PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.
 def test_case(case: Case):
     if case.needs_fem and not has_fem():
         pytest.skip("scikit-fem is not installed")
-    rows = case.run().rows
-    assert rows
-    for row in rows:
-        said = f"{row.case}: expected {row.expected:.6g}, measured {row.measured:.6g}, error {row.error:.3g}"
-        assert row.verdict == "met" or row.case in SHORTFALLS, f"{said}, tolerance {row.tolerance:.3g}"
-        assert row.verdict == "not met" or row.case not in SHORTFALLS, f"{said}: no longer a shortfall"
+    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=(case,))
+    assert found.rows
+    said = [f"{row.case}: expected {row.expected:.6g}, measured {row.measured:.6g}" for row in found.unexplained]
+    assert not said, "not met, and not a known shortfall or worse than known"
+    assert not found.outdated, "no longer a shortfall"
 
 
 def row(name: str, measured: float) -> Row:
@@ -39,20 +37,24 @@ def test_verdicts():
 
 def test_a_run_passes_only_where_every_shortfall_is_known(monkeypatch):
     cases = (Case("good", lambda: Outcome((row("good", 1.0),))), Case("bad", lambda: Outcome((row("bad", 2.0),))))
-    monkeypatch.setattr(suite, "load_shortfalls", lambda: {"good": "once"})
+    known = {"good": suite.Shortfall("once", 1.0)}
+    monkeypatch.setattr(suite, "load_shortfalls", lambda: known)
     found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
     assert not found.passed and [one.case for one in found.unexplained] == ["bad"]
     assert found.outdated == ["good"]
-    monkeypatch.setattr(suite, "load_shortfalls", lambda: {"bad": "soft"})
+    known.clear()
+    known["bad"] = suite.Shortfall("soft", 1.0)
     found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
     assert found.passed and found.reason(found.rows[1]) == "soft"
+    known["bad"] = suite.Shortfall("soft", 0.9)
+    assert not suite.run_cases(quick=False, console=Console(quiet=True), cases=cases).passed
 
 
 def test_shortfalls_have_reasons(tmp_path):
     path = tmp_path / "list.toml"
-    path.write_text('[[shortfall]]\ncases = ["a", "b"]\nreason = "soft"\n')
-    assert suite.load_shortfalls(path) == {"a": "soft", "b": "soft"}
-    path.write_text('[[shortfall]]\ncases = ["a"]\nreason = " "\n')
+    path.write_text('[[shortfall]]\nreason = "soft"\ncases = { a = 0.1, b = 0.2 }\n')
+    assert suite.load_shortfalls(path) == {"a": suite.Shortfall("soft", 0.1), "b": suite.Shortfall("soft", 0.2)}
+    path.write_text('[[shortfall]]\nreason = " "\ncases = { a = 0.1 }\n')
     with pytest.raises(ValueError, match="needs `cases` and a `reason`"):
         suite.load_shortfalls(path)
 

@@ -41,7 +41,7 @@ def cosine_stiffness(nu: float, half_wave: int) -> float:
     stiffness = assemble_stiffness(linear_organ(mesh, MODULUS, nu))
     # f . u = p U A / 2 for a displacement U cos(k x).
     amplitude = 2.0 * float(load @ solve_displacement(stiffness, held, 0.0, load)) / (size[0] * size[1])
-    return 1.0 / (amplitude * MODULUS * wave / (2.0 * (1.0 - nu**2)))
+    return float(1.0 / (amplitude * MODULUS * wave / (2.0 * (1.0 - nu**2))))
 
 
 def cosine_load(half_waves: tuple[int, ...]) -> Outcome:

@@ -101,7 +101,7 @@ def write_figure_5(pressed: Deformed, path: Path) -> None:
     ring = np.array([[np.cos(t), np.sin(t), 0.0] for t in np.linspace(0.0, 2.0 * np.pi, 61)]) * RING + pressed.site
     body.plot(1e3 * ring @ right, 1e3 * ring @ up, "w-", linewidth=2.0)
     body.set_title(
-        f"(b) pressed {1e3 * depth:.0f} mm with {pressed.load:.1f} N; colour: displacement (blue 0, yellow "
+        f"(b) pressed {1e3 * depth:.0f} mm with {pressed.load:.1f} N; colour: displacement (dark 0, yellow "
         f"{1e3 * pressed.displacement.max():.0f} mm); white: {1e2 * RING:.0f} cm around"
     )
     distance, share = settling(pressed)

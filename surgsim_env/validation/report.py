@@ -111,9 +111,19 @@ def write_plot(curves: list[Curve], path: Path) -> None:
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    colour = "C0"
     for curve in curves:
-        style = "k--" if curve.label.startswith(REFERENCES) else "o-"
-        axes.plot(curve.x, curve.y, style, label=curve.label, markersize=4)
+        # A reference is dashed in the colour of what is held against it, the line before.
+        dashed = curve.label.startswith(REFERENCES)
+        (line,) = axes.plot(
+            curve.x,
+            curve.y,
+            "--" if dashed else "o-",
+            color=colour if dashed else None,
+            label=curve.label,
+            markersize=4,
+        )
+        colour = line.get_color()
     if curves[0].logarithmic:
         axes.set_xscale("log")
         axes.set_yscale("log")

@@ -168,8 +168,9 @@ def _validate(command: Validate, console: Console) -> int:
     from surgsim_env.validation.report import print_report, write_report
     from surgsim_env.validation.suite import run_cases
 
-    docs = Path(__file__).resolve().parents[1] / "docs"
-    default = docs if docs.is_dir() and not command.quick else Path("runs") / "validation"
+    root = Path(__file__).resolve().parents[1]
+    checkout = (root / "pyproject.toml").is_file()
+    default = root / "docs" if checkout and not command.quick else Path("runs") / "validation"
     validation = run_cases(quick=command.quick, console=console)
     print_report(validation, console)
     path = write_report(validation, command.out or default)

@@ -148,7 +148,9 @@ def _run(command: Palpate | Organ | Scenes | Validate) -> int:
     if isinstance(command, Palpate):
         _palpate(command, console)
     elif isinstance(command, Validate):
-        return _validate(command, console)
+        from surgsim_env.validation.command import validate
+
+        return validate(quick=command.quick, folder=command.out, console=console)
     elif isinstance(command, Organ):
         from surgsim_env.organ_report import report_organ
 
@@ -162,20 +164,6 @@ def _run(command: Palpate | Organ | Scenes | Validate) -> int:
             table.add_row(name, make_scene(name).description)
         console.print(table)
     return 0
-
-
-def _validate(command: Validate, console: Console) -> int:
-    from surgsim_env.validation.report import print_report, write_report
-    from surgsim_env.validation.suite import run_cases
-
-    root = Path(__file__).resolve().parents[1]
-    checkout = (root / "pyproject.toml").is_file()
-    default = root / "docs" if checkout and not command.quick else Path("runs") / "validation"
-    validation = run_cases(quick=command.quick, console=console)
-    print_report(validation, console)
-    path = write_report(validation, command.out or default)
-    console.print(f"written: {path}", highlight=False, soft_wrap=True)
-    return 0 if validation.passed else 1
 
 
 def _palpate(command: Palpate, console: Console) -> None:

@@ -50,8 +50,8 @@ def _share(value: float, row: Row) -> str:
     if not math.isfinite(value):
         return ""
     if row.absolute:
-        return f"{value:+.2g} {row.unit}".rstrip()
-    return f"{100.0 * value:+.2g} %"
+        return f"{value:+.3g} {row.unit}".rstrip()
+    return f"{100.0 * value:+.3g} %"
 
 
 def summary(validation: Validation) -> str:

@@ -1,4 +1,4 @@
-"""The command line: `surgsim palpate`, `surgsim organ`, `surgsim scenes`."""
+"""The command line: `surgsim palpate`, `surgsim organ`, `surgsim scenes`, `surgsim validate`."""
 
 import contextlib
 import io
@@ -96,15 +96,29 @@ class Scenes:
     """List the shipped scenes."""
 
 
+@dataclass(frozen=True)
+class Validate:
+    """Hold the tissue against closed forms and finite elements, print the table, and write it with its plots.
+
+    Exit status 0: every row is met or a known shortfall (surgsim_env/validation/known_shortfalls.toml); 1 otherwise.
+    """
+
+    quick: bool = False
+    """Only the cases that take seconds."""
+    out: MaybePath = None
+    """Folder for validation.md and images/. Default: docs/ of a checkout; runs/validation elsewhere or with --quick."""
+
+
 Command = (
     Annotated[Palpate, tyro.conf.subcommand("palpate")]
     | Annotated[Organ, tyro.conf.subcommand("organ")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Validate, tyro.conf.subcommand("validate")]
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status is 0, 2 for bad input (one line on standard error) or 130 for Ctrl-C."""
+    """Run the command line; exit status 0, 1 (validate: a row is not met), 2 (bad input, one line) or 130 (Ctrl-C)."""
     given = _joined(list(sys.argv[1:] if arguments is None else arguments))
     said = io.StringIO()
     try:
@@ -119,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            _run(command)
+            return _run(command)
     except KeyboardInterrupt:
         print("surgsim: stopped", file=sys.stderr)
         return 130
@@ -127,13 +141,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"surgsim: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    return 0
 
 
-def _run(command: Palpate | Organ | Scenes) -> None:
+def _run(command: Palpate | Organ | Scenes | Validate) -> int:
     console = Console()
     if isinstance(command, Palpate):
         _palpate(command, console)
+    elif isinstance(command, Validate):
+        from surgsim_env.validation.command import validate
+
+        return validate(quick=command.quick, folder=command.out, console=console)
     elif isinstance(command, Organ):
         from surgsim_env.organ_report import report_organ
 
@@ -146,6 +163,7 @@ def _run(command: Palpate | Organ | Scenes) -> None:
         for name in list_scenes():
             table.add_row(name, make_scene(name).description)
         console.print(table)
+    return 0
 
 
 def _palpate(command: Palpate, console: Console) -> None:

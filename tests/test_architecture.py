@@ -40,7 +40,7 @@ ALLOCATING = {
     *("zeros_like", "ones_like", "empty_like", "full_like", "copy", "concatenate", "stack", "vstack", "hstack"),
     *("column_stack", "cross", "outer", "append", "repeat", "tile", "where", "nonzero", "unique", "astype", "flatten"),
 }
-HEAVY = {"matplotlib", "meshio", "sb3_contrib", "stable_baselines3", "torch", "trimesh", "tyro"}
+HEAVY = {"matplotlib", "meshio", "sb3_contrib", "skfem", "stable_baselines3", "torch", "trimesh", "tyro"}
 
 
 class Source(NamedTuple):

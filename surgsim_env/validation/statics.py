@@ -1,0 +1,100 @@
+"""The organ linearised at rest as a sparse matrix, put together independently of the kernels, and its solution."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.linalg import LinearOperator, cg
+
+from msdm_core.damping import Damping
+from msdm_core.kernels import OrganModel, apply_stiffness
+from msdm_core.mesh import TET_FACES, FloatArray, TetMesh
+from msdm_core.organ import OrganSpec, compile_organ
+from msdm_core.regions import Lesion, Material
+
+DENSITY = 1060.0  # [kg/m^3]
+RESIDUAL = 1e-8  # of the linear solution, relative; energies are then right to its square
+
+
+def linear_organ(
+    mesh: TetMesh, youngs_modulus: float, poisson_ratio: float = 0.25, *, lesions: tuple[Lesion, ...] = ()
+) -> OrganModel:
+    """A free, undamped organ of one tissue, as the product compiles it."""
+    material = Material(youngs_modulus, DENSITY, poisson_ratio)
+    return compile_organ(OrganSpec(mesh, material, lesions=lesions, damping=Damping(alpha=0.0)))
+
+
+def assemble_stiffness(model: OrganModel) -> csr_array:
+    """K [N/m] at rest, (3 n_node, 3 n_node): sum_s k n n^T and sum_t (K_t / V_t) g g^T, g = dV/dx.
+
+    Raises:
+        AssertionError: the kernels' linearised forces are those of another matrix: this one lacks a term.
+    """
+    points = model.node_rest_position
+    count = points.size
+    span = points[model.spring_nodes[:, 1]] - points[model.spring_nodes[:, 0]]
+    direction = span / np.linalg.norm(span, axis=1)[:, None]
+    springs = np.concatenate([-direction, direction], axis=1) * np.sqrt(model.spring_stiffness)[:, None]
+    matrix = _outer_products(model.spring_nodes, springs, count)
+    members = np.flatnonzero(model.tet_bulk)
+    if members.size:
+        tets = model.tet_nodes[members]
+        corners = points[tets[:, TET_FACES]]
+        outward = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]) / 2.0
+        factor = np.sqrt(model.tet_bulk[members] / model.tet_rest_volume[members])
+        gradient = (-outward / 3.0).reshape(-1, 12) * factor[:, None]
+        matrix = matrix + _outer_products(tets, gradient, count)
+    assert stiffness_mismatch(model, matrix) < 1e-9, "the kernels hold a term that this assembly does not know"
+    return matrix
+
+
+def stiffness_mismatch(model: OrganModel, matrix: csr_array) -> float:
+    """|K u - kernel(u)| / |K u| of an irregular displacement u."""
+    displacement = np.sin(1.0 + 1.7 * np.arange(model.node_rest_position.size) ** 1.1).reshape(-1, 3)
+    force = np.empty_like(displacement)
+    apply_stiffness(model, displacement, force)
+    own = matrix @ displacement.ravel()
+    return float(np.linalg.norm(own - force.ravel()) / np.linalg.norm(own))
+
+
+def _outer_products(nodes: NDArray[np.int32], vectors: FloatArray, count: int) -> csr_array:
+    """Sum of v v^T over items with the given nodes, v listing three components a node."""
+    places = (3 * nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(nodes), -1)
+    width = places.shape[1]
+    values = vectors[:, :, None] * vectors[:, None, :]
+    rows, columns = np.repeat(places, width, axis=1), np.tile(places, (1, width))
+    return coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(count, count)).tocsr()
+
+
+def nodal_dofs(nodes: ArrayLike, axes: tuple[int, ...] = (0, 1, 2)) -> NDArray[np.int64]:
+    """Rows of the matrix that belong to some nodes' axes, node by node."""
+    return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.asarray(axes)).ravel()
+
+
+def solve_displacement(
+    stiffness: csr_array, held: NDArray[np.int64], value: ArrayLike = 0.0, load: FloatArray | None = None
+) -> FloatArray:
+    """The u with K u = load where it is free and u = value where it is held (Jacobi-preconditioned CG).
+
+    Free rigid motions do no harm, as long as the load does no work on them.
+    """
+    count = len(stiffness.indptr) - 1
+    displacement = np.zeros(count)
+    displacement[held] = value
+    free = np.setdiff1d(np.arange(count), held)
+    right = -(stiffness @ displacement)[free]
+    if load is not None:
+        right += load[free]
+    inner = csr_array(stiffness[free][:, free])
+    inverse = 1.0 / np.asarray(inner.diagonal(), dtype=np.float64)
+    # scipy's stubs do not know the factory form of LinearOperator.
+    jacobi = LinearOperator(inner.shape, matvec=lambda x: inverse * x, dtype=np.float64)  # pyright: ignore[reportCallIssue]
+    found, code = cg(inner, right, rtol=RESIDUAL, maxiter=20000, M=jacobi)
+    if code != 0:
+        raise ValueError(f"the linear solution did not converge in {code} iterations")
+    displacement[free] = found
+    return displacement
+
+
+def twice_energy(stiffness: csr_array, displacement: FloatArray) -> float:
+    """The product u . K u [J]; for a unit displacement of what is held this is its stiffness."""
+    return float(displacement @ (stiffness @ displacement))

@@ -1,0 +1,66 @@
+"""The cases of `surgsim validate`: every row is met, or listed with its reason among the known shortfalls."""
+
+import math
+
+import pytest
+from rich.console import Console
+
+from surgsim_env.validation import suite
+from surgsim_env.validation.catalogue import CASES
+from surgsim_env.validation.fem import has_fem
+from surgsim_env.validation.row import Case, Outcome, Row, compare
+
+PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else []) for case in CASES]
+
+
+@pytest.mark.parametrize("case", PARAMETERS)
+def test_case(case: Case):
+    if case.needs_fem and not has_fem():
+        pytest.skip("scikit-fem is not installed")
+    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=(case,))
+    assert found.rows
+    said = [f"{row.case}: expected {row.expected:.6g}, measured {row.measured:.6g}" for row in found.unexplained]
+    assert not said, "not met, and not a known shortfall or worse than known"
+    assert not found.outdated, "no longer a shortfall"
+
+
+def row(name: str, measured: float) -> Row:
+    return compare(name, "by hand", expected=1.0, measured=measured, tolerance=0.05)
+
+
+def test_verdicts():
+    assert row("near", 1.049).verdict == "met"
+    assert row("far", 0.94).verdict == "not met"
+    assert row("nothing", math.nan).verdict == "not met"
+    assert compare("pp", "", expected=-50.0, measured=-50.03, tolerance=0.02, absolute=True).verdict == "not met"
+
+
+def test_a_run_passes_only_where_every_shortfall_is_known(monkeypatch):
+    cases = (Case("good", lambda: Outcome((row("good", 1.0),))), Case("bad", lambda: Outcome((row("bad", 2.0),))))
+    known = {"good": suite.Shortfall("once", 1.0)}
+    monkeypatch.setattr(suite, "load_shortfalls", lambda: known)
+    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
+    assert not found.passed and [one.case for one in found.unexplained] == ["bad"]
+    assert found.outdated == ["good"]
+    known.clear()
+    known["bad"] = suite.Shortfall("soft", 1.0)
+    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
+    assert found.passed and found.reason(found.rows[1]) == "soft"
+    known["bad"] = suite.Shortfall("soft", 0.9)
+    assert not suite.run_cases(quick=False, console=Console(quiet=True), cases=cases).passed
+
+
+def test_shortfalls_have_reasons(tmp_path):
+    path = tmp_path / "list.toml"
+    path.write_text('[[shortfall]]\nreason = "soft"\ncases = { a = 0.1, b = 0.2 }\n')
+    assert suite.load_shortfalls(path) == {"a": suite.Shortfall("soft", 0.1), "b": suite.Shortfall("soft", 0.2)}
+    path.write_text('[[shortfall]]\nreason = " "\ncases = { a = 0.1 }\n')
+    with pytest.raises(ValueError, match="needs `cases` and a `reason`"):
+        suite.load_shortfalls(path)
+
+
+def test_without_scikit_fem_its_rows_are_said_to_be_skipped(monkeypatch):
+    monkeypatch.setattr(suite, "has_fem", lambda: False)
+    cases = (Case("block", lambda: Outcome((row("block", 1.0),)), needs_fem=True),)
+    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
+    assert found.passed and found.rows[0].verdict == "skipped" and "scikit-fem is not installed" in found.rows[0].note

@@ -3,6 +3,7 @@
 import msdm_core.numba_cache  # noqa: F401  # before kernels: gives numba a folder it can write
 from msdm_core.damping import Damping
 from msdm_core.errors import MeshError, OrganDivergedError, OrganError
+from msdm_core.fitting import FitReport, spring_fit
 from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.lumping import lump_mass
 from msdm_core.mesh import TetMesh
@@ -20,6 +21,7 @@ __all__ = [
     "ContactLaw",
     "ContactShapes",
     "Damping",
+    "FitReport",
     "Lesion",
     "Material",
     "MeshError",
@@ -38,6 +40,7 @@ __all__ = [
     "read_mesh",
     "read_surface",
     "rest_state",
+    "spring_fit",
     "spring_network",
     "stable_dt",
     "write_mesh",

@@ -184,7 +184,8 @@ def test_each_tet_adds_its_own_share(rule: str):
 
 
 def test_unknown_rule_lists_the_rules_and_suggests_one():
-    with pytest.raises(OrganError, match="'loyd' is unknown; the rules are lloyd, van_gelder; did you mean 'lloyd'"):
+    known = "the rules are lloyd, fitted, van_gelder; did you mean 'lloyd'"
+    with pytest.raises(OrganError, match=f"'loyd' is unknown; {known}"):
         spring_network(LATTICE, MODULUS, rule="loyd")
 
 

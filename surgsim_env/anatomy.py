@@ -49,6 +49,7 @@ class Anatomy:
                 lesions=tuple(lesions),
                 anchors=self.anchors,
                 damping=scene.damping,
+                stiffness_rule=scene.stiffness_rule,
             )
         )
 

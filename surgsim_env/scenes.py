@@ -13,6 +13,7 @@ from msdm_core.damping import Damping
 from msdm_core.errors import OrganError
 from msdm_core.kernels import ContactLaw
 from msdm_core.regions import Capsule, Material
+from msdm_core.stiffness import check_stiffness_rule
 from surgsim_env.scene_files import scenes_folder
 
 Vector = tuple[float, float, float]
@@ -263,7 +264,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Scene:
-    """A whole scene; `name` is the file's stem."""
+    """A whole scene; `name` is the file's stem, `stiffness_rule` one of msdm_core.stiffness.STIFFNESS_RULES."""
 
     name: str
     description: str
@@ -281,6 +282,10 @@ class Scene:
     lesion: LesionDraw
     capsule: Capsule | None = None
     demonstration: tuple[FixedLesion, ...] = field(default=())
+    stiffness_rule: str = "lloyd"
+
+    def __post_init__(self) -> None:
+        check_stiffness_rule(self.stiffness_rule)
 
 
 def _require(what: str, value: float, least: float, unit: str, *, above: bool = False) -> None:

@@ -8,8 +8,9 @@ tets, the network is then too stiff (clamped torsion of the paper's prism: +58 %
 
 f_mi the force that the springs s_e k_e, k_e of formula (6), put on node i in the affine strain m, F_mi the force of
 linear tets (finite elements of first order, nu = 1/4, lambda = mu = 2 E / 5) in the same field, both with the mesh's
-moduli; w_i = V_i^(-2/3), V_i the mean volume of the tets around a node, makes coarse and fine parts of a mesh count
-alike. The six strains are an orthonormal basis (|eps| = 1), so the sum does not change when the mesh is turned.
+moduli; w_i = V_i^(-2/3) / E_i, of the mean volume and modulus of the tets around a node, makes coarse and fine, soft
+and hard parts count alike. The six strains are an orthonormal basis (|eps| = 1), so the sum does not change when the
+mesh is turned.
 
 The affine strain asks every straight line of springs through a lattice for one tension, so that what the surface asks
 of a line runs through the body. Inside, formula (6) is right already: the pull p_e towards it is weak near the surface
@@ -211,7 +212,7 @@ def _force_equations(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> t
     """
     edges, node_count = mesh.edges.astype(np.int64), mesh.node_count
     stiffness = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(edges))
-    weight = _node_weights(mesh)
+    weight = _node_weights(mesh, modulus)
     spans = mesh.points[edges[:, 1]] - mesh.points[edges[:, 0]]
     stretch = np.einsum("ei,mij,ej->em", spans, UNIT_STRAINS, spans) / np.einsum("ei,ei->e", spans, spans)[:, None]
     tension = ((stiffness[:, None] * stretch)[:, :, None] * spans[:, None, :]).reshape(-1, 18)
@@ -224,12 +225,14 @@ def _force_equations(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> t
     return matrix, (weight[:, None] * _solid_forces(mesh, modulus)).ravel()
 
 
-def _node_weights(mesh: TetMesh) -> FloatArray:
-    """w_i = V_i^(-2/3), V_i the mean volume of the tets around a node, shape (n_node,)."""
+def _node_weights(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
+    """w_i = V_i^(-2/3) / E_i, V_i and E_i the mean volume and modulus of the tets around a node, shape (n_node,)."""
     corners = mesh.tets.ravel()
-    count = np.bincount(corners, minlength=mesh.node_count)
-    total = np.bincount(corners, np.repeat(mesh.volumes, 4), mesh.node_count)
-    return np.cbrt(total / count) ** -2.0
+    count, volume, stiffness = (
+        np.bincount(corners, np.repeat(values, 4), mesh.node_count)
+        for values in (np.ones(mesh.tet_count), mesh.volumes, modulus)
+    )
+    return count / (stiffness * np.cbrt(volume / count) ** 2)
 
 
 def _solid_forces(mesh: TetMesh, modulus: FloatArray) -> FloatArray:

@@ -1,0 +1,290 @@
+"""Springs fitted to the mesh: stiffness of whole bodies against the solid's, the fallback, the cache and the file."""
+
+import gc
+import time
+import warnings
+import weakref
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from scipy.sparse import csr_array
+
+from msdm_core.bounded_quadratic import minimise_bounded
+from msdm_core.errors import OrganError
+from msdm_core.fit_file import read_fit, write_fit
+from msdm_core.fitting import LARGEST_RESIDUAL, SMALLEST_FACTOR, UNIT_STRAINS, fit_springs, spring_fit
+from msdm_core.mesh import TetMesh
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, compile_organ
+from msdm_core.regions import Lesion, Material, lesion_fraction
+from msdm_core.stiffness import spring_network
+from tests.core.static_solve import (
+    clamped_torsion,
+    jittered_mesh,
+    kuhn_mesh,
+    nodal_volume_matrix,
+    solid_matrix,
+    spring_matrix,
+    uniaxial_modulus,
+)
+
+MODULUS = 20e3  # [Pa]
+PRISM = (0.02, 0.05, 0.10)  # [m], the paper's
+# Hexahedral FEM, 12 x 30 x 60 elements, nu = 1/4, ends clamped; tests/core/static_solve's linear tets on BCC cells of
+# 5 and 2.5 mm, extrapolated with their order 2, give 9.23e-3, and 8.40e-3 and 8.20e-3 at nu 0.40 and 0.45.
+TORSION = {0.25: 9.26e-3, 0.40: 8.40e-3, 0.45: 8.20e-3}  # [N m/rad]
+
+
+@cache
+def prism(cells_across: int) -> TetMesh:
+    return box_mesh(PRISM, (cells_across, cells_across * 5 // 2, cells_across * 5))
+
+
+@cache
+def block(cells: int) -> TetMesh:
+    return box_mesh((0.06, 0.06, 0.06), (cells, cells, cells))
+
+
+def body_matrix(mesh: TetMesh, rule: str, nu: float = 0.25) -> csr_array:
+    """Springs of the rule and the volume term from nodal volumes, for a tissue of MODULUS and nu."""
+    material = Material(MODULUS, 1000.0, nu)
+    springs = spring_matrix(mesh, spring_network(mesh, material.spring_modulus, rule=rule)[1])
+    return springs if nu == 0.25 else csr_array(springs + nodal_volume_matrix(mesh, material.volume_modulus))
+
+
+# ---- stiffness of whole bodies ----------------------------------------------------------------------------------
+
+
+def test_the_solver_is_right_about_a_solid():
+    """Linear tets in uniaxial tension are exact, E; torsion falls onto the finer FEM's value with order 2."""
+    mesh = prism(2)
+    assert uniaxial_modulus(mesh, solid_matrix(mesh, MODULUS, 0.3)) == pytest.approx(MODULUS, rel=1e-9)
+    coarse, fine = (clamped_torsion(prism(n), solid_matrix(prism(n), MODULUS, 0.25)) for n in (2, 4))
+    assert fine + (fine - coarse) / 3.0 == pytest.approx(TORSION[0.25], rel=0.03)
+
+
+@pytest.mark.parametrize("nu", [0.25, 0.40, 0.45])
+def test_prism_of_the_papers_resolution(nu: float):
+    """E within 2 %, clamped torsion within 20 % of the solid's, where formula (6) is 13 % and 58 % too stiff."""
+    mesh = prism(2)
+    assert (mesh.node_count, mesh.tet_count) == (298, 1200)
+    fitted, lloyd = body_matrix(mesh, "fitted", nu), body_matrix(mesh, "lloyd", nu)
+    assert uniaxial_modulus(mesh, fitted) == pytest.approx(MODULUS, rel=0.02)
+    assert clamped_torsion(mesh, fitted) == pytest.approx(TORSION[nu], rel=0.10)
+    assert uniaxial_modulus(mesh, lloyd) > 1.08 * MODULUS
+    assert clamped_torsion(mesh, lloyd) > 1.5 * TORSION[nu]
+
+
+@pytest.mark.parametrize("cells", [6, 8])
+def test_thick_block(cells: int):
+    """Fitting leaves a thick block's modulus alone (within 1 %), and brings its torsion near the same mesh's FEM."""
+    mesh = block(cells)
+    fitted, solid = body_matrix(mesh, "fitted"), solid_matrix(mesh, MODULUS, 0.25)
+    for axis in range(3):
+        assert uniaxial_modulus(mesh, fitted, axis) == pytest.approx(MODULUS, rel=0.01)
+    assert clamped_torsion(mesh, fitted) == pytest.approx(clamped_torsion(mesh, solid), rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nu", [0.25, 0.40, 0.45])
+def test_finer_prism(nu: float):
+    """At 5 mm, E within 2 % and torsion within 10 %."""
+    mesh = prism(4)
+    fitted = body_matrix(mesh, "fitted", nu)
+    assert uniaxial_modulus(mesh, fitted) == pytest.approx(MODULUS, rel=0.02)
+    assert clamped_torsion(mesh, fitted) == pytest.approx(TORSION[nu], rel=0.10)
+
+
+# ---- the factors ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mesh", [prism(2), prism(4), block(8)], ids=["prism-10mm", "prism-5mm", "block"])
+def test_factors_and_report(mesh: TetMesh):
+    fit = spring_fit(mesh)
+    assert not fit.report.fallback
+    assert fit.edge_factor.min() == fit.report.factor_smallest >= SMALLEST_FACTOR
+    assert fit.edge_factor.max() == fit.report.factor_largest < 3.0
+    assert fit.report.residual_after < 0.13 < 0.4 < fit.report.residual_before
+    np.testing.assert_array_equal(fit.tet_factor, 1.0)
+    _, lloyd = spring_network(mesh, MODULUS)
+    np.testing.assert_array_equal(spring_network(mesh, MODULUS, rule="fitted")[1], fit.edge_factor * lloyd)
+
+
+def node_forces(mesh: TetMesh, stiffness: NDArray, strain: NDArray) -> NDArray:
+    """Forces of linearised springs in an affine strain, k (n . eps n) |d| n on the second node, (n_node, 3)."""
+    span = mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]]
+    along = span / np.linalg.norm(span, axis=1)[:, None]
+    pull = (stiffness * np.einsum("si,ij,sj->s", along, strain, span))[:, None] * along
+    force = np.zeros_like(mesh.points)
+    np.add.at(force, mesh.edges[:, 1], pull)
+    np.add.at(force, mesh.edges[:, 0], -pull)
+    return force
+
+
+def test_residual_is_that_of_the_node_forces():
+    """Node forces of springs and of FEM's K u in each unit strain, on cells alike so that weights cancel."""
+    mesh = prism(2)
+    solid = solid_matrix(mesh, MODULUS, 0.25)
+    wanted = [(solid @ (mesh.points @ strain).ravel()).reshape(-1, 3) for strain in UNIT_STRAINS]
+    for rule, residual in (("lloyd", "residual_before"), ("fitted", "residual_after")):
+        stiffness = spring_network(mesh, MODULUS, rule=rule)[1]
+        missed = [node_forces(mesh, stiffness, strain) - force for strain, force in zip(UNIT_STRAINS, wanted)]
+        ratio = np.linalg.norm(missed) / np.linalg.norm(wanted)
+        assert getattr(spring_fit(mesh).report, residual) == pytest.approx(ratio, rel=1e-9)
+
+
+def test_the_inside_of_a_block_is_formula_6():
+    """Factors tend to 1 with depth; a cell's corner and centre together keep the lattice's constants.
+
+    C11 = 1.2095 E and C12 = C44 = 0.40317 E, from 2.5 cells below the surface within 10 %, single springs from 5 cells
+    on within a factor of 1.5: a line of springs carries what the surface asks of it, its neighbour lines the rest.
+    """
+    cells, size = 12, 0.06
+    mesh, cell = block(cells), size / cells
+    fit = spring_fit(mesh)
+    middle = mesh.points[mesh.edges].mean(axis=1)
+    depth = np.minimum(middle, size - middle).min(axis=1) / cell
+    spread = [np.abs(np.log(fit.edge_factor[depth > layer])).max() for layer in (0, 2, 3, 4, 4.99)]
+    assert spread == sorted(spread, reverse=True)
+    assert spread[-1] < np.log(1.5)
+    span = mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]]
+    weight = 0.5 * spring_network(mesh, 1.0, rule="fitted")[1] / (span * span).sum(axis=1)
+    constants = np.zeros((mesh.node_count, 3, 3))
+    for end in (0, 1):
+        np.add.at(constants, mesh.edges[:, end], weight[:, None, None] * span[:, :, None] ** 2 * span[:, None, :] ** 2)
+    corner_count = (cells + 1) ** 3
+    at_corner = constants[:corner_count].reshape(cells + 1, cells + 1, cells + 1, 3, 3)
+    around = sum(at_corner[i : cells + i, j : cells + j, k : cells + k] for i, j, k in np.ndindex(2, 2, 2)) / 8
+    pair = (around + constants[corner_count:].reshape(around.shape))[2:-2, 2:-2, 2:-2] / cell**3
+    lattice = 2 ** (1 / 3) * (0.32 + 0.64 * np.eye(3))
+    np.testing.assert_allclose(pair / lattice, 1.0, atol=0.10)
+
+
+def test_minimum_is_the_one_that_scipy_finds():
+    """minimise_bounded against lsq_linear's bounded-variable least squares, on a small system with active bounds."""
+    random = np.random.default_rng(3)
+    system, right = random.normal(size=(60, 40)), random.normal(size=60)
+    expected = lsq_linear(system, right, bounds=(0.05, np.inf), method="bvls", tol=1e-14).x
+    assert (expected == 0.05).any() and (expected > 0.05).any()
+    found = minimise_bounded(csr_array(system.T @ system), system.T @ right, np.ones(40), 0.05)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_no_convergence_is_said():
+    """A matrix that is not positive definite has no minimum."""
+    with pytest.raises(OrganError, match=r'did not converge in 60 rounds .* use stiffness_rule="lloyd"'):
+        minimise_bounded(csr_array(np.diag([1.0, -1.0])), np.array([0.0, 1.0]), np.ones(2), 0.05)
+
+
+def test_repeats_to_the_bit_and_ignores_the_place():
+    """The same mesh gives the same bits; turned by 90 degrees and moved, the same factors to the solver's tolerance."""
+    again = box_mesh(PRISM, (2, 5, 10))
+    np.testing.assert_array_equal(fit_springs(again).edge_factor, spring_fit(prism(2)).edge_factor)
+    turned = TetMesh(again.points[:, [1, 2, 0]] + [0.3, -0.2, 0.1], again.tets)
+    np.testing.assert_allclose(fit_springs(turned).edge_factor, spring_fit(prism(2)).edge_factor, atol=1e-3)
+
+
+def test_size_does_not_matter():
+    large = TetMesh(10.0 * prism(2).points, prism(2).tets)
+    np.testing.assert_allclose(fit_springs(large).edge_factor, spring_fit(prism(2)).edge_factor, atol=1e-3)
+
+
+# ---- lesions ----------------------------------------------------------------------------------------------------
+
+
+def test_a_lesion_needs_no_refit():
+    """Factors of the homogeneous organ with an 8x lesion, against a fit of the organ with it: stiffness within 1 %."""
+    mesh = block(8)
+    tissue = Material(MODULUS, 1000.0)
+    lesion = Lesion((0.03, 0.03, 0.04), 0.012, Material(8 * MODULUS, 1000.0))
+    organ = compile_organ(OrganSpec(mesh, tissue, lesions=(lesion,), stiffness_rule="fitted"))
+    modulus = MODULUS * (1.0 + 7.0 * lesion_fraction(mesh, lesion))
+    once = spring_matrix(mesh, organ.spring_stiffness)
+    anew = spring_matrix(mesh, fit_springs(mesh, modulus).edge_factor * spring_network(mesh, modulus)[1])
+    assert uniaxial_modulus(mesh, once) > 1.05 * MODULUS
+    assert uniaxial_modulus(mesh, once) == pytest.approx(uniaxial_modulus(mesh, anew), rel=0.01)
+    assert clamped_torsion(mesh, once) == pytest.approx(clamped_torsion(mesh, anew), rel=0.01)
+
+
+# ---- the fallback -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "mesh", [kuhn_mesh((0.06, 0.06, 0.06), (6, 6, 6)), jittered_mesh(0.06, 6, 0.25)], ids=["kuhn", "delaunay"]
+)
+def test_fallback_to_one_scalar(mesh: TetMesh):
+    """One scalar that makes sum k l^2 = 6 E V, a warning that names the residual, and a report."""
+    with pytest.warns(UserWarning, match=r"residual of 0\.\d\d .* more than 0\.25.*one scalar per region \(0\.\d+\)"):
+        fit = fit_springs(mesh)
+    assert fit.report.fallback and fit.report.residual_after > LARGEST_RESIDUAL
+    assert fit.report.factor_smallest == fit.report.factor_largest
+    np.testing.assert_array_equal(fit.edge_factor, 1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _, stiffness = spring_network(mesh, MODULUS, rule="fitted")
+    span = mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]]
+    assert stiffness @ (span * span).sum(axis=1) == pytest.approx(6.0 * MODULUS * mesh.volumes.sum(), rel=1e-9)
+
+
+def test_fallback_has_one_scalar_for_each_region():
+    """In each region sum over tets of k_t l^2 = 6 E_t V_t; slabs of Kuhn cells and of stretched ones differ."""
+    plain = kuhn_mesh((0.06, 0.06, 0.06), (6, 6, 6))
+    points = plain.points.copy()
+    points[:, 2] += np.where(points[:, 2] > 0.03, 0.8, 0.0) * (points[:, 2] - 0.03)
+    above = points[plain.tets].mean(axis=1)[:, 2] > 0.03
+    mesh = TetMesh(points, plain.tets, np.where(above, 7, 2))
+    with pytest.warns(UserWarning, match=r"one scalar per region \(0\.\d+, 0\.\d+\)"):
+        fit = fit_springs(mesh)
+    scalars = [np.unique(fit.tet_factor[part]) for part in (above, ~above)]
+    assert [len(part) for part in scalars] == [1, 1] and scalars[0] != scalars[1]
+    assert (fit.report.factor_smallest, fit.report.factor_largest) == (fit.tet_factor.min(), fit.tet_factor.max())
+
+
+def test_cells_alike_are_no_reason_for_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_springs(prism(2))
+
+
+# ---- cache, file, time ------------------------------------------------------------------------------------------
+
+
+def test_a_mesh_is_fitted_once_and_forgotten_with_it():
+    mesh = box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
+    fit = spring_fit(mesh)
+    spring_network(mesh, MODULUS, rule="fitted")
+    assert spring_fit(mesh) is fit
+    gone = weakref.ref(fit)
+    del fit, mesh
+    gc.collect()
+    assert gone() is None
+
+
+def test_file_keeps_a_fit(tmp_path):
+    mesh = box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
+    written = write_fit(tmp_path / "fit.npz", mesh)
+    twin = box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
+    read = read_fit(tmp_path / "fit.npz", twin)
+    np.testing.assert_array_equal(read.edge_factor, written.edge_factor)
+    np.testing.assert_array_equal(read.tet_factor, written.tet_factor)
+    assert read.report == written.report and spring_fit(twin) is read
+    with pytest.raises(OrganError, match="fitted to another mesh"):
+        read_fit(tmp_path / "fit.npz", prism(2))
+    (tmp_path / "bad.npz").write_bytes(b"nothing")
+    with pytest.raises(OrganError, match="cannot be read as fitted springs"):
+        read_fit(tmp_path / "bad.npz", twin)
+
+
+@pytest.mark.parametrize(
+    ("cells", "limit"), [((4, 10, 20), 2.0), pytest.param((14, 14, 22), 20.0, marks=pytest.mark.slow)]
+)
+def test_time_to_fit(cells: tuple[int, int, int], limit: float):
+    """Under 2 s for 2000 nodes; 9487 nodes take about 1 s. The limits are the issue's, not what is measured."""
+    mesh = box_mesh(0.005 * np.array(cells), cells)
+    started = time.process_time()
+    report = fit_springs(mesh).report
+    assert time.process_time() - started < limit
+    assert 0.0 < report.duration and not report.fallback

@@ -12,10 +12,14 @@ moduli; w_i = V_i^(-2/3) / E_i, of the mean volume and modulus of the tets aroun
 and hard parts count alike. The six strains are an orthonormal basis (|eps| = 1), so the sum does not change when the
 mesh is turned.
 
+On the surface, averages over neighbouring nodes are compared in the place of single nodes, whose differences count
+0.003: linear tets give a node with eight triangles twice the traction of one with four, and springs made to follow that
+vary as much (single surface nodes of a block then differ by 43 % in stiffness; 8 % with averages and with formula (6)).
+
 The affine strain asks every straight line of springs through a lattice for one tension, so that what the surface asks
 of a line runs through the body. Inside, formula (6) is right already: the pull p_e towards it is weak near the surface
-and doubles with every layer of nodes from the third on, which brings the factors back to 1 over some five cells and
-costs little there. A pull that is weak everywhere left factors of 0.1 to 2.6 in the middle of 8^3 cells.
+and triples with every layer of nodes from the third on, which brings the factors back to 1 over some five cells and
+costs little there.
 
 No published source is known for this; it was tried for this project, and `FitReport` says how well it went.
 
@@ -30,7 +34,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.csgraph import dijkstra
 
 from msdm_core.bounded_quadratic import dot, minimise_bounded
@@ -39,16 +43,19 @@ from msdm_core.mesh import TET_FACES, FloatArray, TetMesh
 
 # No spring is fitted softer than this share of formula (6): a spring near 0 would leave its nodes loose.
 SMALLEST_FACTOR = 0.05
-# p_e at the surface, over the mean diagonal of the normal equations (from 1e-2 to 2e-3 the modulus of the prism of
-# 10 mm cells moves by 1.1 %), and how it grows with the layer of nodes, counted in springs from the surface.
-PULL_TO_LLOYD = 5e-3
-PULL_GROWTH = 2.0
+# p_e at the surface, over the mean diagonal of the normal equations, and how it grows with the layer of nodes, counted
+# in springs from the surface.
+PULL_TO_LLOYD = 2e-3
+PULL_GROWTH = 3.0
 WEAK_LAYERS = 2
 LARGEST_PULL = 1.0
-# Above this residual the network cannot represent the solid. Cubic BCC blocks leave 0.09 to 0.12; stretched by 1.5 to 1
-# 0.22; surfaces filled by isosurface stuffing 0.30 to 0.45; jittered Delaunay and 6-tet cubes 0.38 to 0.48: on all of
-# these from 0.30 on, torsion or shear falls to 0.4 to 0.8 of the solid's, and formula (6) is nearer.
-LARGEST_RESIDUAL = 0.25
+# Share of the difference of single surface nodes' forces in the sum, beside that of their averages.
+SINGLE_NODE_SHARE = 3e-3
+# Above this residual the network cannot represent the solid. Blocks of cubes cut as BCC or into five tets leave 0.02 to
+# 0.1, BCC cells stretched by 1.5 to 1 0.18: tension within 5 % and torsion within 12 %. Surfaces filled by isosurface
+# stuffing leave 0.07 to 0.23 and are as near as formula (6) or nearer up to 0.17; jittered Delaunay and 6-tet cubes
+# leave 0.24 to 0.5, and torsion falls to 0.66 of the solid's and less.
+LARGEST_RESIDUAL = 0.2
 
 _H = 0.5**0.5
 # Orthonormal basis of the symmetric tensors: three stretches, three shears, shape (6, 3, 3).
@@ -70,7 +77,7 @@ class FitReport:
     """How well springs could be fitted to a mesh.
 
     Fields:
-        residual_before: |f - F| / |F| of formula (6), weighted node forces over the six unit strains.
+        residual_before: |f - F| / |F| of formula (6), of the node forces as they are compared, six unit strains.
         residual_after: the same of the fitted springs (of the attempt, where the fallback was used).
         fallback: whether the springs are formula (6) times one scalar per region, because the residual stayed large.
         factor_smallest: smallest factor on formula (6).
@@ -141,6 +148,8 @@ def fit_springs(mesh: TetMesh, youngs_modulus: ArrayLike = 1.0) -> SpringFit:
     modulus = modulus / modulus.mean()
     share = lloyd_share(mesh, modulus)
     matrix, target = _force_equations(mesh, share, modulus)
+    spread = _surface_averages(mesh)
+    matrix, target = csr_array(spread @ matrix), spread @ target
     factor = _fit_factors(matrix, target, _pull_to_lloyd(mesh))
     before = _relative(matrix @ np.ones_like(factor) - target, target)
     after = _relative(matrix @ factor - target, target)
@@ -183,7 +192,7 @@ def _warn_of_fallback(residual: float, tet_factor: FloatArray) -> None:
     warnings.warn(
         f"springs fitted to this mesh leave a residual of {residual:.2f} of the solid's node forces, more than "
         f"{LARGEST_RESIDUAL:g}: the network cannot represent the solid there. Formula (6) times one scalar per region "
-        f"({scalars}) is used instead; a block of cubic cells (box_mesh) can be fitted",
+        f"({scalars}) is used instead; blocks of cubic cells (box_mesh) can be fitted",
         UserWarning,
         stacklevel=4,
     )
@@ -223,6 +232,25 @@ def _force_equations(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> t
     entries = (values.ravel()[present], (rows.ravel()[present], columns[present]))
     matrix = csr_array(entries, shape=(18 * node_count, len(edges)))
     return matrix, (weight[:, None] * _solid_forces(mesh, modulus)).ravel()
+
+
+def _surface_averages(mesh: TetMesh) -> csr_array:
+    """From node forces to those that are compared: averages on the surface, then single nodes, (36 n, 18 n).
+
+    A surface node's force is shared among its triangles by area, and each triangle hands a third to its corners. So
+    eight triangles around one node and four around the next, as outer faces are cut, ask nothing of the springs.
+    """
+    triangles, node_count = mesh.boundary_triangles, mesh.node_count
+    corners = mesh.points[triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    around = np.bincount(triangles.ravel(), np.repeat(area, 3), node_count)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    places, shape = (owner, triangles.ravel()), (len(triangles), node_count)
+    shared = csr_array((np.repeat(area, 3) / around[triangles.ravel()], places), shape=shape)
+    handed = csr_array((np.full(owner.size, 1.0 / 3.0), places), shape=shape)
+    single = np.ones(node_count)
+    single[mesh.boundary_nodes] = SINGLE_NODE_SHARE**0.5
+    return csr_array(kron(vstack([handed.T @ shared, diags_array(single)]), eye_array(18), format="csr"))
 
 
 def _node_weights(mesh: TetMesh, modulus: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "llo
 
     * "lloyd": k_ij = sum over tets of (2 sqrt 2 / 25) l_t E_t, l_t = (12 V_t / sqrt 2)^(1/3), the edge of the regular
       tet of the same volume (Sala et al. 2011, eq. 6; Lloyd et al. 2007).
-    * "fitted": formula (6) times factors fitted to the mesh, see `msdm_core.fitting`; for blocks of cubic cells.
+    * "fitted": formula (6) times factors fitted to the mesh, see `msdm_core.fitting`; best on blocks of cubic cells.
     * "van_gelder": k_ij = sum over tets of E_t V_t / l_ij^2 (Van Gelder 1998, extended to tets).
 
     Args:

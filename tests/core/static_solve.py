@@ -112,6 +112,16 @@ def clamped_torsion(mesh: TetMesh, matrix: csr_array, axis: int = 2) -> float:
     return work_of(matrix, held, np.concatenate([np.zeros(3 * len(low)), turn.ravel()]))
 
 
+def point_stiffness(mesh: TetMesh, matrix: csr_array, nodes: NDArray) -> FloatArray:
+    """Stiffness of single nodes along z [N/m], the lowest face held, shape of `nodes`."""
+    low, _ = end_nodes(mesh, 2)
+    free = np.setdiff1d(np.arange(matrix.shape[0]), (3 * low[:, None] + np.arange(3)).ravel())
+    places = np.searchsorted(free, 3 * nodes + 2)
+    push = np.zeros((len(free), len(nodes)))
+    push[places, np.arange(len(nodes))] = 1.0
+    return 1.0 / np.diag(splu(csc_array(csr_array(matrix[free])[:, free])).solve(push)[places])
+
+
 def kuhn_mesh(size: tuple[float, float, float], cells: tuple[int, int, int]) -> TetMesh:
     """A block of cubes cut into six tets each, along the same diagonal (Kuhn)."""
     counts = np.array(cells)

@@ -15,7 +15,14 @@ from scipy.sparse import csr_array
 from msdm_core.bounded_quadratic import minimise_bounded
 from msdm_core.errors import OrganError
 from msdm_core.fit_file import read_fit, write_fit
-from msdm_core.fitting import LARGEST_RESIDUAL, SMALLEST_FACTOR, UNIT_STRAINS, fit_springs, spring_fit
+from msdm_core.fitting import (
+    LARGEST_RESIDUAL,
+    SINGLE_NODE_SHARE,
+    SMALLEST_FACTOR,
+    UNIT_STRAINS,
+    fit_springs,
+    spring_fit,
+)
 from msdm_core.mesh import TetMesh
 from msdm_core.meshing import box_mesh
 from msdm_core.organ import OrganSpec, compile_organ
@@ -26,6 +33,7 @@ from tests.core.static_solve import (
     jittered_mesh,
     kuhn_mesh,
     nodal_volume_matrix,
+    point_stiffness,
     solid_matrix,
     spring_matrix,
     uniaxial_modulus,
@@ -80,22 +88,22 @@ def test_prism_of_the_papers_resolution(nu: float):
 
 @pytest.mark.parametrize("cells", [6, 8])
 def test_thick_block(cells: int):
-    """Fitting leaves a thick block's modulus alone (within 1 %), and brings its torsion near the same mesh's FEM."""
+    """Fitting leaves a thick block's modulus alone (within 2 %), and brings its torsion near the same mesh's FEM."""
     mesh = block(cells)
     fitted, solid = body_matrix(mesh, "fitted"), solid_matrix(mesh, MODULUS, 0.25)
     for axis in range(3):
-        assert uniaxial_modulus(mesh, fitted, axis) == pytest.approx(MODULUS, rel=0.01)
+        assert uniaxial_modulus(mesh, fitted, axis) == pytest.approx(MODULUS, rel=0.02)
     assert clamped_torsion(mesh, fitted) == pytest.approx(clamped_torsion(mesh, solid), rel=0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("nu", [0.25, 0.40, 0.45])
 def test_finer_prism(nu: float):
-    """At 5 mm, E within 2 % and torsion within 10 %."""
+    """At 5 mm, E within 2 % and torsion within 15 %, where formula (6) is 7 % and 31 % too stiff."""
     mesh = prism(4)
     fitted = body_matrix(mesh, "fitted", nu)
     assert uniaxial_modulus(mesh, fitted) == pytest.approx(MODULUS, rel=0.02)
-    assert clamped_torsion(mesh, fitted) == pytest.approx(TORSION[nu], rel=0.10)
+    assert clamped_torsion(mesh, fitted) == pytest.approx(TORSION[nu], rel=0.15)
 
 
 # ---- the factors ------------------------------------------------------------------------------------------------
@@ -107,7 +115,7 @@ def test_factors_and_report(mesh: TetMesh):
     assert not fit.report.fallback
     assert fit.edge_factor.min() == fit.report.factor_smallest >= SMALLEST_FACTOR
     assert fit.edge_factor.max() == fit.report.factor_largest < 3.0
-    assert fit.report.residual_after < 0.13 < 0.4 < fit.report.residual_before
+    assert fit.report.residual_after < 0.05 < 0.35 < fit.report.residual_before
     np.testing.assert_array_equal(fit.tet_factor, 1.0)
     _, lloyd = spring_network(mesh, MODULUS)
     np.testing.assert_array_equal(spring_network(mesh, MODULUS, rule="fitted")[1], fit.edge_factor * lloyd)
@@ -124,23 +132,56 @@ def node_forces(mesh: TetMesh, stiffness: NDArray, strain: NDArray) -> NDArray:
     return force
 
 
+def averages(mesh: TetMesh, force: NDArray) -> NDArray:
+    """Surface nodes hand their force to their triangles by area, these a third to each corner, (n_node, 3)."""
+    corners = mesh.points[mesh.boundary_triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    around, average = np.zeros(mesh.node_count), np.zeros_like(force)
+    for triangle, nodes in enumerate(mesh.boundary_triangles):
+        around[nodes] += area[triangle]
+    for triangle, nodes in enumerate(mesh.boundary_triangles):
+        average[nodes] += (force[nodes] * (area[triangle] / around[nodes])[:, None]).sum(axis=0) / 3
+    return average
+
+
 def test_residual_is_that_of_the_node_forces():
     """Node forces of springs and of FEM's K u in each unit strain, on cells alike so that weights cancel."""
     mesh = prism(2)
     solid = solid_matrix(mesh, MODULUS, 0.25)
     wanted = [(solid @ (mesh.points @ strain).ravel()).reshape(-1, 3) for strain in UNIT_STRAINS]
+    single = np.ones((mesh.node_count, 1))
+    single[mesh.boundary_nodes] = SINGLE_NODE_SHARE**0.5
+
+    def size(forces: list[NDArray]) -> float:
+        return float(np.linalg.norm([np.concatenate([averages(mesh, force), single * force]) for force in forces]))
+
     for rule, residual in (("lloyd", "residual_before"), ("fitted", "residual_after")):
         stiffness = spring_network(mesh, MODULUS, rule=rule)[1]
         missed = [node_forces(mesh, stiffness, strain) - force for strain, force in zip(UNIT_STRAINS, wanted)]
-        ratio = np.linalg.norm(missed) / np.linalg.norm(wanted)
-        assert getattr(spring_fit(mesh).report, residual) == pytest.approx(ratio, rel=1e-9)
+        assert getattr(spring_fit(mesh).report, residual) == pytest.approx(size(missed) / size(wanted), rel=1e-9)
+
+
+@pytest.mark.parametrize("rule", ["lloyd", "fitted"])
+def test_surface_nodes_are_alike(rule: str):
+    """Stiffness of single nodes in the middle of a face, bottom held: differs by at most 15 %, mean within 10 % of FEM.
+
+    Springs fitted to the forces of single nodes differ by 43 %, linear tets themselves by 16 %.
+    """
+    mesh = block(8)
+    inside = np.abs(mesh.points[:, :2] - 0.03).max(axis=1) < 0.012
+    nodes = np.flatnonzero(inside & (mesh.points[:, 2] > 0.06 - 1e-9))
+    stiffness = point_stiffness(mesh, body_matrix(mesh, rule), nodes)
+    solid = point_stiffness(mesh, solid_matrix(mesh, MODULUS, 0.25), nodes)
+    assert np.ptp(stiffness) < 0.15 * stiffness.mean()
+    if rule == "fitted":
+        assert stiffness.mean() == pytest.approx(solid.mean(), rel=0.10)
 
 
 def test_the_inside_of_a_block_is_formula_6():
     """Factors tend to 1 with depth; a cell's corner and centre together keep the lattice's constants.
 
     C11 = 1.2095 E and C12 = C44 = 0.40317 E, from 2.5 cells below the surface within 10 %, single springs from 5 cells
-    on within a factor of 1.5: a line of springs carries what the surface asks of it, its neighbour lines the rest.
+    on within a quarter: a line of springs carries what the surface asks of it, its neighbour lines the rest.
     """
     cells, size = 12, 0.06
     mesh, cell = block(cells), size / cells
@@ -149,7 +190,7 @@ def test_the_inside_of_a_block_is_formula_6():
     depth = np.minimum(middle, size - middle).min(axis=1) / cell
     spread = [np.abs(np.log(fit.edge_factor[depth > layer])).max() for layer in (0, 2, 3, 4, 4.99)]
     assert spread == sorted(spread, reverse=True)
-    assert spread[-1] < np.log(1.5)
+    assert spread[-1] < np.log(1.25)
     span = mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]]
     weight = 0.5 * spring_network(mesh, 1.0, rule="fitted")[1] / (span * span).sum(axis=1)
     constants = np.zeros((mesh.node_count, 3, 3))
@@ -217,7 +258,7 @@ def test_a_lesion_needs_no_refit():
 )
 def test_fallback_to_one_scalar(mesh: TetMesh):
     """One scalar that makes sum k l^2 = 6 E V, a warning that names the residual, and a report."""
-    with pytest.warns(UserWarning, match=r"residual of 0\.\d\d .* more than 0\.25.*one scalar per region \(0\.\d+\)"):
+    with pytest.warns(UserWarning, match=r"residual of 0\.\d\d .* more than 0\.2.*one scalar per region \(0\.\d+\)"):
         fit = fit_springs(mesh)
     assert fit.report.fallback and fit.report.residual_after > LARGEST_RESIDUAL
     assert fit.report.factor_smallest == fit.report.factor_largest

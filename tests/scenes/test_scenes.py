@@ -10,6 +10,7 @@ import pytest
 
 import surgsim_env
 from msdm_core.errors import OrganError
+from msdm_core.fitting import spring_fit
 from msdm_core.stability import stable_dt
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.scene_files import scenes_folder
@@ -111,6 +112,18 @@ def test_too_few_substeps_are_refused_with_the_number_needed():
 def test_bad_entries_are_named(entries, message):
     with pytest.raises(ValueError, match=message):
         changed(**entries)
+
+
+def test_a_scene_chooses_the_stiffness_rule():
+    """Of one scene's organ with formula (6) and with fitted springs, the springs differ by the mesh's factors."""
+    lloyd, fitted = load_anatomy(changed()), load_anatomy(changed(stiffness_rule="fitted"))
+    factor = spring_fit(fitted.mesh).edge_factor
+    assert not spring_fit(fitted.mesh).report.fallback
+    lesion = lloyd.demonstration_lesions()
+    springs = lloyd.organ(lesion).spring_stiffness
+    np.testing.assert_array_equal(fitted.organ(lesion).spring_stiffness, factor * springs)
+    with pytest.raises(ValueError, match=r"scene 'changed': stiffness rule 'fited' is unknown.*did you mean 'fitted'"):
+        changed(stiffness_rule="fited")
 
 
 def test_an_anchor_that_holds_nothing_is_refused():

@@ -94,7 +94,8 @@ def ball_force(body: Layer, radius: float, depth: float, contact_stiffness: floa
     for _ in range(60):
         before = surface.interpolate(displacement)
         held_off, load = csc_array(stiff.assemble(surface, prev=before)), push.assemble(surface, prev=before)
-        whole = (body.stiffness + held_off)[free][:, free].tocsc()
+        # The sum of sparse arrays is typed as their base, which has no indexing.
+        whole = csc_array(body.stiffness + held_off)[free][:, free].tocsc()
         displacement[free] = np.asarray(spsolve(whole, -load[free]))
         previous, force = force, float((held_off @ displacement + load)[body.axis == 1].sum())
         if abs(force - previous) <= 1e-6 * abs(force):

@@ -56,7 +56,8 @@ SINGLE_NODE_SHARE = 3e-3
 # Above this residual the network cannot represent the solid. Blocks of cubes cut as BCC or into five tets leave 0.02 to
 # 0.11 (37000 nodes), BCC cells stretched by 1.5 to 1 0.177: tension within 5 % and torsion within 12 %. Surfaces filled
 # by isosurface stuffing leave 0.07 to 0.23: fine ones (a 6 mm sphere) come nearer than formula (6), coarse curved ones
-# do not (a 10 mm sphere, residual 0.11, comes out softer, 0.70 of the solid in shear against 0.79); prefer "lloyd" there. Jittered Delaunay and 6-tet cubes leave 0.24 to 0.5, and torsion falls to 0.66 and less.
+# do not (a 10 mm sphere, residual 0.11, comes out softer, 0.70 of the solid in shear, not 0.79): use "lloyd" there.
+# Jittered Delaunay and 6-tet cubes leave 0.24 to 0.5, and torsion falls to 0.66 and less.
 LARGEST_RESIDUAL = 0.18
 
 _H = 0.5**0.5

@@ -14,7 +14,7 @@ from msdm_core.kernels import FAULT_NONE, QUADRATURE_COUNT, OrganModel, OrganSta
 from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
+from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
 from msdm_core.stability import largest_frequency, step_limit
 from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.stiffness import membrane_stiffness, spring_network
@@ -50,7 +50,7 @@ class OrganSpec:
 def compile_organ(spec: OrganSpec) -> OrganModel:
     """Masses, springs and volume moduli of an organ, as read-only arrays for the kernels.
 
-    Each tet's modulus, volume modulus and density is the mean over what fills it, by volume fraction.
+    A tet that a lesion fills in part has the mean density by volume, and `mixed_moduli`.
 
     Raises:
         OrganError: an organ of impossible size, a region without material, a lesion outside the organ or smaller than
@@ -145,8 +145,7 @@ def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray
     for lesion in spec.lesions:
         material = cast(Material, lesion.material)
         fraction = lesion_fraction(mesh, lesion)
-        spring_modulus += fraction * (material.spring_modulus - spring_modulus)
-        bulk += fraction * (material.volume_modulus - bulk)
+        spring_modulus, bulk = mixed_moduli(spring_modulus, bulk, material, fraction)
         density += fraction * (material.density - density)
     return spring_modulus, bulk, density
 

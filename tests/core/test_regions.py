@@ -10,7 +10,7 @@ from msdm_core.lumping import lump_mass
 from msdm_core.mesh import TET_FACES, TetMesh
 from msdm_core.meshing import box_mesh
 from msdm_core.organ import OrganSpec, compile_organ
-from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction
+from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
 from msdm_core.stiffness import spring_network
 
 HEALTHY = Material(youngs_modulus=5000.0, density=1060.0, poisson_ratio=0.45)
@@ -170,29 +170,76 @@ def test_the_papers_capsule_is_every_tet_with_a_face_on_the_boundary():
     np.testing.assert_allclose(model.tet_bulk, bulk, rtol=1e-12)
 
 
+def bulk_modulus(spring_modulus, volume_modulus):
+    """K = lambda + (2/3) mu, springs with lambda = mu = (2/5) E_s and the volume term's K_t in lambda."""
+    return (2.0 / 3.0) * spring_modulus + volume_modulus
+
+
+def mixture(share):
+    """Spring and volume modulus of HEALTHY with a share of HARD: p^(1 - f) q^f of the shear and the bulk moduli."""
+    modulus = HEALTHY.spring_modulus ** (1.0 - share) * HARD.spring_modulus**share
+    soft, hard = (bulk_modulus(one.spring_modulus, one.volume_modulus) for one in (HEALTHY, HARD))
+    return modulus, soft ** (1.0 - share) * hard**share - (2.0 / 3.0) * modulus
+
+
 def test_a_lesions_properties_enter_by_volume_fraction():
-    """p_t = (1 - f_t) p_healthy + f_t p_lesion for the springs' modulus, the volume modulus and the density alike."""
+    """Shear and bulk modulus by the geometric mean p^(1 - f) q^f, the density by the arithmetic one."""
     lesion = Lesion(INTERIOR, 0.008, HARD)
     fraction = lesion_fraction(BLOCK, lesion)
+    assert ((fraction > 0.01) & (fraction < 0.99)).sum() > 20
     model = compile_organ(OrganSpec(BLOCK, HEALTHY, lesions=(lesion,)))
-    modulus = (1.0 - fraction) * HEALTHY.spring_modulus + fraction * HARD.spring_modulus
-    bulk = (1.0 - fraction) * HEALTHY.volume_modulus + fraction * HARD.volume_modulus
+    modulus, volume_modulus = mixture(fraction)
     density = (1.0 - fraction) * 1060.0 + fraction * 1100.0
     np.testing.assert_allclose(model.spring_stiffness, spring_network(BLOCK, modulus)[1], rtol=1e-12)
-    np.testing.assert_allclose(model.tet_bulk, bulk, rtol=1e-12)
+    np.testing.assert_allclose(model.tet_bulk, volume_modulus, rtol=1e-12)
     np.testing.assert_allclose(model.node_mass, lump_mass(BLOCK, density, scheme="barycentric"), rtol=1e-12)
     np.testing.assert_allclose(model.node_mass.sum(), density @ BLOCK.volumes, rtol=1e-12)
 
 
+@pytest.mark.parametrize("nu", [0.25, 0.45])
+def test_a_lesion_of_the_healthy_tissue_changes_nothing(nu: float):
+    tissue = Material(5000.0, 1060.0, nu)
+    plain = compile_organ(OrganSpec(BLOCK, tissue))
+    model = compile_organ(OrganSpec(BLOCK, tissue, lesions=(Lesion(INTERIOR, 0.008, tissue),)))
+    np.testing.assert_array_equal(model.spring_stiffness, plain.spring_stiffness)
+    np.testing.assert_allclose(model.tet_bulk, plain.tet_bulk, rtol=1e-14)
+
+
+def test_at_a_quarter_a_lesion_needs_no_volume_term():
+    """K = (2/3) E_s in both tissues: their geometric means leave K_t = 0 to the bit, the paper's model."""
+    lesion = Lesion(INTERIOR, 0.008, Material(40000.0, 1060.0))
+    model = compile_organ(OrganSpec(BLOCK, Material(5000.0, 1060.0), lesions=(lesion,)))
+    np.testing.assert_array_equal(model.tet_bulk, 0.0)
+
+
+def test_mixed_moduli_lie_between_one_stress_and_one_strain():
+    """Between the harmonic and the arithmetic mean, tissue of nu 0.25 with a lesion of 0.49; K_t never below 0."""
+    soft, hard = Material(5000.0, 1000.0), Material(40000.0, 1000.0, 0.49)
+    f = np.linspace(0.0, 1.0, 11)
+    spring, volume = mixed_moduli(np.full(11, soft.spring_modulus), np.full(11, soft.volume_modulus), hard, f)
+    assert (volume >= 0.0).all()
+    assert (spring[0], volume[0]) == (soft.spring_modulus, soft.volume_modulus)
+    for mixed, low, high in (
+        (spring, soft.spring_modulus, hard.spring_modulus),
+        (
+            bulk_modulus(spring, volume),
+            bulk_modulus(soft.spring_modulus, soft.volume_modulus),
+            bulk_modulus(hard.spring_modulus, hard.volume_modulus),
+        ),
+    ):
+        assert mixed[-1] == pytest.approx(high, rel=1e-14)
+        assert (mixed[1:-1] > 1.0 / ((1.0 - f) / low + f / high)[1:-1]).all()
+        assert (mixed[1:-1] < ((1.0 - f) * low + f * high)[1:-1]).all()
+
+
 def test_later_lesions_overlay_earlier_ones():
-    """A second lesion over the same place replaces its share of the first, in order."""
+    """A second lesion over the same place takes its share of what the first one left, in order."""
     first = Lesion(INTERIOR, 0.010, HARD, "first")
     second = Lesion(INTERIOR, 0.006, HEALTHY, "core")
     model = compile_organ(OrganSpec(BLOCK, HEALTHY, lesions=(first, second)))
     a, b = lesion_fraction(BLOCK, first), lesion_fraction(BLOCK, second)
     share = a * (1.0 - b)
-    bulk = HEALTHY.volume_modulus + share * (HARD.volume_modulus - HEALTHY.volume_modulus)
-    np.testing.assert_allclose(model.tet_bulk, bulk, rtol=1e-12)
+    np.testing.assert_allclose(model.tet_bulk, mixture(share)[1], rtol=1e-12)
 
 
 def test_regions_have_their_own_material():

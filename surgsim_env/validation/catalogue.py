@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from surgsim_env.validation import ball, beams, cosine, lattice, lumped_mass, paper_tests, prism, punch, sphere, steps
+from surgsim_env.validation import ball, beams, capsule, cosine, lattice, lumped_mass, paper_tests, prism, punch, sphere, steps
 from surgsim_env.validation.row import Case
 
 CASES: tuple[Case, ...] = (
@@ -15,6 +15,9 @@ CASES: tuple[Case, ...] = (
     Case("clamped torsion", prism.torsion, needs_fem=True),
     Case("cantilever", beams.cantilever_case, needs_fem=True),
     Case("fixed-free rod", beams.rod_case),
+    Case("capsule, faces", capsule.faces),
+    Case("capsule, curved", capsule.curved),
+    Case("capsule, pulled", capsule.pulled),
     Case("damping rate", beams.damping_case),
     Case("stable step", steps.stable_step),
     Case("energy", steps.energy_drift),

@@ -69,7 +69,7 @@ def thick_block(cells: int) -> Outcome:
         stiffness = assemble_stiffness(linear_organ(mesh, MODULUS, nu))
         shear = np.array([[0.0, 0.5, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
         found = (
-            ("E", _uniaxial(mesh, stiffness, size), MODULUS),
+            ("E", uniaxial_modulus(mesh, stiffness, size), MODULUS),
             # W = G gamma^2 / 2 and W = 9 K e^2 / 2.
             ("G", _affine(mesh, stiffness, shear), MODULUS / (2.0 * (1.0 + nu))),
             ("K", _affine(mesh, stiffness, np.eye(3)) / 9.0, MODULUS / (3.0 * (1.0 - 2.0 * nu))),
@@ -84,7 +84,7 @@ def thick_block(cells: int) -> Outcome:
     return Outcome(tuple(rows))
 
 
-def _uniaxial(mesh: TetMesh, stiffness: csr_array, size: float) -> float:
+def uniaxial_modulus(mesh: TetMesh, stiffness: csr_array, size: float) -> float:
     """Young's modulus from a stretch whose ends slide freely [Pa]."""
     low, high = np.flatnonzero(mesh.points[:, 2] < 1e-9), np.flatnonzero(mesh.points[:, 2] > size - 1e-9)
     held = nodal_dofs(np.concatenate([low, high]), (2,))

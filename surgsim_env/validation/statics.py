@@ -34,7 +34,7 @@ def assemble_stiffness(model: OrganModel) -> csr_array:
     span = points[model.spring_nodes[:, 1]] - points[model.spring_nodes[:, 0]]
     direction = span / np.linalg.norm(span, axis=1)[:, None]
     springs = np.concatenate([-direction, direction], axis=1) * np.sqrt(model.spring_stiffness)[:, None]
-    matrix = _outer_products(model.spring_nodes, springs, count)
+    matrix = outer_products(model.spring_nodes, springs, count)
     members = np.flatnonzero(model.tet_bulk)
     if members.size:
         tets = model.tet_nodes[members]
@@ -42,7 +42,7 @@ def assemble_stiffness(model: OrganModel) -> csr_array:
         outward = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]) / 2.0
         factor = np.sqrt(model.tet_bulk[members] / model.tet_rest_volume[members])
         gradient = (-outward / 3.0).reshape(-1, 12) * factor[:, None]
-        matrix = matrix + _outer_products(tets, gradient, count)
+        matrix = matrix + outer_products(tets, gradient, count)
     assert stiffness_mismatch(model, matrix) < 1e-9, "the kernels hold a term that this assembly does not know"
     return matrix
 
@@ -56,7 +56,7 @@ def stiffness_mismatch(model: OrganModel, matrix: csr_array) -> float:
     return float(np.linalg.norm(own - force.ravel()) / np.linalg.norm(own))
 
 
-def _outer_products(nodes: NDArray[np.int32], vectors: FloatArray, count: int) -> csr_array:
+def outer_products(nodes: NDArray[np.int32], vectors: FloatArray, count: int) -> csr_array:
     """Sum of v v^T over items with the given nodes, v listing three components a node."""
     places = (3 * nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(nodes), -1)
     width = places.shape[1]

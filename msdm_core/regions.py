@@ -65,9 +65,9 @@ class Capsule:
     """The organ's outer layer (stroma), found from the boundary.
 
     With a thickness it is a membrane, E_c h_c whatever the mesh: for a real capsule, whose modulus and thickness are
-    known. Without one it is the paper's rule: the tets with a face on the boundary take this modulus, a layer of a sixth
-    of a cell whose membrane stiffness, 0.29 cell (E_c - E), grows with the cell: to repeat the paper, or for stroma that
-    thick. A layer thicker than a cell is a region of the mesh.
+    known. Without one it is the paper's rule, to repeat the paper or for stroma about that thick: the tets with a face
+    on the boundary take this modulus, a layer of a sixth of a cell, whose membrane stiffness of 0.29 cell (E_c - E)
+    grows with the cell. A layer thicker than a cell is a region of the mesh.
 
     Args:
         youngs_modulus: E_c [Pa], above 0.

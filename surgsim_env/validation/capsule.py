@@ -88,7 +88,7 @@ def _spread(mesh: TetMesh) -> str:
     directions = np.concatenate([one[1] for one in found]) / STIFFNESS
     low, high = np.quantile(directions, (0.05, 0.95))
     return (
-        f"along 12 directions in {PATCH_COUNT} patches of some 80 triangles: {directions.mean():.2f} E_c h_c on average, "
+        f"12 directions in {PATCH_COUNT} patches of some 80 triangles: {directions.mean():.2f} E_c h_c on average, "
         f"{low:.2f} to {high:.2f} in nine of ten, {directions.min():.2f} to {directions.max():.2f} in all"
     )
 

@@ -2,7 +2,19 @@
 
 from functools import partial
 
-from surgsim_env.validation import ball, beams, capsule, cosine, lattice, lumped_mass, paper_tests, prism, punch, sphere, steps
+from surgsim_env.validation import (
+    ball,
+    beams,
+    capsule,
+    cosine,
+    lattice,
+    lumped_mass,
+    paper_tests,
+    prism,
+    punch,
+    sphere,
+    steps,
+)
 from surgsim_env.validation.row import Case
 
 CASES: tuple[Case, ...] = (

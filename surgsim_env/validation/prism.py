@@ -32,27 +32,33 @@ def cell_size(across: int) -> float:
 
 
 @lru_cache(maxsize=4)
-def _prism(across: int) -> tuple[TetMesh, csr_array]:
-    mesh = box_mesh(SIZE, np.array((2, 5, 10)) * across // 2)
-    return mesh, assemble_stiffness(linear_organ(mesh, MODULUS))
+def prism_mesh(across: int) -> TetMesh:
+    """The prism with so many cubic cells along its thickness."""
+    return box_mesh(SIZE, np.array((2, 5, 10)) * across // 2)
+
+
+@lru_cache(maxsize=4)
+def _prism(across: int, rule: str, nu: float) -> tuple[TetMesh, csr_array]:
+    mesh = prism_mesh(across)
+    return mesh, assemble_stiffness(linear_organ(mesh, MODULUS, nu, stiffness_rule=rule))
 
 
 def _ends(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(points[:, 2] < 1e-9), np.flatnonzero(points[:, 2] > SIZE[2] - 1e-9)
 
 
-def tension_stiffness(across: int) -> float:
+def tension_stiffness(across: int, rule: str = "lloyd", nu: float = 0.25) -> float:
     """Force per elongation along the 10 cm, ends free to contract [N/m]."""
-    mesh, stiffness = _prism(across)
+    mesh, stiffness = _prism(across, rule, nu)
     low, high = _ends(mesh.points)
     held = nodal_dofs(np.concatenate([low, high]), (2,))
     value = np.repeat([0.0, 1.0], [len(low), len(high)])
     return twice_energy(stiffness, solve_displacement(stiffness, held, value))
 
 
-def torsion_stiffness(across: int) -> float:
+def torsion_stiffness(across: int, rule: str = "lloyd", nu: float = 0.25) -> float:
     """Torque per angle with both ends held as rigid plates [N m/rad]."""
-    mesh, stiffness = _prism(across)
+    mesh, stiffness = _prism(across, rule, nu)
     low, high = _ends(mesh.points)
     arm = mesh.points[high] - 0.5 * np.array(SIZE)
     turn = np.stack([-arm[:, 1], arm[:, 0], np.zeros(len(high))], axis=1)

@@ -16,11 +16,17 @@ RESIDUAL = 1e-8  # of the linear solution, relative; energies are then right to 
 
 
 def linear_organ(
-    mesh: TetMesh, youngs_modulus: float, poisson_ratio: float = 0.25, *, lesions: tuple[Lesion, ...] = ()
+    mesh: TetMesh,
+    youngs_modulus: float,
+    poisson_ratio: float = 0.25,
+    *,
+    lesions: tuple[Lesion, ...] = (),
+    stiffness_rule: str = "lloyd",
 ) -> OrganModel:
     """A free, undamped organ of one tissue, as the product compiles it."""
     material = Material(youngs_modulus, DENSITY, poisson_ratio)
-    return compile_organ(OrganSpec(mesh, material, lesions=lesions, damping=Damping(alpha=0.0)))
+    still = Damping(alpha=0.0)
+    return compile_organ(OrganSpec(mesh, material, lesions=lesions, damping=still, stiffness_rule=stiffness_rule))
 
 
 def assemble_stiffness(model: OrganModel) -> csr_array:

@@ -250,17 +250,17 @@ def test_size_does_not_matter():
 
 
 def test_a_lesion_needs_no_refit():
-    """Factors of the homogeneous organ with an 8x lesion, against a fit of the organ with it: stiffness within 1 %."""
+    """Factors of the homogeneous organ with an 8x lesion, against a fit of the organ with it: within 0.8 %."""
     mesh = block(8)
     tissue = Material(MODULUS, 1000.0)
     lesion = Lesion((0.03, 0.03, 0.04), 0.012, Material(8 * MODULUS, 1000.0))
     organ = compile_organ(OrganSpec(mesh, tissue, lesions=(lesion,), stiffness_rule="fitted"))
-    modulus = MODULUS * (1.0 + 7.0 * lesion_fraction(mesh, lesion))
+    modulus = MODULUS * 8.0 ** lesion_fraction(mesh, lesion)
     once = spring_matrix(mesh, organ.spring_stiffness)
     anew = spring_matrix(mesh, fit_springs(mesh, modulus).edge_factor * spring_network(mesh, modulus)[1])
     assert uniaxial_modulus(mesh, once) > 1.05 * MODULUS
-    assert uniaxial_modulus(mesh, once) == pytest.approx(uniaxial_modulus(mesh, anew), rel=0.01)
-    assert clamped_torsion(mesh, once) == pytest.approx(clamped_torsion(mesh, anew), rel=0.01)
+    assert uniaxial_modulus(mesh, once) == pytest.approx(uniaxial_modulus(mesh, anew), rel=0.008)
+    assert clamped_torsion(mesh, once) == pytest.approx(clamped_torsion(mesh, anew), rel=0.008)
 
 
 # ---- the fallback -----------------------------------------------------------------------------------------------

@@ -71,8 +71,8 @@ def thick_block(cells: int) -> Outcome:
         found = (
             ("E", uniaxial_modulus(mesh, stiffness, size), MODULUS),
             # W = G gamma^2 / 2 and W = 9 K e^2 / 2.
-            ("G", _affine(mesh, stiffness, shear), MODULUS / (2.0 * (1.0 + nu))),
-            ("K", _affine(mesh, stiffness, np.eye(3)) / 9.0, MODULUS / (3.0 * (1.0 - 2.0 * nu))),
+            ("G", affine_modulus(mesh, stiffness, shear), MODULUS / (2.0 * (1.0 + nu))),
+            ("K", affine_modulus(mesh, stiffness, np.eye(3)) / 9.0, MODULUS / (3.0 * (1.0 - 2.0 * nu))),
         )
         rows += [
             compare(
@@ -84,15 +84,16 @@ def thick_block(cells: int) -> Outcome:
     return Outcome(tuple(rows))
 
 
-def uniaxial_modulus(mesh: TetMesh, stiffness: csr_array, size: float) -> float:
-    """Young's modulus from a stretch whose ends slide freely [Pa]."""
-    low, high = np.flatnonzero(mesh.points[:, 2] < 1e-9), np.flatnonzero(mesh.points[:, 2] > size - 1e-9)
-    held = nodal_dofs(np.concatenate([low, high]), (2,))
+def uniaxial_modulus(mesh: TetMesh, stiffness: csr_array, size: float, axis: int = 2) -> float:
+    """Young's modulus of a cube from a stretch whose ends slide freely [Pa]."""
+    place = mesh.points[:, axis]
+    low, high = np.flatnonzero(place < 1e-9), np.flatnonzero(place > size - 1e-9)
+    held = nodal_dofs(np.concatenate([low, high]), (axis,))
     value = np.repeat([0.0, 1.0], [len(low), len(high)])
     return twice_energy(stiffness, solve_displacement(stiffness, held, value)) / size
 
 
-def _affine(mesh: TetMesh, stiffness: csr_array, gradient: FloatArray) -> float:
+def affine_modulus(mesh: TetMesh, stiffness: csr_array, gradient: FloatArray) -> float:
     """Twice the energy per volume of an affine displacement of the whole boundary [Pa]."""
     boundary = np.asarray(mesh.boundary_nodes)
     value = (mesh.points[boundary] @ gradient.T).ravel()

@@ -49,7 +49,11 @@ def _ends(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def tension_stiffness(across: int, rule: str = "lloyd", nu: float = 0.25) -> float:
     """Force per elongation along the 10 cm, ends free to contract [N/m]."""
-    mesh, stiffness = _prism(across, rule, nu)
+    return pulled(*_prism(across, rule, nu))
+
+
+def pulled(mesh: TetMesh, stiffness: csr_array) -> float:
+    """The same of any mesh of the prism."""
     low, high = _ends(mesh.points)
     held = nodal_dofs(np.concatenate([low, high]), (2,))
     value = np.repeat([0.0, 1.0], [len(low), len(high)])
@@ -58,7 +62,11 @@ def tension_stiffness(across: int, rule: str = "lloyd", nu: float = 0.25) -> flo
 
 def torsion_stiffness(across: int, rule: str = "lloyd", nu: float = 0.25) -> float:
     """Torque per angle with both ends held as rigid plates [N m/rad]."""
-    mesh, stiffness = _prism(across, rule, nu)
+    return twisted(*_prism(across, rule, nu))
+
+
+def twisted(mesh: TetMesh, stiffness: csr_array) -> float:
+    """The same of any mesh of the prism."""
     low, high = _ends(mesh.points)
     arm = mesh.points[high] - 0.5 * np.array(SIZE)
     turn = np.stack([-arm[:, 1], arm[:, 0], np.zeros(len(high))], axis=1)

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.meshing import box_mesh
 from msdm_core.regions import Lesion, Material
 from surgsim_env.validation.layer_fem import layer, punch_stiffness
@@ -46,7 +46,11 @@ class Hidden:
 @lru_cache(maxsize=32)
 def block_stiffness(cells: int, nu: float, hidden: Hidden | None = None) -> float:
     """Force per depth of the punch on the block with so many cells along 6 cm [N/m]."""
-    mesh = box_mesh(SIZE, (cells, cells, cells // 2))
+    return pressed(box_mesh(SIZE, (cells, cells, cells // 2)), nu, hidden)
+
+
+def pressed(mesh: TetMesh, nu: float, hidden: Hidden | None = None) -> float:
+    """The same of any mesh of the block."""
     lesions: tuple[Lesion, ...] = ()
     if hidden is not None:
         centre = (0.03, 0.03, SIZE[2] - hidden.cover - hidden.radius)

@@ -97,6 +97,24 @@ def compare(
     return Row(case, source, expected, measured, error, tolerance, verdict, unit, absolute, note)
 
 
+def bounded(
+    case: str,
+    source: str,
+    *,
+    measured: float,
+    least: float = -math.inf,
+    most: float = math.inf,
+    unit: str = "",
+    note: str = "",
+) -> Row:
+    """A row whose measured value has a bound on one side, shown as what is expected."""
+    bound = least if math.isfinite(least) else most
+    verdict: Verdict = "met" if least <= measured <= most else "not met"
+    side = "verdict: at least that" if math.isfinite(least) else "verdict: at most that"
+    text = f"{side}; {note}" if note else side
+    return Row(case, source, bound, measured, measured / bound - 1.0, math.inf, verdict, unit, note=text)
+
+
 def convergence_order(sizes: list[float], errors: list[float]) -> float:
     """The p of |error| = C size^p, by least squares of the logarithms."""
     return float(np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0])

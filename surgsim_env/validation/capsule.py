@@ -60,7 +60,10 @@ def curved() -> Outcome:
     rows: list[Row] = []
     bodies = [
         (f"{name}, cell {1e3 * cell:g} mm", mesh_surface(*_ellipsoid(radii), cell_size=cell))
-        for name, radii in (("a ball of 40 mm", (0.04,) * 3), ("an ellipsoid of 60, 40, 30 mm", (0.06, 0.04, 0.03)))
+        for name, radii in (
+            ("a ball of 40 mm", (0.04, 0.04, 0.04)),
+            ("an ellipsoid of 60, 40, 30 mm", (0.06, 0.04, 0.03)),
+        )
         for cell in (0.010, 0.005)
     ]
     for name, mesh in (*bodies, ("the scene `liver`", load_anatomy(make_scene("liver")).mesh)):

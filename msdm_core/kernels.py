@@ -1,9 +1,8 @@
-"""Every compiled function of the organ, the structures it reads and the constants it uses, in one file.
+"""Every compiled function that steps the organ, the structures it reads and the constants it uses, in one file.
 
 numba's disk cache does not see edits in other files, so nothing here may come from one (only math, typing,
 numpy and numba are imported). Arrays of `OrganModel` are read-only, which numba holds at compile time; the
-kernels of a substep work in place and allocate nothing; none uses fastmath beyond `contract`, so that a run repeats to
-the bit.
+kernels work in place, allocate nothing, and use no fastmath beyond `contract`, so that a run repeats to the bit.
 """
 
 import math
@@ -640,85 +639,3 @@ def evaluate_forces(model, state):
     _begin_forces(model, state)
     _add_spring_forces(model, state)
     _add_volume_forces(model, state)
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def apply_stiffness(model, displacement, force):
-    """Linearised internal forces K u at rest [N], from a displacement u [m], both (n_node, 3)."""
-    rest = model.node_rest_position
-    nodes, stiffness, tets, bulk = model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_bulk
-    rest_volume = model.tet_rest_volume
-    force[:, :] = 0.0
-    for spring in range(nodes.shape[0]):
-        i = np.uint32(nodes[spring, 0])
-        j = np.uint32(nodes[spring, 1])
-        dx = rest[j, 0] - rest[i, 0]
-        dy = rest[j, 1] - rest[i, 1]
-        dz = rest[j, 2] - rest[i, 2]
-        stretch = (
-            dx * (displacement[j, 0] - displacement[i, 0])
-            + dy * (displacement[j, 1] - displacement[i, 1])
-            + dz * (displacement[j, 2] - displacement[i, 2])
-        )
-        scale = stiffness[spring] * stretch / (dx * dx + dy * dy + dz * dz)
-        force[i, 0] -= scale * dx
-        force[i, 1] -= scale * dy
-        force[i, 2] -= scale * dz
-        force[j, 0] += scale * dx
-        force[j, 1] += scale * dy
-        force[j, 2] += scale * dz
-    averaged, pressure = model.averages_volume, np.zeros(model.node_bulk.shape[0])
-    if averaged:
-        for tet in range(tets.shape[0]):
-            change = _volume_change(rest, tets, tet, displacement)
-            for corner in range(4):
-                pressure[tets[tet, corner]] += 0.25 * change
-        for node in range(pressure.shape[0]):
-            pressure[node] *= model.node_bulk[node] / model.node_rest_volume[node]
-    for tet in range(tets.shape[0]):
-        if bulk[tet] == 0.0 and not averaged:
-            continue
-        a = np.uint32(tets[tet, 0])
-        scale = bulk[tet] * _volume_change(rest, tets, tet, displacement) / rest_volume[tet]
-        for corner in range(4):
-            scale += 0.25 * pressure[tets[tet, corner]]
-        for corner in range(1, 4):
-            gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
-            node = np.uint32(tets[tet, corner])
-            force[node, 0] += scale * gx
-            force[node, 1] += scale * gy
-            force[node, 2] += scale * gz
-            force[a, 0] -= scale * gx
-            force[a, 1] -= scale * gy
-            force[a, 2] -= scale * gz
-
-
-@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
-def _volume_change(rest, tets, tet, displacement):
-    """Change of one tet's volume to first order in a displacement [m^3]."""
-    a = np.uint32(tets[tet, 0])
-    change = 0.0
-    for corner in range(1, 4):
-        gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
-        node = np.uint32(tets[tet, corner])
-        change += (
-            gx * (displacement[node, 0] - displacement[a, 0])
-            + gy * (displacement[node, 1] - displacement[a, 1])
-            + gz * (displacement[node, 2] - displacement[a, 2])
-        )
-    return change
-
-
-@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
-def _corner_gradient(position, tets, tet, corner):
-    """dV/dx of corner 1, 2 or 3 of one tet [m^2]: a sixth of the cross product of the edges to the next two."""
-    a = np.uint32(tets[tet, 0])
-    p = np.uint32(tets[tet, 1 + corner % 3])
-    q = np.uint32(tets[tet, 1 + (corner + 1) % 3])
-    px = position[p, 0] - position[a, 0]
-    py = position[p, 1] - position[a, 1]
-    pz = position[p, 2] - position[a, 2]
-    qx = position[q, 0] - position[a, 0]
-    qy = position[q, 1] - position[a, 1]
-    qz = position[q, 2] - position[a, 2]
-    return (py * qz - pz * qy) / 6.0, (pz * qx - px * qz) / 6.0, (px * qy - py * qx) / 6.0

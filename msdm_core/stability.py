@@ -6,12 +6,21 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from msdm_core.kernels import ContactLaw, OrganModel, apply_stiffness
+from msdm_core.kernels import ContactLaw, OrganModel
+from msdm_core.linear_kernels import multiply_stiffness
 from msdm_core.mesh import FloatArray
 
 # Relative accuracy asked of the largest eigenvalue: 1 % of the step. Lanczos comes from below, so it is added back.
 EIGENVALUE_TOLERANCE = 0.02
 LANCZOS_VECTORS = 12
+
+
+def apply_stiffness(model: OrganModel, displacement: FloatArray, force: FloatArray) -> None:
+    """Fill `force` with the linearised internal forces at rest, K u [N], of a displacement u [m]; both (n_node, 3)."""
+    multiply_stiffness(
+        model.node_rest_position, model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_rest_volume,
+        model.tet_bulk, model.node_rest_volume, model.node_bulk, displacement, np.empty(len(model.node_mass)), force,
+    )  # fmt: skip
 
 
 def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = None) -> float:

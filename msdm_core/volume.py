@@ -30,6 +30,6 @@ def nodal_average(mesh: TetMesh, tet_modulus: FloatArray) -> tuple[FloatArray, F
     V_a = sum_t V_t / 4 and K_a = sum_t (V_t / 4) K_t / V_a (averaged volumes: Bonet and Burton 1998).
     """
     corners = mesh.tets.ravel()
-    volume = np.bincount(corners, np.repeat(mesh.volumes / 4.0, 4), mesh.node_count)
+    volume = np.bincount(corners, np.repeat(mesh.volumes / 4.0, 4), mesh.node_count).astype(np.float64)
     modulus = np.bincount(corners, np.repeat(mesh.volumes / 4.0 * tet_modulus, 4), mesh.node_count) / volume
     return volume, modulus

@@ -6,10 +6,11 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from msdm_core.damping import Damping
-from msdm_core.kernels import OrganModel, apply_stiffness
+from msdm_core.kernels import OrganModel
 from msdm_core.mesh import TET_FACES, FloatArray, TetMesh
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.regions import Lesion, Material
+from msdm_core.stability import apply_stiffness
 
 DENSITY = 1060.0  # [kg/m^3]
 RESIDUAL = 1e-8  # of the linear solution, relative; energies are then right to its square

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from msdm_core.damping import Damping
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState, apply_stiffness
+from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.measure import (
     angular_momentum,
     internal_forces,
@@ -22,7 +22,7 @@ from msdm_core.measure import (
 from msdm_core.mesh import TetMesh
 from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material
-from msdm_core.stability import contact_node_area, contact_node_stiffness, stable_dt, step_limit
+from msdm_core.stability import apply_stiffness, contact_node_area, contact_node_stiffness, stable_dt, step_limit
 from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 from tests.core import oracle
 

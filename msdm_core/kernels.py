@@ -1,4 +1,4 @@
-"""Every compiled function of the organ, the structures it reads and the constants it uses, in one file.
+"""Every compiled function that steps the organ, the structures it reads and the constants it uses, in one file.
 
 numba's disk cache does not see edits in other files, so nothing here may come from one (only math, typing,
 numpy and numba are imported). Arrays of `OrganModel` are read-only, which numba holds at compile time; the
@@ -20,6 +20,10 @@ FAULT_NOT_FINITE = 2
 
 # Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
 CANDIDATE_MARGIN = 1e-3
+
+# Below this volume ratio a tet also bears the share of its volume term that is averaged at nodes: an average lets
+# single tets collapse between swollen neighbours (without it, a deep press turned some inside out).
+SQUEEZED_RATIO = 0.6
 
 # Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
 QUADRATURE_COUNT = 4
@@ -46,7 +50,11 @@ class OrganModel(NamedTuple):
         spring_rest_length: [m]                                                  (n_spring,)
         tet_nodes: corners of each tet                                           (n_tet, 4)
         tet_rest_volume: [m^3]                                                   (n_tet,)
-        tet_bulk: modulus of the volume term, K_t = lambda - mu [Pa]             (n_tet,)
+        tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet,)
+        tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet,)
+        node_rest_volume: volume averaged at a node, a quarter of its tets [m^3] (n_node,)
+        node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node,)
+        averages_volume: whether any node_bulk is above 0                        scalar
         surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
         surface_rest_area: [m^2]                                                 (n_surface,)
         gravity: [m/s^2]                                                         (3,)
@@ -64,6 +72,10 @@ class OrganModel(NamedTuple):
     tet_nodes: NDArray[np.int32]
     tet_rest_volume: FloatArray
     tet_bulk: FloatArray
+    tet_averaged_bulk: FloatArray
+    node_rest_volume: FloatArray
+    node_bulk: FloatArray
+    averages_volume: bool
     surface_triangles: NDArray[np.int32]
     surface_rest_area: FloatArray
     gravity: FloatArray
@@ -79,6 +91,7 @@ class OrganState(NamedTuple):
         node_position: [m]                                                       (n_node, 3)
         node_velocity: [m/s]                                                     (n_node, 3)
         node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3)
+        node_pressure: scratch: tension of the averaged volume term [Pa]         (n_node,)
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
@@ -89,6 +102,7 @@ class OrganState(NamedTuple):
     node_position: FloatArray
     node_velocity: FloatArray
     node_force: FloatArray
+    node_pressure: FloatArray
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
@@ -180,8 +194,13 @@ def _add_spring_forces(model, state):
 def _add_volume_forces(model, state):
     """Volume term W = (K_t / 2) V0 (J - 1)^2 per tet: f_a = -K_t (J - 1) dV/dx_a; watches the smallest J.
 
-    It adds K_t to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020).
+    It adds K_t to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020). Where volumes
+    are averaged at nodes, the mean of the corners' tension is added to K_t (J - 1): `_average_volumes`; and, below
+    SQUEEZED_RATIO, the term (K / 2) V0 (J - SQUEEZED_RATIO)^2 of the averaged share K.
     """
+    if model.averages_volume:
+        _average_volumes(model, state)
+    averaged, pressure, averaged_bulk = model.averages_volume, state.node_pressure, model.tet_averaged_bulk
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     tets, rest_volume, bulk, beta = model.tet_nodes, model.tet_rest_volume, model.tet_bulk, model.beta
     smallest = state.volume_ratio_smallest[0]
@@ -229,6 +248,10 @@ def _add_volume_forces(model, state):
             )
             strain += beta * rate / (6.0 * rest_volume[tet])
         scale = -bulk[tet] * strain / 6.0
+        if averaged:
+            scale -= (pressure[a] + pressure[b] + pressure[c] + pressure[d]) / 24.0
+            if ratio < SQUEEZED_RATIO:
+                scale -= averaged_bulk[tet] * (ratio - SQUEEZED_RATIO) / 6.0
         force[a, 0] -= scale * (gbx + gcx + gdx)
         force[a, 1] -= scale * (gby + gcy + gdy)
         force[a, 2] -= scale * (gbz + gcz + gdz)
@@ -243,6 +266,55 @@ def _add_volume_forces(model, state):
         force[d, 2] += scale * gdz
     state.volume_ratio_smallest[0] = smallest
     state.volume_ratio_tet[0] = smallest_tet
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _average_volumes(model, state):
+    """Tension of the volumes averaged at nodes: p_a = K_a (J_a - 1), J_a = sum_t V_t / 4 over what it is at rest.
+
+    It is the derivative of W = sum_a (K_a / 2) V_a (J_a - 1)^2 by J_a V_a, so that a tet pulls its corners with the
+    mean of their p_a: fewer constraints than tets, which near incompressibility would lock (Bonet and Burton 1998).
+    """
+    position, velocity, pressure = state.node_position, state.node_velocity, state.node_pressure
+    tets, rest_volume, bulk, beta = model.tet_nodes, model.node_rest_volume, model.node_bulk, model.beta
+    pressure[:] = 0.0
+    for tet in range(tets.shape[0]):
+        a = np.uint32(tets[tet, 0])
+        b = np.uint32(tets[tet, 1])
+        c = np.uint32(tets[tet, 2])
+        d = np.uint32(tets[tet, 3])
+        bx = position[b, 0] - position[a, 0]
+        by = position[b, 1] - position[a, 1]
+        bz = position[b, 2] - position[a, 2]
+        cx = position[c, 0] - position[a, 0]
+        cy = position[c, 1] - position[a, 1]
+        cz = position[c, 2] - position[a, 2]
+        dx = position[d, 0] - position[a, 0]
+        dy = position[d, 1] - position[a, 1]
+        dz = position[d, 2] - position[a, 2]
+        gx = cy * dz - cz * dy
+        gy = cz * dx - cx * dz
+        gz = cx * dy - cy * dx
+        volume = bx * gx + by * gy + bz * gz
+        if beta > 0.0:
+            volume += beta * (
+                gx * (velocity[b, 0] - velocity[a, 0])
+                + gy * (velocity[b, 1] - velocity[a, 1])
+                + gz * (velocity[b, 2] - velocity[a, 2])
+                + (dy * bz - dz * by) * (velocity[c, 0] - velocity[a, 0])
+                + (dz * bx - dx * bz) * (velocity[c, 1] - velocity[a, 1])
+                + (dx * by - dy * bx) * (velocity[c, 2] - velocity[a, 2])
+                + (by * cz - bz * cy) * (velocity[d, 0] - velocity[a, 0])
+                + (bz * cx - bx * cz) * (velocity[d, 1] - velocity[a, 1])
+                + (bx * cy - by * cx) * (velocity[d, 2] - velocity[a, 2])
+            )
+        pressure[a] += volume
+        pressure[b] += volume
+        pressure[c] += volume
+        pressure[d] += volume
+    for node in range(pressure.shape[0]):
+        # The sum holds 24 times the averaged volume: six for the box product, four for the quarter.
+        pressure[node] = bulk[node] * (pressure[node] / (24.0 * rest_volume[node]) - 1.0)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -567,68 +639,3 @@ def evaluate_forces(model, state):
     _begin_forces(model, state)
     _add_spring_forces(model, state)
     _add_volume_forces(model, state)
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def apply_stiffness(model, displacement, force):
-    """Linearised internal forces K u at rest [N], from a displacement u [m], both (n_node, 3)."""
-    rest = model.node_rest_position
-    nodes, stiffness, tets, bulk = model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_bulk
-    rest_volume = model.tet_rest_volume
-    force[:, :] = 0.0
-    for spring in range(nodes.shape[0]):
-        i = np.uint32(nodes[spring, 0])
-        j = np.uint32(nodes[spring, 1])
-        dx = rest[j, 0] - rest[i, 0]
-        dy = rest[j, 1] - rest[i, 1]
-        dz = rest[j, 2] - rest[i, 2]
-        stretch = (
-            dx * (displacement[j, 0] - displacement[i, 0])
-            + dy * (displacement[j, 1] - displacement[i, 1])
-            + dz * (displacement[j, 2] - displacement[i, 2])
-        )
-        scale = stiffness[spring] * stretch / (dx * dx + dy * dy + dz * dz)
-        force[i, 0] -= scale * dx
-        force[i, 1] -= scale * dy
-        force[i, 2] -= scale * dz
-        force[j, 0] += scale * dx
-        force[j, 1] += scale * dy
-        force[j, 2] += scale * dz
-    for tet in range(tets.shape[0]):
-        if bulk[tet] == 0.0:
-            continue
-        a = np.uint32(tets[tet, 0])
-        change = 0.0
-        for corner in range(1, 4):
-            gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
-            node = np.uint32(tets[tet, corner])
-            change += (
-                gx * (displacement[node, 0] - displacement[a, 0])
-                + gy * (displacement[node, 1] - displacement[a, 1])
-                + gz * (displacement[node, 2] - displacement[a, 2])
-            )
-        scale = bulk[tet] * change / rest_volume[tet]
-        for corner in range(1, 4):
-            gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
-            node = np.uint32(tets[tet, corner])
-            force[node, 0] += scale * gx
-            force[node, 1] += scale * gy
-            force[node, 2] += scale * gz
-            force[a, 0] -= scale * gx
-            force[a, 1] -= scale * gy
-            force[a, 2] -= scale * gz
-
-
-@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
-def _corner_gradient(position, tets, tet, corner):
-    """dV/dx of corner 1, 2 or 3 of one tet [m^2]: a sixth of the cross product of the edges to the next two."""
-    a = np.uint32(tets[tet, 0])
-    p = np.uint32(tets[tet, 1 + corner % 3])
-    q = np.uint32(tets[tet, 1 + (corner + 1) % 3])
-    px = position[p, 0] - position[a, 0]
-    py = position[p, 1] - position[a, 1]
-    pz = position[p, 2] - position[a, 2]
-    qx = position[q, 0] - position[a, 0]
-    qy = position[q, 1] - position[a, 1]
-    qz = position[q, 2] - position[a, 2]
-    return (py * qz - pz * qy) / 6.0, (pz * qx - px * qz) / 6.0, (px * qy - py * qx) / 6.0

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.kernels import OrganModel, OrganState, evaluate_forces
+from msdm_core.kernels import SQUEEZED_RATIO, OrganModel, OrganState, evaluate_forces
 from msdm_core.mesh import FloatArray, IntArray, tet_volumes
 
 
@@ -15,14 +15,21 @@ def kinetic_energy(model: OrganModel, state: OrganState) -> float:
 def potential_energy(model: OrganModel, state: OrganState) -> float:
     """Energy of springs, volume term and gravity, zero at the undeformed position [J].
 
-    U = sum_s k_s (l_s - l0_s)^2 / 2 + sum_t K_t V0_t (J_t - 1)^2 / 2 - sum_i m_i g . (x_i - X_i); a resting tool's
-    contact energy is not in it.
+    U = sum_s k_s (l_s - l0_s)^2 / 2 + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
+        + sum_t K'_t V0_t (J_t - J')^2 / 2 - sum_i m_i g . (x_i - X_i)
+    where a is a volume averaged at a node, K'_t the share averaged and the fourth sum over tets below
+    J' = SQUEEZED_RATIO. A resting tool's contact energy is not in it.
     """
     ends = state.node_position[model.spring_nodes]
     stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length
     springs = 0.5 * float(model.spring_stiffness @ stretch**2)
-    strain = volume_ratios(model, state) - 1.0
-    volume = 0.5 * float((model.tet_bulk * model.tet_rest_volume) @ strain**2)
+    ratio = volume_ratios(model, state)
+    volume = 0.5 * float((model.tet_bulk * model.tet_rest_volume) @ (ratio - 1.0) ** 2)
+    squeezed = np.minimum(ratio - SQUEEZED_RATIO, 0.0)
+    volume += 0.5 * float((model.tet_averaged_bulk * model.tet_rest_volume) @ squeezed**2)
+    quarter = np.repeat(ratio * model.tet_rest_volume / 4.0, 4)
+    averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(model.node_mass)) / model.node_rest_volume
+    volume += 0.5 * float((model.node_bulk * model.node_rest_volume) @ (averaged - 1.0) ** 2)
     lift = (state.node_position - model.node_rest_position) @ model.gravity
     return springs + volume - float(model.node_mass @ lift)
 
@@ -57,6 +64,7 @@ def internal_forces(model: OrganModel, state: OrganState) -> FloatArray:
     no_gravity.setflags(write=False)
     scratch = state._replace(
         node_force=np.empty_like(state.node_force),
+        node_pressure=np.empty_like(state.node_pressure),
         volume_ratio_smallest=np.ones(1),
         volume_ratio_tet=np.zeros(1, np.int32),
     )

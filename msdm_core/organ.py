@@ -18,6 +18,7 @@ from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_
 from msdm_core.stability import largest_frequency, step_limit
 from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.stiffness import membrane_stiffness, spring_network
+from msdm_core.volume import averaged_volume_modulus, nodal_average
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     mesh = spec.mesh
     _check_extent(mesh)
     spring_modulus, bulk, density = _tet_properties(spec)
+    averaged_bulk = averaged_volume_modulus(spring_modulus, bulk)
+    node_volume, node_bulk = nodal_average(mesh, averaged_bulk)
     nodes, stiffness = spring_network(mesh, spring_modulus, rule=spec.stiffness_rule)
     if spec.capsule is not None and spec.capsule.thickness is not None:
         stiffness = stiffness + membrane_stiffness(mesh, spec.capsule.youngs_modulus, spec.capsule.thickness)
@@ -76,7 +79,11 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         spring_rest_length=_read_only(np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
         tet_nodes=_read_only(mesh.tets),
         tet_rest_volume=_read_only(mesh.volumes),
-        tet_bulk=_read_only(bulk),
+        tet_bulk=_read_only(bulk - averaged_bulk),
+        tet_averaged_bulk=_read_only(averaged_bulk),
+        node_rest_volume=_read_only(node_volume),
+        node_bulk=_read_only(node_bulk),
+        averages_volume=bool(node_bulk.any()),
         surface_triangles=_read_only(np.ascontiguousarray(surface)),
         surface_rest_area=_read_only(area),
         gravity=_read_only(_checked_gravity(spec.gravity)),
@@ -98,6 +105,7 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         node_position=model.node_rest_position.copy(),
         node_velocity=np.zeros_like(model.node_rest_position),
         node_force=np.zeros_like(model.node_rest_position),
+        node_pressure=np.zeros_like(model.node_mass),
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
         contact_stretch=np.zeros((shape_count, point_count, 3)),
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),

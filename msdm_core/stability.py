@@ -6,12 +6,21 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from msdm_core.kernels import ContactLaw, OrganModel, apply_stiffness
+from msdm_core.kernels import ContactLaw, OrganModel
+from msdm_core.linear_kernels import multiply_stiffness
 from msdm_core.mesh import FloatArray
 
 # Relative accuracy asked of the largest eigenvalue: 1 % of the step. Lanczos comes from below, so it is added back.
 EIGENVALUE_TOLERANCE = 0.02
 LANCZOS_VECTORS = 12
+
+
+def apply_stiffness(model: OrganModel, displacement: FloatArray, force: FloatArray) -> None:
+    """Fill `force` with the linearised internal forces at rest, K u [N], of a displacement u [m]; both (n_node, 3)."""
+    multiply_stiffness(
+        model.node_rest_position, model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_rest_volume,
+        model.tet_bulk, model.node_rest_volume, model.node_bulk, displacement, np.empty(len(model.node_mass)), force,
+    )  # fmt: skip
 
 
 def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = None) -> float:
@@ -52,6 +61,28 @@ def contact_node_area(model: OrganModel) -> FloatArray:
     return np.bincount(model.surface_triangles.ravel(), thirds, len(model.node_mass)).astype(np.float64)
 
 
+def contact_node_stiffness(model: OrganModel, contact: ContactLaw) -> FloatArray:
+    """The most that contact can hold each node with, in any direction x [N/m], shape (n_node,).
+
+    A patch of normal n, touched along e (the shape's own normal), holds x with k_p (n.e)^2 (e.x)^2 + k_t (1 - (e.x)^2)
+    per area, at most k_t + (k_p - k_t) ((1 + n.x) / 2)^2, whatever e. Over the areas A around a node (a third of each
+    triangle; the rows of its contact stiffness sum to that) and whatever x this is at most
+    k_t sum A + (k_p - k_t) (sum A + 2 |sum A n| + lambda_max(sum A n n^T)) / 4: k_p A on a plane, less than three times
+    that where three faces meet in a corner.
+    """
+    corners = model.node_rest_position[model.surface_triangles]
+    share = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6.0
+    nodes, count = model.surface_triangles.ravel(), len(model.node_mass)
+    outer = np.einsum("ti,tj->tij", share, share) / (model.surface_rest_area / 3.0)[:, None, None]
+    vector, matrix = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    np.add.at(vector, nodes, np.repeat(share, 3, axis=0))
+    np.add.at(matrix, nodes, np.repeat(outer, 3, axis=0))
+    area = contact_node_area(model)
+    facing = 0.25 * (area + 2.0 * np.linalg.norm(vector, axis=1) + np.linalg.eigvalsh(matrix)[:, -1])
+    across = contact.tangential_stiffness if contact.friction > 0.0 else 0.0
+    return across * area + max(0.0, contact.stiffness - across) * facing
+
+
 def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) -> float:
     """Stable step of symplectic Euler for one mode, v' = e^(-alpha dt) v - dt (w^2 x + (beta w^2 + drag) v) [s].
 
@@ -72,13 +103,16 @@ def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) 
 def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     """Largest stable step [s]: springs, volume term, alpha, beta, and contact stiffness, damping and friction if given.
 
-    Contact holds a node of surface area A_i with at most k_p A_i in any direction and drags it with c_p A_i (the rows
-    of a triangle's contact stiffness sum to that); k_p stands for the larger of normal and tangential stiffness.
+    Contact holds each node with `contact_node_stiffness` and drags it with c_p times its area A. The step is stable
+    where (K + k_contact) dt^2 + 2 c_p A dt <= 4 M: drag counts as a stiffness 2 c_p A / dt, taken at a step that is
+    surely stable, the one for the hardest held and the most dragged node being the same.
     """
     if contact is None:
         return model.stable_step
-    area = contact_node_area(model)
-    stiffest = max(contact.stiffness, contact.tangential_stiffness if contact.friction > 0.0 else 0.0)
-    omega = largest_frequency(model, stiffest * area)
-    drag_rate = contact.damping * float((area * model.node_inverse_mass).max())
-    return step_limit(omega, model.alpha, model.beta, drag_rate)
+    held = contact_node_stiffness(model, contact)
+    drag = contact.damping * contact_node_area(model)
+    omega = largest_frequency(model, held)
+    dt = step_limit(omega, model.alpha, model.beta, float((drag * model.node_inverse_mass).max()))
+    if contact.damping == 0.0 or not math.isfinite(dt):
+        return dt
+    return max(dt, step_limit(largest_frequency(model, held + 2.0 * drag / dt), model.alpha, model.beta))

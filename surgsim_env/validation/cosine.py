@@ -9,8 +9,8 @@ from surgsim_env.validation.statics import assemble_stiffness, linear_organ, nod
 MODULUS = 20e3  # [Pa]
 CELL = 0.005  # [m]
 RATIOS = (0.25, 0.40, 0.45, 0.49)
-# No tolerance is given; 5 % of the stiffness at nu = 1/4 is about what nodal volumes show (facts, section 8).
-TOLERANCE = 0.05
+# No tolerance is given; a trial of nodal volumes lay within 3 % of nu = 1/4 (facts, section 8), so does this one.
+TOLERANCE = 0.03
 
 
 def cosine_stiffness(nu: float, half_wave: int) -> float:

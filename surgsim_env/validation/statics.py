@@ -6,10 +6,11 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from msdm_core.damping import Damping
-from msdm_core.kernels import OrganModel, apply_stiffness
+from msdm_core.kernels import OrganModel
 from msdm_core.mesh import TET_FACES, FloatArray, TetMesh
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.regions import Lesion, Material
+from msdm_core.stability import apply_stiffness
 
 DENSITY = 1060.0  # [kg/m^3]
 RESIDUAL = 1e-8  # of the linear solution, relative; energies are then right to its square
@@ -30,7 +31,9 @@ def linear_organ(
 
 
 def assemble_stiffness(model: OrganModel) -> csr_array:
-    """K [N/m] at rest, (3 n_node, 3 n_node): sum_s k n n^T and sum_t (K_t / V_t) g g^T, g = dV/dx.
+    """K [N/m] at rest, (3 n_node, 3 n_node): sum_s k n n^T, sum_t (K_t / V_t) g g^T and sum_a (K_a / V_a) g g^T.
+
+    g is dV/dx of a tet's volume, or of the volume averaged at a node: a quarter of the tets around it.
 
     Raises:
         AssertionError: the kernels' linearised forces are those of another matrix: this one lacks a term.
@@ -41,16 +44,29 @@ def assemble_stiffness(model: OrganModel) -> csr_array:
     direction = span / np.linalg.norm(span, axis=1)[:, None]
     springs = np.concatenate([-direction, direction], axis=1) * np.sqrt(model.spring_stiffness)[:, None]
     matrix = outer_products(model.spring_nodes, springs, count)
-    members = np.flatnonzero(model.tet_bulk)
-    if members.size:
-        tets = model.tet_nodes[members]
-        corners = points[tets[:, TET_FACES]]
-        outward = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]) / 2.0
-        factor = np.sqrt(model.tet_bulk[members] / model.tet_rest_volume[members])
-        gradient = (-outward / 3.0).reshape(-1, 12) * factor[:, None]
-        matrix = matrix + outer_products(tets, gradient, count)
+    gradient = _volume_gradient(points, model.tet_nodes)
+    by_tet = gradient * np.sqrt(model.tet_bulk / model.tet_rest_volume)[:, None]
+    matrix = matrix + outer_products(model.tet_nodes, by_tet, count)
+    if model.node_bulk.any():
+        averaged = _averaged_gradient(model.tet_nodes, gradient, count)
+        matrix = matrix + averaged.T @ averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
     assert stiffness_mismatch(model, matrix) < 1e-9, "the kernels hold a term that this assembly does not know"
     return matrix
+
+
+def _volume_gradient(points: FloatArray, tets: NDArray[np.int32]) -> FloatArray:
+    """dV/dx of each tet's corners [m^2], (n_tet, 12)."""
+    corners = points[tets[:, TET_FACES]]
+    outward = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]) / 2.0
+    return (-outward / 3.0).reshape(-1, 12)
+
+
+def _averaged_gradient(tets: NDArray[np.int32], gradient: FloatArray, count: int) -> csr_array:
+    """dV/dx of the volume averaged at each node [m^2], (n_node, 3 n_node)."""
+    columns = (3 * tets[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(tets), -1)
+    rows = np.repeat(tets, columns.shape[1], axis=1)
+    values, places = np.tile(gradient / 4.0, (1, 4)), np.tile(columns, (1, 4))
+    return coo_array((values.ravel(), (rows.ravel(), places.ravel())), shape=(count // 3, count)).tocsr()
 
 
 def stiffness_mismatch(model: OrganModel, matrix: csr_array) -> float:

@@ -51,15 +51,40 @@ def volume_gradient(corners: FloatArray) -> FloatArray:
 
 
 def volume_forces(model: OrganModel, position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """f_a = -K_t ((J - 1) + beta dJ/dt) dV/dx_a [N], shape (n_node, 3)."""
+    """f_a = -(K_t e_t + K' min(J - 0.6, 0) + mean of the corners' K_a e_a) dV/dx_a [N], shape (n_node, 3).
+
+    e = (J - 1) + beta dJ/dt; e_a is that of the volume around a node, of which each of its tets gives a quarter.
+    """
     force = np.zeros_like(position)
-    for nodes, rest_volume, bulk in zip(model.tet_nodes, model.tet_rest_volume, model.tet_bulk):
-        a, b, c, d = position[nodes]
-        ratio = float(np.linalg.det([b - a, c - a, d - a])) / 6.0 / rest_volume
-        gradient = volume_gradient(position[nodes])
-        rate = float((gradient * velocity[nodes]).sum()) / rest_volume
-        force[nodes] -= bulk * ((ratio - 1.0) + model.beta * rate) * gradient
+    tension = averaged_tension(model, position, velocity)
+    moduli = zip(model.tet_nodes, model.tet_rest_volume, model.tet_bulk, model.tet_averaged_bulk)
+    for nodes, rest_volume, bulk, averaged_bulk in moduli:
+        volume, rate, gradient = tet_volume(position[nodes], velocity[nodes])
+        strain = volume / rest_volume - 1.0 + model.beta * rate / rest_volume
+        squeezed = averaged_bulk * min(volume / rest_volume - 0.6, 0.0)
+        force[nodes] -= (bulk * strain + squeezed + tension[nodes].mean()) * gradient
     return force
+
+
+def tet_volume(corners: FloatArray, velocity: FloatArray) -> tuple[float, float, FloatArray]:
+    """Volume of a tet [m^3], its rate [m^3/s] and dV/dx of its corners [m^2] (4, 3)."""
+    a, b, c, d = corners
+    gradient = volume_gradient(corners)
+    return float(np.linalg.det([b - a, c - a, d - a])) / 6.0, float((gradient * velocity).sum()), gradient
+
+
+def averaged_tension(model: OrganModel, position: FloatArray, velocity: FloatArray) -> FloatArray:
+    """K_a ((V - V0) + beta dV/dt) / V0 of the volume around each node [Pa], shape (n_node,)."""
+    tension = np.zeros(len(position))
+    for node in range(len(position)):
+        around = np.flatnonzero((model.tet_nodes == node).any(axis=1))
+        grown = rest = 0.0
+        for nodes in model.tet_nodes[around]:
+            volume, rate, _ = tet_volume(position[nodes], velocity[nodes])
+            grown += 0.25 * (volume + model.beta * rate)
+            rest += 0.25 * tet_volume(model.node_rest_position[nodes], velocity[nodes])[0]
+        tension[node] = model.node_bulk[node] * (grown / rest - 1.0)
+    return tension
 
 
 def total_forces(model: OrganModel, position: FloatArray, velocity: FloatArray) -> FloatArray:
@@ -144,6 +169,7 @@ def irregular_organ(seed: int, *, damping: Damping = UNDAMPED) -> OrganModel:
     model = model._replace(
         spring_stiffness=frozen(model.spring_stiffness * random.uniform(0.3, 3.0, len(model.spring_stiffness))),
         tet_bulk=frozen(model.tet_bulk * random.uniform(0.0, 3.0, len(model.tet_bulk))),
+        node_bulk=frozen(model.node_bulk * random.uniform(0.0, 3.0, len(model.node_bulk))),
     )
     return model._replace(stable_step=step_limit(largest_frequency(model), model.alpha, model.beta))
 
@@ -160,7 +186,10 @@ def deformed_state(model: OrganModel, seed: int, *, shape_count: int = 0) -> Org
 def without_stiffness(model: OrganModel) -> OrganModel:
     """The same organ without springs and volume term: what is left of `node_force` is contact."""
     return model._replace(
-        spring_stiffness=frozen(np.zeros_like(model.spring_stiffness)), tet_bulk=frozen(np.zeros_like(model.tet_bulk))
+        spring_stiffness=frozen(np.zeros_like(model.spring_stiffness)),
+        tet_bulk=frozen(np.zeros_like(model.tet_bulk)),
+        node_bulk=frozen(np.zeros_like(model.node_bulk)),
+        averages_volume=False,
     )
 
 

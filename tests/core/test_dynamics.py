@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from msdm_core.damping import Damping
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState, apply_stiffness
+from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.measure import (
     angular_momentum,
     internal_forces,
@@ -21,7 +22,7 @@ from msdm_core.measure import (
 from msdm_core.mesh import TetMesh
 from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material
-from msdm_core.stability import contact_node_area, stable_dt, step_limit
+from msdm_core.stability import apply_stiffness, contact_node_area, contact_node_stiffness, stable_dt, step_limit
 from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 from tests.core import oracle
 
@@ -77,6 +78,8 @@ def oscillator(damping: Damping = oracle.UNDAMPED) -> tuple[OrganModel, float]:
         spring_stiffness=oracle.frozen([SPRING_STIFFNESS]),
         spring_rest_length=oracle.frozen([SPRING_LENGTH]),
         tet_bulk=oracle.frozen([0.0]),
+        node_bulk=oracle.frozen([0.0] * 4),
+        averages_volume=False,
         stable_step=1.0,
     )
     return model, math.sqrt(SPRING_STIFFNESS / float(model.node_mass[1]))
@@ -288,21 +291,70 @@ def test_step_limit_of_drag_alone_and_of_nothing():
 
 
 STIFF_CONTACT = ContactLaw(stiffness=2e8, damping=0.0, friction=0.0, tangential_stiffness=1e8)
+FIRM_CONTACT = STIFF_CONTACT._replace(tangential_stiffness=8e8)
 
 
 def test_contact_is_counted_in_the_stable_step():
-    """2 / w_max of M^-1 (K + k_p A_i), to 1 % from below; friction's stiffness counts where there is friction."""
+    """2 / w_max of M^-1 (K + contact), to 1 % from below; friction's stiffness counts where there is friction."""
     model = SMALL_ORGANS["anchored"]
     area = contact_node_area(model)
     assert area.sum() == pytest.approx(model.surface_rest_area.sum(), rel=EXACT)
-    for law, stiffest in (
-        (STIFF_CONTACT, 2e8),
-        (STIFF_CONTACT._replace(tangential_stiffness=8e8), 2e8),
-        (STIFF_CONTACT._replace(tangential_stiffness=8e8, friction=0.1), 8e8),
-    ):
-        true_step = 2.0 / math.sqrt(dense_modes(model, stiffest * area)[0][-1])
+    for law in (STIFF_CONTACT, FIRM_CONTACT, FIRM_CONTACT._replace(friction=0.1)):
+        true_step = 2.0 / math.sqrt(dense_modes(model, contact_node_stiffness(model, law))[0][-1])
         assert 0.99 * true_step <= stable_dt(model, law) <= true_step * (1.0 + 1e-12)
-    assert stable_dt(model, STIFF_CONTACT._replace(damping=1e4)) < 0.9 * stable_dt(model, STIFF_CONTACT)
+    np.testing.assert_array_equal(
+        contact_node_stiffness(model, FIRM_CONTACT), contact_node_stiffness(model, STIFF_CONTACT)
+    )
+    np.testing.assert_allclose(contact_node_stiffness(model, FIRM_CONTACT._replace(friction=0.1)), 8e8 * area)
+
+
+def test_contact_damping_is_counted_in_the_stable_step():
+    """The step where the largest eigenvalue of M^-1 ((K + contact) dt^2 + 2 c_p A dt) is 4, to 1 % from below."""
+    model = SMALL_ORGANS["anchored"]
+    held, area = contact_node_stiffness(model, STIFF_CONTACT), contact_node_area(model)
+    for damping in (1e3, 1e4, 1e5):
+
+        def excess(dt: float, damping: float = damping) -> float:
+            return dense_modes(model, held + 2.0 * damping * area / dt)[0][-1] * dt**2 - 4.0
+
+        true_step = brentq(excess, 1e-7, 1e-2, rtol=1e-6)
+        found = stable_dt(model, STIFF_CONTACT._replace(damping=damping))
+        assert 0.98 * true_step <= found <= true_step * (1.0 + 1e-5)
+
+
+def test_contact_holds_no_node_harder_than_counted():
+    """Patches touched along any directions e hold a node along any x with at most `contact_node_stiffness`.
+
+    On a plane that is k_p A; on an edge and in a corner less than the areas of all faces together would give.
+    """
+    model, random = SMALL_ORGANS["anchored"], np.random.default_rng(0)
+    law = STIFF_CONTACT._replace(friction=0.3)
+    area, held = contact_node_area(model), contact_node_stiffness(model, law)
+    corners = model.node_rest_position[model.surface_triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    greatest = np.zeros(len(area))
+    for node in np.flatnonzero(area > 0.0):
+        around = (model.surface_triangles == node).any(axis=1)
+        n, third = normal[around], model.surface_rest_area[around, None] / 3.0
+        for x in [*n, n.sum(axis=0), *random.normal(size=(60, 3))]:
+            x = x / np.linalg.norm(x)
+            # Along e somewhere between the patch's normal and x it is held hardest; others are tried as well.
+            share = random.uniform(0.0, 1.0, (len(n), 40, 1))
+            e = share * n[:, None] + (1.0 - share) * x + random.normal(scale=0.1, size=(len(n), 40, 3))
+            e /= np.linalg.norm(e, axis=2)[:, :, None]
+            pressed, along = np.maximum((e * n[:, None]).sum(axis=2), 0.0) ** 2, (e @ x) ** 2
+            one = law.stiffness * pressed * along + law.tangential_stiffness * (1.0 - along)
+            greatest[node] = max(greatest[node], float((third * one).max(axis=1).sum()))
+    assert (greatest <= held * (1.0 + 1e-9)).all()
+    free = area > 0.0
+    assert (greatest[free] > 0.85 * held[free]).all()  # nor is it much too careful
+    faces = np.zeros((len(area), 3), dtype=bool)
+    for corner in range(3):
+        np.logical_or.at(faces, model.surface_triangles[:, corner], np.abs(normal) > 0.9)
+    flat = faces.sum(axis=1) == 1
+    np.testing.assert_allclose(held[flat], law.stiffness * area[flat], rtol=1e-9)
+    assert (held[faces.sum(axis=1) == 3] < 0.85 * law.stiffness * area[faces.sum(axis=1) == 3]).all()
 
 
 @pytest.mark.parametrize(("counted", "stable"), [(True, True), (False, False)])
@@ -407,9 +459,9 @@ def test_a_number_that_is_not_finite_is_named(field: str):
     node = 11
     getattr(state, field)[node, 1] = math.nan
     first = node
-    if field == "node_position":  # its springs spread it to its neighbours within the step
-        touching = (model.tet_nodes == node).any(axis=1)
-        first = int(model.tet_nodes[touching].min())
+    if field == "node_position":  # springs and averaged volumes spread it to the neighbours and theirs in the step
+        around = np.unique(model.tet_nodes[(model.tet_nodes == node).any(axis=1)])
+        first = int(model.tet_nodes[np.isin(model.tet_nodes, around).any(axis=1)].min())
     with pytest.raises(OrganDivergedError, match=rf"node {first} is no longer finite"):
         advance(model, state, dt=1e-5)
 

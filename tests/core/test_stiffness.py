@@ -132,6 +132,7 @@ def test_a_quarter_is_the_papers_model_to_the_bit():
     model = compile_organ(OrganSpec(LATTICE, Material(MODULUS, 1000.0)))
     np.testing.assert_array_equal(model.spring_stiffness, spring_network(LATTICE, MODULUS)[1])
     np.testing.assert_array_equal(model.tet_bulk, 0.0)
+    assert not model.averages_volume
 
 
 # ---- Van Gelder's rule --------------------------------------------------------------------------------------------

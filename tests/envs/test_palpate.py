@@ -58,14 +58,15 @@ def test_declaring_on_the_lesion_wins(env):
 
 
 def test_success_is_judged_at_ten_millimetres_along_the_surface(env):
-    for offset, success in ((0.0088, True), (0.0112, False)):
+    for offset, success in ((0.0085, True), (0.0115, False)):
         env.reset(seed=1)
         x, y = lesion_place(env)
         inwards = np.sign(0.03 - x)
         (_, _, _, _, info), _ = press_and_declare(env, x + inwards * offset, y)
         assert info["declared"]
         assert info["success"] is success
-        assert info["error_mm"] == pytest.approx(offset * 1000, abs=0.6)
+        # The tissue between tip and lesion is squeezed aside: the touched patch comes from up to 1 mm further out.
+        assert info["error_mm"] == pytest.approx(offset * 1000, abs=1.0)
     assert SUCCESS_DISTANCE == 0.010
 
 

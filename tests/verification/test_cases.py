@@ -8,7 +8,7 @@ from rich.console import Console
 from surgsim_env.validation import suite
 from surgsim_env.validation.catalogue import CASES
 from surgsim_env.validation.fem import has_fem
-from surgsim_env.validation.row import Case, Outcome, Row, compare
+from surgsim_env.validation.row import Case, Outcome, Row, bounded, compare
 
 PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else []) for case in CASES]
 
@@ -33,6 +33,17 @@ def test_verdicts():
     assert row("far", 0.94).verdict == "not met"
     assert row("nothing", math.nan).verdict == "not met"
     assert compare("pp", "", expected=-50.0, measured=-50.03, tolerance=0.02, absolute=True).verdict == "not met"
+
+
+def test_a_bound_holds_on_its_side():
+    assert [bounded("share", "", measured=value, most=0.4).verdict for value in (0.1, 0.4, 0.41)] == [
+        "met",
+        "met",
+        "not met",
+    ]
+    assert [bounded("angle", "", measured=value, least=8.0).verdict for value in (9.0, 7.9)] == ["met", "not met"]
+    assert bounded("nothing", "", measured=math.nan, most=1.0).verdict == "not met"
+    assert bounded("share", "", measured=0.5, most=0.4).error == pytest.approx(0.25)
 
 
 def test_a_run_passes_only_where_every_shortfall_is_known(monkeypatch):

@@ -202,8 +202,8 @@ def mixed_moduli(
     added_by_material = math.log1p(material.volume_modulus / (2.0 / 3.0 * material.spring_modulus))
     spring = spring_modulus * (material.spring_modulus / spring_modulus) ** fraction
     volume = 2.0 / 3.0 * spring * np.expm1((1.0 - fraction) * added + fraction * added_by_material)
-    touched = fraction > 0.0
-    return np.where(touched, spring, spring_modulus), np.where(touched, volume, volume_modulus)
+    # log and exp round: a tet that the lesion does not reach keeps its modulus to the bit.
+    return spring, np.where(fraction > 0.0, volume, volume_modulus)
 
 
 def boundary_layer(mesh: TetMesh) -> NDArray[np.bool_]:

@@ -196,6 +196,13 @@ def test_a_lesions_properties_enter_by_volume_fraction():
     np.testing.assert_allclose(model.node_mass.sum(), density @ BLOCK.volumes, rtol=1e-12)
 
 
+def test_tets_out_of_a_lesions_reach_keep_their_moduli_to_the_bit():
+    moduli = np.linspace(900.0, 5000.0, 101)
+    spring, volume = mixed_moduli(moduli, 7.0 * moduli, HARD, np.zeros(101))
+    np.testing.assert_array_equal(spring, moduli)
+    np.testing.assert_array_equal(volume, 7.0 * moduli)
+
+
 @pytest.mark.parametrize("nu", [0.25, 0.45])
 def test_a_lesion_of_the_healthy_tissue_changes_nothing(nu: float):
     tissue = Material(5000.0, 1060.0, nu)

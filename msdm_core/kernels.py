@@ -17,9 +17,13 @@ FloatArray = NDArray[np.float64]
 FAULT_NONE = 0
 FAULT_INVERTED_TET = 1
 FAULT_NOT_FINITE = 2
+FAULT_CONTACT_LOST = 3
 
 # Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
 CANDIDATE_MARGIN = 1e-3
+
+# The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
+GUARD_SHARE = 0.5
 
 # Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
 QUADRATURE_COUNT = 4
@@ -81,6 +85,7 @@ class OrganState(NamedTuple):
         node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3)
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
+        contact_guarded: 1 where the guard keeps a triangle off a shape's axis, 2 where it was passed  (n_shape, n_surface)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
         volume_ratio_tet: the tet that had it                                    (1,)
@@ -91,6 +96,7 @@ class OrganState(NamedTuple):
     node_force: FloatArray
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
+    contact_guarded: NDArray[np.uint8]
     contact_candidates: NDArray[np.int32]
     volume_ratio_smallest: FloatArray
     volume_ratio_tet: NDArray[np.int32]
@@ -255,6 +261,7 @@ def _find_candidates(model, state, shapes, duration):
     # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
     position, ends, surface = state.node_position, shapes.shape_ends, model.surface_triangles
     engaged, candidates, twist = state.contact_engaged, state.contact_candidates, shapes.tool_twist
+    guarded = state.contact_guarded
     most = 0
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
@@ -278,7 +285,7 @@ def _find_candidates(model, state, shapes, duration):
             limit = math.sqrt(max(reach, other)) + radius + margin
             px, py, pz = _closest_on_axis(ends, shape, position[a, 0], position[a, 1], position[a, 2])
             gap = (position[a, 0] - px) ** 2 + (position[a, 1] - py) ** 2 + (position[a, 2] - pz) ** 2
-            near = gap <= limit * limit
+            near = gap <= limit * limit or guarded[shape, triangle] != 0
             if not near:
                 first = triangle * QUADRATURE_COUNT
                 for point in range(first, first + QUADRATURE_COUNT):
@@ -500,6 +507,167 @@ def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrench):
+    """Keep the surface off the shapes' axes, whatever the quadrature points do; False once it was passed.
+
+    Where a ball is small against a triangle, the surface opens between its quadrature points. So the point of each
+    triangle nearest to the axis, at the distance d, is pushed away from it by k h (h / d - 1) below h = r / 2, with
+    k = pi r^2 k_p: nothing at h, without bound at the axis. It is taken implicitly, with the nodes' masses, so that it
+    asks for no shorter step; it must therefore come after all other forces. An axis that was in front of a triangle
+    and is behind it in the next substep, without having gone around an edge, has passed through.
+    """
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    candidates, guarded, surface = state.contact_candidates, state.contact_guarded, model.surface_triangles
+    inverse_mass, ends, twist, centre = model.node_inverse_mass, shapes.shape_ends, shapes.tool_twist, shapes.tool_centre
+    kept = True
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        radius = shapes.shape_radius[shape]
+        reach = GUARD_SHARE * radius
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
+            bx = position[b, 0] - position[a, 0]
+            by = position[b, 1] - position[a, 1]
+            bz = position[b, 2] - position[a, 2]
+            cx = position[c, 0] - position[a, 0]
+            cy = position[c, 1] - position[a, 1]
+            cz = position[c, 2] - position[a, 2]
+            nx = by * cz - bz * cy
+            ny = bz * cx - bx * cz
+            nz = bx * cy - by * cx
+            limit = reach * math.sqrt(nx * nx + ny * ny + nz * nz)
+            first = (
+                (ends[shape, 0, 0] - position[a, 0]) * nx
+                + (ends[shape, 0, 1] - position[a, 1]) * ny
+                + (ends[shape, 0, 2] - position[a, 2]) * nz
+            )
+            second = (
+                (ends[shape, 1, 0] - position[a, 0]) * nx
+                + (ends[shape, 1, 1] - position[a, 1]) * ny
+                + (ends[shape, 1, 2] - position[a, 2]) * nz
+            )
+            before = guarded[shape, triangle]
+            guarded[shape, triangle] = 0
+            if min(first, second) > limit or max(first, second) < -limit:
+                continue
+            # The nearest pair of axis and triangle by turns: at once for a ball, near enough for a capsule.
+            wb = 1.0 / 3.0
+            wc = 1.0 / 3.0
+            inside = False
+            for _ in range(1 if first == second else 4):
+                x = position[a, 0] + wb * bx + wc * cx
+                y = position[a, 1] + wb * by + wc * cy
+                z = position[a, 2] + wb * bz + wc * cz
+                px, py, pz = _closest_on_axis(ends, shape, x, y, z)
+                wb, wc, inside = _closest_in_triangle(
+                    bx, by, bz, cx, cy, cz, px - position[a, 0], py - position[a, 1], pz - position[a, 2]
+                )
+            wa = 1.0 - wb - wc
+            x = position[a, 0] + wb * bx + wc * cx
+            y = position[a, 1] + wb * by + wc * cy
+            z = position[a, 2] + wb * bz + wc * cz
+            ex = x - px
+            ey = y - py
+            ez = z - pz
+            distance = math.sqrt(ex * ex + ey * ey + ez * ez)
+            if distance >= reach:
+                continue
+            if ex * nx + ey * ny + ez * nz >= 0.0:  # behind the triangle
+                if inside and before != 0:
+                    guarded[shape, triangle] = 2
+                    kept = False
+                continue
+            guarded[shape, triangle] = 1
+            ex /= distance
+            ey /= distance
+            ez /= distance
+            ox = x - centre[tool, 0]
+            oy = y - centre[tool, 1]
+            oz = z - centre[tool, 2]
+            speed = -(
+                ex * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
+                + ey * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
+                + ez * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
+            )
+            mobility = 0.0
+            for corner in range(3):
+                node, weight = (a, wa) if corner == 0 else ((b, wb) if corner == 1 else (c, wc))
+                give = dt * inverse_mass[node]
+                speed += weight * (
+                    ex * (velocity[node, 0] + give * force[node, 0])
+                    + ey * (velocity[node, 1] + give * force[node, 1])
+                    + ez * (velocity[node, 2] + give * force[node, 2])
+                )
+                mobility += weight * weight * give
+            stiffness = math.pi * radius * radius * law.stiffness
+            slope = stiffness * (reach / distance) ** 2
+            push = stiffness * reach * (reach / distance - 1.0) - slope * dt * speed
+            push /= 1.0 + slope * dt * mobility
+            if push <= 0.0:
+                continue
+            fx = push * ex
+            fy = push * ey
+            fz = push * ez
+            for corner in range(3):
+                node, weight = (a, wa) if corner == 0 else ((b, wb) if corner == 1 else (c, wc))
+                force[node, 0] += weight * fx
+                force[node, 1] += weight * fy
+                force[node, 2] += weight * fz
+            x -= reference[tool, 0]
+            y -= reference[tool, 1]
+            z -= reference[tool, 2]
+            wrench[tool, 0] -= fx
+            wrench[tool, 1] -= fy
+            wrench[tool, 2] -= fz
+            wrench[tool, 3] -= y * fz - z * fy
+            wrench[tool, 4] -= z * fx - x * fz
+            wrench[tool, 5] -= x * fy - y * fx
+    return kept
+
+
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+def _closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
+    """Weights of the corners b and c, seen from the corner a, of the triangle's point nearest to p; whether inside.
+
+    After Ericson, Real-Time Collision Detection (2005), 5.1.5.
+    """
+    bb = bx * bx + by * by + bz * bz
+    cc = cx * cx + cy * cy + cz * cz
+    bc = bx * cx + by * cy + bz * cz
+    pb = px * bx + py * by + pz * bz
+    pc = px * cx + py * cy + pz * cz
+    determinant = bb * cc - bc * bc
+    wb = cc * pb - bc * pc
+    wc = bb * pc - bc * pb
+    if wb > 0.0 and wc > 0.0 and wb + wc < determinant:
+        return wb / determinant, wc / determinant, True
+    # The nearest of the three edges' nearest points.
+    on_b = min(1.0, max(0.0, pb / bb))
+    best = on_b * (on_b * bb - 2.0 * pb)
+    wb = on_b
+    wc = 0.0
+    on_c = min(1.0, max(0.0, pc / cc))
+    distance = on_c * (on_c * cc - 2.0 * pc)
+    if distance < best:
+        best = distance
+        wb = 0.0
+        wc = on_c
+    # Along b to c.
+    along = min(1.0, max(0.0, (bb - bc - pb + pc) / (bb + cc - 2.0 * bc)))
+    ub = 1.0 - along
+    distance = ub * ub * bb + along * along * cc + 2.0 * ub * along * bc - 2.0 * (ub * pb + along * pc)
+    if distance < best:
+        wb = ub
+        wc = along
+    return wb, wc, False
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _integrate(model, state, dt, decay):
     """Symplectic Euler: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt); returns a sum finite if all is."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
@@ -549,12 +717,15 @@ def advance_substeps(model, state, shapes, law, dt, decay, substep_count, refere
         _add_spring_forces(model, state)
         _add_volume_forces(model, state)
         _add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench)
+        kept = _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrench)
         total = _integrate(model, state, dt, decay)
         _move_shapes(shapes, dt)
         if not math.isfinite(total):
             return FAULT_NOT_FINITE
         if not state.volume_ratio_smallest[0] > 0.0:
             return FAULT_INVERTED_TET
+        if not kept:
+            return FAULT_CONTACT_LOST
     for tool in range(wrench.shape[0]):
         for part in range(6):
             wrench[tool, part] /= substep_count

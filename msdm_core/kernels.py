@@ -23,7 +23,10 @@ FAULT_CONTACT_LOST = 3
 CANDIDATE_MARGIN = 1e-3
 
 # The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
-GUARD_SHARE = 0.5
+GUARD_SHARE = 0.6
+GUARD_TURNS = 4
+# Half a thousandth of a triangle is taken for its edge, so that nothing slips through between two.
+EDGE_WIDTH = 5e-4
 
 # Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
 QUADRATURE_COUNT = 4
@@ -85,8 +88,8 @@ class OrganState(NamedTuple):
         node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3)
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
-        contact_guarded: 1 where the guard keeps a triangle off a shape's axis, 2 where it was passed  (n_shape, n_surface)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
+        contact_passed: the shape and the triangle it passed through, after such a fault  (2,)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
         volume_ratio_tet: the tet that had it                                    (1,)
     """
@@ -96,8 +99,8 @@ class OrganState(NamedTuple):
     node_force: FloatArray
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
-    contact_guarded: NDArray[np.uint8]
     contact_candidates: NDArray[np.int32]
+    contact_passed: NDArray[np.int32]
     volume_ratio_smallest: FloatArray
     volume_ratio_tet: NDArray[np.int32]
 
@@ -261,7 +264,6 @@ def _find_candidates(model, state, shapes, duration):
     # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
     position, ends, surface = state.node_position, shapes.shape_ends, model.surface_triangles
     engaged, candidates, twist = state.contact_engaged, state.contact_candidates, shapes.tool_twist
-    guarded = state.contact_guarded
     most = 0
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
@@ -285,7 +287,7 @@ def _find_candidates(model, state, shapes, duration):
             limit = math.sqrt(max(reach, other)) + radius + margin
             px, py, pz = _closest_on_axis(ends, shape, position[a, 0], position[a, 1], position[a, 2])
             gap = (position[a, 0] - px) ** 2 + (position[a, 1] - py) ** 2 + (position[a, 2] - pz) ** 2
-            near = gap <= limit * limit or guarded[shape, triangle] != 0
+            near = gap <= limit * limit
             if not near:
                 first = triangle * QUADRATURE_COUNT
                 for point in range(first, first + QUADRATURE_COUNT):
@@ -508,22 +510,26 @@ def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrench):
-    """Keep the surface off the shapes' axes, whatever the quadrature points do; False once it was passed.
+    """Keep the surface off the shapes' axes, whatever the quadrature points do; False where an axis passed through.
 
     Where a ball is small against a triangle, the surface opens between its quadrature points. So the point of each
-    triangle nearest to the axis, at the distance d, is pushed away from it by k h (h / d - 1) below h = r / 2, with
+    triangle nearest to the axis, at the distance d, is pushed away from it by k h (h / d - 1) below h = 0.6 r, with
     k = pi r^2 k_p: nothing at h, without bound at the axis. It is taken implicitly, with the nodes' masses, so that it
-    asks for no shorter step; it must therefore come after all other forces. An axis that was in front of a triangle
-    and is behind it in the next substep, without having gone around an edge, has passed through.
+    asks for no shorter step; it must therefore come after all other forces.
     """
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
-    candidates, guarded, surface = state.contact_candidates, state.contact_guarded, model.surface_triangles
-    inverse_mass, ends, twist, centre = model.node_inverse_mass, shapes.shape_ends, shapes.tool_twist, shapes.tool_centre
+    candidates, surface, inverse_mass = state.contact_candidates, model.surface_triangles, model.node_inverse_mass
+    ends, twist, centre = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre
     kept = True
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
         radius = shapes.shape_radius[shape]
         reach = GUARD_SHARE * radius
+        stiffness = math.pi * radius * radius * law.stiffness
+        # What an axis may pass in one substep, with the broad phase's bound on its speed.
+        watched = reach
+        for part in range(6):
+            watched += dt * abs(twist[tool, part])
         for entry in range(candidate_count):
             triangle = candidates[shape, entry]
             if triangle < 0:
@@ -540,49 +546,40 @@ def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrenc
             nx = by * cz - bz * cy
             ny = bz * cx - bx * cz
             nz = bx * cy - by * cx
-            limit = reach * math.sqrt(nx * nx + ny * ny + nz * nz)
-            first = (
-                (ends[shape, 0, 0] - position[a, 0]) * nx
-                + (ends[shape, 0, 1] - position[a, 1]) * ny
-                + (ends[shape, 0, 2] - position[a, 2]) * nz
-            )
-            second = (
-                (ends[shape, 1, 0] - position[a, 0]) * nx
-                + (ends[shape, 1, 1] - position[a, 1]) * ny
-                + (ends[shape, 1, 2] - position[a, 2]) * nz
-            )
-            before = guarded[shape, triangle]
-            guarded[shape, triangle] = 0
-            if min(first, second) > limit or max(first, second) < -limit:
+            twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
+            first = 0.0
+            second = 0.0
+            for axis, part in ((0, nx), (1, ny), (2, nz)):
+                first += (ends[shape, 0, axis] - position[a, axis]) * part
+                second += (ends[shape, 1, axis] - position[a, axis]) * part
+            low = 0 if first < second else 1
+            if min(first, second) > watched * twice_area or max(first, second) < -watched * twice_area:
                 continue
-            # The nearest pair of axis and triangle by turns: at once for a ball, near enough for a capsule.
-            wb = 1.0 / 3.0
-            wc = 1.0 / 3.0
-            inside = False
-            for _ in range(1 if first == second else 4):
+            if min(first, second) <= 0.0 and _passed(shapes, shape, position, velocity, dt, a, b, c):
+                state.contact_passed[0] = shape
+                state.contact_passed[1] = triangle
+                kept = False
+                continue
+            # The nearest pair of axis and triangle by turns, from the lower end: at once for a ball.
+            px, py, pz = ends[shape, low, 0], ends[shape, low, 1], ends[shape, low, 2]
+            for _ in range(GUARD_TURNS):
+                wb, wc = _closest_in_triangle(
+                    bx, by, bz, cx, cy, cz, px - position[a, 0], py - position[a, 1], pz - position[a, 2]
+                )
                 x = position[a, 0] + wb * bx + wc * cx
                 y = position[a, 1] + wb * by + wc * cy
                 z = position[a, 2] + wb * bz + wc * cz
+                before_x, before_y, before_z = px, py, pz
                 px, py, pz = _closest_on_axis(ends, shape, x, y, z)
-                wb, wc, inside = _closest_in_triangle(
-                    bx, by, bz, cx, cy, cz, px - position[a, 0], py - position[a, 1], pz - position[a, 2]
-                )
-            wa = 1.0 - wb - wc
-            x = position[a, 0] + wb * bx + wc * cx
-            y = position[a, 1] + wb * by + wc * cy
-            z = position[a, 2] + wb * bz + wc * cz
+                if px == before_x and py == before_y and pz == before_z:
+                    break
             ex = x - px
             ey = y - py
             ez = z - pz
             distance = math.sqrt(ex * ex + ey * ey + ez * ez)
-            if distance >= reach:
+            # Behind the triangle, beyond one of its edges: another one stands between.
+            if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
                 continue
-            if ex * nx + ey * ny + ez * nz >= 0.0:  # behind the triangle
-                if inside and before != 0:
-                    guarded[shape, triangle] = 2
-                    kept = False
-                continue
-            guarded[shape, triangle] = 1
             ex /= distance
             ey /= distance
             ez /= distance
@@ -594,27 +591,22 @@ def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrenc
                 + ey * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
                 + ez * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
             )
-            mobility = 0.0
-            for corner in range(3):
-                node, weight = (a, wa) if corner == 0 else ((b, wb) if corner == 1 else (c, wc))
-                give = dt * inverse_mass[node]
+            give = 0.0
+            for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
+                rate = dt * inverse_mass[node]
                 speed += weight * (
-                    ex * (velocity[node, 0] + give * force[node, 0])
-                    + ey * (velocity[node, 1] + give * force[node, 1])
-                    + ez * (velocity[node, 2] + give * force[node, 2])
+                    ex * (velocity[node, 0] + rate * force[node, 0])
+                    + ey * (velocity[node, 1] + rate * force[node, 1])
+                    + ez * (velocity[node, 2] + rate * force[node, 2])
                 )
-                mobility += weight * weight * give
-            stiffness = math.pi * radius * radius * law.stiffness
+                give += weight * weight * rate
             slope = stiffness * (reach / distance) ** 2
             push = stiffness * reach * (reach / distance - 1.0) - slope * dt * speed
-            push /= 1.0 + slope * dt * mobility
-            if push <= 0.0:
-                continue
+            push = max(0.0, push / (1.0 + slope * dt * give))
             fx = push * ex
             fy = push * ey
             fz = push * ez
-            for corner in range(3):
-                node, weight = (a, wa) if corner == 0 else ((b, wb) if corner == 1 else (c, wc))
+            for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
                 force[node, 0] += weight * fx
                 force[node, 1] += weight * fy
                 force[node, 2] += weight * fz
@@ -630,9 +622,70 @@ def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrenc
     return kept
 
 
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _passed(shapes, shape, position, velocity, dt, a, b, c):
+    """Whether an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
+    ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]
+    ux, uy, uz, wx, wy, wz = twist[tool]
+    highest, highest_b, highest_c = 0.0, 0.0, 0.0
+    lowest, lowest_b, lowest_c = 0.0, 0.0, 0.0
+    for end in range(2):
+        x = ends[shape, end, 0]
+        y = ends[shape, end, 1]
+        z = ends[shape, end, 2]
+        now, now_b, now_c = _foot(x, y, z, position, velocity, 0.0, a, b, c)
+        ox = x - centre[tool, 0]
+        oy = y - centre[tool, 1]
+        oz = z - centre[tool, 2]
+        x -= dt * (ux + wy * oz - wz * oy)
+        y -= dt * (uy + wz * ox - wx * oz)
+        z -= dt * (uz + wx * oy - wy * ox)
+        then, then_b, then_c = _foot(x, y, z, position, velocity, dt, a, b, c)
+        if then > 0.0 >= now and _is_inside(then, then_b, then_c, now, now_b, now_c):
+            return True
+        if now > highest:
+            highest, highest_b, highest_c = now, now_b, now_c
+        if now < lowest:
+            lowest, lowest_b, lowest_c = now, now_b, now_c
+    return highest > 0.0 > lowest and _is_inside(highest, highest_b, highest_c, lowest, lowest_b, lowest_c)
+
+
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+def _foot(x, y, z, position, velocity, dt, a, b, c):
+    """Of a point over a triangle as it was dt ago: height [m], and its foot's weights of the corners b and c."""
+    ax = position[a, 0] - dt * velocity[a, 0]
+    ay = position[a, 1] - dt * velocity[a, 1]
+    az = position[a, 2] - dt * velocity[a, 2]
+    bx = position[b, 0] - dt * velocity[b, 0] - ax
+    by = position[b, 1] - dt * velocity[b, 1] - ay
+    bz = position[b, 2] - dt * velocity[b, 2] - az
+    cx = position[c, 0] - dt * velocity[c, 0] - ax
+    cy = position[c, 1] - dt * velocity[c, 1] - ay
+    cz = position[c, 2] - dt * velocity[c, 2] - az
+    px = x - ax
+    py = y - ay
+    pz = z - az
+    nx = by * cz - bz * cy
+    ny = bz * cx - bx * cz
+    nz = bx * cy - by * cx
+    squared = nx * nx + ny * ny + nz * nz
+    wb = ((py * cz - pz * cy) * nx + (pz * cx - px * cz) * ny + (px * cy - py * cx) * nz) / squared
+    wc = ((by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz) / squared
+    return (px * nx + py * ny + pz * nz) / math.sqrt(squared), wb, wc
+
+
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+def _is_inside(high, high_b, high_c, low, low_b, low_c):
+    """Whether the way from a height above a triangle to one below it leads through it, its edges included."""
+    share = high / (high - low)
+    wb = high_b + share * (low_b - high_b)
+    wc = high_c + share * (low_c - high_c)
+    return wb >= -EDGE_WIDTH and wc >= -EDGE_WIDTH and wb + wc <= 1.0 + EDGE_WIDTH
+
+
 @njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
 def _closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
-    """Weights of the corners b and c, seen from the corner a, of the triangle's point nearest to p; whether inside.
+    """Weights of the corners b and c, seen from the corner a, of the triangle's point nearest to p.
 
     After Ericson, Real-Time Collision Detection (2005), 5.1.5.
     """
@@ -645,7 +698,7 @@ def _closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
     wb = cc * pb - bc * pc
     wc = bb * pc - bc * pb
     if wb > 0.0 and wc > 0.0 and wb + wc < determinant:
-        return wb / determinant, wc / determinant, True
+        return wb / determinant, wc / determinant
     # The nearest of the three edges' nearest points.
     on_b = min(1.0, max(0.0, pb / bb))
     best = on_b * (on_b * bb - 2.0 * pb)
@@ -664,7 +717,7 @@ def _closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
     if distance < best:
         wb = ub
         wc = along
-    return wb, wc, False
+    return wb, wc
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

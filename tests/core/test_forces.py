@@ -142,6 +142,7 @@ TOP = 0.02  # height of the small block [m]
 SHAPES = {
     "ball": oracle.ball((0.014, 0.011, TOP + 0.0055), 0.007),
     "deep ball": oracle.ball((0.014, 0.011, TOP - 0.003), 0.007),
+    "ball near its axis": oracle.ball((0.014, 0.011, TOP + 0.0035), 0.007),
     "capsule's side": oracle.single_tool(
         [[0.003, 0.009, TOP + 0.004], [0.027, 0.012, TOP + 0.005]], 0.006, centre=(0.01, 0.0, 0.05)
     ),
@@ -232,7 +233,7 @@ def test_action_equals_reaction(name: str, law: ContactLaw):
     assert largest(torque + wrench[3:]) <= 1e-12 * scale * 0.1
 
 
-@pytest.mark.parametrize("name", ["ball", "deep ball"])
+@pytest.mark.parametrize("name", ["ball", "deep ball", "ball near its axis"])
 def test_a_frictionless_ball_feels_no_torque_about_its_centre(name: str):
     """The energy does not change when a ball turns: torque = 0 to 1e-12 of force times radius."""
     model = oracle.irregular_organ(4)

@@ -24,7 +24,6 @@ CANDIDATE_MARGIN = 1e-3
 
 # The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
 GUARD_SHARE = 0.6
-GUARD_TURNS = 4
 # Half a thousandth of a triangle is taken for its edge, so that nothing slips through between two.
 EDGE_WIDTH = 5e-4
 
@@ -560,19 +559,16 @@ def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrenc
                 state.contact_passed[1] = triangle
                 kept = False
                 continue
-            # The nearest pair of axis and triangle by turns, from the lower end: at once for a ball.
-            px, py, pz = ends[shape, low, 0], ends[shape, low, 1], ends[shape, low, 2]
-            for _ in range(GUARD_TURNS):
-                wb, wc = _closest_in_triangle(
-                    bx, by, bz, cx, cy, cz, px - position[a, 0], py - position[a, 1], pz - position[a, 2]
-                )
-                x = position[a, 0] + wb * bx + wc * cx
-                y = position[a, 1] + wb * by + wc * cy
-                z = position[a, 2] + wb * bz + wc * cz
-                before_x, before_y, before_z = px, py, pz
-                px, py, pz = _closest_on_axis(ends, shape, x, y, z)
-                if px == before_x and py == before_y and pz == before_z:
-                    break
+            # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, near for a shaft.
+            wb, wc = _closest_in_triangle(
+                bx, by, bz, cx, cy, cz,
+                ends[shape, low, 0] - position[a, 0], ends[shape, low, 1] - position[a, 1],
+                ends[shape, low, 2] - position[a, 2],
+            )  # fmt: skip
+            x = position[a, 0] + wb * bx + wc * cx
+            y = position[a, 1] + wb * by + wc * cy
+            z = position[a, 2] + wb * bz + wc * cz
+            px, py, pz = _closest_on_axis(ends, shape, x, y, z)
             ex = x - px
             ey = y - py
             ez = z - pz

@@ -85,6 +85,21 @@ def test_no_ball_passes_through_to_the_hard_limit(site: str, radius: float, spee
     assert radius < 0.008 or not push.end
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.01])
+@pytest.mark.parametrize("aside", [0.0, 0.0025])
+def test_a_shaft_on_its_side_does_not_pass_through(tilt: float, aside: float):
+    """A thin shaft (2 mm), lying or tilted, pressed in until a tet turns inside out: its force rises, it stays outside."""
+    model, state = organ(), rest_state(organ(), shape_count=1)
+    ends = [[0.01, 0.03 + aside, 0.032], [0.05, 0.036 + aside, 0.032 + tilt]]
+    shapes = oracle.single_tool(ends, [0.002], twist=(0.0, 0.0, -0.05, 0.0, 0.0, 0.0))
+    force = []
+    with pytest.raises(OrganDivergedError, match="turned inside out"):
+        for _ in range(400):
+            force.append(step(model, state, shapes, phantom().scene.contact.law, 4)[2])
+    assert rises(np.array(force)) and force[-1] > 0.99 * max(force) > 1.0
+    assert not any(holds(model, state, point) for point in np.linspace(*shapes.shape_ends[0], 20))
+
+
 def test_a_hard_lesion_below_does_not_open_the_surface_either():
     push = Push(SITES["between nodes"], 0.003, 0.02, HARD_LIMIT, hard=True)
     assert not push.inside and (not push.end or "turned inside out" in push.end)

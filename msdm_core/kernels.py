@@ -524,7 +524,6 @@ def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrenc
         tool = shapes.shape_tool[shape]
         radius = shapes.shape_radius[shape]
         reach = GUARD_SHARE * radius
-        stiffness = math.pi * radius * radius * law.stiffness
         # What an axis may pass in one substep, with the broad phase's bound on its speed.
         watched = reach
         for part in range(6):
@@ -576,46 +575,58 @@ def _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrenc
             # Behind the triangle, beyond one of its edges: another one stands between.
             if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
                 continue
-            ex /= distance
-            ey /= distance
-            ez /= distance
-            ox = x - centre[tool, 0]
-            oy = y - centre[tool, 1]
-            oz = z - centre[tool, 2]
-            speed = -(
-                ex * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
-                + ey * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
-                + ez * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
-            )
-            give = 0.0
-            for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
-                rate = dt * inverse_mass[node]
-                speed += weight * (
-                    ex * (velocity[node, 0] + rate * force[node, 0])
-                    + ey * (velocity[node, 1] + rate * force[node, 1])
-                    + ez * (velocity[node, 2] + rate * force[node, 2])
-                )
-                give += weight * weight * rate
-            slope = stiffness * (reach / distance) ** 2
-            push = stiffness * reach * (reach / distance - 1.0) - slope * dt * speed
-            push = max(0.0, push / (1.0 + slope * dt * give))
-            fx = push * ex
-            fy = push * ey
-            fz = push * ez
-            for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
-                force[node, 0] += weight * fx
-                force[node, 1] += weight * fy
-                force[node, 2] += weight * fz
-            x -= reference[tool, 0]
-            y -= reference[tool, 1]
-            z -= reference[tool, 2]
-            wrench[tool, 0] -= fx
-            wrench[tool, 1] -= fy
-            wrench[tool, 2] -= fz
-            wrench[tool, 3] -= y * fz - z * fy
-            wrench[tool, 4] -= z * fx - x * fz
-            wrench[tool, 5] -= x * fy - y * fx
+            _hold_off(
+                position, velocity, force, inverse_mass, twist, centre, dt, reference, wrench, tool, reach,
+                math.pi * radius * radius * law.stiffness, distance, ex, ey, ez, x, y, z, a, b, c, wb, wc,
+            )  # fmt: skip
     return kept
+
+
+@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+def _hold_off(
+    position, velocity, force, inverse_mass, twist, centre, dt, reference, wrench, tool, reach, stiffness, distance,
+    ex, ey, ez, x, y, z, a, b, c, wb, wc,
+):  # fmt: skip
+    """The guard's push on a triangle's point (x, y, z) along e, with the speed and mobility it has in this substep."""
+    ex /= distance
+    ey /= distance
+    ez /= distance
+    ox = x - centre[tool, 0]
+    oy = y - centre[tool, 1]
+    oz = z - centre[tool, 2]
+    speed = -(
+        ex * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
+        + ey * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
+        + ez * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
+    )
+    give = 0.0
+    for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
+        rate = dt * inverse_mass[node]
+        speed += weight * (
+            ex * (velocity[node, 0] + rate * force[node, 0])
+            + ey * (velocity[node, 1] + rate * force[node, 1])
+            + ez * (velocity[node, 2] + rate * force[node, 2])
+        )
+        give += weight * weight * rate
+    slope = stiffness * (reach / distance) ** 2
+    push = stiffness * reach * (reach / distance - 1.0) - slope * dt * speed
+    push = max(0.0, push / (1.0 + slope * dt * give))
+    fx = push * ex
+    fy = push * ey
+    fz = push * ez
+    for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
+        force[node, 0] += weight * fx
+        force[node, 1] += weight * fy
+        force[node, 2] += weight * fz
+    x -= reference[tool, 0]
+    y -= reference[tool, 1]
+    z -= reference[tool, 2]
+    wrench[tool, 0] -= fx
+    wrench[tool, 1] -= fy
+    wrench[tool, 2] -= fz
+    wrench[tool, 3] -= y * fz - z * fy
+    wrench[tool, 4] -= z * fx - x * fz
+    wrench[tool, 5] -= x * fy - y * fx
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

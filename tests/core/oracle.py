@@ -131,9 +131,7 @@ def nearest_pair(ends: FloatArray, corners: FloatArray, normal: FloatArray) -> t
         pairs += [(nearest_on_axis(ends, corner[None])[0], corner) for corner in corners]
         matrix = np.array([[along @ along, -(along @ edge)], [along @ edge, -(edge @ edge)]])
         if abs(np.linalg.det(matrix)) > 1e-20:
-            share, edge_share = np.linalg.solve(
-                matrix, [along @ (corners[i] - ends[0]), edge @ (corners[i] - ends[0])]
-            )
+            share, edge_share = np.linalg.solve(matrix, [along @ (corners[i] - ends[0]), edge @ (corners[i] - ends[0])])
             if 0.0 <= share <= 1.0 and 0.0 <= edge_share <= 1.0:
                 pairs.append((ends[0] + share * along, corners[i] + edge_share * edge))
     return min(pairs, key=lambda pair: float(np.linalg.norm(pair[0] - pair[1])))

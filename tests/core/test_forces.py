@@ -281,7 +281,7 @@ def test_the_guard_never_throws_the_surface():
     foot, radius, height = corners[triangle].T @ [0.35, 0.55, 0.10], 0.0008, 0.0001
     law = ContactLaw(stiffness=1e12, damping=0.0, friction=0.0, tangential_stiffness=1.0)
     state = rest_state(model, shape_count=1)
-    shapes = oracle.ball(foot + [0.0, 0.0, height], radius)
+    shapes = oracle.ball(foot + np.array([0.0, 0.0, height]), radius)
     wrench = np.zeros((1, 6))
     advance_organ(model._replace(alpha=0.0), state, shapes, law, 2.5e-4, 1, wrench)
     assert not state.contact_engaged.any() and wrench[0, 2] > 0.0

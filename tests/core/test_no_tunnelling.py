@@ -26,7 +26,7 @@ HARD_LIMIT = 1.2  # [N] one and a half times the scene's
 
 
 class Push:
-    """Force along z at each haptic step [N], the last depth [m], why it ended ("" at the wanted force) and the state."""
+    """Force along z at each haptic step [N], why it ended ("" at the wanted force), whether the centre is inside."""
 
     def __init__(self, site: ArrayLike, radius: float, speed: float, stop: float, hard: bool = False) -> None:
         model, law, substeps = organ(hard), phantom().scene.contact.law, phantom().scene.timing.substep_count
@@ -61,7 +61,7 @@ def holds(model: OrganModel, state: OrganState, point: NDArray) -> bool:
 @pytest.mark.parametrize("site", SITES)
 @pytest.mark.parametrize(("radius", "force"), [(0.003, 0.27), (0.005, 0.80), (0.008, 1.80)])
 def test_a_ball_is_held_far_beyond_a_palpation(site: str, radius: float, force: float):
-    """Quasi-static and without a fault up to these forces; pressure inside the ball alone lost it at 0.20, 0.56, 1.26 N."""
+    """Quasi-static, no fault; a pressure inside the ball alone lost these at 0.20, 0.56, 1.26 N (facts, section 8)."""
     push = Push(SITES[site], radius, 0.02, force)
     assert not push.end and not push.inside and rises(push.force)
 
@@ -88,7 +88,7 @@ def test_no_ball_passes_through_to_the_hard_limit(site: str, radius: float, spee
 @pytest.mark.parametrize("tilt", [0.0, 0.01])
 @pytest.mark.parametrize("aside", [0.0, 0.0025])
 def test_a_shaft_on_its_side_does_not_pass_through(tilt: float, aside: float):
-    """A thin shaft (2 mm), lying or tilted, pressed in until a tet turns inside out: its force rises, it stays outside."""
+    """A thin shaft (2 mm), lying or tilted, pressed until a tet turns inside out: force rises, it stays outside."""
     model, state = organ(), rest_state(organ(), shape_count=1)
     ends = [[0.01, 0.03 + aside, 0.032], [0.05, 0.036 + aside, 0.032 + tilt]]
     shapes = oracle.single_tool(ends, [0.002], twist=(0.0, 0.0, -0.05, 0.0, 0.0, 0.0))
@@ -126,10 +126,10 @@ def test_the_guard_is_silent_in_a_palpation(site: str):
 @pytest.mark.parametrize("site", SITES)
 @pytest.mark.parametrize(("ball", "tissue"), [(-40.0, 0.0), (0.0, 16.0)], ids=["ball at 40 m/s", "organ at 16 m/s"])
 def test_a_surface_that_was_passed_is_named(site: str, ball: float, tissue: float):
-    """A ball carried through the top within one substep (10 mm), or the whole organ (4 mm): the fault says so at once."""
+    """A ball carried through the top within one substep (10 mm), or the organ past it (4 mm): the fault says so."""
     model = organ()
     state = rest_state(model, shape_count=1)
-    shapes = oracle.ball(np.asarray(SITES[site]) + [0.0, 0.0, 0.003], 0.003, velocity=(0.0, 0.0, ball))
+    shapes = oracle.ball(np.add(SITES[site], (0.0, 0.0, 0.003)), 0.003, velocity=(0.0, 0.0, ball))
     state.node_velocity[:, 2] = tissue
     with pytest.raises(OrganDivergedError, match=r"contact lost: contact shape 0 passed through surface triangle \d+"):
         step(model, state, shapes, phantom().scene.contact.law, 4)
@@ -138,12 +138,12 @@ def test_a_surface_that_was_passed_is_named(site: str, ball: float, tissue: floa
 
 
 def test_a_shaft_that_sticks_in_the_surface_is_named():
-    """A capsule whose upper end is outside and whose lower end is inside, at rest; beside the organ there is no fault."""
+    """A capsule with one end outside and one inside, at rest; the same beside the organ is no fault."""
     model, law = organ(), phantom().scene.contact.law
     ends = np.array([[0.031, 0.032, 0.025], [0.033, 0.03, 0.08]])
     with pytest.raises(OrganDivergedError, match="contact lost"):
         step(model, rest_state(model, shape_count=1), oracle.single_tool(ends, [0.003]), law, 4)
-    step(model, rest_state(model, shape_count=1), oracle.single_tool(ends + [0.035, 0.0, 0.0], [0.003]), law, 4)
+    step(model, rest_state(model, shape_count=1), oracle.single_tool(np.add(ends, (0.035, 0.0, 0.0)), [0.003]), law, 4)
 
 
 def test_around_an_edge_is_not_through_it():

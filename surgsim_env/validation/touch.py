@@ -83,11 +83,16 @@ def ball(site: ArrayLike, radius: float) -> ContactShapes:
     )
 
 
-def block(cells: int, *, alpha: float | None = ALPHA, lesions: tuple[Lesion, ...] = ()) -> Touch:
-    """The phantom with so many cells along 6 cm; `alpha` [1/s] instead of the scene's damping."""
+def block(
+    cells: int, *, alpha: float | None = ALPHA, lesions: tuple[Lesion, ...] = (), friction: float | None = None
+) -> Touch:
+    """The phantom with so many cells along 6 cm; `alpha` [1/s] and `friction` instead of the scene's."""
     scene = phantom(cells)
-    model = load_anatomy(scene).organ(lesions)
-    return Touch.on(model if alpha is None else model._replace(alpha=alpha), scene.contact.law)
+    model, law = load_anatomy(scene).organ(lesions), scene.contact.law
+    return Touch.on(
+        model if alpha is None else model._replace(alpha=alpha),
+        law if friction is None else law._replace(friction=friction),
+    )
 
 
 @lru_cache(maxsize=16)
@@ -131,7 +136,7 @@ def sites(
 
 
 def contrast(cells: int, ratio: float) -> Outcome:
-    """Force over a sphere over that without it, at three places on the lattice."""
+    """Force over a sphere over that without it, at three places on the lattice; without friction, as the reference."""
     radius, depth = 0.008, 0.004
     cell = SIZE[0] / cells
     anatomy = load_anatomy(phantom(cells))
@@ -140,13 +145,13 @@ def contrast(cells: int, ratio: float) -> Outcome:
         place = 0.5 * np.array(SIZE[:2]) + cell * np.array(shift)
         centre = [*place, SIZE[2] - LESION_COVER - LESION_RADIUS]
         lesion = anatomy.lesion_at(centre, LESION_RADIUS, ratio, "lesion")
-        healthy.append(block(cells).held(place, radius, depth))
-        hard.append(block(cells, lesions=(lesion,)).held(place, radius, depth))
+        healthy.append(block(cells, friction=0.0).held(place, radius, depth))
+        hard.append(block(cells, lesions=(lesion,), friction=0.0).held(place, radius, depth))
     expected = reference_force(radius, depth, ratio) / reference_force(radius, depth)
     row = compare(
         f"touch, contrast of a sphere {ratio:g} x, cell {1e3 * cell:.1f} mm", "scikit-fem, axisymmetric, same k_p",
         expected=expected, measured=sum(hard) / sum(healthy), tolerance=CONTRAST_TOLERANCE,
-        note=f"radius {1e3 * LESION_RADIUS:g} mm, cover {1e3 * LESION_COVER:g} mm, tip 8 mm pressed 4 mm",
+        note=f"radius {1e3 * LESION_RADIUS:g} mm, cover {1e3 * LESION_COVER:g} mm, tip 8 mm pressed 4 mm, no friction",
     )  # fmt: skip
     return Outcome((row,))
 

@@ -10,24 +10,25 @@ from surgsim_env.validation.touch import Touch, ball, block
 
 RADIUS = 0.008  # [m]
 SPEED = 0.02  # [m/s]
-# Where the ball is drawn from, and along which direction: 16 mm, more than three cells; the first 4 mm settle.
+# Where the ball is drawn from, along which direction, and over how many haptic steps once 4 mm have settled it: two
+# periods of the lattice, so that what the mesh adds and takes away cancels.
 LINES = {
-    "along edges": ((0.022, 0.030), (1.0, 0.0)),
-    "between nodes": ((0.022, 0.0312), (1.0, 0.0)),
-    "along diagonals": ((0.0245, 0.025), (0.7071, 0.7071)),
+    "along edges": ((0.022, 0.030), (1.0, 0.0), 500),
+    "between nodes": ((0.022, 0.0312), (1.0, 0.0), 500),
+    "along diagonals": ((0.0225, 0.0225), (0.7071, 0.7071), 707),
 }
-SETTLING, DRAWN = 200, 800
+SETTLING = 200
 JUMP_TOLERANCE = 0.02
 FRICTION_TOLERANCE = 0.05
 
 
 def slide(touch: Touch, line: str, depth: float) -> tuple[FloatArray, OrganState, ContactShapes]:
     """Forces of the steady part [N] (n, 3), and what is left at its end."""
-    start, direction = LINES[line]
+    start, direction, count = LINES[line]
     state, shapes = rest_state(touch.model, shape_count=1), ball(start, RADIUS)
     touch.move(state, shapes, (0.0, 0.0, -0.02), round(depth / 2e-5))
     touch.move(state, shapes, (0.0, 0.0, 0.0), 200)
-    force = touch.move(state, shapes, (SPEED * direction[0], SPEED * direction[1], 0.0), DRAWN)
+    force = touch.move(state, shapes, (SPEED * direction[0], SPEED * direction[1], 0.0), SETTLING + count)
     return force[SETTLING:], state, shapes
 
 
@@ -61,7 +62,7 @@ def sliding() -> Outcome:
     touch = block(12, alpha=None)
     friction = touch.law.friction
     rows: list[Row] = []
-    for line, (_, direction) in LINES.items():
+    for line, (_, direction, _) in LINES.items():
         way = np.array([*direction, 0.0])
         force, _, _ = slide(touch, line, 0.004)
         jump = float((np.linalg.norm(np.diff(force, axis=0), axis=1) / np.linalg.norm(force[1:], axis=1)).max())
@@ -73,11 +74,13 @@ def sliding() -> Outcome:
             )
         )  # fmt: skip
         shallow, _, _ = slide(touch, line, 0.0015)
+        share = -shallow @ way / shallow[:, 2]
         rows.append(
             compare(
                 f"sliding {line}, tangential force over mu N", "Coulomb", expected=1.0,
-                measured=float((-shallow @ way / (friction * shallow[:, 2])).mean()), tolerance=FRICTION_TOLERANCE,
-                note="tip 8 mm, 1.5 mm deep",
+                measured=float(share.mean()) / friction, tolerance=FRICTION_TOLERANCE,
+                note="tip 8 mm, 1.5 mm deep (cell / contact radius 1.44), mean over two cells; on the way the mesh "
+                f"makes it swing by {share.std():.3f} N / N, without friction too",
             )
         )  # fmt: skip
     rows += [deep_friction(touch), sticking()]

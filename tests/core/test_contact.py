@@ -215,23 +215,26 @@ def test_sticking_friction_is_a_spring_that_remembers():
 
 
 def test_sliding_on_tissue():
-    """On the phantom too, friction drags by mu N of the pressure, and not at all where mu = 0.
+    """On the phantom too, friction drags by mu N, and not at all where mu = 0: mean over one cell of the lattice.
 
-    Pressed 1.5 mm and drawn 6 mm along x; the frictionless twin takes out what ploughing alone pushes back. The ball
-    touches out to a / r = 0.43 rad, where friction lies along its flanks: 1 - (a / r)^2 / 2 = 0.91 of mu N at the rim.
+    Pressed 1.5 mm and drawn along x; on the way the mesh lets the force along x swing by 0.03 N / N either way.
     """
     drag = {}
     for friction in (0.2, 0.0):
         model, law = phantom_organ("a node", False), phantom().scene.contact.law._replace(friction=friction)
         state = rest_state(model, shape_count=1)
-        shapes = oracle.ball((0.025, 0.03, 0.038), 0.008, velocity=(0.0, 0.0, -0.015))
+        shapes = oracle.ball((0.022, 0.0312, 0.038), 0.008, velocity=(0.0, 0.0, -0.015))
         for _ in range(100):
             step(model, state, shapes, law, 4)
-        shapes.tool_twist[0, :3] = (0.01, 0.0, 0.0)
-        wrench = np.array([step(model, state, shapes, law, 4) for _ in range(600)])[400:]
+        shapes.tool_twist[0, :3] = 0.0
+        for _ in range(100):
+            step(model, state, shapes, law, 4)
+        shapes.tool_twist[0, :3] = (0.02, 0.0, 0.0)
+        wrench = np.array([step(model, state, shapes, law, 4) for _ in range(450)])[200:]
         drag[friction] = float((wrench[:, 0] / wrench[:, 2]).mean())
-    assert abs(drag[0.0]) < 0.05
-    assert 0.91 * 0.2 < drag[0.0] - drag[0.2] < 0.2
+    print(f"\nmean drag / N: {drag}")
+    assert abs(drag[0.0]) < 0.05 * 0.2
+    assert -drag[0.2] == pytest.approx(0.2, rel=0.05)
 
 
 def test_sticking_on_tissue_does_not_creep():

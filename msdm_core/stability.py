@@ -73,7 +73,8 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     """Largest stable step [s]: springs, volume term, alpha, beta, and contact stiffness, damping and friction if given.
 
     Contact holds a node of surface area A_i with at most k_p A_i in any direction and drags it with c_p A_i (the rows
-    of a triangle's contact stiffness sum to that); k_p stands for the larger of normal and tangential stiffness.
+    of a triangle's contact stiffness sum to that); k_p stands for the larger of normal and tangential stiffness. The
+    guard of the shapes' axes asks for nothing: it is taken implicitly.
     """
     if contact is None:
         return model.stable_step

@@ -46,9 +46,15 @@ CASES: tuple[Case, ...] = (
     Case("touch, 0.88", partial(touch.sites, 12, 0.008, 0.004, 100, 0.20, 0.03, 0.12), slow=True, needs_fem=True),
     Case("touch, 0.70", partial(touch.sites, 12, 0.010, 0.0051, 100, 0.20, 0.01, 0.04), slow=True, needs_fem=True),
     Case("touch, 0.50", partial(touch.sites, 20, 0.008, 0.0045, 8, 0.10, None, None), slow=True, needs_fem=True),
-    Case("touch, contrast 4 x", partial(touch.contrast, 12, 4.0), slow=True, needs_fem=True),
-    Case("touch, contrast 8 x", partial(touch.contrast, 12, 8.0), slow=True, needs_fem=True),
-    Case("touch, contrast, fine", partial(touch.contrast, 18, 8.0), slow=True, needs_fem=True),
+    *(
+        Case(
+            f"touch, contrast, {hidden.name}, {cells}",
+            partial(touch.contrast, cells, hidden),
+            slow=True,
+            needs_fem=True,
+        )
+        for cells, hidden in touch.CONTRASTS
+    ),
     Case("deep presses", touch.deep_presses),
     Case("sliding", sliding.sliding, slow=True),
     Case("test A", paper_tests.run_test_a),

@@ -109,6 +109,7 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
         contact_stretch=np.zeros((shape_count, point_count, 3)),
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
+        contact_passed=np.zeros(2, dtype=np.int32),
         volume_ratio_smallest=np.ones(1),
         volume_ratio_tet=np.zeros(1, dtype=np.int32),
     )

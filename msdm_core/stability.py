@@ -105,7 +105,8 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
 
     Contact holds each node with `contact_node_stiffness` and drags it with c_p times its area A. The step is stable
     where (K + k_contact) dt^2 + 2 c_p A dt <= 4 M: drag counts as a stiffness 2 c_p A / dt, taken at a step that is
-    surely stable, the one for the hardest held and the most dragged node being the same.
+    surely stable, the one for the hardest held and the most dragged node being the same. The
+    guard of the shapes' axes asks for nothing: it is taken implicitly.
     """
     if contact is None:
         return model.stable_step

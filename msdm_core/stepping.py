@@ -6,6 +6,7 @@ import numpy as np
 
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels import (
+    FAULT_CONTACT_LOST,
     FAULT_INVERTED_TET,
     FAULT_NONE,
     QUADRATURE_COUNT,
@@ -128,6 +129,12 @@ def describe_fault(state: OrganState, fault: int) -> str:
             f"tet {int(state.volume_ratio_tet[0])} turned inside out: volume ratio "
             f"{float(state.volume_ratio_smallest[0]):.3g}, it must stay above 0: press less deep, use smaller cells "
             "or a higher Poisson's ratio"
+        )
+    if fault == FAULT_CONTACT_LOST:
+        shape, triangle = state.contact_passed.tolist()
+        return (
+            f"contact lost: contact shape {shape} passed through surface triangle {triangle}: press less deep or more "
+            "slowly, use smaller cells or a larger shape"
         )
     bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
     return f"node {int(bad[0]) if bad.size else 0} is no longer finite: the step is too long for the forces at work"

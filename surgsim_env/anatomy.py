@@ -15,6 +15,7 @@ from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.regions import Lesion
 from msdm_core.surface import triangles_facing
 from msdm_core.triangles import nearest_triangle
+from surgsim_env.cell_share import surface_cell, warn_of_coarse_cells
 from surgsim_env.palpable_face import PalpableFace, find_palpable_face
 from surgsim_env.scenes import Anchor, FixedLesion, Scene, SurfaceMesh
 
@@ -30,6 +31,11 @@ class Anatomy:
     mesh: TetMesh
     anchors: IntArray
     face: PalpableFace
+
+    @cached_property
+    def palpable_cell(self) -> float:
+        """Edge of the cells at the palpable face [m]."""
+        return surface_cell(self.mesh, self.face.triangles)
 
     @cached_property
     def along_surface(self) -> SurfaceDistance:
@@ -126,7 +132,10 @@ class Anatomy:
 
 
 def load_anatomy(scene: Scene) -> Anatomy:
-    """Mesh a scene's organ and find its anchors and palpable face; the same scene and files give the same object."""
+    """Mesh a scene's organ and find its anchors and palpable face; the same scene and files give the same object.
+
+    Warns, once, where the cells of its palpable face are larger than the contact radius: the mesh would be felt.
+    """
     source = scene.mesh.surface or scene.mesh.tets
     file = None if source is None else scene.folder / source.file
     return _load_anatomy(scene, file.stat().st_mtime_ns if file is not None and file.is_file() else None)
@@ -138,7 +147,11 @@ def _load_anatomy(scene: Scene, file_time: int | None) -> Anatomy:
     mesh = _load_mesh(scene)
     anchors = _anchored_nodes(mesh, scene.anchors)
     face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)
-    return Anatomy(scene, mesh, anchors, face)
+    anatomy = Anatomy(scene, mesh, anchors, face)
+    warn_of_coarse_cells(
+        f"scene {scene.name!r}", anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth
+    )
+    return anatomy
 
 
 def _load_mesh(scene: Scene) -> TetMesh:

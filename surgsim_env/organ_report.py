@@ -10,6 +10,7 @@ from msdm_core.length_unit import LengthUnit
 from msdm_core.mesh import TetMesh
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.quality import MeshQuality, mesh_quality
+from surgsim_env.cell_share import share_text, surface_cell, warn_of_coarse_cells
 from surgsim_env.scenes import make_scene
 
 
@@ -21,7 +22,7 @@ def report_organ(
     out: Path | None,
     console: Console,
 ) -> None:
-    """Print what an organ made from a file is like, with the shipped liver's tissue, and write its mesh.
+    """Print what an organ made from a file is like, with the shipped liver's tissue and touch, and write its mesh.
 
     Raises:
         MeshError: the file cannot become an organ.
@@ -37,6 +38,8 @@ def report_organ(
     organ = compile_organ(OrganSpec(mesh=mesh, materials=material, damping=liver.damping))
     fit = "no surface to compare with" if quality.volume_error is None else f"{quality.volume_error:+.2%}"
     x, y, z = (mesh.points.max(axis=0) - mesh.points.min(axis=0)) * 1e3
+    cell = surface_cell(mesh, mesh.boundary_triangles)
+    touch = (liver.instrument.tip_radius, liver.palpation.press_depth)
     step = f"{organ.stable_step * 1e3:.3f} ms"
     rows = {
         "extent": f"{x:.1f} x {y:.1f} x {z:.1f} mm",
@@ -47,12 +50,14 @@ def report_organ(
         "mass": f"{organ.node_mass.sum():.4f} kg at {material.density:g} kg/m^3",
         "dihedral angles": f"{quality.dihedral_smallest_deg:.1f} to {quality.dihedral_largest_deg:.1f} degrees",
         "radius ratio": f"from {quality.radius_ratio_smallest:.3f} (1 is regular)",
+        "cell / contact radius": share_text(cell, *touch),
         "stable step": f"{step} at E {material.youngs_modulus:g} Pa, nu {material.poisson_ratio:g}",
     }
     table = Table(title=file.name, show_header=False)
     for name, value in rows.items():
         table.add_row(name, value)
     console.print(table)
+    warn_of_coarse_cells(file.name, cell, *touch)
     if out is not None:
         from msdm_core.mesh_io import write_mesh
 

@@ -88,6 +88,7 @@ class Simulation:
         state.node_force[:] = 0.0
         state.contact_engaged[:] = 0
         state.contact_stretch[:] = 0.0
+        state.contact_passed[:] = 0
         state.volume_ratio_smallest[:] = 1.0
         state.volume_ratio_tet[:] = 0
         self.instrument.place(tip_position)

@@ -27,7 +27,7 @@ NUMBA_SETTINGS = ("msdm_core/numba_cache.py",)
 LINES_PER_FILE = 400
 LINES_PER_FUNCTION = 80
 # What may be longer, how long, and why.
-LONGER_FILES = {"msdm_core/kernels.py": 700}  # the one-file rule above
+LONGER_FILES = {"msdm_core/kernels.py": 950}  # the one-file rule above: forces, contact, its guard, the step
 LONGER_FUNCTIONS = {"msdm_core/kernels.py:_add_point_contact": 150}  # one contact law, unrolled: calls cost there
 
 EMPTY_NAMES = {"util", "utils", "helper", "helpers", "manager", "managers", "misc", "common"}

@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from surgsim_env.cell_share import contact_radius, share_text
 from surgsim_env.palpation.felt import ContrastMap, LesionScore
 from surgsim_env.palpation.job import MODEL, MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, Palpation
 
@@ -59,6 +60,9 @@ def write_summary(palpation: Palpation, path: Path, inputs: Mapping[str, Any]) -
         "press": {
             "depth_m": scene.palpation.press_depth,
             "tip_radius_m": scene.instrument.tip_radius,
+            "cell_m": palpation.anatomy.palpable_cell,
+            "cell_over_contact_radius": palpation.anatomy.palpable_cell
+            / contact_radius(scene.instrument.tip_radius, scene.palpation.press_depth),
             "spacing_m": scene.palpation.site_spacing,
             "substeps_per_haptic_step": scene.timing.substep_count,
             "haptic_step_s": scene.timing.haptic_step,
@@ -141,6 +145,9 @@ def print_report(palpation: Palpation, console: Console) -> None:
         f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N, "
         f"smallest volume ratio {min(press.volume_ratio_smallest for press in every):.2f}"
     )
+    scene = palpation.anatomy.scene
+    share = share_text(palpation.anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth)
+    console.print(f"cell / contact radius {share}")
     console.print(
         f"simulated {palpation.simulated_time:.1f} s in {palpation.wall_time:.1f} s: "
         f"{palpation.simulated_time / palpation.wall_time:.2f} times real time"

@@ -14,8 +14,10 @@ from surgsim_env.validation import (
     paper_tests,
     prism,
     punch,
+    sliding,
     sphere,
     steps,
+    touch,
 )
 from surgsim_env.validation.row import Case
 
@@ -55,6 +57,20 @@ CASES: tuple[Case, ...] = (
     Case("graded liver", graded.graded_liver),
     Case("ball", partial(ball.ball_on_layer, 12, (0.001, 0.002, 0.003, 0.004)), slow=True, needs_fem=True),
     Case("ball, fine", partial(ball.ball_on_layer, 18, (0.0015, 0.002, 0.003, 0.004)), slow=True, needs_fem=True),
+    Case("touch, 0.88", partial(touch.sites, 12, 0.008, 0.004, 100, 0.20, 0.03, 0.12), slow=True, needs_fem=True),
+    Case("touch, 0.70", partial(touch.sites, 12, 0.010, 0.0051, 100, 0.20, 0.01, 0.04), slow=True, needs_fem=True),
+    Case("touch, 0.50", partial(touch.sites, 20, 0.008, 0.0045, 8, 0.10, None, None), slow=True, needs_fem=True),
+    *(
+        Case(
+            f"touch, contrast, {hidden.name}, {cells}",
+            partial(touch.contrast, cells, hidden),
+            slow=True,
+            needs_fem=True,
+        )
+        for cells, hidden in touch.CONTRASTS
+    ),
+    Case("deep presses", touch.deep_presses),
+    Case("sliding", sliding.sliding, slow=True),
     Case("test A", paper_tests.run_test_a),
     Case("test B", paper_tests.run_test_b),
     Case("cosine load", partial(cosine.cosine_load, (3, 6))),

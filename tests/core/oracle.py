@@ -124,7 +124,42 @@ def contact_energy(
             counted = (chord_squared > 0.0) & (chord + height > 0.0) & ((height <= 0.0) | held)
             depth = np.where(counted, chord * (chord + height) / radius, 0.0)
             energy += 0.5 * stiffness * 0.25 * model.surface_rest_area[triangle] * float(depth @ depth)
+            energy += guard_energy(shapes.shape_ends[shape], radius, corners, normal, stiffness)
     return energy
+
+
+def guard_energy(ends: FloatArray, radius: float, corners: FloatArray, normal: FloatArray, stiffness: float) -> float:
+    """Of the force k h (h / d - 1) below d = h = 0.6 r, k = pi r^2 k_p: E = k h (h ln(h / d) - (h - d)) [J].
+
+    d is the distance from the axis to the triangle, counted where the axis' nearest point is in front of it.
+    """
+    reach = 0.6 * radius
+    axis_point, triangle_point = nearest_pair(ends, corners, normal)
+    distance = float(np.linalg.norm(axis_point - triangle_point))
+    if distance >= reach or (axis_point - triangle_point) @ normal <= 0.0:
+        return 0.0
+    return math.pi * radius**2 * stiffness * reach * (reach * math.log(reach / distance) - (reach - distance))
+
+
+def nearest_pair(ends: FloatArray, corners: FloatArray, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Nearest points of a segment and a triangle that it does not cross: an end over the face, or segment and edge."""
+    pairs = []
+    for end in ends:
+        foot = end - ((end - corners[0]) @ normal) * normal
+        if all(np.cross(corners[i - 2] - corners[i], foot - corners[i]) @ normal >= 0.0 for i in range(3)):
+            pairs.append((end, foot))
+    along = ends[1] - ends[0]
+    for i in range(3):
+        edge = corners[i - 2] - corners[i]
+        # Ends of one against the other, and, where they are not parallel, the common perpendicular.
+        pairs += [(end, nearest_on_axis(np.array([corners[i], corners[i - 2]]), end[None])[0]) for end in ends]
+        pairs += [(nearest_on_axis(ends, corner[None])[0], corner) for corner in corners]
+        matrix = np.array([[along @ along, -(along @ edge)], [along @ edge, -(edge @ edge)]])
+        if abs(np.linalg.det(matrix)) > 1e-20:
+            share, edge_share = np.linalg.solve(matrix, [along @ (corners[i] - ends[0]), edge @ (corners[i] - ends[0])])
+            if 0.0 <= share <= 1.0 and 0.0 <= edge_share <= 1.0:
+                pairs.append((ends[0] + share * along, corners[i] + edge_share * edge))
+    return min(pairs, key=lambda pair: float(np.linalg.norm(pair[0] - pair[1])))
 
 
 def nearest_on_axis(ends: FloatArray, points: FloatArray) -> FloatArray:

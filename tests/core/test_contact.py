@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.damping import Damping
-from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.errors import OrganError
 from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.measure import inverted_tets
 from msdm_core.organ import rest_state
@@ -147,43 +147,6 @@ def test_a_lesion_is_felt():
     assert force[1] > 2.0 * force[0]
 
 
-# A ball of the radius in metres, pressed to the force in newtons. A pressure counted only inside the ball lets these
-# through at 0.20, 0.56 and 1.26 N (facts/science.md, section 8).
-TUNNEL = [
-    pytest.param(0.003, 0.27, id="3 mm, 0.27 N"),
-    pytest.param(0.005, 0.80, id="5 mm, 0.80 N"),
-    pytest.param(0.008, 1.80, id="8 mm, 1.80 N"),
-    pytest.param(
-        0.003,
-        1.2,
-        id="3 mm, 1.2 N",
-        marks=pytest.mark.xfail(
-            strict=True, reason="cells of 5 mm: the surface opens between its quadrature points at 0.31 N, 8 mm deep"
-        ),
-    ),
-    pytest.param(
-        0.005,
-        1.2,
-        id="5 mm, 1.2 N",
-        marks=pytest.mark.xfail(
-            strict=True, reason="cells of 5 mm: a tet inverts at 0.82 N, 12 mm deep, or the surface opens at 0.99 N"
-        ),
-    ),
-]
-
-
-@pytest.mark.parametrize(("radius", "force"), TUNNEL)
-@pytest.mark.parametrize("site", SITES)
-def test_a_ball_does_not_tunnel(site: str, radius: float, force: float):
-    """The force keeps rising to the given one, far beyond a palpation, and the ball stays on its side."""
-    try:
-        pressed = press(phantom_organ(site, False), SITES[site], radius, force, speed=2.0 * PRESS_SPEED)
-    except OrganDivergedError as error:
-        pytest.fail(str(error))
-    assert pressed.force[-1] >= force, f"lost at {pressed.force.max():.3f} N, depth {pressed.depth[-1] * 1e3:.1f} mm"
-    assert rises(pressed.force)
-
-
 # ---- a floor: closed forms ----------------------------------------------------------------------------------------
 
 FLOOR_LAW = ContactLaw(stiffness=2e7, damping=0.0, friction=0.3, tangential_stiffness=1e7)
@@ -252,23 +215,26 @@ def test_sticking_friction_is_a_spring_that_remembers():
 
 
 def test_sliding_on_tissue():
-    """On the phantom too, friction drags by mu N of the pressure, and not at all where mu = 0.
+    """On the phantom too, friction drags by mu N, and not at all where mu = 0: mean over one cell of the lattice.
 
-    Pressed 1.5 mm and drawn 6 mm along x; the frictionless twin takes out what ploughing alone pushes back. The ball
-    touches out to a / r = 0.43 rad, where friction lies along its flanks: 1 - (a / r)^2 / 2 = 0.91 of mu N at the rim.
+    Pressed 1.5 mm and drawn along x; on the way the mesh lets the force along x swing by 0.03 N / N either way.
     """
     drag = {}
     for friction in (0.2, 0.0):
         model, law = phantom_organ("a node", False), phantom().scene.contact.law._replace(friction=friction)
         state = rest_state(model, shape_count=1)
-        shapes = oracle.ball((0.025, 0.03, 0.038), 0.008, velocity=(0.0, 0.0, -0.015))
+        shapes = oracle.ball((0.022, 0.0312, 0.038), 0.008, velocity=(0.0, 0.0, -0.015))
         for _ in range(100):
             step(model, state, shapes, law, 4)
-        shapes.tool_twist[0, :3] = (0.01, 0.0, 0.0)
-        wrench = np.array([step(model, state, shapes, law, 4) for _ in range(600)])[400:]
+        shapes.tool_twist[0, :3] = 0.0
+        for _ in range(100):
+            step(model, state, shapes, law, 4)
+        shapes.tool_twist[0, :3] = (0.02, 0.0, 0.0)
+        wrench = np.array([step(model, state, shapes, law, 4) for _ in range(450)])[200:]
         drag[friction] = float((wrench[:, 0] / wrench[:, 2]).mean())
-    assert abs(drag[0.0]) < 0.05
-    assert 0.91 * 0.2 < drag[0.0] - drag[0.2] < 0.2
+    print(f"\nmean drag / N: {drag}")
+    assert abs(drag[0.0]) < 0.05 * 0.2
+    assert -drag[0.2] == pytest.approx(0.2, rel=0.05)
 
 
 def test_sticking_on_tissue_does_not_creep():

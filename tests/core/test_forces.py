@@ -13,7 +13,7 @@ from msdm_core.damping import Damping
 from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.measure import internal_forces, potential_energy, volume_ratios
 from msdm_core.organ import rest_state
-from msdm_core.stepping import advance
+from msdm_core.stepping import advance, advance_organ
 from tests.core import oracle
 
 SEEDS = (0, 1, 2)
@@ -150,6 +150,7 @@ TOP = 0.02  # height of the small block [m]
 SHAPES = {
     "ball": oracle.ball((0.014, 0.011, TOP + 0.0055), 0.007),
     "deep ball": oracle.ball((0.014, 0.011, TOP - 0.003), 0.007),
+    "ball near its axis": oracle.ball((0.014, 0.011, TOP + 0.0035), 0.007),
     "capsule's side": oracle.single_tool(
         [[0.003, 0.009, TOP + 0.004], [0.027, 0.012, TOP + 0.005]], 0.006, centre=(0.01, 0.0, 0.05)
     ),
@@ -240,7 +241,7 @@ def test_action_equals_reaction(name: str, law: ContactLaw):
     assert largest(torque + wrench[3:]) <= 1e-12 * scale * 0.1
 
 
-@pytest.mark.parametrize("name", ["ball", "deep ball"])
+@pytest.mark.parametrize("name", ["ball", "deep ball", "ball near its axis"])
 def test_a_frictionless_ball_feels_no_torque_about_its_centre(name: str):
     """The energy does not change when a ball turns: torque = 0 to 1e-12 of force times radius."""
     model = oracle.irregular_organ(4)
@@ -274,3 +275,26 @@ def test_contact_turns_with_the_frame(turn: tuple[float, float, float], shift: t
     np.testing.assert_allclose(
         turned_wrench.reshape(2, 3), wrench.reshape(2, 3) @ rotation.T, rtol=0, atol=1e-11 * largest(wrench)
     )
+
+
+def test_the_guard_never_throws_the_surface():
+    """Taken implicitly, a guard of any stiffness moves the surface no farther than to h = 0.6 r in one substep.
+
+    The push is at most the one whose step ends at d + s / (1 + s) d (h - d) / h < h, s = k (h / d)^2 dt^2 W. A ball of
+    0.8 mm between quadrature points, which it does not touch, so that only the guard acts.
+    """
+    model = oracle.without_stiffness(oracle.block())
+    corners = model.node_rest_position[model.surface_triangles]
+    triangle = int(np.argmin(np.linalg.norm(corners.mean(axis=1) - [0.015, 0.01, TOP], axis=1)))
+    foot, radius, height = corners[triangle].T @ [0.35, 0.55, 0.10], 0.0008, 0.0001
+    law = ContactLaw(stiffness=1e12, damping=0.0, friction=0.0, tangential_stiffness=1.0)
+    state = rest_state(model, shape_count=1)
+    shapes = oracle.ball(foot + np.array([0.0, 0.0, height]), radius)
+    wrench = np.zeros((1, 6))
+    advance_organ(model._replace(alpha=0.0), state, shapes, law, 2.5e-4, 1, wrench)
+    assert not state.contact_engaged.any() and wrench[0, 2] > 0.0
+    after = state.node_position[model.surface_triangles[triangle]]
+    normal = np.cross(after[1] - after[0], after[2] - after[0])
+    one, other = oracle.nearest_pair(shapes.shape_ends[0], after, normal / np.linalg.norm(normal))
+    reach = 0.6 * radius
+    assert np.linalg.norm(one - other) == pytest.approx(height + height * (reach - height) / reach, rel=1e-3)

@@ -34,7 +34,8 @@ def haptic_step(
     mujoco.mj_step1(instrument.model, instrument.data)
     instrument.drive()
     instrument.read_shapes()
-    fault = advance_organ(model, state, instrument.shapes, contact, dt, substep_count, wrench)
+    instrument.read_response()
+    fault = advance_organ(model, state, instrument.shapes, contact, dt, substep_count, wrench, instrument.response)
     if fault != FAULT_NONE:
         raise OrganDivergedError(describe_fault(state, fault))
     if not np.isfinite(wrench).all():

@@ -7,6 +7,7 @@ import numpy as np
 
 from msdm_core.kernels import ContactShapes
 from msdm_core.mesh import FloatArray
+from msdm_core.stepping import unyielding
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene
 
@@ -46,6 +47,7 @@ class Instrument:
             tool_centre=np.zeros((count, 3)),
             tool_twist=np.zeros((count, 6)),
         )
+        self.response = unyielding(count)
         self._velocity = np.zeros(6)
         self._command = np.zeros(3)
         self.workspace_limited = False
@@ -100,6 +102,27 @@ class Instrument:
             shapes.tool_centre[index] = data.xipos[body]
             shapes.tool_twist[index, :3] = self._velocity[3:]
             shapes.tool_twist[index, 3:] = self._velocity[:3]
+
+    def read_response(self) -> None:
+        """How the tools move on without the tissue and yield to it, into `response`; call after `drive`.
+
+        With M the inertia and D the joints' damping, which MuJoCo's integrators take implicitly, a wrench w on a tool
+        of Jacobian J changes its twist at the rate J (M + dt D)^-1 (q + J^T w), q being all other forces. Centripetal
+        terms are left out; a velocity servo's implicit share too (it only brakes).
+        """
+        model, data = self.model, self.data
+        data.xfrc_applied[self._tools] = 0.0
+        mujoco.mj_fwdActuation(model, data)
+        mujoco.mj_fwdAcceleration(model, data)
+        inertia = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, inertia)
+        inertia[np.diag_indices(model.nv)] += model.opt.timestep * model.dof_damping
+        jacobian = np.zeros((6, model.nv))
+        for index, body in enumerate(self._tools):
+            mujoco.mj_jacBodyCom(model, data, jacobian[:3], jacobian[3:], body)
+            yielded = np.linalg.solve(inertia, jacobian.T)
+            self.response.tool_acceleration[index] = data.qfrc_smooth @ yielded
+            self.response.tool_mobility[index] = jacobian @ yielded
 
     def apply_wrench(self, wrench: FloatArray) -> None:
         """Write the tissue's mean wrench on each tool (overwritten each step), shape (n_tool, 6)."""

@@ -140,7 +140,7 @@ def test_the_reading_is_of_the_current_step(monkeypatch: pytest.MonkeyPatch):
     probe = driven_probe()
     seen = []
 
-    def spy(_model, _state, shapes, _law, _dt, _count, wrench) -> int:
+    def spy(_model, _state, shapes, _law, _dt, _count, wrench, _response) -> int:
         seen.append((shapes.shape_ends[0, 0].copy(), shapes.tool_centre[0].copy(), shapes.tool_twist[0].copy()))
         wrench[:] = 0.0
         return FAULT_NONE
@@ -162,7 +162,7 @@ def test_the_wrench_acts_in_the_same_step(monkeypatch: pytest.MonkeyPatch):
     model, state = free_organ()
     tool = FreeBody(BALL, (0.0, 0.0, 0.5), np.zeros(6))
 
-    def push(_model, _state, _shapes, _law, _dt, _count, wrench) -> int:
+    def push(_model, _state, _shapes, _law, _dt, _count, wrench, _response) -> int:
         wrench[:] = [0.02, 0.0, -0.04, 0.0, 0.0, 0.0]
         return FAULT_NONE
 
@@ -202,7 +202,7 @@ def test_a_force_that_is_not_finite_never_reaches_mujoco():
 def test_a_bad_wrench_never_reaches_mujoco(value: float, message: str, monkeypatch: pytest.MonkeyPatch):
     """Even where every node is finite."""
 
-    def push(_model, _state, _shapes, _law, _dt, _count, wrench) -> int:
+    def push(_model, _state, _shapes, _law, _dt, _count, wrench, _response) -> int:
         wrench[:] = [0.0, 0.0, value, 0.0, 0.0, 0.0]
         return FAULT_NONE
 

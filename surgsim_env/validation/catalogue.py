@@ -2,7 +2,19 @@
 
 from functools import partial
 
-from surgsim_env.validation import ball, beams, cosine, lattice, lumped_mass, paper_tests, prism, punch, sphere, steps
+from surgsim_env.validation import (
+    ball,
+    beams,
+    cosine,
+    lattice,
+    lumped_mass,
+    paper_tests,
+    passivity,
+    prism,
+    punch,
+    sphere,
+    steps,
+)
 from surgsim_env.validation.row import Case
 
 CASES: tuple[Case, ...] = (
@@ -18,6 +30,10 @@ CASES: tuple[Case, ...] = (
     Case("damping rate", beams.damping_case),
     Case("stable step", steps.stable_step),
     Case("energy", steps.energy_drift),
+    Case("passivity, bounces", partial(passivity.bounces, ((0.005, 0.0005),))),
+    Case("passivity, more bounces", partial(passivity.bounces, passivity.OTHER_FALLS), slow=True),
+    Case("passivity, presses", partial(passivity.presses, 100)),
+    Case("passivity, many presses", partial(passivity.presses, 1000), slow=True),
     Case("Eshelby, coarse", partial(sphere.eshelby, (3.0,), 0.25, 16)),
     Case("Eshelby, nu 0.25", partial(sphere.eshelby, (3.0, 5.0, 8.0), 0.25), slow=True),
     Case("Eshelby, nu 0.45", partial(sphere.eshelby, (5.0,), 0.45), slow=True),

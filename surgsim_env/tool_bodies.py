@@ -38,6 +38,9 @@ class ToolBodies:
         self.response = unyielding(count)
         self._velocity = np.zeros(6)
         self._jacobian = np.zeros((6, model.nv))
+        self._inertia = np.zeros((model.nv, model.nv))
+        self._yielded = np.zeros((count, model.nv, 6))
+        self._known = [b""] * count
 
     @property
     def tool_count(self) -> int:
@@ -72,23 +75,29 @@ class ToolBodies:
         tissue's q, a wrench w on a tool of Jacobian J changes its twist at the rate J (M + dt D)^-1 (q + J^T w).
         Centripetal terms are left out, and the implicit share of a velocity servo, which only brakes.
         """
-        model, data = self.model, self.data
+        model, data, response = self.model, self.data, self.response
         data.xfrc_applied[self._tools] = 0.0
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         inertia = self.damped_inertia(model.opt.timestep)
         for index in range(self.tool_count):
             jacobian = self.jacobian(index)
-            yielded = np.linalg.solve(inertia, jacobian.T)
-            self.response.tool_acceleration[index] = data.qfrc_smooth @ yielded
-            self.response.tool_mobility[index] = jacobian @ yielded
+            # Slides keep both: solved anew only when either has changed.
+            known = inertia.tobytes() + jacobian.tobytes()
+            if known != self._known[index]:
+                self._known[index] = known
+                self._yielded[index] = np.linalg.solve(inertia, jacobian.T)
+                response.tool_mobility[index] = jacobian @ self._yielded[index]
+            response.tool_acceleration[index] = data.qfrc_smooth @ self._yielded[index]
 
     def damped_inertia(self, dt: float) -> FloatArray:
-        """M + dt D: joint-space inertia, armature included, and the joints' damping over dt [s], (nv, nv)."""
-        inertia = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, self.data, inertia)
-        inertia[np.diag_indices(self.model.nv)] += dt * self.model.dof_damping
-        return inertia
+        """M + dt D: joint-space inertia, armature included, and the joints' damping over dt [s], (nv, nv).
+
+        Overwritten by the next call.
+        """
+        mujoco.mj_fullM(self.model, self.data, self._inertia)
+        self._inertia.ravel()[:: self.model.nv + 1] += dt * self.model.dof_damping
+        return self._inertia
 
     def jacobian(self, tool: int) -> FloatArray:
         """From joint velocities to a tool's twist at its centre of mass, shape (6, nv); overwritten by the next."""

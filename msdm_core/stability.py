@@ -73,7 +73,8 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     """Largest stable step [s]: springs, volume term, alpha, beta, and contact stiffness, damping and friction if given.
 
     Contact holds a node of surface area A_i with at most k_p A_i in any direction and drags it with c_p A_i (the rows
-    of a triangle's contact stiffness sum to that); k_p stands for the larger of normal and tangential stiffness.
+    of a triangle's contact stiffness sum to that); k_p stands for the larger of normal and tangential stiffness. Beta
+    damps the organ alone: it counts with the organ's own w_max, and the largest of each part are added.
     """
     if contact is None:
         return model.stable_step
@@ -81,4 +82,6 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     stiffest = max(contact.stiffness, contact.tangential_stiffness if contact.friction > 0.0 else 0.0)
     omega = largest_frequency(model, stiffest * area)
     drag_rate = contact.damping * float((area * model.node_inverse_mass).max())
-    return step_limit(omega, model.alpha, model.beta, drag_rate)
+    if model.beta > 0.0:
+        drag_rate += model.beta * largest_frequency(model) ** 2
+    return step_limit(omega, model.alpha, 0.0, drag_rate)

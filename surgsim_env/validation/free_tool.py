@@ -68,6 +68,7 @@ class Coupled:
     def __init__(self, model: OrganModel, ball: ToolBodies, contact: ContactLaw = ELASTIC) -> None:
         """The organ at rest, the ball as it is."""
         self.model, self.ball, self.contact = model, ball, contact
+        mujoco.mj_forward(ball.model, ball.data)  # its inertia, which `energy` reads
         self.state: OrganState = rest_state(model, shape_count=1)
         self.wrench: FloatArray = np.zeros((1, 6))
         self._ground = BLOCK[2] + float(ball.shapes.shape_radius[0])

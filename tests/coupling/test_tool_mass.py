@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.kernels import OrganState
+from msdm_core.organ import rest_state
+from msdm_core.stepping import advance_organ
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.scenes import make_scene
 from surgsim_env.simulation import Simulation
 from surgsim_env.tool_bodies import ToolBodies
 from surgsim_env.tool_mass import check_tool_masses, tool_masses
 from surgsim_env.validation.free_tool import ELASTIC, UPRIGHT, free_ball
+from tests.core import oracle
 from tests.coupling.test_passivity import resting, static_force
 
 DT = 1e-3
@@ -128,6 +132,32 @@ def test_the_bound_counts_more_than_is_felt():
     assert felt == pytest.approx(0.5 * 2e7 * np.pi * 0.008**2, rel=0.02)
     (found,) = tool_masses(free_ball(0.1, 0.008, 0.0), ELASTIC, WIDE)
     assert 1.5 * felt < found.stiffness < 2.5 * felt
+
+
+def test_no_press_is_felt_stiffer_than_the_bound():
+    """A ball pressed 8 mm into the phantom, nodes held at each 2 mm: stiffness along its stiffest direction."""
+    scene = make_scene("phantom")
+    model = load_anatomy(scene).organ()
+    held = model._replace(node_inverse_mass=oracle.frozen(np.zeros_like(model.node_mass)))
+    law, radius = scene.contact.law._replace(damping=0.0, friction=0.0), scene.instrument.tip_radius
+    state = rest_state(model, shape_count=1)
+    shapes = oracle.ball((0.0312, 0.0287, 0.03 + radius), radius, velocity=(0.0, 0.0, -0.02))
+    felt = []
+    for _ in range(4):
+        assert advance_organ(model, state, shapes, law, 2.5e-4, 400, np.zeros((1, 6))) == 0
+        slope = np.empty((3, 3))
+        for axis in range(3):
+            force = []
+            for shift in (1e-7, -1e-7):
+                moved = oracle.ball(shapes.tool_centre[0] + shift * np.eye(3)[axis], radius)
+                still = OrganState(*(array.copy() for array in state))
+                wrench = np.zeros((1, 6))
+                advance_organ(held, still, moved, law, 1e-9, 1, wrench)
+                force.append(wrench[0, :3])
+            slope[:, axis] = (force[1] - force[0]) / 2e-7
+        felt.append(float(np.linalg.eigvalsh(0.5 * (slope + slope.T))[-1]))
+    bound = law.stiffness * np.pi * radius**2
+    assert 0.2 * bound < max(felt) < 0.67 * bound
 
 
 @pytest.mark.parametrize(("substeps", "limit"), [(1, 0.25), (4, 0.284)])

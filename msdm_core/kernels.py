@@ -135,6 +135,22 @@ class ContactShapes(NamedTuple):
     tool_twist: FloatArray
 
 
+class ToolResponse(NamedTuple):
+    """How tools yield to the tissue within one haptic step, SI units; zeros for tools that move as told.
+
+    Fields:
+        tool_acceleration: rate of the twist without the tissue [m/s^2, rad/s^2]  (n_tool, 6)
+        tool_mobility: rate of the twist per wrench [1/kg, ...]                  (n_tool, 6, 6)
+        tool_wrench: scratch: sum of the wrenches before the substep [N, N m]    (n_tool, 6)
+        tool_lag: scratch: how far the tool ends behind twist times step [m, rad] (n_tool, 6)
+    """
+
+    tool_acceleration: FloatArray
+    tool_mobility: FloatArray
+    tool_wrench: FloatArray
+    tool_lag: FloatArray
+
+
 class ContactLaw(NamedTuple):
     """How tissue and instrument push on each other, per unit of surface area.
 
@@ -816,7 +832,7 @@ def _integrate(model, state, dt, decay):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _move_shapes(shapes, dt):
-    """Carry the shapes along their tool's twist (held constant over the haptic step)."""
+    """Carry the shapes along their tool's twist."""
     twist = shapes.tool_twist
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
@@ -833,23 +849,71 @@ def _move_shapes(shapes, dt):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def advance_substeps(model, state, shapes, law, dt, decay, substep_count, reference, wrench):
+def _push_tools(shapes, response, dt, substep, wrench):
+    """Let the substep's wrench change the tools' twist: twist += dt (a + B w), before the shapes move along it."""
+    twist, before, lag = shapes.tool_twist, response.tool_wrench, response.tool_lag
+    acceleration, mobility = response.tool_acceleration, response.tool_mobility
+    for tool in range(twist.shape[0]):
+        for row in range(6):
+            rate = acceleration[tool, row]
+            for column in range(6):
+                rate += mobility[tool, row, column] * (wrench[tool, column] - before[tool, column])
+            twist[tool, row] += dt * rate
+            lag[tool, row] += dt * dt * substep * rate
+        for row in range(6):
+            before[tool, row] = wrench[tool, row]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _stretch_by_lag(model, state, shapes, response, candidate_count):
+    """Sticking friction follows a tool to where MuJoCo puts it: the last twist times the step, ahead by the lag."""
+    position, surface = state.node_position, model.surface_triangles
+    engaged, stretch, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
+    centre, lag = shapes.tool_centre, response.tool_lag
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            for point in range(QUADRATURE_COUNT):
+                item = triangle * QUADRATURE_COUNT + point
+                if not engaged[shape, item]:
+                    continue
+                ox = -centre[tool, 0]
+                oy = -centre[tool, 1]
+                oz = -centre[tool, 2]
+                for corner in range(3):
+                    weight = QUADRATURE_BARYCENTRIC[point, corner]
+                    ox += weight * position[surface[triangle, corner], 0]
+                    oy += weight * position[surface[triangle, corner], 1]
+                    oz += weight * position[surface[triangle, corner], 2]
+                stretch[shape, item, 0] -= lag[tool, 0] + lag[tool, 4] * oz - lag[tool, 5] * oy
+                stretch[shape, item, 1] -= lag[tool, 1] + lag[tool, 5] * ox - lag[tool, 3] * oz
+                stretch[shape, item, 2] -= lag[tool, 2] + lag[tool, 3] * oy - lag[tool, 4] * ox
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def advance_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
     """Advance an organ by some substeps against moving shapes; the kernel behind `organ.advance`.
 
-    Model: model, law
+    Model: model, law, response
     In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point of each tool's torque [m] (n_tool, 3)
     Out:   state, shapes (moved), wrench: MEAN force [N] and torque [N m] on each tool (n_tool, 6)
     Returns a FAULT_ code; a fault stops at the substep that showed it.
     """
     wrench[:, :] = 0.0
+    response.tool_wrench[:, :] = 0.0
+    response.tool_lag[:, :] = 0.0
     candidate_count = _find_candidates(model, state, shapes, dt * substep_count)
-    for _ in range(substep_count):
+    for substep in range(substep_count):
         _begin_forces(model, state)
         _add_spring_forces(model, state)
         _add_volume_forces(model, state)
         _add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench)
         kept = _guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrench)
         total = _integrate(model, state, dt, decay)
+        _push_tools(shapes, response, dt, substep, wrench)
         _move_shapes(shapes, dt)
         if not math.isfinite(total):
             return FAULT_NOT_FINITE
@@ -857,6 +921,8 @@ def advance_substeps(model, state, shapes, law, dt, decay, substep_count, refere
             return FAULT_INVERTED_TET
         if not kept:
             return FAULT_CONTACT_LOST
+    if law.friction > 0.0:
+        _stretch_by_lag(model, state, shapes, response, candidate_count)
     for tool in range(wrench.shape[0]):
         for part in range(6):
             wrench[tool, part] /= substep_count

@@ -3,7 +3,17 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.kernels import SQUEEZED_RATIO, OrganModel, OrganState, evaluate_forces
+from msdm_core.kernels import (
+    QUADRATURE_BARYCENTRIC,
+    QUADRATURE_COUNT,
+    QUADRATURE_WEIGHT,
+    SQUEEZED_RATIO,
+    ContactLaw,
+    ContactShapes,
+    OrganModel,
+    OrganState,
+    evaluate_forces,
+)
 from msdm_core.mesh import FloatArray, IntArray, tet_volumes
 
 
@@ -18,7 +28,7 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     U = sum_s k_s (l_s - l0_s)^2 / 2 + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
         + sum_t K'_t V0_t (J_t - J')^2 / 2 - sum_i m_i g . (x_i - X_i)
     where a is a volume averaged at a node, K'_t the share averaged and the fourth sum over tets below
-    J' = SQUEEZED_RATIO. A resting tool's contact energy is not in it.
+    J' = SQUEEZED_RATIO. A resting tool's contact energy (`contact_energy`) is not in it.
     """
     ends = state.node_position[model.spring_nodes]
     stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length
@@ -32,6 +42,34 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     volume += 0.5 * float((model.node_bulk * model.node_rest_volume) @ (averaged - 1.0) ** 2)
     lift = (state.node_position - model.node_rest_position) @ model.gravity
     return springs + volume - float(model.node_mass @ lift)
+
+
+def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> float:
+    """Energy stored between tissue and shapes where they stand now, without friction's [J].
+
+    E = sum over shapes and quadrature points of (k_p / 2) A g^2, g = s (s + t) / r: with d from the shape's axis to the
+    point and n the triangle's normal, t = d . n and s^2 = r^2 - (|d|^2 - t^2). Counted are points inside the shape that
+    it meets from outside (t <= 0) or holds already (`state.contact_engaged`).
+    """
+    corners = state.node_position[model.surface_triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    points = np.einsum("qc,tcx->tqx", QUADRATURE_BARYCENTRIC, corners)
+    energy = 0.0
+    for shape, radius in enumerate(shapes.shape_radius):
+        start, axis = shapes.shape_ends[shape, 0], np.diff(shapes.shape_ends[shape], axis=0)[0]
+        squared = float(axis @ axis)
+        along = np.clip((points - start) @ axis / squared, 0.0, 1.0) if squared > 0.0 else np.zeros(points.shape[:2])
+        offset = points - start - along[:, :, None] * axis
+        height = np.einsum("tqx,tx->tq", offset, normal)
+        chord_squared = radius**2 - (np.einsum("tqx,tqx->tq", offset, offset) - height**2)
+        chord = np.sqrt(np.maximum(chord_squared, 0.0))
+        held = state.contact_engaged[shape].reshape(-1, QUADRATURE_COUNT) != 0
+        inside = (chord_squared > 0.0) & (chord + height > 0.0) & (held | (height <= 0.0))
+        depth = np.where(inside, chord * (chord + height) / radius, 0.0)
+        area = model.surface_rest_area * QUADRATURE_WEIGHT
+        energy += 0.5 * contact.stiffness * float(area @ (depth * depth).sum(axis=1))
+    return energy
 
 
 def momentum(model: OrganModel, state: OrganState) -> FloatArray:

@@ -14,6 +14,7 @@ from msdm_core.kernels import (
     ContactShapes,
     OrganModel,
     OrganState,
+    ToolResponse,
     advance_substeps,
 )
 from msdm_core.mesh import FloatArray
@@ -115,11 +116,22 @@ def advance_organ(
     dt: float,
     substep_count: int,
     wrench: FloatArray,
+    response: ToolResponse | None = None,
 ) -> int:
-    """`advance` without its checks, for a loop that has made them once: fills `wrench`, returns a FAULT_ code."""
+    """`advance` without its checks, for a loop that has made them once: fills `wrench`, returns a FAULT_ code.
+
+    With a `response` the tools yield to the tissue within the call, and `shapes.tool_twist` is changed by it.
+    """
     decay = math.exp(-model.alpha * dt)
     reference = shapes.tool_centre.copy()
-    return advance_substeps(model, state, shapes, contact, dt, decay, substep_count, reference, wrench)
+    if response is None:
+        response = unyielding(len(reference))
+    return advance_substeps(model, state, shapes, contact, response, dt, decay, substep_count, reference, wrench)
+
+
+def unyielding(tool_count: int) -> ToolResponse:
+    """The response of tools that move as told, whatever the tissue does."""
+    return ToolResponse(*(np.zeros((tool_count, *shape)) for shape in ((6,), (6, 6), (6,), (6,))))
 
 
 def describe_fault(state: OrganState, fault: int) -> str:

@@ -7,7 +7,7 @@ from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.stepping import advance_organ, describe_fault
-from surgsim_env.instrument import Instrument
+from surgsim_env.tool_bodies import ToolBodies
 
 # No palpation comes near this: a force beyond it [N] is a fault of the simulation, not a touch.
 FORCE_CAP = 100.0
@@ -16,7 +16,7 @@ FORCE_CAP = 100.0
 def haptic_step(
     model: OrganModel,
     state: OrganState,
-    instrument: Instrument,
+    instrument: ToolBodies,
     contact: ContactLaw,
     dt: float,
     substep_count: int,
@@ -24,9 +24,18 @@ def haptic_step(
 ) -> None:
     """Advance organ and instrument together by one haptic step; `wrench` (n_tool, 6) [N, N m] receives the mean.
 
-    The instrument's shapes are read from the current step (mj_step1), carried along their twist through the organ's
-    substeps, and the MEAN wrench of the tissue, torque about each tool's centre of mass at the start, acts on the tool
-    in mj_step2: the organ's change of momentum is minus that wrench times the step, exactly.
+    The instrument's shapes are read from the current step (mj_step1) and carried along their twist through the organ's
+    substeps; the MEAN wrench of the tissue, torque about each tool's centre of mass at the start, acts on the tool in
+    mj_step2: the organ's change of momentum is minus that wrench times the step, exactly.
+
+    Within the step the twist answers each substep's wrench at the rate J (M + dt D)^-1 (q + J^T w), as MuJoCo answers
+    their mean, and so ends where MuJoCo's does. MuJoCo then places the tool dt v_end on, ahead of where the organ saw
+    it by delta = (dt^2 / m) int_0^1 s F(s dt) ds, F being all force on it. That step of the shapes costs the energy
+    F(dt) . delta: at frequency w its mean is |F|^2 dt^2 / (2 m) (1 - cos w dt) / (w dt)^2, never negative, so that the
+    exchange takes energy and gives none. With the twist held through the step delta would be dt^2 / m times the mean
+    force, which is out of step with F(dt): tissue vibrating above about 370 Hz under the tool then gains energy until
+    damping stops it. (No explicit exchange is passive as such: Brown & Colgate 1998, Minimum mass for haptic display
+    simulations; hence the least mass of `tool_mass`.)
 
     Raises:
         OrganDivergedError: an inverted tet, a number that is not finite, or a force beyond FORCE_CAP.
@@ -34,7 +43,8 @@ def haptic_step(
     mujoco.mj_step1(instrument.model, instrument.data)
     instrument.drive()
     instrument.read_shapes()
-    fault = advance_organ(model, state, instrument.shapes, contact, dt, substep_count, wrench)
+    instrument.read_response()
+    fault = advance_organ(model, state, instrument.shapes, contact, dt, substep_count, wrench, instrument.response)
     if fault != FAULT_NONE:
         raise OrganDivergedError(describe_fault(state, fault))
     if not np.isfinite(wrench).all():

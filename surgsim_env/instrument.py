@@ -1,59 +1,28 @@
-"""An instrument simulated in MuJoCo: its contact shapes, its tools' poses and twists, and its velocity servo."""
+"""An instrument simulated in MuJoCo: its model made for a scene, its tip and its velocity servo."""
 
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from msdm_core.kernels import ContactShapes
 from msdm_core.mesh import FloatArray
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene
+from surgsim_env.tool_bodies import ToolBodies
 
-# Geoms of this group are what tissue feels: spheres and capsules.
-CONTACT_GROUP = 3
 SLIDES = ("x", "y", "z")
 
 
-class Instrument:
-    """A Cartesian probe of a scene, placed in the world frame: slide coordinates are the tip's position.
-
-    A tool is a body that carries contact shapes; wrenches and twists refer to its centre of mass, which is what both
-    `xfrc_applied` and `mj_objectVelocity` of a body mean. The order swap (MuJoCo gives angular before linear) happens
-    here and nowhere else.
-    """
+class Instrument(ToolBodies):
+    """A Cartesian probe of a scene, placed in the world frame: slide coordinates are the tip's position."""
 
     def __init__(self, scene: Scene, lower: FloatArray, upper: FloatArray) -> None:
         """Load the scene's model; the tip may move in the box from lower to upper [m]."""
-        self.model = _compile(scene, lower, upper)
-        self.data = mujoco.MjData(self.model)
+        super().__init__(_compile(scene, lower, upper))
         self.lower, self.upper = lower, upper
         self._tip = self.model.site("tip").id
-        self._geoms = np.flatnonzero(self.model.geom_group == CONTACT_GROUP)
-        bodies = self.model.geom_bodyid[self._geoms]
-        self._tools = np.unique(bodies)
-        self._half_length = np.array(
-            [
-                self.model.geom_size[geom, 1] if self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
-                for geom in self._geoms
-            ]
-        )
-        count = len(self._tools)
-        self.shapes = ContactShapes(
-            shape_ends=np.zeros((len(self._geoms), 2, 3)),
-            shape_radius=self.model.geom_size[self._geoms, 0].copy(),
-            shape_tool=np.searchsorted(self._tools, bodies).astype(np.int32),
-            tool_centre=np.zeros((count, 3)),
-            tool_twist=np.zeros((count, 6)),
-        )
-        self._velocity = np.zeros(6)
         self._command = np.zeros(3)
         self.workspace_limited = False
-
-    @property
-    def tool_count(self) -> int:
-        """How many bodies carry contact shapes."""
-        return len(self._tools)
 
     @property
     def tip_position(self) -> FloatArray:
@@ -87,23 +56,6 @@ class Instrument:
         self.workspace_limited = bool(stopped.any())
         self.data.ctrl[:3] = held
         self.data.ctrl[3:6] = np.where(stopped, 0.0, self._command)
-
-    def read_shapes(self) -> None:
-        """Copy the current pose and twist of every contact shape into `shapes`; call after mj_step1."""
-        shapes, data = self.shapes, self.data
-        for index, geom in enumerate(self._geoms):
-            axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * self._half_length[index]
-            shapes.shape_ends[index, 0] = data.geom_xpos[geom] - axis
-            shapes.shape_ends[index, 1] = data.geom_xpos[geom] + axis
-        for index, body in enumerate(self._tools):
-            mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_BODY, body, self._velocity, 0)
-            shapes.tool_centre[index] = data.xipos[body]
-            shapes.tool_twist[index, :3] = self._velocity[3:]
-            shapes.tool_twist[index, 3:] = self._velocity[:3]
-
-    def apply_wrench(self, wrench: FloatArray) -> None:
-        """Write the tissue's mean wrench on each tool (overwritten each step), shape (n_tool, 6)."""
-        self.data.xfrc_applied[self._tools] = wrench
 
     def refresh(self) -> None:
         """Bring poses and velocities up to the current coordinates (after mj_step2 they are one step old)."""

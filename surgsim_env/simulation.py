@@ -11,6 +11,7 @@ from surgsim_env.anatomy import Anatomy
 from surgsim_env.exchange import haptic_step
 from surgsim_env.instrument import Instrument
 from surgsim_env.timing import substeps_needed
+from surgsim_env.tool_mass import check_tool_masses
 
 # How far beyond the organ's bounding box the tip may travel [m].
 WORKSPACE_MARGIN = 0.04
@@ -23,7 +24,7 @@ class Simulation:
         """Set up a scene's healthy organ and its instrument, the tip in the far corner of its workspace.
 
         Raises:
-            OrganError: the scene's number of substeps is too small for its organ.
+            OrganError: the scene's number of substeps is too small for its organ, or a tool too light for its contact.
         """
         scene = anatomy.scene
         self.anatomy = anatomy
@@ -34,12 +35,14 @@ class Simulation:
         margin = WORKSPACE_MARGIN + scene.instrument.tip_radius
         points = anatomy.mesh.points
         self.instrument = Instrument(scene, points.min(axis=0) - margin, points.max(axis=0) + margin)
+        healthy = anatomy.organ()
+        check_tool_masses(scene.name, self.instrument, self.contact, float(healthy.surface_rest_area.sum()))
         self._wrench = np.zeros((self.instrument.tool_count, 6))
         self._step = 0
         self.fault = ""
         self.organ_model: OrganModel
         self.organ_state: OrganState
-        self.reset(anatomy.organ(), self.instrument.upper)
+        self.reset(healthy, self.instrument.upper)
 
     @property
     def time(self) -> float:

@@ -19,6 +19,7 @@ from surgsim_env.exchange import FORCE_CAP, haptic_step
 from surgsim_env.instrument import Instrument
 from surgsim_env.scenes import Scene, make_scene
 from surgsim_env.simulation import Simulation
+from surgsim_env.tool_bodies import ToolBodies
 from tests.core import oracle
 
 DT, SUBSTEPS = 1e-3, 5
@@ -45,21 +46,13 @@ LOPSIDED = FREE_TOOL.format(
 )
 
 
-class FreeBody(Instrument):
-    """A body that nothing drives, with the instrument's own reading of shapes and writing of wrenches."""
+class FreeBody(ToolBodies):
+    """A body that nothing drives."""
 
     def __init__(self, xml: str, position: tuple[float, float, float], velocity: NDArray) -> None:
-        super().__init__(scene(), np.full(3, -1.0), np.full(3, 1.0))
-        self.model = model = mujoco.MjModel.from_xml_string(xml)
-        self.data = mujoco.MjData(model)
-        self._geoms, self._tools = np.arange(model.ngeom), np.array([1])
-        self._half_length = model.geom_size[:, 1].copy()  # 0 for a sphere
-        self.shapes = oracle.single_tool(np.zeros((model.ngeom, 2, 3)), model.geom_size[:, 0])
+        super().__init__(mujoco.MjModel.from_xml_string(xml))
         self.data.qpos[:3] = position
         self.data.qvel[:] = velocity
-
-    def drive(self) -> None:
-        """Nothing drives it."""
 
 
 @cache
@@ -75,11 +68,11 @@ def free_organ() -> tuple[OrganModel, OrganState]:
     return model, state
 
 
-def free_ball() -> Instrument:
+def free_ball() -> ToolBodies:
     return FreeBody(BALL, (0.014, 0.016, 0.0215), np.array([0.03, -0.02, -0.15, 3.0, -2.0, 5.0]))
 
 
-def lopsided_body() -> Instrument:
+def lopsided_body() -> ToolBodies:
     return FreeBody(LOPSIDED, (0.014, 0.016, 0.0215), np.array([0.03, -0.02, -0.15, 3.0, -2.0, 5.0]))
 
 
@@ -140,7 +133,7 @@ def test_the_reading_is_of_the_current_step(monkeypatch: pytest.MonkeyPatch):
     probe = driven_probe()
     seen = []
 
-    def spy(_model, _state, shapes, _law, _dt, _count, wrench) -> int:
+    def spy(_model, _state, shapes, _law, _dt, _count, wrench, _response) -> int:
         seen.append((shapes.shape_ends[0, 0].copy(), shapes.tool_centre[0].copy(), shapes.tool_twist[0].copy()))
         wrench[:] = 0.0
         return FAULT_NONE
@@ -162,7 +155,7 @@ def test_the_wrench_acts_in_the_same_step(monkeypatch: pytest.MonkeyPatch):
     model, state = free_organ()
     tool = FreeBody(BALL, (0.0, 0.0, 0.5), np.zeros(6))
 
-    def push(_model, _state, _shapes, _law, _dt, _count, wrench) -> int:
+    def push(_model, _state, _shapes, _law, _dt, _count, wrench, _response) -> int:
         wrench[:] = [0.02, 0.0, -0.04, 0.0, 0.0, 0.0]
         return FAULT_NONE
 
@@ -202,7 +195,7 @@ def test_a_force_that_is_not_finite_never_reaches_mujoco():
 def test_a_bad_wrench_never_reaches_mujoco(value: float, message: str, monkeypatch: pytest.MonkeyPatch):
     """Even where every node is finite."""
 
-    def push(_model, _state, _shapes, _law, _dt, _count, wrench) -> int:
+    def push(_model, _state, _shapes, _law, _dt, _count, wrench, _response) -> int:
         wrench[:] = [0.0, 0.0, value, 0.0, 0.0, 0.0]
         return FAULT_NONE
 

@@ -1,0 +1,109 @@
+"""Bodies of a MuJoCo model that tissue feels: their contact shapes, poses and twists, and how they yield."""
+
+import mujoco
+import numpy as np
+
+from msdm_core.kernels import ContactShapes
+from msdm_core.mesh import FloatArray
+from msdm_core.stepping import unyielding
+
+# Geoms of this group are what tissue feels: spheres and capsules.
+CONTACT_GROUP = 3
+
+
+class ToolBodies:
+    """The tools of a MuJoCo model: every body that carries contact shapes. Nothing drives them here.
+
+    Wrenches and twists refer to a body's centre of mass, which is what both `xfrc_applied` and `mj_objectVelocity` of
+    a body mean. The order swap (MuJoCo gives angular before linear) happens here and nowhere else.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """Find the tools of a model, which stays as it is."""
+        self.model = model
+        self.data = mujoco.MjData(model)
+        self._geoms = np.flatnonzero(model.geom_group == CONTACT_GROUP)
+        bodies = model.geom_bodyid[self._geoms]
+        self._tools = np.unique(bodies)
+        capsule = model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_CAPSULE
+        self._half_length = np.where(capsule, model.geom_size[self._geoms, 1], 0.0)
+        count = len(self._tools)
+        self.shapes = ContactShapes(
+            shape_ends=np.zeros((len(self._geoms), 2, 3)),
+            shape_radius=model.geom_size[self._geoms, 0].copy(),
+            shape_tool=np.searchsorted(self._tools, bodies).astype(np.int32),
+            tool_centre=np.zeros((count, 3)),
+            tool_twist=np.zeros((count, 6)),
+        )
+        self.response = unyielding(count)
+        self._velocity = np.zeros(6)
+        self._jacobian = np.zeros((6, model.nv))
+        self._inertia = np.zeros((model.nv, model.nv))
+        self._yielded = np.zeros((count, model.nv, 6))
+        self._known = [b""] * count
+
+    @property
+    def tool_count(self) -> int:
+        """How many bodies carry contact shapes."""
+        return len(self._tools)
+
+    @property
+    def tool_names(self) -> list[str]:
+        """Name of each tool's body in the model."""
+        return [self.model.body(body).name for body in self._tools]
+
+    def drive(self) -> None:
+        """Move what drives the tools by one step; nothing does here."""
+
+    def read_shapes(self) -> None:
+        """Copy the current pose and twist of every contact shape into `shapes`; call after mj_step1."""
+        shapes, data = self.shapes, self.data
+        for index, geom in enumerate(self._geoms):
+            axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * self._half_length[index]
+            shapes.shape_ends[index, 0] = data.geom_xpos[geom] - axis
+            shapes.shape_ends[index, 1] = data.geom_xpos[geom] + axis
+        for index, body in enumerate(self._tools):
+            mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_BODY, body, self._velocity, 0)
+            shapes.tool_centre[index] = data.xipos[body]
+            shapes.tool_twist[index, :3] = self._velocity[3:]
+            shapes.tool_twist[index, 3:] = self._velocity[:3]
+
+    def read_response(self) -> None:
+        """How the tools move on without the tissue and yield to it, into `response`; call after `drive`.
+
+        With the inertia M, the joints' damping D (which MuJoCo's integrators take implicitly) and all forces but the
+        tissue's q, a wrench w on a tool of Jacobian J changes its twist at the rate J (M + dt D)^-1 (q + J^T w).
+        Centripetal terms are left out, and the implicit share of a velocity servo, which only brakes.
+        """
+        model, data, response = self.model, self.data, self.response
+        data.xfrc_applied[self._tools] = 0.0
+        mujoco.mj_fwdActuation(model, data)
+        mujoco.mj_fwdAcceleration(model, data)
+        inertia = self.damped_inertia(model.opt.timestep)
+        for index in range(self.tool_count):
+            jacobian = self.jacobian(index)
+            # Slides keep both: solved anew only when either has changed.
+            known = inertia.tobytes() + jacobian.tobytes()
+            if known != self._known[index]:
+                self._known[index] = known
+                self._yielded[index] = np.linalg.solve(inertia, jacobian.T)
+                response.tool_mobility[index] = jacobian @ self._yielded[index]
+            response.tool_acceleration[index] = data.qfrc_smooth @ self._yielded[index]
+
+    def damped_inertia(self, dt: float) -> FloatArray:
+        """M + dt D: joint-space inertia, armature included, and the joints' damping over dt [s], (nv, nv).
+
+        Overwritten by the next call.
+        """
+        mujoco.mj_fullM(self.model, self.data, self._inertia)
+        self._inertia.ravel()[:: self.model.nv + 1] += dt * self.model.dof_damping
+        return self._inertia
+
+    def jacobian(self, tool: int) -> FloatArray:
+        """From joint velocities to a tool's twist at its centre of mass, shape (6, nv); overwritten by the next."""
+        mujoco.mj_jacBodyCom(self.model, self.data, self._jacobian[:3], self._jacobian[3:], self._tools[tool])
+        return self._jacobian
+
+    def apply_wrench(self, wrench: FloatArray) -> None:
+        """Write the tissue's mean wrench on each tool (overwritten each step), shape (n_tool, 6)."""
+        self.data.xfrc_applied[self._tools] = wrench

@@ -1,0 +1,112 @@
+"""The least mass a tool may have: the force exchange is explicit, and too light a tool would be thrown off by it."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels import ContactLaw
+from msdm_core.mesh import FloatArray
+from surgsim_env.tool_bodies import ToolBodies
+
+
+@dataclass(frozen=True)
+class ToolMass:
+    """What one tool weighs where tissue pushes it, and what it must.
+
+    Args:
+        name: the tool's body.
+        stiffness: largest contact stiffness that it can meet [N/m].
+        damping: contact's largest damping [N s/m].
+        mass: its least effective mass at its contact shapes, in the direction in which it is lightest [kg].
+        braked_mass: the same of M + (dt / 2) D, with the damping of its joints [kg].
+        least_mass: what that must be at least [kg].
+        least_damping: damping along the lightest direction that a tool of this mass needs [N s/m].
+    """
+
+    name: str
+    stiffness: float
+    damping: float
+    mass: float
+    braked_mass: float
+    least_mass: float
+    least_damping: float
+
+
+def contact_area(tools: ToolBodies, tool: int) -> float:
+    """Largest surface area that can push a tool [m^2]: the cross-sections of its shapes, pi r^2 + 2 r l each.
+
+    A surface pressed by k_p per area and penetration holds a shape with k_p int (e . u)^2 dA along u, e being the
+    direction of the pressure. For a ball in a flat surface up to its centre that is half of pi r^2, for one with
+    tissue wrapped around its lower half two thirds; for a capsule's side pi / 4 of 2 r l. What the turning of the
+    pressure adds is smaller by penetration / radius.
+    """
+    mine = tools.shapes.shape_tool == tool
+    radius = tools.shapes.shape_radius[mine]
+    length = np.linalg.norm(np.diff(tools.shapes.shape_ends[mine], axis=1)[:, 0], axis=1)
+    return float((np.pi * radius**2 + 2.0 * radius * length).sum())
+
+
+def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float) -> list[ToolMass]:
+    """Mass of each tool and what the exchange asks of it, where the tools stand now.
+
+    At its worst a tool of mass m meets tissue too heavy to move within a haptic step dt: a spring k = k_p A and a
+    damper c = c_p A, A being `contact_area`, at most the organ's whole surface; k_t stands in for k_p where sticking
+    friction is stiffer. An explicit exchange takes the force at the mean place x_n + v_n dt / 2 of a twist held through
+    the step, v_(n+1) = v_n - (dt / m) (k (x_n + v_n dt / 2) + c v_n), x_(n+1) = x_n + dt v_(n+1). Its characteristic
+    polynomial leaves the unit circle at z = -1, where 4 m = 2 k dt^2 + 2 c dt:
+
+        m + b dt / 2 >= (k dt + c) dt / 2,
+
+    b being the joints' damping, which MuJoCo takes implicitly: m > k dt^2 / 2 without, or b > k dt + c - 2 m / dt with.
+    (The minimum mass of Brown & Colgate 1998, "Minimum mass for haptic display simulations", for this integrator; the
+    damping is Colgate & Schenkel's b > k T / 2, moved from the device to the tool.) As tools here yield within the
+    step, the limit itself lies lower, at 0.25 to 0.33 k dt^2 by the number of substeps: the bound is safe by half.
+    Not counted are a servo's damping, since servos saturate, and its stiffness, which is the instrument's own affair.
+
+    Args:
+        tools: a model; its `data` is brought up to date where it stands.
+        contact: the scene's contact law.
+        surface_area: of the organ where it may be touched [m^2].
+    """
+    mujoco.mj_forward(tools.model, tools.data)
+    tools.read_shapes()
+    dt = tools.model.opt.timestep
+    stiffest = max(contact.stiffness, contact.tangential_stiffness if contact.friction > 0.0 else 0.0)
+    found: list[ToolMass] = []
+    for tool, name in enumerate(tools.tool_names):
+        area = min(contact_area(tools, tool), surface_area)
+        stiffness, damping = stiffest * area, contact.damping * area
+        mass, braked = (effective_mass(tools, tool, tools.damped_inertia(share * dt)) for share in (0.0, 0.5))
+        least = 0.5 * dt * (stiffness * dt + damping)
+        found.append(ToolMass(name, stiffness, damping, mass, braked, least, max(0.0, 2.0 * (least - mass) / dt)))
+    return found
+
+
+def effective_mass(tools: ToolBodies, tool: int, inertia: FloatArray) -> float:
+    """Least mass of a tool at the ends of its shapes' axes, 1 / max eig(J M^-1 J^T) [kg], M (nv, nv) as given."""
+    jacobian = tools.jacobian(tool)
+    mobility = 0.0
+    for end in tools.shapes.shape_ends[tools.shapes.shape_tool == tool].reshape(-1, 3):
+        x, y, z = end - tools.shapes.tool_centre[tool]
+        # Velocity of that end: v + omega x (x, y, z).
+        there = jacobian[:3] + np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ jacobian[3:]
+        mobility = max(mobility, float(np.linalg.eigvalsh(there @ np.linalg.solve(inertia, there.T))[-1]))
+    return 1.0 / mobility if mobility > 0.0 else np.inf
+
+
+def check_tool_masses(scene: str, tools: ToolBodies, contact: ContactLaw, surface_area: float) -> None:
+    """Refuse a tool that is too light for the exchange to be stable.
+
+    Raises:
+        OrganError: names the tool, its mass, the least mass and the damping it would need instead.
+    """
+    for found in tool_masses(tools, contact, surface_area):
+        if found.braked_mass < found.least_mass:
+            raise OrganError(
+                f"scene {scene!r}: tool {found.name!r} weighs {found.mass * 1e3:.3g} g at its tip, too little for a "
+                f"contact as stiff as {found.stiffness:.3g} N/m at steps of {tools.model.opt.timestep * 1e3:g} ms: it "
+                f"would be thrown off. Give it at least {found.least_mass * 1e3:.3g} g, or joints damped with "
+                f"{found.least_damping:.3g} N s/m, or lower contact.stiffness or timing.haptic_step"
+            )

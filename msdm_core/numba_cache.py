@@ -7,14 +7,21 @@ only there, a private folder under the temporary one is named instead. It must h
 """
 
 import atexit
+import hashlib
 import os
 import shutil
 import stat
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from numba.core import config
 from numba.misc.appdirs import AppDirs
+
+FOLDER_PREFIX = "surgsim-kernels-"
+STALE_AGE = 7 * 24 * 3600.0  # [s]
 
 
 def provide_cache_folder(source_folder: Path) -> Path | None:
@@ -26,12 +33,7 @@ def provide_cache_folder(source_folder: Path) -> Path | None:
     Raises:
         OSError: no folder at all can be written, the temporary one included.
     """
-    user_folder = Path(AppDirs(appname="numba", appauthor=False).user_cache_dir)
-    # For a user without a home, numba's own folder is a relative "~/.cache": it would litter the working folder.
-    places = [source_folder / "__pycache__", *([user_folder] if user_folder.is_absolute() else [])]
-    chosen: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
-    if chosen:
-        places.insert(0, Path(chosen))
+    places = _places(source_folder)
     if any(_can_write(place) for place in places):
         return None
     try:
@@ -44,6 +46,41 @@ def provide_cache_folder(source_folder: Path) -> Path | None:
         ) from error
     config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
     return folder
+
+
+@contextmanager
+def kernel_cache(*source_folders: Path) -> Iterator[None]:
+    """Let functions decorated inside be cached in a folder of their own, new whenever a compiled file has changed.
+
+    Args:
+        source_folders: folders whose `*kernels.py` and `vector.py` are compiled together; the cache lies in the first.
+    """
+    files = sorted(file for folder in source_folders for file in (*folder.glob("*kernels.py"), *folder.glob("vector.py")))
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+    before: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
+    place = next(place for place in _places(source_folders[0]) if _can_write(place))
+    _remove_stale(place, keep=f"{FOLDER_PREFIX}{digest}")
+    config.CACHE_DIR = str(place / f"{FOLDER_PREFIX}{digest}")  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = before  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _places(source_folder: Path) -> list[Path]:
+    """Where numba may keep compiled code, in its own order."""
+    user_folder = Path(AppDirs(appname="numba", appauthor=False).user_cache_dir)
+    # For a user without a home, numba's own folder is a relative "~/.cache": it would litter the working folder.
+    places = [source_folder / "__pycache__", *([user_folder] if user_folder.is_absolute() else [])]
+    chosen: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
+    return [Path(chosen), *places] if chosen else places
+
+
+def _remove_stale(place: Path, *, keep: str) -> None:
+    """Remove folders of earlier texts that nobody has written to for STALE_AGE."""
+    for folder in place.glob(f"{FOLDER_PREFIX}*"):
+        if folder.name != keep and time.time() - folder.stat().st_mtime > STALE_AGE:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _can_write(folder: Path) -> bool:

@@ -1,0 +1,64 @@
+"""The equations of one spring and one tet, for numbers or for vectors of them; compiled into every loop over them.
+
+Without fastmath nothing is fused or reordered: one organ, an organ among others and the plain equations in numpy agree
+to the bit as far as the order of their sums does.
+"""
+
+from numba import njit
+
+from msdm_core.vector import below_zero, root
+
+# Below this volume ratio a tet also bears the share of its volume term that is averaged at nodes: an average lets
+# single tets collapse between swollen neighbours (without it, a deep press turned some inside out).
+SQUEEZED_RATIO = 0.6
+
+
+@njit(inline="always", error_model="numpy")
+def spring_scale(dx, dy, dz, stiffness, rest_length):
+    """Force over length of a spring, k (1 - l0 / l) [N/m] (Sala 2011, eq. 1)."""
+    return stiffness * (1.0 - rest_length / root(dx * dx + dy * dy + dz * dz))
+
+
+@njit(inline="always", error_model="numpy")
+def spring_drag(dx, dy, dz, vx, vy, vz, stiffness, beta):
+    """What Rayleigh's beta adds to that, k beta (dl/dt) / l [N/m], from the difference of the ends' velocities [m/s]."""
+    return stiffness * beta * (dx * vx + dy * vy + dz * vz) / (dx * dx + dy * dy + dz * dz)
+
+
+@njit(inline="always", error_model="numpy")
+def tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz):
+    """Six times dV/dx [m^2] of the corners b, c and d of a tet, from the edges to them: cross products of the others."""
+    gbx = cy * dz - cz * dy
+    gby = cz * dx - cx * dz
+    gbz = cx * dy - cy * dx
+    gcx = dy * bz - dz * by
+    gcy = dz * bx - dx * bz
+    gcz = dx * by - dy * bx
+    gdx = by * cz - bz * cy
+    gdy = bz * cx - bx * cz
+    gdz = bx * cy - by * cx
+    return gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz
+
+
+@njit(inline="always", error_model="numpy")
+def six_volumes(bx, by, bz, gbx, gby, gbz):
+    """Six times the volume of a tet [m^3]: one edge times its gradient."""
+    return bx * gbx + by * gby + bz * gbz
+
+
+@njit(inline="always", error_model="numpy")
+def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
+    """What a tet's gradients (six times dV/dx) are to be multiplied with, minus a sixth of its tension [Pa].
+
+    That is K (J - 1) of its own; the mean of the volumes averaged at its corners; and,
+    where it is squeezed, K' (J - SQUEEZED_RATIO) of the share K' that is averaged.
+    """
+    tension = bulk * (ratio - 1.0) + averaged_tension + averaged_bulk * below_zero(ratio - SQUEEZED_RATIO)
+    return tension * (-1.0 / 6.0)
+
+
+@njit(inline="always", error_model="numpy")
+def node_tension(sum_of_six_volumes, rest_volume, bulk):
+    """Tension of the volume averaged at a node, K_a (J_a - 1) [Pa]; the sum holds 24 times that volume: six for the box
+    product, four for the quarter that each tet gives (averaged volumes: Bonet and Burton 1998)."""
+    return bulk * (sum_of_six_volumes / (24.0 * rest_volume) - 1.0)

@@ -1,6 +1,12 @@
 """msdm_core: a tetrahedral mass-spring-damper organ (Sala et al. 2011) in numba, without MuJoCo and Gymnasium."""
 
-import msdm_core.numba_cache  # noqa: F401  # before kernels: gives numba a folder it can write
+from pathlib import Path
+
+from msdm_core import numba_cache
+
+with numba_cache.kernel_cache(Path(__file__).parent):
+    # First of all: what is compiled is cached where it was decorated.
+    from msdm_core import kernels, lane_kernels, linear_kernels  # noqa: F401
 from msdm_core.damping import Damping
 from msdm_core.errors import MeshError, OrganDivergedError, OrganError
 from msdm_core.fitting import FitReport, spring_fit

@@ -13,21 +13,21 @@ from msdm_core.vector import below_zero, root
 SQUEEZED_RATIO = 0.6
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def spring_scale(dx, dy, dz, stiffness, rest_length):
     """Force over length of a spring, k (1 - l0 / l) [N/m] (Sala 2011, eq. 1)."""
     return stiffness * (1.0 - rest_length / root(dx * dx + dy * dy + dz * dz))
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def spring_drag(dx, dy, dz, vx, vy, vz, stiffness, beta):
-    """What Rayleigh's beta adds to that, k beta (dl/dt) / l [N/m], from the difference of the ends' velocities [m/s]."""
+    """What Rayleigh's beta adds to that, k beta (dl/dt) / l [N/m], from the difference v of the ends' velocities."""
     return stiffness * beta * (dx * vx + dy * vy + dz * vz) / (dx * dx + dy * dy + dz * dz)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz):
-    """Six times dV/dx [m^2] of the corners b, c and d of a tet, from the edges to them: cross products of the others."""
+    """Six times dV/dx [m^2] of the corners b, c and d of a tet, from its edges to them: their cross products."""
     gbx = cy * dz - cz * dy
     gby = cz * dx - cx * dz
     gbz = cx * dy - cy * dx
@@ -40,13 +40,13 @@ def tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz):
     return gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def six_volumes(bx, by, bz, gbx, gby, gbz):
     """Six times the volume of a tet [m^3]: one edge times its gradient."""
     return bx * gbx + by * gby + bz * gbz
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     """What a tet's gradients (six times dV/dx) are to be multiplied with, minus a sixth of its tension [Pa].
 
@@ -57,8 +57,10 @@ def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     return tension * (-1.0 / 6.0)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def node_tension(sum_of_six_volumes, rest_volume, bulk):
-    """Tension of the volume averaged at a node, K_a (J_a - 1) [Pa]; the sum holds 24 times that volume: six for the box
-    product, four for the quarter that each tet gives (averaged volumes: Bonet and Burton 1998)."""
+    """Tension of the volume averaged at a node, K_a (J_a - 1) [Pa] (averaged volumes: Bonet and Burton 1998).
+
+    The sum holds 24 times that volume: six for the box product, four for the quarter that each tet gives.
+    """
     return bulk * (sum_of_six_volumes / (24.0 * rest_volume) - 1.0)

@@ -19,7 +19,7 @@ from msdm_core.element_kernels import (
 from msdm_core.vector import keep_lower, load_lanes, spread_like, store_lanes
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _difference(values, items, item, corner):
     """From corner 0 of an item to another of its corners, as three vectors."""
     i, j = 3 * np.intp(items[item, 0]), 3 * np.intp(items[item, corner])
@@ -30,7 +30,7 @@ def _difference(values, items, item, corner):
     )
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _add(force, node, x, y, z):
     """Add to a node's force."""
     place = 3 * np.intp(node)
@@ -39,7 +39,7 @@ def _add(force, node, x, y, z):
     store_lanes(force, place + 2, load_lanes(force, place + 2) + z)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _subtract(force, node, x, y, z):
     """Take from a node's force."""
     place = 3 * np.intp(node)
@@ -48,7 +48,7 @@ def _subtract(force, node, x, y, z):
     store_lanes(force, place + 2, load_lanes(force, place + 2) - z)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _share(total, items, item, value):
     """Add to each corner of a tet."""
     for corner in range(4):
@@ -79,7 +79,7 @@ def add_spring_damping(position, velocity, force, nodes, stiffness, beta):
         _subtract(force, nodes[spring, 1], x, y, z)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _tet(position, tets, tet):
     """Six times the gradients and the volume of a tet."""
     bx, by, bz = _difference(position, tets, tet, 1)
@@ -89,7 +89,7 @@ def _tet(position, tets, tet):
     return gradients, six_volumes(bx, by, bz, gradients[0], gradients[1], gradients[2])
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _six_rates(velocity, tets, tet, g):
     """Rate of six times the volume of a tet [m^3/s]."""
     bx, by, bz = _difference(velocity, tets, tet, 1)
@@ -118,7 +118,7 @@ def average_volumes(position, velocity, tension, tets, node_rest_volume, node_bu
         store_lanes(tension, node, node_tension(load_lanes(tension, node), rest, load_lanes(node_bulk, node)))
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _push(force, tets, tet, scale, g):
     """Forces of a tet on its corners."""
     bx, by, bz = scale * g[0], scale * g[1], scale * g[2]

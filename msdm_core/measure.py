@@ -3,11 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT, QUADRATURE_WEIGHT
+from msdm_core.element_kernels import SQUEEZED_RATIO
 from msdm_core.kernels import (
-    QUADRATURE_BARYCENTRIC,
-    QUADRATURE_COUNT,
-    QUADRATURE_WEIGHT,
-    SQUEEZED_RATIO,
     ContactLaw,
     ContactShapes,
     OrganModel,
@@ -102,7 +100,10 @@ def internal_forces(model: OrganModel, state: OrganState) -> FloatArray:
     no_gravity.setflags(write=False)
     scratch = state._replace(
         node_force=np.empty_like(state.node_force),
-        node_pressure=np.empty_like(state.node_pressure),
+        node_tension=np.empty_like(state.node_tension),
+        row_position=np.zeros_like(state.row_position),
+        row_velocity=np.zeros_like(state.row_velocity),
+        row_force=np.zeros_like(state.row_force),
         volume_ratio_smallest=np.ones(1),
         volume_ratio_tet=np.zeros(1, np.int32),
     )

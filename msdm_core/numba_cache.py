@@ -20,6 +20,7 @@ from pathlib import Path
 from numba.core import config
 from numba.misc.appdirs import AppDirs
 
+KERNEL_FILES = ("*kernels.py", "vector.py")
 FOLDER_PREFIX = "surgsim-kernels-"
 STALE_AGE = 7 * 24 * 3600.0  # [s]
 
@@ -53,9 +54,9 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
     """Let functions decorated inside be cached in a folder of their own, new whenever a compiled file has changed.
 
     Args:
-        source_folders: folders whose `*kernels.py` and `vector.py` are compiled together; the cache lies in the first.
+        source_folders: folders whose KERNEL_FILES are compiled together; the cache lies in the first.
     """
-    files = sorted(file for folder in source_folders for file in (*folder.glob("*kernels.py"), *folder.glob("vector.py")))
+    files = sorted(file for folder in source_folders for name in KERNEL_FILES for file in folder.glob(name))
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
     before: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
     place = next(place for place in _places(source_folders[0]) if _can_write(place))

@@ -8,9 +8,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.contact_kernels import QUADRATURE_COUNT
 from msdm_core.damping import Damping
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import FAULT_NONE, QUADRATURE_COUNT, OrganModel, OrganState, evaluate_forces
+from msdm_core.kernels import FAULT_NONE, OrganModel, OrganState, evaluate_forces
 from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
@@ -18,6 +19,7 @@ from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_
 from msdm_core.stability import largest_frequency, step_limit
 from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.stiffness import membrane_stiffness, spring_network
+from msdm_core.vector import aligned_zeros
 from msdm_core.volume import averaged_volume_modulus, nodal_average
 
 
@@ -105,7 +107,10 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         node_position=model.node_rest_position.copy(),
         node_velocity=np.zeros_like(model.node_rest_position),
         node_force=np.zeros_like(model.node_rest_position),
-        node_pressure=np.zeros_like(model.node_mass),
+        node_tension=np.zeros_like(model.node_mass),
+        row_position=aligned_zeros((len(model.node_mass), 4)),
+        row_velocity=aligned_zeros((len(model.node_mass), 4)),
+        row_force=aligned_zeros((len(model.node_mass), 4)),
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
         contact_stretch=np.zeros((shape_count, point_count, 3)),
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),

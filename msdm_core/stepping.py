@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
+from msdm_core.contact_kernels import QUADRATURE_COUNT
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels import (
     FAULT_CONTACT_LOST,
     FAULT_INVERTED_TET,
     FAULT_NONE,
-    QUADRATURE_COUNT,
     ContactLaw,
     ContactShapes,
     OrganModel,

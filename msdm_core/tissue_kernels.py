@@ -43,7 +43,7 @@ _at_0, _at_1, _at_2, _at_3, _at_4, _at_5, _at_6, _at_7 = (define_extract(place) 
 _COUNT = np.arange(float(GROUP))
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _columns(r0, r1, r2, r3, r4, r5, r6, r7):
     """Eight rows (x, y, z, -) as three vectors of eight."""
     r01, r23, r45, r67 = _join(r0, r1), _join(r2, r3), _join(r4, r5), _join(r6, r7)
@@ -51,23 +51,24 @@ def _columns(r0, r1, r2, r3, r4, r5, r6, r7):
     return _low_halves(low, high), _high_halves(low, high), _low_halves(_pick_z(r01, r23), _pick_z(r45, r67))
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _rows(x, y, z):
-    """Three vectors of eight as eight rows (x, y, z, z)."""
-    low, high, low_z, high_z = _mesh_low(x, y), _mesh_high(x, y), _mesh_low(z, z), _mesh_high(z, z)
+    """Three vectors of eight as eight rows (x, y, z, 0)."""
+    nothing = z * 0.0
+    low, high, low_z, high_z = _mesh_low(x, y), _mesh_high(x, y), _mesh_low(z, nothing), _mesh_high(z, nothing)
     return (
         _row_0(low, low_z), _row_1(low, low_z), _row_2(low, low_z), _row_3(low, low_z),
         _row_0(high, high_z), _row_1(high, high_z), _row_2(high, high_z), _row_3(high, high_z),
     )  # fmt: skip
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _edge(values, items, item, corner):
     """Row from corner 0 of an item to another of its corners."""
     return load_row(values, items[item, corner]) - load_row(values, items[item, 0])
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _edges(values, items, first, corner):
     """The same of eight items, as three vectors."""
     return _columns(
@@ -78,7 +79,7 @@ def _edges(values, items, first, corner):
     )  # fmt: skip
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _pull(force, items, item, pull):
     """Add a row to the first end of a spring and take it from the other."""
     i, j = items[item, 0], items[item, 1]
@@ -86,7 +87,7 @@ def _pull(force, items, item, pull):
     store_row(force, j, load_row(force, j) - pull)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _push(force, items, item, a, b, c, d):
     """Take a row from corner a of a tet and add one to each of the others."""
     at_a, at_b, at_c, at_d = items[item, 0], items[item, 1], items[item, 2], items[item, 3]
@@ -96,13 +97,35 @@ def _push(force, items, item, a, b, c, d):
     store_row(force, at_d, load_row(force, at_d) + d)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _share(total, items, item, value):
     """Add a number to each corner of a tet."""
     total[items[item, 0]] += value
     total[items[item, 1]] += value
     total[items[item, 2]] += value
     total[items[item, 3]] += value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_gravity(force, mass, gravity):
+    """F = m g."""
+    for node in range(force.shape[0]):
+        for axis in range(3):
+            force[node, axis] = mass[node] * gravity[axis]
+        force[node, 3] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def integrate(position, velocity, force, inverse_mass, dt, decay):
+    """Symplectic Euler: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt); returns a sum finite if all is."""
+    total = load_row(position, 0) * 0.0
+    for node in range(position.shape[0]):
+        speed = load_row(velocity, node) * decay + load_row(force, node) * (dt * inverse_mass[node])
+        place = load_row(position, node) + speed * dt
+        store_row(velocity, node, speed)
+        store_row(position, node, place)
+        total = total + (place + speed)
+    return (_at_0(total) + _at_1(total)) + _at_2(total)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -140,7 +163,7 @@ def add_spring_damping(position, velocity, force, nodes, stiffness, beta):
         _pull(force, nodes, spring, _edge(position, nodes, spring, 1) * scale)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _difference(values, items, item, corner):
     """From corner 0 of an item to another of its corners, as three numbers."""
     i, j = items[item, 0], items[item, corner]
@@ -170,7 +193,7 @@ def sum_volumes(position, total, tets):
         _share(total, tets, tet, six)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _one_tet(position, tets, tet):
     """Six times the gradients and the volume of one tet."""
     bx, by, bz = _difference(position, tets, tet, 1)
@@ -180,7 +203,7 @@ def _one_tet(position, tets, tet):
     return gradients, six_volumes(bx, by, bz, gradients[0], gradients[1], gradients[2])
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _six_rates(velocity, tets, tet, g):
     """Rate of six times the volume of one tet [m^3/s]."""
     bx, by, bz = _difference(velocity, tets, tet, 1)
@@ -191,6 +214,13 @@ def _six_rates(velocity, tets, tet, g):
         + six_volumes(cx, cy, cz, g[3], g[4], g[5])
         + six_volumes(dx, dy, dz, g[6], g[7], g[8])
     )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_node_tension(total, node_rest_volume, node_bulk):
+    """From the sums at nodes to the tension of the volumes averaged there, K_a (J_a - 1) [Pa]."""
+    for node in range(total.shape[0]):
+        total[node] = node_tension(total[node], node_rest_volume[node], node_bulk[node])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -210,7 +240,7 @@ def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta)
         _push_one(force, tets, tet, bulk[tet] * rate * (-1.0 / 6.0), gradients)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _corner_tension(tension, tets, tet):
     """Mean tension of the volumes around the corners of a tet."""
     return 0.25 * (tension[tets[tet, 0]] + tension[tets[tet, 1]] + tension[tets[tet, 2]] + tension[tets[tet, 3]])
@@ -270,7 +300,7 @@ def add_volume_forces(position, force, tension, tets, rest_volume, bulk, average
         _push_one(force, tets, tet, scale, gradients)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _keep(low, low_tet, ratio, tet):
     """Remember a volume ratio where it is the smallest yet; of equal ones the first tet."""
     if not ratio >= low[0] or (ratio == low[0] and tet < low_tet[0]):
@@ -278,7 +308,7 @@ def _keep(low, low_tet, ratio, tet):
         low_tet[0] = int(tet)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _push_one(force, tets, tet, scale, gradients):
     """Forces of one tet, corner by corner."""
     for axis in range(3):

@@ -15,11 +15,14 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import types
+from numba import extending, types
 from numba.core import cgutils
-from numba.core.datamodel import PrimitiveModel
-from numba.extending import intrinsic, overload, register_model
+from numba.core.datamodel.models import PrimitiveModel
+from numba.extending import overload, register_model
 from numpy.typing import NDArray
+
+# Untyped: a compiled function is called without the typing context that an intrinsic is defined with.
+intrinsic: Any = extending.intrinsic
 
 # Bytes of the widest register there is: 8 float64 or 16 float32 a vector.
 REGISTER_SIZE = 64
@@ -65,7 +68,9 @@ def _spread(builder: ir.IRBuilder, value: Any, kind: ir.VectorType) -> Any:
     """A number in every place of a vector."""
     empty = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count))
+    return builder.shuffle_vector(
+        first, empty, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
+    )
 
 
 def _operand(context: Any, builder: ir.IRBuilder, value: Any, kind: Any, vector: VectorType) -> Any:
@@ -146,7 +151,7 @@ def below_zero(_typing: Any, value: Any) -> Any:
         return None
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
-        zero = ir.Constant(values[0].type, [0.0] * value.width if vector else 0.0)
+        zero = ir.Constant(values[0].type, [0.0] * value.width if isinstance(value, VectorType) else 0.0)
         return builder.select(builder.fcmp_ordered("<", values[0], zero), values[0], zero)
 
     return value(value), generate
@@ -188,7 +193,7 @@ def _define_store(scale: Callable[[int], int]) -> Any:
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
             place = builder.mul(values[1], ir.Constant(values[1].type, scale(value.width)))
             pointer = _pointer(context, builder, signature.args[0], values[0], place, value)
-            builder.store(values[2], pointer).align = array.dtype.bitwidth // 8
+            builder.store(values[2], pointer, align=array.dtype.bitwidth // 8)
             return context.get_dummy_value()
 
         return types.none(array, types.intp, value), generate

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT, OrganModel, OrganState
+from msdm_core.kernels import OrganModel, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
 from msdm_core.stability import stable_dt

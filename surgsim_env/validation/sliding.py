@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from msdm_core.kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_WEIGHT, ContactShapes, OrganState
+from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_WEIGHT
+from msdm_core.kernels import ContactShapes, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
 from surgsim_env.validation.row import Outcome, Row, compare

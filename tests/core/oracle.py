@@ -223,6 +223,7 @@ def without_stiffness(model: OrganModel) -> OrganModel:
     return model._replace(
         spring_stiffness=frozen(np.zeros_like(model.spring_stiffness)),
         tet_bulk=frozen(np.zeros_like(model.tet_bulk)),
+        tet_averaged_bulk=frozen(np.zeros_like(model.tet_averaged_bulk)),
         node_bulk=frozen(np.zeros_like(model.node_bulk)),
         averages_volume=False,
     )

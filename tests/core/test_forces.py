@@ -49,7 +49,11 @@ def gradient(function, values: NDArray) -> NDArray:
 
 def without_averages(model: OrganModel) -> OrganModel:
     """The same organ without the volume term that is averaged at nodes."""
-    return model._replace(node_bulk=oracle.frozen(np.zeros_like(model.node_bulk)), averages_volume=False)
+    return model._replace(
+        node_bulk=oracle.frozen(np.zeros_like(model.node_bulk)),
+        tet_averaged_bulk=oracle.frozen(np.zeros_like(model.tet_averaged_bulk)),
+        averages_volume=False,
+    )
 
 
 # ---- springs and volume term --------------------------------------------------------------------------------------

@@ -1,0 +1,304 @@
+"""Contact of an organ's surface with the shapes that tools carry: which triangles are near, and how they push."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+# Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
+CANDIDATE_MARGIN = 1e-3
+
+# Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
+QUADRATURE_COUNT = 4
+QUADRATURE_WEIGHT = 0.25
+QUADRATURE_BARYCENTRIC = np.array(
+    [
+        [1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0],
+        [2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0],
+        [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0],
+        [1.0 / 6.0, 1.0 / 6.0, 2.0 / 3.0],
+    ]
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_candidates(model, state, shapes, duration):
+    """Broad phase of one call: the triangles that a shape may touch within `duration` [s], by bounding spheres.
+
+    What moves faster than the margin is met one haptic step later; what is engaged always stays a candidate.
+    Returns how many candidates the busiest shape has; the list of a shape ends with -1.
+    """
+    # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
+    position, ends, surface = state.node_position, shapes.shape_ends, model.surface_triangles
+    engaged, candidates, twist = state.contact_engaged, state.contact_candidates, shapes.tool_twist
+    most = 0
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        radius = shapes.shape_radius[shape]
+        speed = 0.0
+        for part in range(6):
+            # An angular part moves a point by at most its lever, taken as one metre: generous for a hand-held tool.
+            speed += abs(twist[tool, part])
+        margin = CANDIDATE_MARGIN + 2.0 * speed * duration
+        count = 0
+        for triangle in range(surface.shape[0]):
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
+            reach = 0.0
+            for axis in range(3):
+                reach += (position[b, axis] - position[a, axis]) ** 2
+            other = 0.0
+            for axis in range(3):
+                other += (position[c, axis] - position[a, axis]) ** 2
+            limit = math.sqrt(max(reach, other)) + radius + margin
+            px, py, pz = closest_on_axis(ends, shape, position[a, 0], position[a, 1], position[a, 2])
+            gap = (position[a, 0] - px) ** 2 + (position[a, 1] - py) ** 2 + (position[a, 2] - pz) ** 2
+            near = gap <= limit * limit
+            if not near:
+                first = triangle * QUADRATURE_COUNT
+                for point in range(first, first + QUADRATURE_COUNT):
+                    if engaged[shape, point]:
+                        near = True
+            if near:
+                candidates[shape, count] = triangle
+                count += 1
+        if count < candidates.shape[1]:
+            candidates[shape, count] = -1
+        most = max(most, count)
+    return most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
+    """Contact of every shape with its candidate triangles; adds the reaction to the tools' wrench."""
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
+    surface, rest_area = model.surface_triangles, model.surface_rest_area
+    ends, centre, twist = shapes.shape_ends, shapes.tool_centre, shapes.tool_twist
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        radius = shapes.shape_radius[shape]
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
+            bx = position[b, 0] - position[a, 0]
+            by = position[b, 1] - position[a, 1]
+            bz = position[b, 2] - position[a, 2]
+            cx = position[c, 0] - position[a, 0]
+            cy = position[c, 1] - position[a, 1]
+            cz = position[c, 2] - position[a, 2]
+            nx = by * cz - bz * cy
+            ny = bz * cx - bx * cz
+            nz = bx * cy - by * cx
+            twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
+            nx /= twice_area
+            ny /= twice_area
+            nz /= twice_area
+            for point in range(QUADRATURE_COUNT):
+                _add_point_contact(
+                    surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist,
+                    law, dt, reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
+                )  # fmt: skip
+
+
+@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+def closest_on_axis(ends, shape, x, y, z):
+    """The point of a capsule's axis nearest to (x, y, z) [m]."""
+    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
+    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
+    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    along = 0.0
+    if length_squared > 0.0:
+        along = (
+            (x - ends[shape, 0, 0]) * ux + (y - ends[shape, 0, 1]) * uy + (z - ends[shape, 0, 2]) * uz
+        ) / length_squared
+        along = min(1.0, max(0.0, along))
+    return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
+
+
+@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+def _release(engaged, stretch_memory, shape, item):
+    """Forget the contact of one quadrature point with one shape."""
+    engaged[shape, item] = 0
+    for axis in range(3):
+        stretch_memory[shape, item, axis] = 0.0
+
+
+@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+def _add_point_contact(
+    surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist, law, dt,
+    reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
+):  # fmt: skip
+    """Contact of one quadrature point with one shape, by a penetration that keeps rising with depth.
+
+    With d from the shape's axis to the point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2)
+    the half chord, the line through the point along n leaves the ball t + s below the point. The energy per area is
+    (k_p / 2) g^2 with g = s (s + t) / r: to first order the radial penetration r - |d|, yet growing without bound as
+    the ball sinks below the surface, where a radial one falls again and lets the ball tunnel. Forces are its exact
+    gradient, the turning of n with the corners included, so that action and reaction balance, torque too.
+    A point engages where the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays
+    engaged until it parts, so that the far side of a thin organ is never taken for the near one.
+    """
+    item = triangle * QUADRATURE_COUNT + point
+    a = surface[triangle, 0]
+    b = surface[triangle, 1]
+    c = surface[triangle, 2]
+    wa = QUADRATURE_BARYCENTRIC[point, 0]
+    wb = QUADRATURE_BARYCENTRIC[point, 1]
+    wc = QUADRATURE_BARYCENTRIC[point, 2]
+    x = wa * position[a, 0] + wb * position[b, 0] + wc * position[c, 0]
+    y = wa * position[a, 1] + wb * position[b, 1] + wc * position[c, 1]
+    z = wa * position[a, 2] + wb * position[b, 2] + wc * position[c, 2]
+    px, py, pz = closest_on_axis(ends, shape, x, y, z)
+    dx = x - px
+    dy = y - py
+    dz = z - pz
+    t = dx * nx + dy * ny + dz * nz
+    rx = dx - t * nx
+    ry = dy - t * ny
+    rz = dz - t * nz
+    chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
+    if chord_squared <= 0.0:
+        _release(engaged, stretch_memory, shape, item)
+        return
+    s = math.sqrt(chord_squared)
+    depth = s + t
+    if depth <= 0.0 or (not engaged[shape, item] and t > 0.0):
+        _release(engaged, stretch_memory, shape, item)
+        return
+    engaged[shape, item] = 1
+
+    ox = x - centre[tool, 0]
+    oy = y - centre[tool, 1]
+    oz = z - centre[tool, 2]
+    vx = wa * velocity[a, 0] + wb * velocity[b, 0] + wc * velocity[c, 0]
+    vy = wa * velocity[a, 1] + wb * velocity[b, 1] + wc * velocity[c, 1]
+    vz = wa * velocity[a, 2] + wb * velocity[b, 2] + wc * velocity[c, 2]
+    vx -= twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy
+    vy -= twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz
+    vz -= twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox
+    # e: unit vector against the ball's own normal where the line along n leaves the ball.
+    ex = (s * nx - rx) / radius
+    ey = (s * ny - ry) / radius
+    ez = (s * nz - rz) / radius
+    closing = ex * vx + ey * vy + ez * vz
+    load = law.stiffness * depth + law.damping * closing
+    if load < 0.0:
+        load = 0.0
+    weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
+    scale = -weighted_area * load / (radius * radius)
+
+    # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the axis' direction inside a capsule.
+    gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
+    gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
+    gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
+    gx, gy, gz = _without_axis(ends, shape, px, py, pz, gx, gy, gz)
+
+    # Friction: a tangential spring that sticks until mu times the pressure, then slips.
+    ux = stretch_memory[shape, item, 0] + dt * vx
+    uy = stretch_memory[shape, item, 1] + dt * vy
+    uz = stretch_memory[shape, item, 2] + dt * vz
+    out_of_plane = ux * ex + uy * ey + uz * ez
+    ux -= out_of_plane * ex
+    uy -= out_of_plane * ey
+    uz -= out_of_plane * ez
+    stretch = math.sqrt(ux * ux + uy * uy + uz * uz)
+    longest = law.friction * load * s / radius / law.tangential_stiffness
+    if stretch > longest:
+        ux *= longest / stretch
+        uy *= longest / stretch
+        uz *= longest / stretch
+    stretch_memory[shape, item, 0] = ux
+    stretch_memory[shape, item, 1] = uy
+    stretch_memory[shape, item, 2] = uz
+    drag = law.tangential_stiffness * weighted_area
+    gx -= drag * ux
+    gy -= drag * uy
+    gz -= drag * uz
+
+    # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the gradient is along n.
+    bx = position[b, 0] - position[a, 0]
+    by = position[b, 1] - position[a, 1]
+    bz = position[b, 2] - position[a, 2]
+    cx = position[c, 0] - position[a, 0]
+    cy = position[c, 1] - position[a, 1]
+    cz = position[c, 2] - position[a, 2]
+    # rho . grad(lambda_b) = rho . (c x n) / (2 A) for the corner b, rho . (n x b) / (2 A) for the corner c.
+    turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
+    turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
+    turn = -scale * depth * depth
+    tb = turn * turn_b
+    tc = turn * turn_c
+    ta = -tb - tc
+    for corner in range(3):
+        if corner == 0:
+            node, weight, along_n = a, wa, ta
+        elif corner == 1:
+            node, weight, along_n = b, wb, tb
+        else:
+            node, weight, along_n = c, wc, tc
+        fx = weight * gx + along_n * nx
+        fy = weight * gy + along_n * ny
+        fz = weight * gz + along_n * nz
+        force[node, 0] += fx
+        force[node, 1] += fy
+        force[node, 2] += fz
+        ax = position[node, 0] - reference[tool, 0]
+        ay = position[node, 1] - reference[tool, 1]
+        az = position[node, 2] - reference[tool, 2]
+        wrench[tool, 0] -= fx
+        wrench[tool, 1] -= fy
+        wrench[tool, 2] -= fz
+        wrench[tool, 3] -= ay * fz - az * fy
+        wrench[tool, 4] -= az * fx - ax * fz
+        wrench[tool, 5] -= ax * fy - ay * fx
+
+
+@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
+    """Drop the part along a capsule's axis where the nearest axis point lies strictly between the ends."""
+    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
+    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
+    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    if length_squared > 0.0:
+        along = (px - ends[shape, 0, 0]) * ux + (py - ends[shape, 0, 1]) * uy + (pz - ends[shape, 0, 2]) * uz
+        if 0.0 < along < length_squared:
+            share = (gx * ux + gy * uy + gz * uz) / length_squared
+            return gx - share * ux, gy - share * uy, gz - share * uz
+    return gx, gy, gz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def stretch_by_lag(model, state, shapes, response, candidate_count):
+    """Sticking friction follows a tool to where MuJoCo puts it: the last twist times the step, ahead by the lag."""
+    position, surface = state.node_position, model.surface_triangles
+    engaged, stretch, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
+    centre, lag = shapes.tool_centre, response.tool_lag
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            for point in range(QUADRATURE_COUNT):
+                item = triangle * QUADRATURE_COUNT + point
+                if not engaged[shape, item]:
+                    continue
+                ox = -centre[tool, 0]
+                oy = -centre[tool, 1]
+                oz = -centre[tool, 2]
+                for corner in range(3):
+                    weight = QUADRATURE_BARYCENTRIC[point, corner]
+                    ox += weight * position[surface[triangle, corner], 0]
+                    oy += weight * position[surface[triangle, corner], 1]
+                    oz += weight * position[surface[triangle, corner], 2]
+                stretch[shape, item, 0] -= lag[tool, 0] + lag[tool, 4] * oz - lag[tool, 5] * oy
+                stretch[shape, item, 1] -= lag[tool, 1] + lag[tool, 5] * ox - lag[tool, 3] * oz
+                stretch[shape, item, 2] -= lag[tool, 2] + lag[tool, 3] * oy - lag[tool, 4] * ox

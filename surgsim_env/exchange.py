@@ -32,10 +32,9 @@ def haptic_step(
     their mean, and so ends where MuJoCo's does. MuJoCo then places the tool dt v_end on, ahead of where the organ saw
     it by delta = (dt^2 / m) int_0^1 s F(s dt) ds, F being all force on it. That step of the shapes costs the energy
     F(dt) . delta: at frequency w its mean is |F|^2 dt^2 / (2 m) (1 - cos w dt) / (w dt)^2, never negative, so that the
-    exchange takes energy and gives none. With the twist held through the step delta would be dt^2 / m times the mean
-    force, which is out of step with F(dt): tissue vibrating above about 370 Hz under the tool then gains energy until
-    damping stops it. (No explicit exchange is passive as such: Brown & Colgate 1998, Minimum mass for haptic display
-    simulations; hence the least mass of `tool_mass`.)
+    exchange takes energy and gives none, but for k delta^2 / 2, which the least mass of `tool_mass` keeps small. With
+    the twist held through the step delta would be dt^2 / m times the mean force, which is out of step with F(dt):
+    tissue vibrating above about 370 Hz under the tool then gains energy until damping stops it.
 
     Raises:
         OrganDivergedError: an inverted tet, a number that is not finite, or a force beyond FORCE_CAP.

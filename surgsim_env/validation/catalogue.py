@@ -40,6 +40,7 @@ CASES: tuple[Case, ...] = (
     Case("stable step", steps.stable_step),
     Case("energy", steps.energy_drift),
     Case("Eshelby, coarse", partial(sphere.eshelby, (3.0,), 0.25, 16)),
+    Case("lesion anywhere", sphere.anywhere),
     Case("Eshelby, nu 0.25", partial(sphere.eshelby, (3.0, 5.0, 8.0), 0.25), slow=True),
     Case("Eshelby, nu 0.45", partial(sphere.eshelby, (5.0,), 0.45), slow=True),
     Case("flat punch", partial(punch.hayes, (12, 18))),

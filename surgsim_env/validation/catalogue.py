@@ -47,6 +47,7 @@ CASES: tuple[Case, ...] = (
     Case("passivity, presses", partial(passivity.presses, 100)),
     Case("passivity, many presses", partial(passivity.presses, 1000), slow=True),
     Case("Eshelby, coarse", partial(sphere.eshelby, (3.0,), 0.25, 16)),
+    Case("lesion anywhere", sphere.anywhere),
     Case("Eshelby, nu 0.25", partial(sphere.eshelby, (3.0, 5.0, 8.0), 0.25), slow=True),
     Case("Eshelby, nu 0.45", partial(sphere.eshelby, (5.0,), 0.45), slow=True),
     Case("flat punch", partial(punch.hayes, (12, 18))),

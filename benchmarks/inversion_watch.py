@@ -2,8 +2,9 @@
 
     python benchmarks/inversion_watch.py --scene phantom
 
-Both copies are compiled from the text of msdm_core/kernels.py in a temporary folder and run in turn in this process, on
-the scene's organ with a ball pressed into it. Prints `name value unit` lines; times are medians, the cost their ratio.
+Two copies of msdm_core/tissue_kernels.py are compiled in a temporary folder; their volume kernels and a whole substep
+without contact run in turn in this process, on the scene's organ at rest. Prints `name value unit` lines; times are
+medians of processor time.
 """
 
 import argparse
@@ -14,10 +15,12 @@ import tempfile
 import time
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
-WATCH = """        if not ratio >= smallest:
-            smallest = ratio
-            smallest_tet = tet
+import numpy as np
+
+WATCH = """        where = keep_lower(ratio, lowest, load_full(_COUNT, 0) + float(first), where)
+        lowest = keep_lower(ratio, lowest, ratio, lowest)
 """
 
 
@@ -32,40 +35,16 @@ def compiled_copy(folder: Path, name: str, text: str) -> ModuleType:
     return module
 
 
-def pressed_scene(scene_name: str, kernels: ModuleType) -> tuple:
-    """Arguments of `advance_substeps` for one haptic step, in that copy's own structures, a ball 2 mm deep."""
-    import numpy as np
-
+def volume_arguments(model: Any) -> tuple:
+    """Arguments of `add_volume_forces` for a scene's organ at rest."""
     from msdm_core.organ import rest_state
-    from msdm_core.stepping import unyielding
-    from surgsim_env.anatomy import load_anatomy
-    from surgsim_env.scenes import make_scene
 
-    scene = make_scene(scene_name)
-    anatomy = load_anatomy(scene)
-    model = anatomy.organ()
-    point, normal = anatomy.face.random_point(np.random.default_rng(0), scene.palpation.face_margin)
-    centre = point + normal * (scene.instrument.tip_radius - 0.002)
-    shapes = kernels.ContactShapes(
-        np.tile(centre, (1, 2, 1)),
-        np.array([scene.instrument.tip_radius]),
-        np.zeros(1, np.int32),
-        centre[None].copy(),
-        np.zeros((1, 6)),
-    )
-    dt = scene.timing.haptic_step / scene.timing.substep_count
+    state = rest_state(model)
+    state.row_position[:, :3] = model.node_rest_position
     return (
-        kernels.OrganModel(*model),
-        kernels.OrganState(*rest_state(model, shape_count=1)),
-        shapes,
-        kernels.ContactLaw(*scene.contact.law),
-        kernels.ToolResponse(*unyielding(1)),
-        dt,
-        1.0 - scene.damping.alpha * dt,
-        scene.timing.substep_count,
-        centre[None].copy(),
-        np.zeros((1, 6)),
-    )
+        state.row_position, state.row_force, state.node_tension, model.tet_nodes, model.tet_rest_volume, model.tet_bulk,
+        model.tet_averaged_bulk, state.volume_ratio_smallest, state.volume_ratio_tet,
+    )  # fmt: skip
 
 
 def seconds(run, arguments: tuple, count: int) -> float:
@@ -83,29 +62,37 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=201)
     arguments = parser.parse_args()
 
-    import msdm_core.kernels
+    from msdm_core import tissue_kernels
+    from msdm_core.organ import rest_state
+    from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+    from surgsim_env.anatomy import load_anatomy
+    from surgsim_env.scenes import make_scene
 
-    text = Path(msdm_core.kernels.__file__).read_text(encoding="utf-8")
+    scene = make_scene(arguments.scene)
+    model = load_anatomy(scene).organ()
+    text = Path(tissue_kernels.__file__).read_text(encoding="utf-8")
     if text.count(WATCH) != 1:
         sys.exit("the lines that watch are no longer those that this script takes out: bring WATCH up to date")
-    steps, volumes = {}, {}
+    times: dict[str, list[float]] = {"watching": [], "blind": [], "substep": []}
+    state, wrench = rest_state(model), np.zeros((0, 6))
+    dt = 0.5 * model.stable_step
     with tempfile.TemporaryDirectory() as folder:
-        for name, source in (("watching", text), ("blind", text.replace(WATCH, ""))):
-            kernels = compiled_copy(Path(folder), f"kernels_{name}", source)
-            given = pressed_scene(arguments.scene, kernels)
-            steps[name] = (kernels.advance_substeps, given, [])
-            volumes[name] = (kernels._add_volume_forces, given[:2], [])
-        for kind, count in ((steps, 20), (volumes, 80)):
-            for run, given, _ in kind.values():
-                seconds(run, given, 5)
-            for _ in range(arguments.rounds):
-                for run, given, times in kind.values():
-                    times.append(seconds(run, given, count))
-    for label, kind in (("haptic_step", steps), ("volume_kernel", volumes)):
-        watching, blind = (statistics.median(kind[name][2]) for name in ("watching", "blind"))
-        print(f"{label}_watching {watching * 1e6:.1f} us")
-        print(f"{label}_blind {blind * 1e6:.1f} us")
-        print(f"{label}_cost {100.0 * (watching / blind - 1.0):+.1f} %")
+        runs = {
+            name: (compiled_copy(Path(folder), f"{name}_kernels", source).add_volume_forces, volume_arguments(model))
+            for name, source in (("watching", text), ("blind", text.replace(WATCH, "")))
+        }
+        runs["substep"] = (advance_organ, (model, state, NO_SHAPES, NO_CONTACT, dt, 1, wrench))
+        for run, given in runs.values():
+            seconds(run, given, 5)
+        for _ in range(arguments.rounds):
+            for name, (run, given) in runs.items():
+                times[name].append(seconds(run, given, 40))
+    median = {name: statistics.median(values) for name, values in times.items()}
+    for name, value in median.items():
+        print(f"{name} {value * 1e6:.1f} us")
+    cost = median["watching"] - median["blind"]
+    print(f"cost_of_volume_kernel {100.0 * cost / median['blind']:+.1f} %")
+    print(f"cost_of_substep {100.0 * cost / (median['substep'] - cost):+.1f} %")
 
 
 if __name__ == "__main__":

@@ -8,8 +8,9 @@ from numba import njit
 
 from msdm_core.vector import below_zero, root
 
-# Below this volume ratio a tet also bears the share of its volume term that is averaged at nodes: an average lets
-# single tets collapse between swollen neighbours (without it, a deep press turned some inside out).
+# Below this volume ratio s a tet also bears the share K' of its volume term that is averaged at nodes, and ever more of
+# it: an average lets single tets collapse between swollen neighbours. Its energy K' s V0 ((J - s) - s ln(J / s)) has no
+# bound at J = 0. Without it, presses turned tets inside out at half the force and less.
 SQUEEZED_RATIO = 0.6
 
 
@@ -51,9 +52,10 @@ def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     """What a tet's gradients (six times dV/dx) are to be multiplied with, minus a sixth of its tension [Pa].
 
     That is K (J - 1) of its own; the mean of the volumes averaged at its corners; and,
-    where it is squeezed, K' (J - SQUEEZED_RATIO) of the share K' that is averaged.
+    where it is squeezed below s = SQUEEZED_RATIO, K' (J - s) s / J of the share K' that is averaged.
     """
-    tension = bulk * (ratio - 1.0) + averaged_tension + averaged_bulk * below_zero(ratio - SQUEEZED_RATIO)
+    squeezed = below_zero(ratio - SQUEEZED_RATIO) * (SQUEEZED_RATIO / ratio)
+    tension = bulk * (ratio - 1.0) + averaged_tension + averaged_bulk * squeezed
     return tension * (-1.0 / 6.0)
 
 

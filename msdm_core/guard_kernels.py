@@ -13,13 +13,13 @@ EDGE_WIDTH = 5e-4
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrench):
+def guard_axes(model, state, shapes, law, response, dt, candidate_count, reference, wrench):
     """Keep the surface off the shapes' axes, whatever the quadrature points do; False where an axis passed through.
 
     Where a ball is small against a triangle, the surface opens between its quadrature points. So the point of each
     triangle nearest to the axis, at the distance d, is pushed away from it by k h (h / d - 1) below h = 0.6 r, with
-    k = pi r^2 k_p: nothing at h, without bound at the axis. It is taken implicitly, with the nodes' masses, so that it
-    asks for no shorter step; it must therefore come after all other forces.
+    k = pi r^2 k_p: nothing at h, without bound at the axis. It is taken implicitly, with the nodes' masses and the
+    tool's mobility, so that it asks for no shorter step; it must therefore come after all other forces.
     """
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     candidates, surface, inverse_mass = state.contact_candidates, model.surface_triangles, model.node_inverse_mass
@@ -64,7 +64,7 @@ def guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrench
                 kept = False
                 continue
             # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, near for a shaft.
-            wb, wc = _closest_in_triangle(
+            wb, wc = closest_in_triangle(
                 bx, by, bz, cx, cy, cz,
                 ends[shape, low, 0] - position[a, 0], ends[shape, low, 1] - position[a, 1],
                 ends[shape, low, 2] - position[a, 2],
@@ -81,16 +81,16 @@ def guard_axes(model, state, shapes, law, dt, candidate_count, reference, wrench
             if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
                 continue
             _hold_off(
-                position, velocity, force, inverse_mass, twist, centre, dt, reference, wrench, tool, reach,
-                math.pi * radius * radius * law.stiffness, distance, ex, ey, ez, x, y, z, a, b, c, wb, wc,
+                position, velocity, force, inverse_mass, twist, centre, response.tool_mobility, dt, reference, wrench,
+                tool, reach, math.pi * radius * radius * law.stiffness, distance, ex, ey, ez, x, y, z, a, b, c, wb, wc,
             )  # fmt: skip
     return kept
 
 
 @njit(cache=True, inline="always", nogil=True, error_model="numpy")
 def _hold_off(
-    position, velocity, force, inverse_mass, twist, centre, dt, reference, wrench, tool, reach, stiffness, distance,
-    ex, ey, ez, x, y, z, a, b, c, wb, wc,
+    position, velocity, force, inverse_mass, twist, centre, mobility, dt, reference, wrench, tool, reach, stiffness,
+    distance, ex, ey, ez, x, y, z, a, b, c, wb, wc,
 ):  # fmt: skip
     """The guard's push on a triangle's point (x, y, z) along e, with the speed and mobility it has in this substep."""
     ex /= distance
@@ -104,7 +104,11 @@ def _hold_off(
         + ey * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
         + ez * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
     )
+    lever = (ex, ey, ez, oy * ez - oz * ey, oz * ex - ox * ez, ox * ey - oy * ex)
     give = 0.0
+    for row in range(6):
+        for column in range(6):
+            give += dt * lever[row] * mobility[tool, row, column] * lever[column]
     for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
         rate = dt * inverse_mass[node]
         speed += weight * (
@@ -196,7 +200,7 @@ def _is_inside(high, high_b, high_c, low, low_b, low_c):
 
 
 @njit(cache=True, inline="always", nogil=True, error_model="numpy")
-def _closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
+def closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
     """Weights of the corners b and c, seen from the corner a, of the triangle's point nearest to p.
 
     After Ericson, Real-Time Collision Detection (2005), 5.1.5.

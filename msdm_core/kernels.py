@@ -245,7 +245,7 @@ def _substep(model, rows, shapes, law, response, dt, decay, substep, candidate_c
     """One substep; a FAULT_ code."""
     _evaluate(model, rows)
     add_contact_forces(model, rows, shapes, law, dt, candidate_count, reference, wrench)
-    kept = guard_axes(model, rows, shapes, law, dt, candidate_count, reference, wrench)
+    kept = guard_axes(model, rows, shapes, law, response, dt, candidate_count, reference, wrench)
     total = integrate(rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay)
     _push_tools(shapes, response, dt, substep, wrench)
     _move_shapes(shapes, dt)

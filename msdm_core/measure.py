@@ -1,10 +1,13 @@
 """What an organ's state amounts to: energy, momentum, volume ratios, inverted tets, internal forces."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT, QUADRATURE_WEIGHT
+from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT, QUADRATURE_WEIGHT, closest_on_axis
 from msdm_core.element_kernels import SQUEEZED_RATIO
+from msdm_core.guard_kernels import GUARD_SHARE, closest_in_triangle
 from msdm_core.kernels import (
     ContactLaw,
     ContactShapes,
@@ -24,17 +27,20 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     """Energy of springs, volume term and gravity, zero at the undeformed position [J].
 
     U = sum_s k_s (l_s - l0_s)^2 / 2 + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
-        + sum_t K'_t V0_t (J_t - J')^2 / 2 - sum_i m_i g . (x_i - X_i)
+        + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) - sum_i m_i g . (x_i - X_i)
     where a is a volume averaged at a node, K'_t the share averaged and the fourth sum over tets below
-    J' = SQUEEZED_RATIO. A resting tool's contact energy (`contact_energy`) is not in it.
+    s = SQUEEZED_RATIO (infinite for one that is inside out). A resting tool's `contact_energy` is not in it.
     """
     ends = state.node_position[model.spring_nodes]
     stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length
     springs = 0.5 * float(model.spring_stiffness @ stretch**2)
     ratio = volume_ratios(model, state)
     volume = 0.5 * float((model.tet_bulk * model.tet_rest_volume) @ (ratio - 1.0) ** 2)
-    squeezed = np.minimum(ratio - SQUEEZED_RATIO, 0.0)
-    volume += 0.5 * float((model.tet_averaged_bulk * model.tet_rest_volume) @ squeezed**2)
+    squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_averaged_bulk > 0.0))
+    share = np.maximum(ratio[squeezed], 0.0) / SQUEEZED_RATIO
+    with np.errstate(divide="ignore"):
+        barrier = SQUEEZED_RATIO**2 * ((share - 1.0) - np.log(share))
+    volume += float((model.tet_averaged_bulk * model.tet_rest_volume)[squeezed] @ barrier)
     quarter = np.repeat(ratio * model.tet_rest_volume / 4.0, 4)
     averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(model.node_mass)) / model.node_rest_volume
     volume += 0.5 * float((model.node_bulk * model.node_rest_volume) @ (averaged - 1.0) ** 2)
@@ -47,7 +53,7 @@ def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, 
 
     E = sum over shapes and quadrature points of (k_p / 2) A g^2, g = s (s + t) / r: with d from the shape's axis to the
     point and n the triangle's normal, t = d . n and s^2 = r^2 - (|d|^2 - t^2). Counted are points inside the shape that
-    it meets from outside (t <= 0) or holds already (`state.contact_engaged`).
+    it meets from outside (t <= 0) or holds already (`state.contact_engaged`). To this comes the guard's energy.
     """
     corners = state.node_position[model.surface_triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -67,7 +73,30 @@ def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, 
         depth = np.where(inside, chord * (chord + height) / radius, 0.0)
         area = model.surface_rest_area * QUADRATURE_WEIGHT
         energy += 0.5 * contact.stiffness * float(area @ (depth * depth).sum(axis=1))
+        energy += _guard_energy(corners, normal, shapes.shape_ends[shape], radius, contact.stiffness)
     return energy
+
+
+def _guard_energy(corners: FloatArray, normal: FloatArray, ends: FloatArray, radius: float, stiffness: float) -> float:
+    """Of the push k h (h / d - 1) on triangles nearer than d = h to a shape's axis: k h (h ln(h / d) - (h - d)) [J].
+
+    Exact for a ball; a shaft's nearest point is the kernel's.
+    """
+    reach = GUARD_SHARE * radius
+    middle = corners.mean(axis=1)
+    size = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    gap = np.linalg.norm(middle - ends.mean(axis=0), axis=1) - size - 0.5 * np.linalg.norm(ends[1] - ends[0])
+    energy = 0.0
+    for triangle in np.flatnonzero(gap < reach):
+        a, b, c = corners[triangle]
+        low = ends[np.argmin((ends - a) @ normal[triangle])]
+        wb, wc = closest_in_triangle(*(b - a), *(c - a), *(low - a))
+        point = a + wb * (b - a) + wc * (c - a)
+        offset = point - np.array(closest_on_axis(ends[None], 0, *point))
+        distance = float(np.linalg.norm(offset))
+        if distance < reach and offset @ normal[triangle] < 0.0:
+            energy += reach * math.log(reach / distance) - (reach - distance)
+    return math.pi * radius**2 * stiffness * reach * energy
 
 
 def momentum(model: OrganModel, state: OrganState) -> FloatArray:

@@ -51,7 +51,7 @@ def volume_gradient(corners: FloatArray) -> FloatArray:
 
 
 def volume_forces(model: OrganModel, position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """f_a = -(K_t e_t + K' min(J - 0.6, 0) + mean of the corners' K_a e_a) dV/dx_a [N], shape (n_node, 3).
+    """f_a = -(K_t e_t + K' min(J - 0.6, 0) 0.6 / J + mean of the corners' K_a e_a) dV/dx_a [N], shape (n_node, 3).
 
     e = (J - 1) + beta dJ/dt; e_a is that of the volume around a node, of which each of its tets gives a quarter.
     """
@@ -61,7 +61,7 @@ def volume_forces(model: OrganModel, position: FloatArray, velocity: FloatArray)
     for nodes, rest_volume, bulk, averaged_bulk in moduli:
         volume, rate, gradient = tet_volume(position[nodes], velocity[nodes])
         strain = volume / rest_volume - 1.0 + model.beta * rate / rest_volume
-        squeezed = averaged_bulk * min(volume / rest_volume - 0.6, 0.0)
+        squeezed = averaged_bulk * min(volume / rest_volume - 0.6, 0.0) * 0.6 / (volume / rest_volume)
         force[nodes] -= (bulk * strain + squeezed + tension[nodes].mean()) * gradient
     return force
 

@@ -106,9 +106,12 @@ def test_a_scene_whose_contact_is_too_stiff_for_its_tool_is_refused():
 # ---- tools that are thrown off ---------------------------------------------------------------------------------------
 
 
+DEPTH = 0.0025  # [m] of an 8 mm ball: the guard of its centre (beyond 0.4 r) is not met
+
+
 def thrown(mass: float, *, substeps: int = 4, damping: float = 0.0) -> bool:
-    """Whether a ball at rest 6 mm deep in a block that does not move, knocked at 2 mm/s, ends faster than 50."""
-    coupled = resting(mass, 0.006, ELASTIC, joint=UPRIGHT, substeps=substeps)
+    """Whether a ball at rest DEPTH deep in a block that does not move, knocked at 2 mm/s, ends faster than 50."""
+    coupled = resting(mass, DEPTH, ELASTIC, joint=UPRIGHT, substeps=substeps)
     coupled.ball.model.dof_damping[:] = damping
     coupled.ball.data.qvel[0] = 2e-3
     heights = []
@@ -122,16 +125,19 @@ def thrown(mass: float, *, substeps: int = 4, damping: float = 0.0) -> bool:
 
 
 def felt_stiffness() -> float:
-    coupled = resting(0.1, 0.006, ELASTIC, joint=UPRIGHT)
+    coupled = resting(0.1, DEPTH, ELASTIC, joint=UPRIGHT)
     return (static_force(coupled, 1e-6) - static_force(coupled)) / 1e-6
 
 
 def test_the_bound_counts_more_than_is_felt():
-    """A flat surface holds a ball with k_p pi r^2 / 2, to the quadrature; the bound takes the whole of it."""
+    """A flat surface holds a ball with k_p (pi r^2 / 2) (1 - (1 - depth / r)^4); the bound takes k_p pi r^2.
+
+    To 5 %: on the rim of the contact, 5 mm wide, quadrature points come in one after the other.
+    """
     felt = felt_stiffness()
-    assert felt == pytest.approx(0.5 * 2e7 * np.pi * 0.008**2, rel=0.02)
+    assert felt == pytest.approx(0.5 * 2e7 * np.pi * 0.008**2 * (1.0 - (1.0 - DEPTH / 0.008) ** 4), rel=0.05)
     (found,) = tool_masses(free_ball(0.1, 0.008, 0.0), ELASTIC, WIDE)
-    assert 1.5 * felt < found.stiffness < 2.5 * felt
+    assert 2.0 * felt < found.stiffness < 3.0 * felt
 
 
 def test_no_press_is_felt_stiffer_than_the_bound():

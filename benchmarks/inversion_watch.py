@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-WATCH = """        where = keep_lower(ratio, lowest, load_full(_COUNT, 0) + float(first), where)
-        lowest = keep_lower(ratio, lowest, ratio, lowest)
+WATCH = """        lowest = keep_lower(ratio, lowest, ratio, lowest)
 """
 
 
@@ -43,7 +42,7 @@ def volume_arguments(model: Any) -> tuple:
     state.row_position[:, :3] = model.node_rest_position
     return (
         state.row_position, state.row_force, state.node_tension, model.tet_nodes, model.tet_rest_volume, model.tet_bulk,
-        model.tet_averaged_bulk, state.volume_ratio_smallest, state.volume_ratio_tet,
+        model.tet_averaged_bulk, state.volume_ratio_smallest,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ QUADRATURE_BARYCENTRIC = np.array(
 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def find_candidates(model, state, shapes, duration):
     """Broad phase of one call: the triangles that a shape may touch within `duration` [s], by bounding spheres.
 
@@ -69,7 +69,7 @@ def find_candidates(model, state, shapes, duration):
     return most
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
     """Contact of every shape with its candidate triangles; adds the reaction to the tools' wrench."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
@@ -106,7 +106,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 )  # fmt: skip
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def closest_on_axis(ends, shape, x, y, z):
     """The point of a capsule's axis nearest to (x, y, z) [m]."""
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
@@ -122,7 +122,7 @@ def closest_on_axis(ends, shape, x, y, z):
     return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _release(engaged, stretch_memory, shape, item):
     """Forget the contact of one quadrature point with one shape."""
     engaged[shape, item] = 0
@@ -130,7 +130,7 @@ def _release(engaged, stretch_memory, shape, item):
         stretch_memory[shape, item, axis] = 0.0
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _add_point_contact(
     surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist, law, dt,
     reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
@@ -260,7 +260,7 @@ def _add_point_contact(
         wrench[tool, 5] -= ax * fy - ay * fx
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
     """Drop the part along a capsule's axis where the nearest axis point lies strictly between the ends."""
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
@@ -275,7 +275,7 @@ def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
     return gx, gy, gz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def stretch_by_lag(model, state, shapes, response, candidate_count):
     """Sticking friction follows a tool to where MuJoCo puts it: the last twist times the step, ahead by the lag."""
     position, surface = state.node_position, model.surface_triangles

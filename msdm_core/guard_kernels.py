@@ -12,7 +12,7 @@ GUARD_SHARE = 0.6
 EDGE_WIDTH = 5e-4
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def guard_axes(model, state, shapes, law, response, dt, candidate_count, reference, wrench):
     """Keep the surface off the shapes' axes, whatever the quadrature points do; False where an axis passed through.
 
@@ -87,7 +87,7 @@ def guard_axes(model, state, shapes, law, response, dt, candidate_count, referen
     return kept
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _hold_off(
     position, velocity, force, inverse_mass, twist, centre, mobility, dt, reference, wrench, tool, reach, stiffness,
     distance, ex, ey, ez, x, y, z, a, b, c, wb, wc,
@@ -138,7 +138,7 @@ def _hold_off(
     wrench[tool, 5] -= x * fy - y * fx
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _passed(shapes, shape, position, velocity, dt, a, b, c):
     """Whether an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
     ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]
@@ -166,7 +166,7 @@ def _passed(shapes, shape, position, velocity, dt, a, b, c):
     return highest > 0.0 > lowest and _is_inside(highest, highest_b, highest_c, lowest, lowest_b, lowest_c)
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _foot(x, y, z, position, velocity, dt, a, b, c):
     """Of a point over a triangle as it was dt ago: height [m], and its foot's weights of the corners b and c."""
     ax = position[a, 0] - dt * velocity[a, 0]
@@ -190,7 +190,7 @@ def _foot(x, y, z, position, velocity, dt, a, b, c):
     return (px * nx + py * ny + pz * nz) / math.sqrt(squared), wb, wc
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _is_inside(high, high_b, high_c, low, low_b, low_c):
     """Whether the way from a height above a triangle to one below it leads through it, its edges included."""
     share = high / (high - low)
@@ -199,7 +199,7 @@ def _is_inside(high, high_b, high_c, low, low_b, low_c):
     return wb >= -EDGE_WIDTH and wc >= -EDGE_WIDTH and wb + wc <= 1.0 + EDGE_WIDTH
 
 
-@njit(cache=True, inline="always", nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
     """Weights of the corners b and c, seen from the corner a, of the triangle's point nearest to p.
 

@@ -96,7 +96,6 @@ class OrganState(NamedTuple):
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
         contact_passed: the shape and the triangle it passed through, after such a fault  (2,)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
-        volume_ratio_tet: the tet that had it                                    (1,)
     """
 
     node_position: FloatArray
@@ -111,7 +110,6 @@ class OrganState(NamedTuple):
     contact_candidates: NDArray[np.int32]
     contact_passed: NDArray[np.int32]
     volume_ratio_smallest: FloatArray
-    volume_ratio_tet: NDArray[np.int32]
 
 
 class ContactShapes(NamedTuple):
@@ -164,7 +162,7 @@ class ContactLaw(NamedTuple):
     tangential_stiffness: float
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _move_shapes(shapes, dt):
     """Carry the shapes along their tool's twist."""
     twist = shapes.tool_twist
@@ -182,7 +180,7 @@ def _move_shapes(shapes, dt):
             shapes.tool_centre[tool, axis] += dt * twist[tool, axis]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _push_tools(shapes, response, dt, substep, wrench):
     """Let the substep's wrench change the tools' twist: twist += dt (a + B w), before the shapes move along it."""
     twist, before, lag = shapes.tool_twist, response.tool_wrench, response.tool_lag
@@ -198,18 +196,18 @@ def _push_tools(shapes, response, dt, substep, wrench):
             before[tool, row] = wrench[tool, row]
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _in_rows(state):
     """The state with rows of four in place of its node arrays; contact reads x, y and z of either."""
     return OrganState(
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
         state.row_position, state.row_velocity, state.row_force,
         state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
-        state.volume_ratio_smallest, state.volume_ratio_tet,
+        state.volume_ratio_smallest,
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _copy_rows(source, target):
     """The first three columns of an array."""
     for node in range(source.shape[0]):
@@ -217,7 +215,7 @@ def _copy_rows(source, target):
             target[node, axis] = source[node, axis]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _evaluate(model, rows):
     """Gravity, springs and volume term into the rows' force."""
     position, velocity, force, tension = rows.node_position, rows.node_velocity, rows.node_force, rows.node_tension
@@ -234,26 +232,10 @@ def _evaluate(model, rows):
         set_node_tension(tension, model.node_rest_volume, model.node_bulk)
     add_volume_forces(
         position, force, tension, tets, model.tet_rest_volume, model.tet_bulk, model.tet_averaged_bulk,
-        rows.volume_ratio_smallest, rows.volume_ratio_tet,
+        rows.volume_ratio_smallest,
     )  # fmt: skip
     if beta > 0.0:
         add_volume_damping(position, velocity, force, tets, model.tet_rest_volume, model.tet_bulk, beta)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _substep(model, rows, shapes, law, response, dt, decay, substep, candidate_count, reference, wrench):
-    """One substep; a FAULT_ code."""
-    _evaluate(model, rows)
-    add_contact_forces(model, rows, shapes, law, dt, candidate_count, reference, wrench)
-    kept = guard_axes(model, rows, shapes, law, response, dt, candidate_count, reference, wrench)
-    total = integrate(rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay)
-    _push_tools(shapes, response, dt, substep, wrench)
-    _move_shapes(shapes, dt)
-    if not math.isfinite(total):
-        return FAULT_NOT_FINITE
-    if not rows.volume_ratio_smallest[0] > 0.0:
-        return FAULT_INVERTED_TET
-    return FAULT_NONE if kept else FAULT_CONTACT_LOST
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -272,9 +254,23 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
     _copy_rows(state.node_position, rows.node_position)
     _copy_rows(state.node_velocity, rows.node_velocity)
     candidate_count = find_candidates(model, rows, shapes, dt * substep_count)
+    position, velocity, force = rows.node_position, rows.node_velocity, rows.node_force
     fault = FAULT_NONE
     for substep in range(substep_count):
-        fault = _substep(model, rows, shapes, law, response, dt, decay, substep, candidate_count, reference, wrench)
+        _evaluate(model, rows)
+        if not state.volume_ratio_smallest[0] > 0.0:
+            # Before anything moves: the state shows which tet it was.
+            fault = FAULT_INVERTED_TET
+            break
+        add_contact_forces(model, rows, shapes, law, dt, candidate_count, reference, wrench)
+        kept = guard_axes(model, rows, shapes, law, response, dt, candidate_count, reference, wrench)
+        total = integrate(position, velocity, force, model.node_inverse_mass, dt, decay)
+        _push_tools(shapes, response, dt, substep, wrench)
+        _move_shapes(shapes, dt)
+        if not math.isfinite(total):
+            fault = FAULT_NOT_FINITE
+        elif not kept:
+            fault = FAULT_CONTACT_LOST
         if fault != FAULT_NONE:
             break
     if fault == FAULT_NONE and law.friction > 0.0:

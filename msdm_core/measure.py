@@ -134,7 +134,6 @@ def internal_forces(model: OrganModel, state: OrganState) -> FloatArray:
         row_velocity=np.zeros_like(state.row_velocity),
         row_force=np.zeros_like(state.row_force),
         volume_ratio_smallest=np.ones(1),
-        volume_ratio_tet=np.zeros(1, np.int32),
     )
     evaluate_forces(model._replace(gravity=no_gravity), scratch)
     return scratch.node_force

@@ -116,7 +116,6 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
         contact_passed=np.zeros(2, dtype=np.int32),
         volume_ratio_smallest=np.ones(1),
-        volume_ratio_tet=np.zeros(1, dtype=np.int32),
     )
     if np.any(model.gravity != 0.0):
         _settle(model, state)
@@ -206,7 +205,7 @@ def _settle(model: OrganModel, state: OrganState, *, force_tolerance: float = 1e
     for _ in range(rounds):
         fault = advance_organ(relaxed, state, NO_SHAPES, NO_CONTACT, dt, 10, wrench)
         if fault != FAULT_NONE:
-            raise OrganDivergedError("under gravity, " + describe_fault(state, fault))
+            raise OrganDivergedError("under gravity, " + describe_fault(relaxed, state, fault))
         evaluate_forces(relaxed, state)
         if np.linalg.norm(state.node_force[free], axis=1).sum() <= force_tolerance * weight:
             state.node_velocity[:] = 0.0

@@ -17,6 +17,7 @@ from msdm_core.kernels import (
     ToolResponse,
     advance_substeps,
 )
+from msdm_core.measure import volume_ratios
 from msdm_core.mesh import FloatArray
 from msdm_core.stability import stable_dt
 
@@ -61,7 +62,7 @@ def advance(
     wrench = np.zeros((len(shapes.tool_centre), 6))
     fault = advance_organ(model, state, shapes, contact, dt, substep_count, wrench)
     if fault != FAULT_NONE:
-        raise OrganDivergedError(describe_fault(state, fault))
+        raise OrganDivergedError(describe_fault(model, state, fault))
     return wrench
 
 
@@ -134,13 +135,15 @@ def unyielding(tool_count: int) -> ToolResponse:
     return ToolResponse(*(np.zeros((tool_count, *shape)) for shape in ((6,), (6, 6), (6,), (6,))))
 
 
-def describe_fault(state: OrganState, fault: int) -> str:
+def describe_fault(model: OrganModel, state: OrganState, fault: int) -> str:
     """One sentence on a FAULT_ code: what happened and where."""
-    if fault == FAULT_INVERTED_TET:
+    bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
+    if fault == FAULT_INVERTED_TET and not bad.size:
+        ratios = volume_ratios(model, state)
+        tet = int(np.argmin(ratios))
         return (
-            f"tet {int(state.volume_ratio_tet[0])} turned inside out: volume ratio "
-            f"{float(state.volume_ratio_smallest[0]):.3g}, it must stay above 0: press less deep, use smaller cells "
-            "or a higher Poisson's ratio"
+            f"tet {tet} turned inside out: volume ratio {ratios[tet]:.3g}, it must stay above 0: press less deep, use "
+            "smaller cells or a higher Poisson's ratio"
         )
     if fault == FAULT_CONTACT_LOST:
         shape, triangle = state.contact_passed.tolist()
@@ -148,5 +151,4 @@ def describe_fault(state: OrganState, fault: int) -> str:
             f"contact lost: contact shape {shape} passed through surface triangle {triangle}: press less deep or more "
             "slowly, use smaller cells or a larger shape"
         )
-    bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
     return f"node {int(bad[0]) if bad.size else 0} is no longer finite: the step is too long for the forces at work"

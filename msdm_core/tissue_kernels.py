@@ -4,7 +4,6 @@ The rows of eight items are loaded, turned into vectors of eight x, y and z, wor
 `element_kernels`, turned back and added up item by item: the same sums in the same order as a plain loop.
 """
 
-import numpy as np
 from numba import njit
 
 from msdm_core.element_kernels import (
@@ -40,7 +39,6 @@ _row_1 = define_shuffle([2, 3, 10, 11])
 _row_2 = define_shuffle([4, 5, 12, 13])
 _row_3 = define_shuffle([6, 7, 14, 15])
 _at_0, _at_1, _at_2, _at_3, _at_4, _at_5, _at_6, _at_7 = (define_extract(place) for place in range(GROUP))
-_COUNT = np.arange(float(GROUP))
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -106,7 +104,7 @@ def _share(total, items, item, value):
     total[items[item, 3]] += value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def set_gravity(force, mass, gravity):
     """F = m g."""
     for node in range(force.shape[0]):
@@ -115,7 +113,7 @@ def set_gravity(force, mass, gravity):
         force[node, 3] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def integrate(position, velocity, force, inverse_mass, dt, decay):
     """Symplectic Euler: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt); returns a sum finite if all is."""
     total = load_row(position, 0) * 0.0
@@ -128,7 +126,7 @@ def integrate(position, velocity, force, inverse_mass, dt, decay):
     return (_at_0(total) + _at_1(total)) + _at_2(total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def add_spring_forces(position, force, nodes, stiffness, rest_length):
     """Springs: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
     whole = nodes.shape[0] // GROUP * GROUP
@@ -153,7 +151,7 @@ def add_spring_forces(position, force, nodes, stiffness, rest_length):
         _pull(force, nodes, spring, _edge(position, nodes, spring, 1) * scale)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def add_spring_damping(position, velocity, force, nodes, stiffness, beta):
     """Rayleigh's beta along the springs: f = k beta dl/dt."""
     for spring in range(nodes.shape[0]):
@@ -170,7 +168,7 @@ def _difference(values, items, item, corner):
     return values[j, 0] - values[i, 0], values[j, 1] - values[i, 1], values[j, 2] - values[i, 2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def sum_volumes(position, total, tets):
     """Six times the volume of every tet, added up at its corners [m^3]."""
     whole = tets.shape[0] // GROUP * GROUP
@@ -216,14 +214,14 @@ def _six_rates(velocity, tets, tet, g):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def set_node_tension(total, node_rest_volume, node_bulk):
     """From the sums at nodes to the tension of the volumes averaged there, K_a (J_a - 1) [Pa]."""
     for node in range(total.shape[0]):
         total[node] = node_tension(total[node], node_rest_volume[node], node_bulk[node])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def add_volume_rates(position, velocity, total, tets, beta):
     """Beta times the rate of `sum_volumes`."""
     for tet in range(tets.shape[0]):
@@ -231,7 +229,7 @@ def add_volume_rates(position, velocity, total, tets, beta):
         _share(total, tets, tet, beta * _six_rates(velocity, tets, tet, gradients))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
     for tet in range(tets.shape[0]):
@@ -246,23 +244,21 @@ def _corner_tension(tension, tets, tet):
     return 0.25 * (tension[tets[tet, 0]] + tension[tets[tet, 1]] + tension[tets[tet, 2]] + tension[tets[tet, 3]])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_forces(position, force, tension, tets, rest_volume, bulk, averaged_bulk, low, low_tet):
-    """Volume terms: a tet pulls its corners with its tension times dV/dx; keeps the smallest V / V0 seen and its tet.
+@njit(error_model="numpy")
+def add_volume_forces(position, force, tension, tets, rest_volume, bulk, averaged_bulk, low):
+    """Volume terms: a tet pulls its corners with its tension times dV/dx; keeps the smallest V / V0 seen.
 
     K (J - 1) per tet adds K to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020); the
     mean tension of the volumes averaged at its corners comes on top.
     """
     whole = tets.shape[0] // GROUP * GROUP
     lowest = spread_like(rest_volume, low[0])
-    where = spread_like(rest_volume, float(low_tet[0]))
     for first in range(0, whole, GROUP):
         bx, by, bz = _edges(position, tets, first, 1)
         cx, cy, cz = _edges(position, tets, first, 2)
         dx, dy, dz = _edges(position, tets, first, 3)
         gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
         ratio = six_volumes(bx, by, bz, gbx, gby, gbz) / (6.0 * load_full(rest_volume, first))
-        where = keep_lower(ratio, lowest, load_full(_COUNT, 0) + float(first), where)
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         averaged = pack(
             _corner_tension(tension, tets, first), _corner_tension(tension, tets, first + 1),
@@ -284,28 +280,27 @@ def add_volume_forces(position, force, tension, tets, rest_volume, bulk, average
         _push(force, tets, first + 5, a[5], b[5], c[5], d[5])
         _push(force, tets, first + 6, a[6], b[6], c[6], d[6])
         _push(force, tets, first + 7, a[7], b[7], c[7], d[7])
-    _keep(low, low_tet, _at_0(lowest), _at_0(where))
-    _keep(low, low_tet, _at_1(lowest), _at_1(where))
-    _keep(low, low_tet, _at_2(lowest), _at_2(where))
-    _keep(low, low_tet, _at_3(lowest), _at_3(where))
-    _keep(low, low_tet, _at_4(lowest), _at_4(where))
-    _keep(low, low_tet, _at_5(lowest), _at_5(where))
-    _keep(low, low_tet, _at_6(lowest), _at_6(where))
-    _keep(low, low_tet, _at_7(lowest), _at_7(where))
+    _keep(low, _at_0(lowest))
+    _keep(low, _at_1(lowest))
+    _keep(low, _at_2(lowest))
+    _keep(low, _at_3(lowest))
+    _keep(low, _at_4(lowest))
+    _keep(low, _at_5(lowest))
+    _keep(low, _at_6(lowest))
+    _keep(low, _at_7(lowest))
     for tet in range(whole, tets.shape[0]):
         gradients, six = _one_tet(position, tets, tet)
         ratio = six / (6.0 * rest_volume[tet])
-        _keep(low, low_tet, ratio, float(tet))
+        _keep(low, ratio)
         scale = tet_scale(ratio, bulk[tet], averaged_bulk[tet], _corner_tension(tension, tets, tet))
         _push_one(force, tets, tet, scale, gradients)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _keep(low, low_tet, ratio, tet):
-    """Remember a volume ratio where it is the smallest yet; of equal ones the first tet."""
-    if not ratio >= low[0] or (ratio == low[0] and tet < low_tet[0]):
+def _keep(low, ratio):
+    """Remember a volume ratio where it is the smallest yet."""
+    if not ratio >= low[0]:
         low[0] = ratio
-        low_tet[0] = int(tet)
 
 
 @njit(forceinline=True, error_model="numpy")

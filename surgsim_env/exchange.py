@@ -45,7 +45,7 @@ def haptic_step(
     instrument.read_response()
     fault = advance_organ(model, state, instrument.shapes, contact, dt, substep_count, wrench, instrument.response)
     if fault != FAULT_NONE:
-        raise OrganDivergedError(describe_fault(state, fault))
+        raise OrganDivergedError(describe_fault(model, state, fault))
     if not np.isfinite(wrench).all():
         raise OrganDivergedError("the contact wrench is not finite")
     force = float(np.sqrt((wrench[:, :3] ** 2).sum(axis=1)).max())

@@ -94,7 +94,6 @@ class Simulation:
         state.contact_stretch[:] = 0.0
         state.contact_passed[:] = 0
         state.volume_ratio_smallest[:] = 1.0
-        state.volume_ratio_tet[:] = 0
         self.instrument.place(tip_position)
         self._wrench[:] = 0.0
         self._step = 0

@@ -53,7 +53,7 @@ def followed(
     for _ in range(count):
         fault = advance_organ(model, state, NO_SHAPES, NO_CONTACT, dt, every, wrench)
         if fault != FAULT_NONE:
-            raise ValueError(describe_fault(state, fault))
+            raise ValueError(describe_fault(model, state, fault))
         values.append(measure(state))
     return np.array(values)
 

@@ -63,7 +63,7 @@ def twist_prism(angle: float = TWIST) -> Deformed:
         state.node_position[top, :2] = middle[:2] + arm @ np.array([[cosine, sine], [-sine, cosine]])
         fault = advance_organ(model, state, NO_SHAPES, NO_CONTACT, dt, 10, wrench)
         if fault != FAULT_NONE:
-            raise ValueError(describe_fault(state, fault))
+            raise ValueError(describe_fault(model, state, fault))
     lever = state.node_position[top] - middle
     torque = -float(np.cross(lever, state.node_force[top])[:, 2].sum())
     smallest = float(state.volume_ratio_smallest[0])

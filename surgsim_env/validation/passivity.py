@@ -97,6 +97,6 @@ def press_work(model: OrganModel, substeps: int, random: np.random.Generator) ->
         for _ in range(steps):
             fault = advance_organ(model, state, shapes, LOSSY, HAPTIC_STEP / substeps, substeps, wrench)
             if fault != FAULT_NONE:
-                raise OrganDivergedError(describe_fault(state, fault))
+                raise OrganDivergedError(describe_fault(model, state, fault))
             work.append(-HAPTIC_STEP * float(wrench[0, :3] @ velocity))
     return np.array(work)

@@ -21,7 +21,7 @@ QUADRATURE_BARYCENTRIC = np.array(
 )
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def find_candidates(model, state, shapes, duration):
     """Broad phase of one call: the triangles that a shape may touch within `duration` [s], by bounding spheres.
 
@@ -69,7 +69,7 @@ def find_candidates(model, state, shapes, duration):
     return most
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
     """Contact of every shape with its candidate triangles; adds the reaction to the tools' wrench."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
@@ -275,7 +275,7 @@ def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
     return gx, gy, gz
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def stretch_by_lag(model, state, shapes, response, candidate_count):
     """Sticking friction follows a tool to where MuJoCo puts it: the last twist times the step, ahead by the lag."""
     position, surface = state.node_position, model.surface_triangles

@@ -12,7 +12,7 @@ GUARD_SHARE = 0.6
 EDGE_WIDTH = 5e-4
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def guard_axes(model, state, shapes, law, response, dt, candidate_count, reference, wrench):
     """Keep the surface off the shapes' axes, whatever the quadrature points do; False where an axis passed through.
 
@@ -138,7 +138,7 @@ def _hold_off(
     wrench[tool, 5] -= x * fy - y * fx
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _passed(shapes, shape, position, velocity, dt, a, b, c):
     """Whether an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
     ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]

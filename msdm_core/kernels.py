@@ -162,7 +162,7 @@ class ContactLaw(NamedTuple):
     tangential_stiffness: float
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _move_shapes(shapes, dt):
     """Carry the shapes along their tool's twist."""
     twist = shapes.tool_twist
@@ -180,7 +180,7 @@ def _move_shapes(shapes, dt):
             shapes.tool_centre[tool, axis] += dt * twist[tool, axis]
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _push_tools(shapes, response, dt, substep, wrench):
     """Let the substep's wrench change the tools' twist: twist += dt (a + B w), before the shapes move along it."""
     twist, before, lag = shapes.tool_twist, response.tool_wrench, response.tool_lag
@@ -207,7 +207,7 @@ def _in_rows(state):
     )  # fmt: skip
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _copy_rows(source, target):
     """The first three columns of an array."""
     for node in range(source.shape[0]):
@@ -215,7 +215,7 @@ def _copy_rows(source, target):
             target[node, axis] = source[node, axis]
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(model, rows):
     """Gravity, springs and volume term into the rows' force."""
     position, velocity, force, tension = rows.node_position, rows.node_velocity, rows.node_force, rows.node_tension

@@ -104,7 +104,7 @@ def _share(total, items, item, value):
     total[items[item, 3]] += value
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def set_gravity(force, mass, gravity):
     """F = m g."""
     for node in range(force.shape[0]):
@@ -113,7 +113,7 @@ def set_gravity(force, mass, gravity):
         force[node, 3] = 0.0
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def integrate(position, velocity, force, inverse_mass, dt, decay):
     """Symplectic Euler: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt); returns a sum finite if all is."""
     total = load_row(position, 0) * 0.0
@@ -126,7 +126,7 @@ def integrate(position, velocity, force, inverse_mass, dt, decay):
     return (_at_0(total) + _at_1(total)) + _at_2(total)
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_spring_forces(position, force, nodes, stiffness, rest_length):
     """Springs: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
     whole = nodes.shape[0] // GROUP * GROUP
@@ -151,7 +151,7 @@ def add_spring_forces(position, force, nodes, stiffness, rest_length):
         _pull(force, nodes, spring, _edge(position, nodes, spring, 1) * scale)
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_spring_damping(position, velocity, force, nodes, stiffness, beta):
     """Rayleigh's beta along the springs: f = k beta dl/dt."""
     for spring in range(nodes.shape[0]):
@@ -168,7 +168,7 @@ def _difference(values, items, item, corner):
     return values[j, 0] - values[i, 0], values[j, 1] - values[i, 1], values[j, 2] - values[i, 2]
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def sum_volumes(position, total, tets):
     """Six times the volume of every tet, added up at its corners [m^3]."""
     whole = tets.shape[0] // GROUP * GROUP
@@ -214,14 +214,14 @@ def _six_rates(velocity, tets, tet, g):
     )
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def set_node_tension(total, node_rest_volume, node_bulk):
     """From the sums at nodes to the tension of the volumes averaged there, K_a (J_a - 1) [Pa]."""
     for node in range(total.shape[0]):
         total[node] = node_tension(total[node], node_rest_volume[node], node_bulk[node])
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_volume_rates(position, velocity, total, tets, beta):
     """Beta times the rate of `sum_volumes`."""
     for tet in range(tets.shape[0]):
@@ -229,7 +229,7 @@ def add_volume_rates(position, velocity, total, tets, beta):
         _share(total, tets, tet, beta * _six_rates(velocity, tets, tet, gradients))
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
     for tet in range(tets.shape[0]):
@@ -244,7 +244,7 @@ def _corner_tension(tension, tets, tet):
     return 0.25 * (tension[tets[tet, 0]] + tension[tets[tet, 1]] + tension[tets[tet, 2]] + tension[tets[tet, 3]])
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_volume_forces(position, force, tension, tets, rest_volume, bulk, averaged_bulk, low):
     """Volume terms: a tet pulls its corners with its tension times dV/dx; keeps the smallest V / V0 seen.
 

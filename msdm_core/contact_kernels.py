@@ -45,22 +45,22 @@ def find_candidates(model, state, shapes, duration):
             a = surface[triangle, 0]
             b = surface[triangle, 1]
             c = surface[triangle, 2]
+            # Cheap first: from one corner, with the longer of its edges; then from the middle.
             reach = 0.0
-            for axis in range(3):
-                reach += (position[b, axis] - position[a, axis]) ** 2
             other = 0.0
             for axis in range(3):
+                reach += (position[b, axis] - position[a, axis]) ** 2
                 other += (position[c, axis] - position[a, axis]) ** 2
             limit = math.sqrt(max(reach, other)) + radius + margin
             px, py, pz = closest_on_axis(ends, shape, position[a, 0], position[a, 1], position[a, 2])
             gap = (position[a, 0] - px) ** 2 + (position[a, 1] - py) ** 2 + (position[a, 2] - pz) ** 2
             near = gap <= limit * limit
-            if not near:
-                first = triangle * QUADRATURE_COUNT
-                for point in range(first, first + QUADRATURE_COUNT):
-                    if engaged[shape, point]:
-                        near = True
             if near:
+                x, y, z, size_squared = _middle(position, a, b, c)
+                px, py, pz = closest_on_axis(ends, shape, x, y, z)
+                limit = math.sqrt(size_squared) + radius + margin
+                near = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 <= limit * limit
+            if near or _is_held(engaged, shape, triangle):
                 candidates[shape, count] = triangle
                 count += 1
         if count < candidates.shape[1]:
@@ -86,6 +86,13 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
             a = surface[triangle, 0]
             b = surface[triangle, 1]
             c = surface[triangle, 2]
+            if not _is_held(engaged, shape, triangle):
+                # Only points inside the shape can be met, and they lie within half of that radius around the middle.
+                x, y, z, size_squared = _middle(position, a, b, c)
+                px, py, pz = closest_on_axis(ends, shape, x, y, z)
+                limit = 0.5 * math.sqrt(size_squared) + radius
+                if (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 > limit * limit:
+                    continue
             bx = position[b, 0] - position[a, 0]
             by = position[b, 1] - position[a, 1]
             bz = position[b, 2] - position[a, 2]
@@ -104,6 +111,28 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                     surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist,
                     law, dt, reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
                 )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def _middle(position, a, b, c):
+    """Centroid of a triangle [m], and the square of the radius around it that holds its corners [m^2]."""
+    x = (position[a, 0] + position[b, 0] + position[c, 0]) / 3.0
+    y = (position[a, 1] + position[b, 1] + position[c, 1]) / 3.0
+    z = (position[a, 2] + position[b, 2] + position[c, 2]) / 3.0
+    to_a = (position[a, 0] - x) ** 2 + (position[a, 1] - y) ** 2 + (position[a, 2] - z) ** 2
+    to_b = (position[b, 0] - x) ** 2 + (position[b, 1] - y) ** 2 + (position[b, 2] - z) ** 2
+    to_c = (position[c, 0] - x) ** 2 + (position[c, 1] - y) ** 2 + (position[c, 2] - z) ** 2
+    return x, y, z, max(to_a, to_b, to_c)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _is_held(engaged, shape, triangle):
+    """Whether a shape holds any point of a triangle."""
+    first = triangle * QUADRATURE_COUNT
+    for point in range(first, first + QUADRATURE_COUNT):
+        if engaged[shape, point]:
+            return True
+    return False
 
 
 @njit(inline="always", error_model="numpy")

@@ -1,0 +1,83 @@
+"""SurgSim/Palpate-v0 many times over: environments whose organs advance side by side in vector registers."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import iterate
+
+from msdm_core.vector import lane_count
+from surgsim_env.env import PalpateEnv
+from surgsim_env.lane_group import LaneGroup
+from surgsim_env.tasks.palpate import EPISODE_STEPS
+
+
+class PalpateVectorEnv(SyncVectorEnv):
+    """Environments of one scene, stepped together; each gives what it would give alone.
+
+    Everything but the control step itself is `SyncVectorEnv`'s: resets, autoreset modes, infos, spaces. In float64 each
+    environment equals a single one to the bit, whatever its neighbours do.
+
+        envs = gym.make_vec("SurgSim/Palpate-v0", num_envs=16, vectorization_mode="vector_entry_point")
+
+    Args:
+        num_envs: how many; multiples of 8 (float64) or 16 (float32) leave no lane empty.
+        scene: a scene's name or the path of a scene file.
+        autoreset_mode: "NextStep", "SameStep" or "Disabled" (reset with `options={"reset_mask": ...}`).
+        dtype: "float64", or "float32" for twice the speed and forces within 0.5 %.
+        threads: groups of organs that advance at the same time; as many as there are cores by default.
+        max_episode_steps: truncate after so many control steps, at most the environment's own number.
+        render_mode: None.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scene: str = "phantom",
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        dtype: Literal["float64", "float32"] = "float64",
+        threads: int | None = None,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        def make() -> gym.Env:
+            env = PalpateEnv(scene, render_mode=render_mode)
+            limited = max_episode_steps is not None and max_episode_steps < EPISODE_STEPS
+            return gym.wrappers.TimeLimit(env, max_episode_steps) if limited else env
+
+        super().__init__([make] * num_envs, autoreset_mode=autoreset_mode)
+        self._palpations: list[PalpateEnv] = [env.unwrapped for env in self.envs]  # type: ignore[misc]
+        width = lane_count(np.dtype(dtype))
+        self._members = [range(first, min(first + width, num_envs)) for first in range(0, num_envs, width)]
+        self._groups = [
+            LaneGroup([self._palpations[index].simulation for index in members], np.dtype(dtype).type)
+            for members in self._members
+        ]
+        workers = min(len(self._groups), threads if threads is not None else os.cpu_count() or 1)
+        self._pool = ThreadPoolExecutor(max_workers=workers)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One control step of all environments whose episode runs; the others are reset as their mode says."""
+        active = np.zeros(self.num_envs, dtype=np.bool_)
+        for index, action in enumerate(iterate(self.action_space, actions)):
+            if not (self._autoreset_envs[index] and self.autoreset_mode is AutoresetMode.NEXT_STEP):
+                self._palpations[index].command(action)
+                active[index] = True
+        first = self._palpations[0]
+        count, limit = first.scene.timing.haptic_steps_per_control, first.task.force_limit
+        list(
+            self._pool.map(
+                lambda group, members: group.control_step(active[members.start : members.stop], count, limit),
+                self._groups,
+                self._members,
+            )
+        )
+        return super().step(actions)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the threads and close the environments."""
+        self._pool.shutdown()
+        super().close_extras(**kwargs)

@@ -1,5 +1,13 @@
 """surgsim_env: soft organs and robotic instruments as Gymnasium environments; importing it registers their ids."""
 
+from pathlib import Path
+
+import msdm_core
+from msdm_core import numba_cache
+
+with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
+    # First of all: what is compiled is cached where it was decorated.
+    from surgsim_env import haptic_kernels  # noqa: F401
 from surgsim_env.env import register
 from surgsim_env.scenes import list_scenes, make_scene
 

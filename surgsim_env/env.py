@@ -114,9 +114,8 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         if not self._running:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
         self.simulation.instrument.command_velocity(self.task.command(self._checked(action)))
-        for _ in range(self.scene.timing.haptic_steps_per_control):
-            if not self.simulation.haptic_step() or self.task.watch(self.simulation):
-                break
+        count = self.scene.timing.haptic_steps_per_control
+        force_peak = self.simulation.control_step(count, self.task.force_limit)
         fault = self.simulation.fault
         saturated = False
         if not fault:
@@ -125,7 +124,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
             fault = self.simulation.fault or self._out_of_bounds(values)
             if not fault:
                 self._observation = values.astype(np.float32)
-        verdict = self.task.judge(self.simulation, fault)
+        verdict = self.task.judge(self.simulation, force_peak, fault)
         self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
         return self._observation.copy(), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info

@@ -1,4 +1,7 @@
-"""The force exchange between organ and instrument, once per haptic step."""
+"""The force exchange between organ and instrument: one haptic step to read, and many in one compiled call."""
+
+import math
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -7,10 +10,15 @@ from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.stepping import advance_organ, describe_fault
+from surgsim_env import mujoco_library
+from surgsim_env.haptic_kernels import (
+    FAULT_FORCE_CAP,
+    FAULT_WRENCH_NOT_FINITE,
+    FORCE_CAP,
+    advance_haptic_steps,
+    check_wrench,
+)
 from surgsim_env.tool_bodies import ToolBodies
-
-# No palpation comes near this: a force beyond it [N] is a fault of the simulation, not a touch.
-FORCE_CAP = 100.0
 
 
 def haptic_step(
@@ -44,12 +52,57 @@ def haptic_step(
     instrument.read_shapes()
     instrument.read_response()
     fault = advance_organ(model, state, instrument.shapes, contact, dt, substep_count, wrench, instrument.response)
+    if fault == FAULT_NONE:
+        fault = check_wrench(wrench)
     if fault != FAULT_NONE:
-        raise OrganDivergedError(describe_fault(model, state, fault))
-    if not np.isfinite(wrench).all():
-        raise OrganDivergedError("the contact wrench is not finite")
-    force = float(np.sqrt((wrench[:, :3] ** 2).sum(axis=1)).max())
-    if force > FORCE_CAP:
-        raise OrganDivergedError(f"contact force {force:.4g} N is beyond the physical cap of {FORCE_CAP:g} N")
+        raise OrganDivergedError(describe(model, state, wrench, fault))
     instrument.apply_wrench(wrench)
     mujoco.mj_step2(instrument.model, instrument.data)
+
+
+class StepsTaken(NamedTuple):
+    """What came of some haptic steps: how many were finished, their largest total force [N], a fault or ""."""
+
+    count: int
+    force_peak: float
+    fault: str
+
+
+def compiled_steps(
+    model: OrganModel,
+    state: OrganState,
+    instrument: ToolBodies,
+    contact: ContactLaw,
+    dt: float,
+    substep_count: int,
+    wrench: FloatArray,
+    count: int,
+    force_limit: float,
+) -> StepsTaken:
+    """`haptic_step` up to `count` times in one compiled call without the interpreter's lock, equal to the bit.
+
+    It ends with the step whose total force passes `force_limit` [N]; a fault is told, not raised, and leaves `wrench`
+    as the last good step had it. Tools move by their `servo`: a `drive` written anew in Python is not seen.
+
+    Raises:
+        RuntimeError: MuJoCo's functions are not known to the linker (says why).
+    """
+    if missing := mujoco_library.missing():
+        raise RuntimeError(f"haptic steps cannot be compiled: {missing}; call haptic_step in a loop")
+    tools = instrument.views()
+    decay = math.exp(-model.alpha * dt)
+    taken, fault, peak = advance_haptic_steps(
+        model, state, contact, instrument.shapes, instrument.response, tools, dt, decay, substep_count, wrench, count,
+        force_limit,
+    )  # fmt: skip
+    return StepsTaken(taken, peak, describe(model, state, tools.wrench, fault) if fault != FAULT_NONE else "")
+
+
+def describe(model: OrganModel, state: OrganState, wrench: FloatArray, fault: int) -> str:
+    """One sentence on a FAULT_ code of a haptic step; `wrench` is the one that showed it."""
+    if fault == FAULT_WRENCH_NOT_FINITE:
+        return "the contact wrench is not finite"
+    if fault == FAULT_FORCE_CAP:
+        force = float(np.sqrt((wrench[:, :3] ** 2).sum(axis=1)).max())
+        return f"contact force {force:.4g} N is beyond the physical cap of {FORCE_CAP:g} N"
+    return describe_fault(model, state, fault)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from msdm_core.mesh import FloatArray
+from surgsim_env.haptic_kernels import Servo
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene
 from surgsim_env.tool_bodies import ToolBodies
@@ -21,8 +22,12 @@ class Instrument(ToolBodies):
         super().__init__(_compile(scene, lower, upper))
         self.lower, self.upper = lower, upper
         self._tip = self.model.site("tip").id
-        self._command = np.zeros(3)
-        self.workspace_limited = False
+        self.servo = Servo(np.zeros(3), lower, upper, np.zeros(1, dtype=bool))
+
+    @property
+    def workspace_limited(self) -> bool:
+        """Whether the servo's target was stopped at the edge of the workspace in the last haptic step."""
+        return bool(self.servo.limited[0])
 
     @property
     def tip_position(self) -> FloatArray:
@@ -40,22 +45,22 @@ class Instrument(ToolBodies):
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:3] = position
         self.data.ctrl[:3] = position
-        self._command[:] = 0.0
-        self.workspace_limited = False
+        self.servo.command[:] = 0.0
+        self.servo.limited[0] = False
         mujoco.mj_forward(self.model, self.data)
 
     def command_velocity(self, velocity: FloatArray) -> None:
         """Set the tip velocity that the servo follows from now on [m/s], shape (3,)."""
-        self._command[:] = velocity
+        self.servo.command[:] = velocity
 
     def drive(self) -> None:
         """Move the servo's target by one step of the commanded velocity; it stops at the workspace, and says so."""
-        target = self.data.ctrl[:3] + self._command * self.model.opt.timestep
+        target = self.data.ctrl[:3] + self.servo.command * self.model.opt.timestep
         held = np.clip(target, self.lower, self.upper)
         stopped = held != target
-        self.workspace_limited = bool(stopped.any())
+        self.servo.limited[0] = stopped.any()
         self.data.ctrl[:3] = held
-        self.data.ctrl[3:6] = np.where(stopped, 0.0, self._command)
+        self.data.ctrl[3:6] = np.where(stopped, 0.0, self.servo.command)
 
     def refresh(self) -> None:
         """Bring poses and velocities up to the current coordinates (after mj_step2 they are one step old)."""
@@ -75,14 +80,14 @@ class Instrument(ToolBodies):
         signature = mujoco.mjtState.mjSTATE_INTEGRATION
         state = np.empty(mujoco.mj_stateSize(self.model, signature))
         mujoco.mj_getState(self.model, self.data, state, signature)
-        return np.concatenate([state, self._command, [float(self.workspace_limited)]])
+        return np.concatenate([state, self.servo.command, [float(self.workspace_limited)]])
 
     def set_state(self, state: FloatArray) -> None:
         """Restore what `get_state` gave, to the bit."""
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, state[:-4], mujoco.mjtState.mjSTATE_INTEGRATION)
-        self._command[:] = state[-4:-1]
-        self.workspace_limited = bool(state[-1])
+        self.servo.command[:] = state[-4:-1]
+        self.servo.limited[0] = bool(state[-1])
         self.refresh()
 
 

@@ -1,5 +1,10 @@
 """Both states and the clock: an organ and an instrument that exchange forces at haptic rate."""
 
+import math
+import os
+import warnings
+from functools import cache
+
 import numpy as np
 
 from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
@@ -8,18 +13,24 @@ from msdm_core.kernels import OrganModel, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
 from msdm_core.stability import stable_dt
+from surgsim_env import mujoco_library
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.exchange import haptic_step
+from surgsim_env.exchange import compiled_steps, haptic_step
 from surgsim_env.instrument import Instrument
 from surgsim_env.timing import substeps_needed
 from surgsim_env.tool_mass import check_tool_masses
 
 # How far beyond the organ's bounding box the tip may travel [m].
 WORKSPACE_MARGIN = 0.04
+# "python": control steps run in the plain loop, as they do by themselves where MuJoCo's functions cannot be linked.
+LOOP_VARIABLE = "SURGSIM_LOOP"
 
 
 class Simulation:
-    """An organ and an instrument in contact; advanced by `haptic_step`, read by tasks."""
+    """An organ and an instrument in contact; advanced by `control_step` or `haptic_step`, read by tasks.
+
+    `compiled` says whether control steps run in one compiled call or in the plain loop: the bits are the same.
+    """
 
     def __init__(self, anatomy: Anatomy) -> None:
         """Set up a scene's healthy organ and its instrument, the tip in the far corner of its workspace.
@@ -41,6 +52,7 @@ class Simulation:
         self._wrench = np.zeros((self.instrument.tool_count, 6))
         self._step = 0
         self.fault = ""
+        self.compiled = _runs_compiled(os.environ.get(LOOP_VARIABLE, "compiled"))
         self.organ_model: OrganModel
         self.organ_state: OrganState
         self.reset(healthy, self.instrument.upper)
@@ -120,6 +132,37 @@ class Simulation:
         self._step += 1
         return True
 
+    def control_step(self, count: int, force_limit: float = math.inf) -> float:
+        """Advance by `count` haptic steps, fewer where one comes to a `fault` or its force passes a limit [N].
+
+        Returns:
+            The largest size of the tissue's total force in these steps [N].
+        """
+        if self.compiled:
+            taken = compiled_steps(
+                self.organ_model,
+                self.organ_state,
+                self.instrument,
+                self.contact,
+                self.substep_dt,
+                self.substep_count,
+                self._wrench,
+                count,
+                force_limit,
+            )
+            self._step += taken.count
+            self.fault = taken.fault or self.fault
+            return taken.force_peak
+        force_peak = 0.0
+        for _ in range(count):
+            if not self.haptic_step():
+                break
+            x, y, z = self.contact_force.tolist()
+            force_peak = max(force_peak, math.sqrt(x * x + y * y + z * z))
+            if force_peak > force_limit:
+                break
+        return force_peak
+
     def end_control_step(self) -> bool:
         """Bring the instrument's poses up to date and read MuJoCo's warnings; False where there is one."""
         self.instrument.refresh()
@@ -157,3 +200,17 @@ class Simulation:
                 f"are too long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: "
                 f"set timing.substep_count = {needed} or use softer lesions"
             )
+
+
+def _runs_compiled(loop: str) -> bool:
+    if loop not in ("compiled", "python"):
+        raise ValueError(f'{LOOP_VARIABLE} is {loop!r}; it is "compiled" or "python"')
+    return loop == "compiled" and not _warn_of_missing_library(mujoco_library.missing())
+
+
+@cache
+def _warn_of_missing_library(missing: str) -> bool:
+    """Say once that, and why, control steps run in the plain loop; False where nothing is missing."""
+    if missing:
+        warnings.warn(f"control steps run in the plain Python loop, more slowly: {missing}", RuntimeWarning, 2)
+    return bool(missing)

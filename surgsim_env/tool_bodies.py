@@ -6,6 +6,7 @@ import numpy as np
 from msdm_core.kernels import ContactShapes
 from msdm_core.mesh import FloatArray
 from msdm_core.stepping import unyielding
+from surgsim_env.haptic_kernels import Servo, ToolViews, factorise, yield_tool
 
 # Geoms of this group are what tissue feels: spheres and capsules.
 CONTACT_GROUP = 3
@@ -36,11 +37,11 @@ class ToolBodies:
             tool_twist=np.zeros((count, 6)),
         )
         self.response = unyielding(count)
+        self.servo = Servo(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(1, dtype=bool))
         self._velocity = np.zeros(6)
         self._jacobian = np.zeros((6, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
-        self._yielded = np.zeros((count, model.nv, 6))
-        self._known = [b""] * count
+        self._yielded = np.zeros((model.nv, 6))
 
     @property
     def tool_count(self) -> int:
@@ -80,15 +81,16 @@ class ToolBodies:
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         inertia = self.damped_inertia(model.opt.timestep)
+        factorise(inertia)
         for index in range(self.tool_count):
-            jacobian = self.jacobian(index)
-            # Slides keep both: solved anew only when either has changed.
-            known = inertia.tobytes() + jacobian.tobytes()
-            if known != self._known[index]:
-                self._known[index] = known
-                self._yielded[index] = np.linalg.solve(inertia, jacobian.T)
-                response.tool_mobility[index] = jacobian @ self._yielded[index]
-            response.tool_acceleration[index] = data.qfrc_smooth @ self._yielded[index]
+            yield_tool(
+                inertia,
+                self.jacobian(index),
+                data.qfrc_smooth,
+                self._yielded,
+                response.tool_mobility[index],
+                response.tool_acceleration[index],
+            )
 
     def damped_inertia(self, dt: float) -> FloatArray:
         """M + dt D: joint-space inertia, armature included, and the joints' damping over dt [s], (nv, nv).
@@ -107,3 +109,29 @@ class ToolBodies:
     def apply_wrench(self, wrench: FloatArray) -> None:
         """Write the tissue's mean wrench on each tool (overwritten each step), shape (n_tool, 6)."""
         self.data.xfrc_applied[self._tools] = wrench
+
+    def views(self) -> ToolViews:
+        """What compiled code needs to step these tools; good until the next call that replaces `data`."""
+        model, data = self.model, self.data
+        return ToolViews(
+            model=model._address,
+            data=data._address,
+            timestep=model.opt.timestep,
+            geoms=self._geoms,
+            half_length=self._half_length,
+            bodies=self._tools,
+            joint_damping=model.dof_damping,
+            geom_position=data.geom_xpos,
+            geom_rotation=data.geom_xmat,
+            body_centre=data.xipos,
+            smooth_force=data.qfrc_smooth,
+            applied_wrench=data.xfrc_applied,
+            control=data.ctrl,
+            servo=self.servo,
+            velocity=self._velocity,
+            jacobian=self._jacobian,
+            inertia=self._inertia,
+            yielded=self._yielded,
+            reference=np.zeros((self.tool_count, 3)),
+            wrench=np.zeros((self.tool_count, 6)),
+        )

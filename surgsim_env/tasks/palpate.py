@@ -56,7 +56,6 @@ class PalpateTask:
         self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
-        self._force_peak = 0.0
 
     def bounds(self, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of the observation, from the tip's workspace [m]."""
@@ -72,7 +71,6 @@ class PalpateTask:
         self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
-        self._force_peak = 0.0
         above, outward = self.anatomy.face.random_point(rng, self.anatomy.scene.palpation.face_margin)
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
         return Start((self.lesion,), above + outward * gap)
@@ -81,14 +79,12 @@ class PalpateTask:
         """Begin a control step: the tip velocity that an action asks for [m/s], shape (3,)."""
         self.step_count += 1
         self._declare_value = float(action[3])
-        self._force_peak = 0.0
         return np.asarray(action[:3], dtype=np.float64) * SPEED_FULL_SCALE
 
-    def watch(self, simulation: Simulation) -> bool:
-        """Judge a haptic step; True where the hard limit was passed and the episode must end."""
-        force = simulation.contact_force
-        self._force_peak = max(self._force_peak, float(np.sqrt(force @ force)))
-        return self._force_peak > self.limits.hard_force
+    @property
+    def force_limit(self) -> float:
+        """A control step ends with the haptic step whose force passes this, and the episode with it [N]."""
+        return self.limits.hard_force
 
     def observe(self, simulation: Simulation, rng: np.random.Generator) -> tuple[FloatArray, bool]:
         """Tip position, tip velocity, force reading, time left; and whether the sensor saturated."""
@@ -97,14 +93,20 @@ class PalpateTask:
         instrument = simulation.instrument
         return np.concatenate([instrument.tip_position, instrument.tip_velocity, reading, [left]]), saturated
 
-    def judge(self, simulation: Simulation, fault: str) -> Verdict:
-        """End a control step: see whether something was declared, and say how it ends."""
-        hard = not fault and self._force_peak > self.limits.hard_force
+    def judge(self, simulation: Simulation, force_peak: float, fault: str) -> Verdict:
+        """End a control step: see whether something was declared, and say how it ends.
+
+        Args:
+            simulation: as the step left it.
+            force_peak: largest contact force of its haptic steps [N].
+            fault: what the simulation came to, or an empty string.
+        """
+        hard = not fault and force_peak > self.force_limit
         declared = not fault and not hard and self._declares(simulation)
         error = self.declared_error(simulation) if declared else None
         found = error is not None and error <= SUCCESS_DISTANCE
         terminated = bool(fault) or hard or declared
-        excess = (self._force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force)
+        excess = (force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force)
         terms = {
             "time": 1.0,
             "soft_force": min(max(excess, 0.0), 1.0),
@@ -119,7 +121,7 @@ class PalpateTask:
             truncated=not terminated and self.step_count >= EPISODE_STEPS,
             rewards=weighted(terms, PALPATE_WEIGHTS),
             info={
-                "force_peak": self._force_peak,
+                "force_peak": force_peak,
                 "hard_limit": hard,
                 "declared": declared,
                 "success": found,
@@ -158,7 +160,7 @@ class PalpateTask:
                 "youngs_modulus": lesion.material.youngs_modulus,
                 "bias": self.reading.bias.tolist(),
                 "counts": [self.step_count, self.declare_count],
-                "step": [self._declare_value, self._force_peak],
+                "declare_value": self._declare_value,
             }
         )
 
@@ -170,5 +172,5 @@ class PalpateTask:
         )
         self.reading.bias = np.array(table["bias"])
         self.step_count, self.declare_count = table["counts"]
-        self._declare_value, self._force_peak = table["step"]
+        self._declare_value = table["declare_value"]
         return (self.lesion,)

@@ -81,7 +81,7 @@ class OrganModel(NamedTuple):
 
 
 class OrganState(NamedTuple):
-    """What changes while an organ moves, SI units; all of it is saved and restored.
+    """What changes while an organ moves, SI units; all but SCRATCH_FIELDS is saved and restored.
 
     Fields:
         node_position: [m]                                                       (n_node, 3)
@@ -110,6 +110,10 @@ class OrganState(NamedTuple):
     contact_candidates: NDArray[np.int32]
     contact_passed: NDArray[np.int32]
     volume_ratio_smallest: FloatArray
+
+
+# Written anew in every call: need not be saved.
+SCRATCH_FIELDS = ("node_tension", "row_position", "row_velocity", "row_force", "contact_candidates")
 
 
 class ContactShapes(NamedTuple):

@@ -109,11 +109,21 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         info = self._info("", saturated, self.task.blank_info(), self.task.blank_rewards())
         return self._observation.copy(), info
 
-    def step(self, action: Observation) -> tuple[Observation, float, bool, bool, Info]:
-        """One control step: haptic steps until it is over, the hard limit is passed or the simulation faults."""
+    def command(self, action: Observation) -> None:
+        """Check an action and set the tip velocity that it asks for; the first part of `step`, which repeats it.
+
+        Raises:
+            ResetNeeded: no episode is running.
+            ValueError: names the entry of the action that is out of bounds.
+        """
         if not self._running:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
-        self.simulation.instrument.command_velocity(self.task.command(self._checked(action)))
+        self.simulation.instrument.command_velocity(self.task.velocity(self._checked(action)))
+
+    def step(self, action: Observation) -> tuple[Observation, float, bool, bool, Info]:
+        """One control step: haptic steps until it is over, the hard limit is passed or the simulation faults."""
+        self.command(action)
+        self.task.begin(action)
         count = self.scene.timing.haptic_steps_per_control
         force_peak = self.simulation.control_step(count, self.task.force_limit)
         fault = self.simulation.fault
@@ -222,5 +232,6 @@ def register() -> None:
         gym.register(
             id="SurgSim/Palpate-v0",
             entry_point="surgsim_env.env:PalpateEnv",
+            vector_entry_point="surgsim_env.vector_env:PalpateVectorEnv",
             max_episode_steps=EPISODE_STEPS,
         )

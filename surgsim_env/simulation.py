@@ -9,17 +9,19 @@ import numpy as np
 
 from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import OrganModel, OrganState
+from msdm_core.kernels import SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
 from msdm_core.stability import stable_dt
 from surgsim_env import mujoco_library
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.exchange import compiled_steps, haptic_step
+from surgsim_env.exchange import StepsTaken, compiled_steps, haptic_step
 from surgsim_env.instrument import Instrument
 from surgsim_env.timing import substeps_needed
 from surgsim_env.tool_mass import check_tool_masses
 
+# What of an organ's state decides what comes next.
+KEPT_FIELDS = tuple(name for name in OrganState._fields if name not in SCRATCH_FIELDS)
 # How far beyond the organ's bounding box the tip may travel [m].
 WORKSPACE_MARGIN = 0.04
 # "python": control steps run in the plain loop, as they do by themselves where MuJoCo's functions cannot be linked.
@@ -53,6 +55,7 @@ class Simulation:
         self._step = 0
         self.fault = ""
         self.compiled = _runs_compiled(os.environ.get(LOOP_VARIABLE, "compiled"))
+        self._taken: StepsTaken | None = None
         self.organ_model: OrganModel
         self.organ_state: OrganState
         self.reset(healthy, self.instrument.upper)
@@ -138,6 +141,9 @@ class Simulation:
         Returns:
             The largest size of the tissue's total force in these steps [N].
         """
+        if self._taken is not None:
+            taken, self._taken = self._taken, None
+            return taken.force_peak
         if self.compiled:
             taken = compiled_steps(
                 self.organ_model,
@@ -163,6 +169,20 @@ class Simulation:
                 break
         return force_peak
 
+    def take_over(self, organ_state: OrganState, wrench: FloatArray, taken: StepsTaken) -> None:
+        """Accept a control step that was made elsewhere, among others; the next `control_step` only reports it.
+
+        Args:
+            organ_state: where it left the organ; the instrument's own data has moved along.
+            wrench: of the last good haptic step [N, N m], shape (n_tool, 6).
+            taken: what came of it.
+        """
+        self.organ_state = organ_state
+        self._wrench[:] = wrench
+        self._step += taken.count
+        self.fault = taken.fault or self.fault
+        self._taken = taken
+
     def end_control_step(self) -> bool:
         """Bring the instrument's poses up to date and read MuJoCo's warnings; False where there is one."""
         self.instrument.refresh()
@@ -171,7 +191,7 @@ class Simulation:
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that changes, as arrays by name; the organ's model is the caller's to keep."""
-        arrays = {f"organ_{name}": array.copy() for name, array in self.organ_state._asdict().items()}
+        arrays = {f"organ_{name}": getattr(self.organ_state, name).copy() for name in KEPT_FIELDS}
         return {
             **arrays,
             "instrument": self.instrument.get_state(),
@@ -184,7 +204,7 @@ class Simulation:
     def set_state(self, organ_model: OrganModel, arrays: dict[str, np.ndarray]) -> None:
         """Restore what `get_state` gave, to the bit."""
         self.organ_model = organ_model
-        self.organ_state = OrganState(**{name: arrays[f"organ_{name}"].copy() for name in OrganState._fields})
+        self.organ_state = self.organ_state._replace(**{name: arrays[f"organ_{name}"].copy() for name in KEPT_FIELDS})
         self.instrument.set_state(arrays["instrument"])
         self._rest_position = arrays["rest_position"].copy()
         self._wrench[:] = arrays["wrench"]

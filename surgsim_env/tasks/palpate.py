@@ -75,11 +75,14 @@ class PalpateTask:
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
         return Start((self.lesion,), above + outward * gap)
 
-    def command(self, action: FloatArray) -> FloatArray:
-        """Begin a control step: the tip velocity that an action asks for [m/s], shape (3,)."""
+    def velocity(self, action: FloatArray) -> FloatArray:
+        """The tip velocity that an action asks for [m/s], shape (3,)."""
+        return np.asarray(action[:3], dtype=np.float64) * SPEED_FULL_SCALE
+
+    def begin(self, action: FloatArray) -> None:
+        """Begin a control step: count it and note what the action declares."""
         self.step_count += 1
         self._declare_value = float(action[3])
-        return np.asarray(action[:3], dtype=np.float64) * SPEED_FULL_SCALE
 
     @property
     def force_limit(self) -> float:

@@ -1,0 +1,160 @@
+"""Environments side by side give what each would give alone: held against gymnasium's SyncVectorEnv, to the bit."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+from surgsim_env.vector_env import PalpateVectorEnv
+
+ID = "SurgSim/Palpate-v0"
+COUNT = 3  # five lanes stay empty
+DOWN = np.array([0.0, 0.0, -1.0, 0.0], dtype=np.float32)
+
+
+def side_by_side(**settings) -> gym.vector.VectorEnv:
+    return gym.make_vec(ID, num_envs=COUNT, vectorization_mode="vector_entry_point", **settings)
+
+
+def one_after_the_other(mode: str) -> gym.vector.VectorEnv:
+    return gym.make_vec(ID, num_envs=COUNT, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
+
+
+def actions(step: int) -> np.ndarray:
+    """Down and about, so that episodes end at the hard limit at different times; the last one declares now and then."""
+    random = np.random.default_rng(step)
+    moves = np.clip(0.4 * random.normal(size=(COUNT, 4)) + [0.0, 0.0, -0.4, 0.0], -1.0, 1.0)
+    moves[:, 3] = [0.0, 0.0, float(step % 11 > 6)]
+    return moves.astype(np.float32)
+
+
+def assert_equal(one: object, other: object) -> None:
+    """Nested infos, arrays, numbers and strings, to the bit."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_equal(one[key], other[key])
+    elif isinstance(one, tuple) or (isinstance(one, np.ndarray) and one.dtype == object):
+        for left, right in zip(one, other, strict=True):
+            assert_equal(left, right)
+    else:
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_equals_environments_one_after_the_other(mode: str):
+    """Observations, rewards, ends and infos of 45 control steps with several episodes each."""
+    together, apart = side_by_side(autoreset_mode=mode), one_after_the_other(mode)
+    assert isinstance(together, PalpateVectorEnv)
+    assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
+    assert_equal(together.reset(seed=11), apart.reset(seed=11))
+    ends = 0
+    for step in range(45):
+        found, expected = together.step(actions(step)), apart.step(actions(step))
+        assert_equal(found[:4], expected[:4])
+        assert_equal(found[4], expected[4])
+        ends += int((found[2] | found[3]).sum())
+    assert ends >= 3
+    assert np.linalg.norm(together.envs[0].unwrapped.simulation.contact_force) >= 0.0
+    together.close()
+    apart.close()
+
+
+def test_disabled_resets_those_that_the_mask_names():
+    together, apart = side_by_side(autoreset_mode="Disabled"), one_after_the_other("Disabled")
+    assert_equal(together.reset(seed=2), apart.reset(seed=2))
+    for step in range(3):
+        assert_equal(together.step(actions(step)), apart.step(actions(step)))
+    mask = np.array([False, True, False])
+    assert_equal(
+        together.reset(seed=[0, 7, 0], options={"reset_mask": mask}),
+        apart.reset(seed=[0, 7, 0], options={"reset_mask": mask.copy()}),
+    )
+    for step in range(3, 6):
+        assert_equal(together.step(actions(step)), apart.step(actions(step)))
+
+
+def test_a_fault_leaves_the_neighbours_untouched():
+    """A node of the middle organ is not a number any more: its episode ends, the others' bits are as without it."""
+    spoilt, whole = side_by_side(autoreset_mode="SameStep"), side_by_side(autoreset_mode="SameStep")
+    for envs in (spoilt, whole):
+        envs.reset(seed=4)
+        for step in range(4):
+            envs.step(actions(step))
+    spoilt.envs[1].unwrapped.simulation.organ_state.node_velocity[40, 1] = np.nan
+    for step in range(4, 9):
+        found, expected = spoilt.step(actions(step)), whole.step(actions(step))
+        if step == 4:
+            assert found[2][1] and "no longer finite" in found[4]["final_info"]["sim_fault"][1]
+            assert np.isfinite(found[4]["final_obs"][1]).all() and np.isfinite(found[0]).all()
+        for lane in (0, 2):
+            np.testing.assert_array_equal(found[0][lane], expected[0][lane])
+            assert found[1][lane] == expected[1][lane]
+
+
+def test_single_precision_feels_the_same_force():
+    """Within 0.5 % of the largest contact force of a press to 4 mm and back."""
+    exact, fast = side_by_side(), side_by_side(dtype="float32")
+    forces = []
+    for envs in (exact, fast):
+        envs.reset(seed=3)
+        felt = []
+        for step in range(24):
+            envs.step(np.tile(DOWN * (0.5 if step < 14 else -0.5), (COUNT, 1)))
+            felt.append([env.unwrapped.simulation.contact_force for env in envs.envs])
+        forces.append(np.array(felt))
+    largest = np.abs(forces[0]).max()
+    error = np.abs(forces[1] - forces[0]).max()
+    print(f"\nlargest force {largest:.3f} N, float32 off by {error:.2e} N, {100.0 * error / largest:.4f} %")
+    assert largest > 0.1
+    assert 0.0 < error < 0.005 * largest
+
+
+def test_states_are_saved_and_loaded_as_alone():
+    """A state saved alone goes on in a lane, and the other way round."""
+    envs, single = side_by_side(), gym.make(ID)
+    envs.reset(seed=8)
+    single.reset(seed=9)
+    for step in range(5):
+        envs.step(actions(step))
+        single.step(actions(step)[1])
+    state = envs.envs[1].unwrapped.save_state()
+    assert state == single.unwrapped.save_state()
+    ahead = envs.step(actions(5))[0][1]
+    envs.envs[0].unwrapped.load_state(state)
+    np.testing.assert_array_equal(envs.step(np.tile(actions(5)[1], (COUNT, 1)))[0][0], ahead)
+
+
+def test_threads_and_the_number_of_environments_change_nothing():
+    """Ten environments in two groups, on one thread and on two, against the first three alone."""
+    runs = []
+    for count, threads in ((10, 1), (10, 2), (COUNT, 1)):
+        envs = PalpateVectorEnv(count, threads=threads)
+        envs.reset(seed=1)
+        rows = [
+            envs.step(np.concatenate([actions(step), np.tile(DOWN, (count - COUNT, 1))]))[0][:COUNT]
+            for step in range(6)
+        ]
+        runs.append(np.array(rows))
+        envs.close()
+    np.testing.assert_array_equal(runs[0], runs[1])
+    np.testing.assert_array_equal(runs[0], runs[2])
+
+
+def test_a_shorter_time_limit_truncates():
+    envs = side_by_side(max_episode_steps=4)
+    envs.reset(seed=0)
+    ends = [envs.step(np.zeros((COUNT, 4), dtype=np.float32))[3].all() for _ in range(4)]
+    assert ends == [False, False, False, True]
+
+
+def test_a_bad_action_is_refused_before_anything_moves():
+    envs = side_by_side()
+    envs.reset(seed=0)
+    before = envs.envs[0].unwrapped.save_state()
+    bad = np.zeros((COUNT, 4), dtype=np.float32)
+    bad[2, 1] = 1.5
+    with pytest.raises(ValueError, match=r"action\[1\] is 1\.5"):
+        envs.step(bad)
+    assert envs.envs[0].unwrapped.simulation.time == 0.0
+    assert len(before) == len(envs.envs[0].unwrapped.save_state())

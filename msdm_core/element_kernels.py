@@ -48,6 +48,23 @@ def six_volumes(bx, by, bz, gbx, gby, gbz):
 
 
 @njit(forceinline=True, error_model="numpy")
+def tet_shape(b, c, d):
+    """Six times the gradients and the volume of a tet, from its edges to b, c and d, three parts each."""
+    gradients = tet_gradients(b[0], b[1], b[2], c[0], c[1], c[2], d[0], d[1], d[2])
+    return gradients, six_volumes(b[0], b[1], b[2], gradients[0], gradients[1], gradients[2])
+
+
+@njit(forceinline=True, error_model="numpy")
+def six_rates(b, c, d, g):
+    """Rate of that [m^3/s], from what corner a's velocity is short of those of b, c and d, three parts each."""
+    return (
+        six_volumes(b[0], b[1], b[2], g[0], g[1], g[2])
+        + six_volumes(c[0], c[1], c[2], g[3], g[4], g[5])
+        + six_volumes(d[0], d[1], d[2], g[6], g[7], g[8])
+    )
+
+
+@njit(forceinline=True, error_model="numpy")
 def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     """What a tet's gradients (six times dV/dx) are to be multiplied with, minus a sixth of its tension [Pa].
 

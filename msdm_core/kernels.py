@@ -167,7 +167,7 @@ class ContactLaw(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _move_shapes(shapes, dt):
+def move_shapes(shapes, dt):
     """Carry the shapes along their tool's twist."""
     twist = shapes.tool_twist
     for shape in range(shapes.shape_radius.shape[0]):
@@ -185,7 +185,7 @@ def _move_shapes(shapes, dt):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _push_tools(shapes, response, dt, substep, wrench):
+def push_tools(shapes, response, dt, substep, wrench):
     """Let the substep's wrench change the tools' twist: twist += dt (a + B w), before the shapes move along it."""
     twist, before, lag = shapes.tool_twist, response.tool_wrench, response.tool_lag
     acceleration, mobility = response.tool_acceleration, response.tool_mobility
@@ -269,8 +269,8 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
         add_contact_forces(model, rows, shapes, law, dt, candidate_count, reference, wrench)
         kept = guard_axes(model, rows, shapes, law, response, dt, candidate_count, reference, wrench)
         total = integrate(position, velocity, force, model.node_inverse_mass, dt, decay)
-        _push_tools(shapes, response, dt, substep, wrench)
-        _move_shapes(shapes, dt)
+        push_tools(shapes, response, dt, substep, wrench)
+        move_shapes(shapes, dt)
         if not math.isfinite(total):
             fault = FAULT_NOT_FINITE
         elif not kept:

@@ -1,156 +1,313 @@
-"""Springs and volume term of several organs of one mesh side by side: the organ's number is the last index of an array.
+"""Several organs of one mesh side by side in time: their structures, and the compiled loop over substeps.
 
-One register holds the same number of every organ (8 of float64, 16 of float32), so that nothing is gathered or
-scattered. The equations are those of `element_kernels`, the sums in the order of `tissue_kernels`: an organ moves to
-the bit as it would alone.
+What `kernels` is for one organ. Springs, volume term and integration work on all organs at once, in
+`lane_tissue_kernels`; contact, guard and tools are the single organ's own functions, given views of one organ ("lane")
+after the other. An organ that stops, by a fault or because its lane is empty, stands still while its neighbours go on
+untouched.
 """
+
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from msdm_core.element_kernels import (
-    node_tension,
-    six_volumes,
-    spring_drag,
-    spring_scale,
-    tet_gradients,
-    tet_scale,
+from msdm_core.contact_kernels import add_contact_forces, find_candidates, stretch_by_lag
+from msdm_core.guard_kernels import guard_axes
+from msdm_core.kernels import (
+    FAULT_CONTACT_LOST,
+    FAULT_INVERTED_TET,
+    FAULT_NONE,
+    FAULT_NOT_FINITE,
+    ContactShapes,
+    FloatArray,
+    ToolResponse,
+    move_shapes,
+    push_tools,
 )
-from msdm_core.vector import keep_lower, load_lanes, spread_like, store_lanes
+from msdm_core.lane_tissue_kernels import (
+    add_spring_damping,
+    add_spring_forces,
+    add_volume_damping,
+    add_volume_forces,
+    average_volumes,
+    integrate,
+    put_back,
+    set_gravity,
+)
+
+# In place of a fault: no organ is in this lane, or it is to stand still.
+LANE_EMPTY = -1
+
+# float64 or float32, eight or sixteen lanes.
+LaneArray = NDArray[Any]
+
+
+class LaneModel(NamedTuple):
+    """What organs side by side are: read-only arrays, SI units; the mesh is shared, the lane is the last index.
+
+    Fields:
+        node_mass: lumped mass [kg]                                              (n_node, n_lane)
+        node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node, n_lane)
+        spring_nodes: the two nodes of each spring                               (n_spring, 2)
+        spring_stiffness: [N/m]                                                  (n_spring, n_lane)
+        spring_rest_length: [m]                                                  (n_spring,)
+        tet_nodes: corners of each tet                                           (n_tet, 4)
+        tet_rest_volume: [m^3]                                                   (n_tet,)
+        tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet, n_lane)
+        tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet, n_lane)
+        node_rest_volume: volume averaged at a node [m^3]                        (n_node,)
+        node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node, n_lane)
+        averages_volume: whether any node_bulk of the lane is above 0            (n_lane,)
+        node_rest_position: undeformed position [m]                              (n_node, 3)
+        surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
+        surface_rest_area: [m^2]                                                 (n_surface,)
+        gravity: [m/s^2]                                                         (3,)
+        alpha: mass-proportional damping rate [1/s]                              scalar
+        beta: stiffness-proportional damping time [s]                            scalar
+        stable_step: largest stable step without contact [s]                     (n_lane,)
+    """
+
+    node_mass: LaneArray
+    node_inverse_mass: LaneArray
+    spring_nodes: NDArray[np.int32]
+    spring_stiffness: LaneArray
+    spring_rest_length: FloatArray
+    tet_nodes: NDArray[np.int32]
+    tet_rest_volume: FloatArray
+    tet_bulk: LaneArray
+    tet_averaged_bulk: LaneArray
+    node_rest_volume: FloatArray
+    node_bulk: LaneArray
+    averages_volume: NDArray[np.bool_]
+    node_rest_position: FloatArray
+    surface_triangles: NDArray[np.int32]
+    surface_rest_area: FloatArray
+    gravity: FloatArray
+    alpha: float
+    beta: float
+    stable_step: FloatArray
+
+
+class LaneState(NamedTuple):
+    """What changes while organs side by side move, SI units.
+
+    Fields:
+        node_position: [m]                                                       (n_node, 3, n_lane)
+        node_velocity: [m/s]                                                     (n_node, 3, n_lane)
+        node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3, n_lane)
+        volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1, n_lane)
+        lane_fault: a FAULT_ code, or LANE_EMPTY; stands still unless FAULT_NONE (n_lane,)
+        contact_engaged: 1 where a quadrature point is held off by a shape       (n_lane, n_shape, n_surface * 4)
+        contact_stretch: tangential stretch of sticking friction [m]             (n_lane, n_shape, n_surface * 4, 3)
+        contact_candidates: scratch: triangles in reach, shape by shape          (n_lane, n_shape, n_surface)
+        contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
+        node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
+        kept_force: scratch: node_force of the lanes that stand still [N]        (n_node, 3, n_lane)
+        moving: scratch: 1 where a lane moves, else 0                            (1, n_lane)
+        finite_sum: scratch: finite where a lane's positions and velocities are  (1, n_lane)
+        candidate_count: scratch: candidates of the busiest shape                (n_lane,)
+        contact_kept: scratch: 0 where the surface passed through an axis        (n_lane,)
+    """
+
+    node_position: LaneArray
+    node_velocity: LaneArray
+    node_force: LaneArray
+    volume_ratio_smallest: LaneArray
+    lane_fault: NDArray[np.int32]
+    contact_engaged: NDArray[np.uint8]
+    contact_stretch: FloatArray
+    contact_candidates: NDArray[np.int32]
+    contact_passed: NDArray[np.int32]
+    node_tension: LaneArray
+    kept_force: LaneArray
+    moving: LaneArray
+    finite_sum: LaneArray
+    candidate_count: NDArray[np.int32]
+    contact_kept: NDArray[np.uint8]
+
+
+class _Surface(NamedTuple):
+    """What contact reads of one lane's model."""
+
+    surface_triangles: NDArray[np.int32]
+    surface_rest_area: FloatArray
+    node_inverse_mass: LaneArray
+
+
+class _Touched(NamedTuple):
+    """What contact reads and writes of one lane's state."""
+
+    node_position: LaneArray
+    node_velocity: LaneArray
+    node_force: LaneArray
+    contact_engaged: NDArray[np.uint8]
+    contact_stretch: FloatArray
+    contact_candidates: NDArray[np.int32]
+    contact_passed: NDArray[np.int32]
 
 
 @njit(forceinline=True, error_model="numpy")
-def _difference(values, items, item, corner):
-    """From corner 0 of an item to another of its corners, as three vectors."""
-    i, j = 3 * np.intp(items[item, 0]), 3 * np.intp(items[item, corner])
-    return (
-        load_lanes(values, j) - load_lanes(values, i),
-        load_lanes(values, j + 1) - load_lanes(values, i + 1),
-        load_lanes(values, j + 2) - load_lanes(values, i + 2),
-    )
+def _surface_of(model, lane):
+    return _Surface(model.surface_triangles, model.surface_rest_area, model.node_inverse_mass[:, lane])
 
 
 @njit(forceinline=True, error_model="numpy")
-def _add(force, node, x, y, z):
-    """Add to a node's force."""
-    place = 3 * np.intp(node)
-    store_lanes(force, place, load_lanes(force, place) + x)
-    store_lanes(force, place + 1, load_lanes(force, place + 1) + y)
-    store_lanes(force, place + 2, load_lanes(force, place + 2) + z)
+def _touched_of(state, lane):
+    return _Touched(
+        state.node_position[:, :, lane], state.node_velocity[:, :, lane], state.node_force[:, :, lane],
+        state.contact_engaged[lane], state.contact_stretch[lane], state.contact_candidates[lane],
+        state.contact_passed[lane],
+    )  # fmt: skip
 
 
 @njit(forceinline=True, error_model="numpy")
-def _subtract(force, node, x, y, z):
-    """Take from a node's force."""
-    place = 3 * np.intp(node)
-    store_lanes(force, place, load_lanes(force, place) - x)
-    store_lanes(force, place + 1, load_lanes(force, place + 1) - y)
-    store_lanes(force, place + 2, load_lanes(force, place + 2) - z)
+def _shapes_of(shapes, lane):
+    return ContactShapes(
+        shapes.shape_ends[lane], shapes.shape_radius[lane], shapes.shape_tool[lane], shapes.tool_centre[lane],
+        shapes.tool_twist[lane],
+    )  # fmt: skip
 
 
 @njit(forceinline=True, error_model="numpy")
-def _share(total, items, item, value):
-    """Add to each corner of a tet."""
-    for corner in range(4):
-        node = items[item, corner]
-        store_lanes(total, node, load_lanes(total, node) + value)
+def _response_of(response, lane):
+    return ToolResponse(
+        response.tool_acceleration[lane], response.tool_mobility[lane], response.tool_wrench[lane],
+        response.tool_lag[lane],
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_forces(position, force, nodes, stiffness, rest_length):
-    """Springs: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
-    for spring in range(nodes.shape[0]):
-        x, y, z = _difference(position, nodes, spring, 1)
-        scale = spring_scale(x, y, z, load_lanes(stiffness, spring), spread_like(position, rest_length[spring]))
-        x, y, z = x * scale, y * scale, z * scale
-        _add(force, nodes[spring, 0], x, y, z)
-        _subtract(force, nodes[spring, 1], x, y, z)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_damping(position, velocity, force, nodes, stiffness, beta):
-    """Rayleigh's beta along the springs: f = k beta dl/dt."""
-    for spring in range(nodes.shape[0]):
-        x, y, z = _difference(position, nodes, spring, 1)
-        vx, vy, vz = _difference(velocity, nodes, spring, 1)
-        scale = spring_drag(x, y, z, vx, vy, vz, load_lanes(stiffness, spring), beta)
-        x, y, z = x * scale, y * scale, z * scale
-        _add(force, nodes[spring, 0], x, y, z)
-        _subtract(force, nodes[spring, 1], x, y, z)
-
-
-@njit(forceinline=True, error_model="numpy")
-def _tet(position, tets, tet):
-    """Six times the gradients and the volume of a tet."""
-    bx, by, bz = _difference(position, tets, tet, 1)
-    cx, cy, cz = _difference(position, tets, tet, 2)
-    dx, dy, dz = _difference(position, tets, tet, 3)
-    gradients = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
-    return gradients, six_volumes(bx, by, bz, gradients[0], gradients[1], gradients[2])
-
-
-@njit(forceinline=True, error_model="numpy")
-def _six_rates(velocity, tets, tet, g):
-    """Rate of six times the volume of a tet [m^3/s]."""
-    bx, by, bz = _difference(velocity, tets, tet, 1)
-    cx, cy, cz = _difference(velocity, tets, tet, 2)
-    dx, dy, dz = _difference(velocity, tets, tet, 3)
-    return (
-        six_volumes(bx, by, bz, g[0], g[1], g[2])
-        + six_volumes(cx, cy, cz, g[3], g[4], g[5])
-        + six_volumes(dx, dy, dz, g[6], g[7], g[8])
-    )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def average_volumes(position, velocity, tension, tets, node_rest_volume, node_bulk, beta):
-    """Tension of the volumes averaged at nodes [Pa], K_a (J_a - 1), with beta's share."""
-    tension[:, :] = 0.0
-    for tet in range(tets.shape[0]):
-        _, six = _tet(position, tets, tet)
-        _share(tension, tets, tet, six)
-    if beta > 0.0:
-        for tet in range(tets.shape[0]):
-            gradients, _ = _tet(position, tets, tet)
-            _share(tension, tets, tet, beta * _six_rates(velocity, tets, tet, gradients))
-    for node in range(tension.shape[0]):
-        rest = spread_like(position, node_rest_volume[node])
-        store_lanes(tension, node, node_tension(load_lanes(tension, node), rest, load_lanes(node_bulk, node)))
-
-
-@njit(forceinline=True, error_model="numpy")
-def _push(force, tets, tet, scale, g):
-    """Forces of a tet on its corners."""
-    bx, by, bz = scale * g[0], scale * g[1], scale * g[2]
-    cx, cy, cz = scale * g[3], scale * g[4], scale * g[5]
-    dx, dy, dz = scale * g[6], scale * g[7], scale * g[8]
-    _subtract(force, tets[tet, 0], bx + cx + dx, by + cy + dy, bz + cz + dz)
-    _add(force, tets[tet, 1], bx, by, bz)
-    _add(force, tets[tet, 2], cx, cy, cz)
-    _add(force, tets[tet, 3], dx, dy, dz)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_forces(position, force, tension, tets, rest_volume, bulk, averaged_bulk, low):
-    """Volume terms, as in `tissue_kernels`; keeps the smallest V / V0 seen of every organ, (1, organ)."""
-    lowest = load_lanes(low, 0)
-    for tet in range(tets.shape[0]):
-        gradients, six = _tet(position, tets, tet)
-        ratio = six / spread_like(position, 6.0 * rest_volume[tet])
-        lowest = keep_lower(ratio, lowest, ratio, lowest)
-        a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
-        averaged = 0.25 * (
-            load_lanes(tension, a) + load_lanes(tension, b) + load_lanes(tension, c) + load_lanes(tension, d)
+def _begin(model, state, shapes, response, duration, wrench):
+    """Note who moves, keep the forces of those that do not, and look for the triangles in reach."""
+    wrench[:, :, :] = 0.0
+    stands = False
+    for lane in range(state.lane_fault.shape[0]):
+        moves = state.lane_fault[lane] == FAULT_NONE
+        state.moving[0, lane] = 1.0 if moves else 0.0
+        if not moves:
+            stands = True
+            continue
+        response.tool_wrench[lane, :, :] = 0.0
+        response.tool_lag[lane, :, :] = 0.0
+        state.candidate_count[lane] = find_candidates(
+            _surface_of(model, lane), _touched_of(state, lane), _shapes_of(shapes, lane), duration
         )
-        scale = tet_scale(ratio, load_lanes(bulk, tet), load_lanes(averaged_bulk, tet), averaged)
-        _push(force, tets, tet, scale, gradients)
-    store_lanes(low, 0, lowest)
+    if stands:
+        state.kept_force[:, :, :] = state.node_force
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta):
-    """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
-    for tet in range(tets.shape[0]):
-        gradients, _ = _tet(position, tets, tet)
-        rate = beta * _six_rates(velocity, tets, tet, gradients) / spread_like(position, 6.0 * rest_volume[tet])
-        _push(force, tets, tet, load_lanes(bulk, tet) * rate * (-1.0 / 6.0), gradients)
+def _stop(state, lane, fault):
+    """Let one lane stand still from now on, as it is."""
+    state.lane_fault[lane] = fault
+    state.moving[0, lane] = 0.0
+    force, kept = state.node_force, state.kept_force
+    for node in range(force.shape[0]):
+        for axis in range(3):
+            kept[node, axis, lane] = force[node, axis, lane]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _evaluate(model, state):
+    """Gravity, springs and volume term of all lanes."""
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    tension, tets, beta = state.node_tension, model.tet_nodes, model.beta
+    set_gravity(force, model.node_mass, model.gravity)
+    add_spring_forces(position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length)
+    if beta > 0.0:
+        add_spring_damping(position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
+    averages = False
+    for lane in range(model.averages_volume.shape[0]):
+        averages = averages or model.averages_volume[lane]
+    if averages:
+        average_volumes(position, velocity, tension, tets, model.node_rest_volume, model.node_bulk, beta)
+    else:
+        tension[:, :] = 0.0
+    add_volume_forces(
+        position, force, tension, tets, model.tet_rest_volume, model.tet_bulk, model.tet_averaged_bulk,
+        state.volume_ratio_smallest, state.moving,
+    )  # fmt: skip
+    if beta > 0.0:
+        add_volume_damping(position, velocity, force, tets, model.tet_rest_volume, model.tet_bulk, beta)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _touch(model, state, shapes, law, response, dt, reference, wrench):
+    """Contact and guard, lane by lane; a lane with an inverted tet stops before anything of it moves."""
+    for lane in range(state.lane_fault.shape[0]):
+        if state.lane_fault[lane] != FAULT_NONE:
+            continue
+        if not state.volume_ratio_smallest[0, lane] > 0.0:
+            _stop(state, lane, FAULT_INVERTED_TET)
+            continue
+        surface, touched, moved = _surface_of(model, lane), _touched_of(state, lane), _shapes_of(shapes, lane)
+        count, about, push = state.candidate_count[lane], reference[lane], wrench[lane]
+        add_contact_forces(surface, touched, moved, law, dt, count, about, push)
+        kept = guard_axes(surface, touched, moved, law, _response_of(response, lane), dt, count, about, push)
+        state.contact_kept[lane] = 1 if kept else 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _move_tools(state, shapes, response, dt, substep, wrench):
+    """Tools yield and move, lane by lane; then see which lanes have to stop."""
+    for lane in range(state.lane_fault.shape[0]):
+        if state.lane_fault[lane] != FAULT_NONE:
+            continue
+        moved = _shapes_of(shapes, lane)
+        push_tools(moved, _response_of(response, lane), dt, substep, wrench[lane])
+        move_shapes(moved, dt)
+        if not math.isfinite(state.finite_sum[0, lane]):
+            _stop(state, lane, FAULT_NOT_FINITE)
+        elif state.contact_kept[lane] == 0:
+            _stop(state, lane, FAULT_CONTACT_LOST)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _end(model, state, shapes, law, response, substep_count, wrench):
+    """Mean wrenches and friction's lag of the lanes that move; forces put back where one stands still."""
+    stands = False
+    for lane in range(state.lane_fault.shape[0]):
+        if state.lane_fault[lane] != FAULT_NONE:
+            stands = True
+            continue
+        if law.friction > 0.0:
+            stretch_by_lag(
+                _surface_of(model, lane), _touched_of(state, lane), _shapes_of(shapes, lane),
+                _response_of(response, lane), state.candidate_count[lane],
+            )  # fmt: skip
+        for tool in range(wrench.shape[1]):
+            for part in range(6):
+                wrench[lane, tool, part] /= substep_count
+    if stands:
+        put_back(state.node_force, state.kept_force, state.moving)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance_lane_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
+    """Advance organs side by side by some substeps; the kernel behind `lanes.advance_lanes`.
+
+    As `kernels.advance_substeps` does with each of them; shapes, response, reference and wrench have the lane as their
+    first index. What a lane ran into stands in `state.lane_fault`; it stops at the substep that showed it, for good.
+
+    Model: model, law, response
+    In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point of each torque [m] (n_lane, n_tool, 3)
+    Out:   state, shapes (moved), wrench: MEAN force [N] and torque [N m] on each tool (n_lane, n_tool, 6)
+    """
+    _begin(model, state, shapes, response, dt * substep_count, wrench)
+    for substep in range(substep_count):
+        _evaluate(model, state)
+        _touch(model, state, shapes, law, response, dt, reference, wrench)
+        integrate(
+            state.node_position, state.node_velocity, state.node_force, model.node_inverse_mass, dt, decay,
+            state.moving, state.finite_sum,
+        )  # fmt: skip
+        _move_tools(state, shapes, response, dt, substep, wrench)
+    _end(model, state, shapes, law, response, substep_count, wrench)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def evaluate_lane_forces(model, state):
+    """Internal forces and gravity of all lanes into `state.node_force` [N], without contact."""
+    _evaluate(model, state)

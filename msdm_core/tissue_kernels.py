@@ -8,11 +8,13 @@ from numba import njit
 
 from msdm_core.element_kernels import (
     node_tension,
+    six_rates,
     six_volumes,
     spring_drag,
     spring_scale,
     tet_gradients,
     tet_scale,
+    tet_shape,
 )
 from msdm_core.vector import (
     define_extract,
@@ -187,31 +189,14 @@ def sum_volumes(position, total, tets):
         _share(total, tets, first + 6, _at_6(six))
         _share(total, tets, first + 7, _at_7(six))
     for tet in range(whole, tets.shape[0]):
-        _, six = _one_tet(position, tets, tet)
+        _, six = tet_shape(*_three_edges(position, tets, tet))
         _share(total, tets, tet, six)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _one_tet(position, tets, tet):
-    """Six times the gradients and the volume of one tet."""
-    bx, by, bz = _difference(position, tets, tet, 1)
-    cx, cy, cz = _difference(position, tets, tet, 2)
-    dx, dy, dz = _difference(position, tets, tet, 3)
-    gradients = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
-    return gradients, six_volumes(bx, by, bz, gradients[0], gradients[1], gradients[2])
-
-
-@njit(forceinline=True, error_model="numpy")
-def _six_rates(velocity, tets, tet, g):
-    """Rate of six times the volume of one tet [m^3/s]."""
-    bx, by, bz = _difference(velocity, tets, tet, 1)
-    cx, cy, cz = _difference(velocity, tets, tet, 2)
-    dx, dy, dz = _difference(velocity, tets, tet, 3)
-    return (
-        six_volumes(bx, by, bz, g[0], g[1], g[2])
-        + six_volumes(cx, cy, cz, g[3], g[4], g[5])
-        + six_volumes(dx, dy, dz, g[6], g[7], g[8])
-    )
+def _three_edges(values, tets, tet):
+    """From corner 0 of a tet to its other three."""
+    return _difference(values, tets, tet, 1), _difference(values, tets, tet, 2), _difference(values, tets, tet, 3)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -225,16 +210,16 @@ def set_node_tension(total, node_rest_volume, node_bulk):
 def add_volume_rates(position, velocity, total, tets, beta):
     """Beta times the rate of `sum_volumes`."""
     for tet in range(tets.shape[0]):
-        gradients, _ = _one_tet(position, tets, tet)
-        _share(total, tets, tet, beta * _six_rates(velocity, tets, tet, gradients))
+        gradients, _ = tet_shape(*_three_edges(position, tets, tet))
+        _share(total, tets, tet, beta * six_rates(*_three_edges(velocity, tets, tet), gradients))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
     for tet in range(tets.shape[0]):
-        gradients, _ = _one_tet(position, tets, tet)
-        rate = beta * _six_rates(velocity, tets, tet, gradients) / (6.0 * rest_volume[tet])
+        gradients, _ = tet_shape(*_three_edges(position, tets, tet))
+        rate = beta * six_rates(*_three_edges(velocity, tets, tet), gradients) / (6.0 * rest_volume[tet])
         _push_one(force, tets, tet, bulk[tet] * rate * (-1.0 / 6.0), gradients)
 
 
@@ -289,7 +274,7 @@ def add_volume_forces(position, force, tension, tets, rest_volume, bulk, average
     _keep(low, _at_6(lowest))
     _keep(low, _at_7(lowest))
     for tet in range(whole, tets.shape[0]):
-        gradients, six = _one_tet(position, tets, tet)
+        gradients, six = tet_shape(*_three_edges(position, tets, tet))
         ratio = six / (6.0 * rest_volume[tet])
         _keep(low, ratio)
         scale = tet_scale(ratio, bulk[tet], averaged_bulk[tet], _corner_tension(tension, tets, tet))

@@ -1,0 +1,185 @@
+"""Springs and volume term of several organs of one mesh side by side: the organ's number is the last index of an array.
+
+One register holds the same number of every organ (8 of float64, 16 of float32), so that nothing is gathered or
+scattered. The equations are those of `element_kernels`, the sums in the order of `tissue_kernels`: an organ moves to
+the bit as it would alone.
+"""
+
+import numpy as np
+from numba import njit
+
+from msdm_core.element_kernels import (
+    node_tension,
+    six_rates,
+    spring_drag,
+    spring_scale,
+    tet_scale,
+    tet_shape,
+)
+from msdm_core.vector import keep_lower, load_lanes, spread_like, store_lanes
+
+
+@njit(forceinline=True, error_model="numpy")
+def _difference(values, items, item, corner):
+    """From corner 0 of an item to another of its corners, as three vectors."""
+    i, j = 3 * np.intp(items[item, 0]), 3 * np.intp(items[item, corner])
+    return (
+        load_lanes(values, j) - load_lanes(values, i),
+        load_lanes(values, j + 1) - load_lanes(values, i + 1),
+        load_lanes(values, j + 2) - load_lanes(values, i + 2),
+    )
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add(force, node, x, y, z):
+    """Add to a node's force."""
+    place = 3 * np.intp(node)
+    store_lanes(force, place, load_lanes(force, place) + x)
+    store_lanes(force, place + 1, load_lanes(force, place + 1) + y)
+    store_lanes(force, place + 2, load_lanes(force, place + 2) + z)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _subtract(force, node, x, y, z):
+    """Take from a node's force."""
+    place = 3 * np.intp(node)
+    store_lanes(force, place, load_lanes(force, place) - x)
+    store_lanes(force, place + 1, load_lanes(force, place + 1) - y)
+    store_lanes(force, place + 2, load_lanes(force, place + 2) - z)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _share(total, items, item, value):
+    """Add to each corner of a tet."""
+    for corner in range(4):
+        node = items[item, corner]
+        store_lanes(total, node, load_lanes(total, node) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _where_moving(moving, after, before):
+    """Organ by organ the one value where it moves (1), the other where it stands still (0)."""
+    return keep_lower(moving, moving * 0.0 + 1.0, before, after)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_gravity(force, mass, gravity):
+    """F = m g."""
+    for node in range(force.shape[0]):
+        for axis in range(3):
+            store_lanes(force, 3 * node + axis, load_lanes(mass, node) * gravity[axis])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def integrate(position, velocity, force, inverse_mass, dt, decay, moving, total):
+    """Symplectic Euler of the organs that move, as in `tissue_kernels`; `total` (1, organ) is finite where all is."""
+    moves = load_lanes(moving, 0)
+    check = moves * 0.0
+    for node in range(position.shape[0]):
+        rate = load_lanes(inverse_mass, node) * dt
+        for axis in range(3):
+            part = 3 * node + axis
+            speed_before, place_before = load_lanes(velocity, part), load_lanes(position, part)
+            speed = speed_before * decay + load_lanes(force, part) * rate
+            place = place_before + speed * dt
+            store_lanes(velocity, part, _where_moving(moves, speed, speed_before))
+            store_lanes(position, part, _where_moving(moves, place, place_before))
+            check = check + (place + speed)
+    store_lanes(total, 0, check)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def put_back(values, kept, moving):
+    """Give the organs that stand still the values that were kept of them."""
+    moves = load_lanes(moving, 0)
+    for node in range(values.shape[0]):
+        for axis in range(3):
+            part = 3 * node + axis
+            store_lanes(values, part, _where_moving(moves, load_lanes(values, part), load_lanes(kept, part)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_spring_forces(position, force, nodes, stiffness, rest_length):
+    """Springs: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
+    for spring in range(nodes.shape[0]):
+        x, y, z = _difference(position, nodes, spring, 1)
+        scale = spring_scale(x, y, z, load_lanes(stiffness, spring), spread_like(position, rest_length[spring]))
+        x, y, z = x * scale, y * scale, z * scale
+        _add(force, nodes[spring, 0], x, y, z)
+        _subtract(force, nodes[spring, 1], x, y, z)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_spring_damping(position, velocity, force, nodes, stiffness, beta):
+    """Rayleigh's beta along the springs: f = k beta dl/dt."""
+    for spring in range(nodes.shape[0]):
+        x, y, z = _difference(position, nodes, spring, 1)
+        vx, vy, vz = _difference(velocity, nodes, spring, 1)
+        scale = spring_drag(x, y, z, vx, vy, vz, load_lanes(stiffness, spring), beta)
+        x, y, z = x * scale, y * scale, z * scale
+        _add(force, nodes[spring, 0], x, y, z)
+        _subtract(force, nodes[spring, 1], x, y, z)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _three_edges(values, tets, tet):
+    """From corner 0 of a tet to its other three."""
+    return _difference(values, tets, tet, 1), _difference(values, tets, tet, 2), _difference(values, tets, tet, 3)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def average_volumes(position, velocity, tension, tets, node_rest_volume, node_bulk, beta):
+    """Tension of the volumes averaged at nodes [Pa], K_a (J_a - 1), with beta's share."""
+    tension[:, :] = 0.0
+    for tet in range(tets.shape[0]):
+        _, six = tet_shape(*_three_edges(position, tets, tet))
+        _share(tension, tets, tet, six)
+    if beta > 0.0:
+        for tet in range(tets.shape[0]):
+            gradients, _ = tet_shape(*_three_edges(position, tets, tet))
+            _share(tension, tets, tet, beta * six_rates(*_three_edges(velocity, tets, tet), gradients))
+    for node in range(tension.shape[0]):
+        rest = spread_like(position, node_rest_volume[node])
+        store_lanes(tension, node, node_tension(load_lanes(tension, node), rest, load_lanes(node_bulk, node)))
+
+
+@njit(forceinline=True, error_model="numpy")
+def _push(force, tets, tet, scale, g):
+    """Forces of a tet on its corners."""
+    bx, by, bz = scale * g[0], scale * g[1], scale * g[2]
+    cx, cy, cz = scale * g[3], scale * g[4], scale * g[5]
+    dx, dy, dz = scale * g[6], scale * g[7], scale * g[8]
+    _subtract(force, tets[tet, 0], bx + cx + dx, by + cy + dy, bz + cz + dz)
+    _add(force, tets[tet, 1], bx, by, bz)
+    _add(force, tets[tet, 2], cx, cy, cz)
+    _add(force, tets[tet, 3], dx, dy, dz)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_volume_forces(position, force, tension, tets, rest_volume, bulk, averaged_bulk, low, moving):
+    """Volume terms, as in `tissue_kernels`; keeps the smallest V / V0 seen of every organ that moves, (1, organ)."""
+    lowest = load_lanes(low, 0)
+    for tet in range(tets.shape[0]):
+        gradients, six = tet_shape(*_three_edges(position, tets, tet))
+        ratio = six / spread_like(position, 6.0 * rest_volume[tet])
+        lowest = keep_lower(ratio, lowest, ratio, lowest)
+        a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
+        averaged = 0.25 * (
+            load_lanes(tension, a) + load_lanes(tension, b) + load_lanes(tension, c) + load_lanes(tension, d)
+        )
+        scale = tet_scale(ratio, load_lanes(bulk, tet), load_lanes(averaged_bulk, tet), averaged)
+        _push(force, tets, tet, scale, gradients)
+    store_lanes(low, 0, _where_moving(load_lanes(moving, 0), lowest, load_lanes(low, 0)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta):
+    """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
+    for tet in range(tets.shape[0]):
+        gradients, _ = tet_shape(*_three_edges(position, tets, tet))
+        rate = (
+            beta
+            * six_rates(*_three_edges(velocity, tets, tet), gradients)
+            / spread_like(position, 6.0 * rest_volume[tet])
+        )
+        _push(force, tets, tet, load_lanes(bulk, tet) * rate * (-1.0 / 6.0), gradients)

@@ -1,0 +1,255 @@
+"""Organs of one mesh side by side: eight float64 or sixteen float32 advance at once, each as it would alone.
+
+Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, damping and
+gravity are shared. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its neighbours.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.contact_kernels import QUADRATURE_COUNT
+from msdm_core.errors import OrganError
+from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState, ToolResponse
+from msdm_core.lane_kernels import LANE_EMPTY, LaneModel, LaneState, advance_lane_substeps
+from msdm_core.mesh import FloatArray
+from msdm_core.organ import rest_state
+from msdm_core.vector import aligned_zeros, lane_count
+
+# Of an organ's arrays, those that each lane has of its own; all others are shared.
+OWN_FIELDS = ("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk")
+OWN_NUMBERS = ("averages_volume", "stable_step")
+SHARED_FIELDS = tuple(name for name in LaneModel._fields if name not in OWN_FIELDS + OWN_NUMBERS)
+NODE_FIELDS = ("node_position", "node_velocity", "node_force")
+CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed")
+
+
+def stack_organs(organs: Sequence[OrganModel], *, dtype: Any = np.float64) -> LaneModel:
+    """Organs of one mesh side by side, in the given order; lanes that are left over have copies of the last one.
+
+    Args:
+        organs: at most 8 in float64, 16 in float32.
+        dtype: np.float64 or np.float32.
+
+    Raises:
+        OrganError: no organ or too many, another dtype, or an organ that differs from the first in what they share: its
+            mesh, anchors, damping or gravity. Names the lane and the field.
+    """
+    if np.dtype(dtype) not in (np.float64, np.float32):
+        raise OrganError(f"dtype is {np.dtype(dtype)}; lanes are float64 (8 organs) or float32 (16 organs)")
+    count = lane_count(dtype)
+    if not 1 <= len(organs) <= count:
+        raise OrganError(
+            f"{len(organs)} organs for the {count} lanes of {np.dtype(dtype)}: stack them in several groups"
+        )
+    first = organs[0]
+    own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in OWN_FIELDS}
+    numbers = {"averages_volume": np.zeros(count, dtype=np.bool_), "stable_step": np.zeros(count)}
+    shared = {name: getattr(first, name) for name in SHARED_FIELDS}
+    model = LaneModel(**own, **numbers, **shared)
+    for lane in range(count):
+        organ = organs[min(lane, len(organs) - 1)]
+        _check_shared(model, lane, organ, first.node_inverse_mass == 0.0)
+        _write_lane(model, lane, organ)
+    return model
+
+
+def set_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
+    """Put another organ of the same mesh into a lane, as with another lesion; its state is left as it is (`put_lane`).
+
+    Raises:
+        OrganError: no such lane, or an organ that differs in what the lanes share.
+    """
+    _check_lane(lane, len(model.stable_step))
+    _check_shared(model, lane, organ, model.node_inverse_mass[:, lane] == 0.0)
+    _write_lane(model, lane, organ)
+
+
+def _check_shared(model: LaneModel, lane: int, organ: OrganModel, anchored: NDArray[np.bool_]) -> None:
+    differing = [name for name in SHARED_FIELDS if not _equal(getattr(model, name), getattr(organ, name))]
+    if not differing and not np.array_equal(organ.node_inverse_mass == 0.0, anchored):
+        differing = ["anchors"]
+    if differing:
+        raise OrganError(
+            f"the organ for lane {lane} has another {differing[0]} than its neighbours: organs side by side share "
+            "mesh, anchors, damping and gravity; put it into a group of its own"
+        )
+
+
+def _equal(a: Any, b: Any) -> bool:
+    return a is b or np.array_equal(a, b)
+
+
+def _write_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
+    # Read-only but for this moment: a kernel that writes to the model does not compile.
+    for name in OWN_FIELDS + OWN_NUMBERS:
+        array = getattr(model, name)
+        array.setflags(write=True)
+        array[..., lane] = getattr(organ, name)
+        array.setflags(write=False)
+
+
+def rest_lanes(organs: Sequence[OrganModel], *, shape_count: int = 0, dtype: Any = np.float64) -> LaneState:
+    """The state at rest of organs side by side, with contact memory for `shape_count` shapes each.
+
+    Lanes that are left over stand still (LANE_EMPTY). Under gravity each organ is settled, as `rest_state` does.
+    """
+    first, count = organs[0], lane_count(dtype)
+    nodes, surface = len(first.node_mass), len(first.surface_triangles)
+    vectors = {name: aligned_zeros((nodes, 3, count), dtype) for name in (*NODE_FIELDS, "kept_force")}
+    state = LaneState(
+        **vectors,
+        volume_ratio_smallest=aligned_zeros((1, count), dtype),
+        lane_fault=np.full(count, LANE_EMPTY, dtype=np.int32),
+        contact_engaged=np.zeros((count, shape_count, surface * QUADRATURE_COUNT), dtype=np.uint8),
+        contact_stretch=np.zeros((count, shape_count, surface * QUADRATURE_COUNT, 3)),
+        contact_candidates=np.zeros((count, shape_count, surface), dtype=np.int32),
+        contact_passed=np.zeros((count, 2), dtype=np.int32),
+        node_tension=aligned_zeros((nodes, count), dtype),
+        moving=aligned_zeros((1, count), dtype),
+        finite_sum=aligned_zeros((1, count), dtype),
+        candidate_count=np.zeros(count, dtype=np.int32),
+        contact_kept=np.ones(count, dtype=np.uint8),
+    )
+    resting = [rest_state(organ, shape_count=shape_count) for organ in organs]
+    for lane in range(count):
+        put_lane(state, lane, resting[min(lane, len(organs) - 1)])
+    state.lane_fault[len(organs) :] = LANE_EMPTY
+    return state
+
+
+def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
+    """Let a lane go on from an organ's state, its fault forgotten; `rest_state(...)` restarts it.
+
+    Raises:
+        OrganError: no such lane, or a state of another mesh or of another number of contact shapes.
+    """
+    _check_lane(lane, len(state.lane_fault))
+    if organ.node_position.shape != state.node_position.shape[:2] or (
+        organ.contact_engaged.shape != state.contact_engaged.shape[1:]
+    ):
+        raise OrganError(
+            f"the state has {len(organ.node_position)} nodes and contact memory {organ.contact_engaged.shape}, lane "
+            f"{lane} {len(state.node_position)} and {state.contact_engaged.shape[1:]}: make it with rest_state(model, "
+            "shape_count=...)"
+        )
+    for name in NODE_FIELDS:
+        getattr(state, name)[:, :, lane] = getattr(organ, name)
+    for name in CONTACT_FIELDS:
+        getattr(state, name)[lane] = getattr(organ, name)
+    state.volume_ratio_smallest[0, lane] = organ.volume_ratio_smallest[0]
+    state.lane_fault[lane] = FAULT_NONE
+
+
+def get_lane(state: LaneState, lane: int) -> OrganState:
+    """A copy of one lane's state as that of an organ alone, in float64: to measure, to save, to describe a fault.
+
+    Raises:
+        OrganError: no such lane.
+    """
+    _check_lane(lane, len(state.lane_fault))
+    nodes = len(state.node_position)
+    rows = {name: aligned_zeros((nodes, 4)) for name in ("row_position", "row_velocity", "row_force")}
+    return OrganState(
+        **{name: np.array(getattr(state, name)[:, :, lane], dtype=np.float64, order="C") for name in NODE_FIELDS},
+        **{name: getattr(state, name)[lane].copy() for name in CONTACT_FIELDS},
+        **rows,
+        node_tension=np.zeros(nodes),
+        contact_candidates=state.contact_candidates[lane].copy(),
+        volume_ratio_smallest=state.volume_ratio_smallest[:, lane].astype(np.float64),
+    )
+
+
+def _check_lane(lane: int, count: int) -> None:
+    if not 0 <= lane < count:
+        raise OrganError(f"lane {lane} does not exist; there are lanes 0 to {count - 1}")
+
+
+def stack_shapes(shapes: Sequence[ContactShapes], *, dtype: Any = np.float64) -> ContactShapes:
+    """The contact shapes of several lanes, equally many each, with the lane as first index; the last one fills up.
+
+    `lane_shapes` gives one lane of it to write to.
+    """
+    lanes = [shapes[min(lane, len(shapes) - 1)] for lane in range(lane_count(dtype))]
+    return ContactShapes(*(np.stack(arrays) for arrays in zip(*lanes, strict=True)))
+
+
+def lane_shapes(shapes: ContactShapes, lane: int) -> ContactShapes:
+    """One lane of stacked shapes, in place: what is written to it is seen by `advance_lanes`."""
+    return ContactShapes(*(array[lane] for array in shapes))
+
+
+def lane_responses(tool_count: int, *, dtype: Any = np.float64) -> ToolResponse:
+    """The responses of every lane's tools, with the lane as first index; zeros: tools that move as told."""
+    sizes = ((6,), (6, 6), (6,), (6,))
+    return ToolResponse(*(np.zeros((lane_count(dtype), tool_count, *size)) for size in sizes))
+
+
+def advance_lanes(
+    model: LaneModel,
+    state: LaneState,
+    shapes: ContactShapes,
+    contact: ContactLaw,
+    dt: float,
+    substep_count: int,
+    wrench: FloatArray,
+    response: ToolResponse | None = None,
+) -> NDArray[np.int32]:
+    """Advance organs side by side in place by `substep_count` steps of dt [s]: `advance_organ` for each of them.
+
+    Args:
+        model: the organs.
+        state: their states; lanes whose `lane_fault` is not FAULT_NONE stand still, to the bit.
+        shapes: every lane's contact shapes, the lane as first index, moved along their twist.
+        contact: the contact law of all lanes.
+        dt: substep [s]; that it is stable with contact is checked by the caller (`stable_dt`).
+        substep_count: how many.
+        wrench: receives each lane's mean wrench on its tools [N, N m], shape (n_lane, n_tool, 6).
+        response: how tools yield, the lane as first index; None where they move as told.
+
+    Returns:
+        `state.lane_fault` (n_lane,), a FAULT_ code each: what stopped a lane in this call or before it.
+
+    Raises:
+        OrganError: arrays that do not fit the organs, no substep, a dt above an organ's stable step without contact.
+    """
+    lanes, tools = len(state.lane_fault), shapes.tool_centre.shape[1]
+    if response is None:
+        response = lane_responses(tools, dtype=state.node_position.dtype)
+    _check_fit(model, state, shapes, wrench, response)
+    limit = float(model.stable_step.min())
+    if substep_count < 1 or not 0.0 < dt <= limit:
+        slowest = int(np.argmin(model.stable_step))
+        raise OrganError(
+            f"{substep_count} substeps of {dt:g} s: at least one is needed, above 0 and at most {limit:.4g} s long, "
+            f"the stable step of lane {slowest} of {lanes}"
+        )
+    decay = math.exp(-model.alpha * dt)
+    reference = shapes.tool_centre.copy()
+    advance_lane_substeps(model, state, shapes, contact, response, dt, decay, substep_count, reference, wrench)
+    return state.lane_fault
+
+
+def _check_fit(
+    model: LaneModel, state: LaneState, shapes: ContactShapes, wrench: FloatArray, response: ToolResponse
+) -> None:
+    """Registers are loaded without looking at an array's bounds: what does not fit must not get there."""
+    lanes, count = shapes.shape_radius.shape
+    tools = shapes.tool_centre.shape[1]
+    nodes, surface = len(model.node_mass), len(model.surface_triangles)
+    fits = {
+        "node_position": (state.node_position, (nodes, 3, model.node_mass.shape[1])),
+        "contact_engaged": (state.contact_engaged, (lanes, count, surface * QUADRATURE_COUNT)),
+        "shape_ends": (shapes.shape_ends, (len(state.lane_fault), count, 2, 3)),
+        "tool_twist": (shapes.tool_twist, (lanes, tools, 6)),
+        "tool_mobility": (response.tool_mobility, (lanes, tools, 6, 6)),
+        "wrench": (wrench, (lanes, tools, 6)),
+    }
+    for name, (array, shape) in fits.items():
+        if array.shape != shape:
+            raise OrganError(f"{name} has shape {array.shape}; with these organs, shapes and tools it is {shape}")
+    if model.node_mass.dtype != state.node_position.dtype:
+        raise OrganError(f"the organs are {model.node_mass.dtype}, their states {state.node_position.dtype}")

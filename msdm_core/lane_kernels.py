@@ -163,7 +163,7 @@ def _touched_of(state, lane):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _shapes_of(shapes, lane):
+def shapes_of(shapes, lane):
     return ContactShapes(
         shapes.shape_ends[lane], shapes.shape_radius[lane], shapes.shape_tool[lane], shapes.tool_centre[lane],
         shapes.tool_twist[lane],
@@ -171,7 +171,7 @@ def _shapes_of(shapes, lane):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _response_of(response, lane):
+def response_of(response, lane):
     return ToolResponse(
         response.tool_acceleration[lane], response.tool_mobility[lane], response.tool_wrench[lane],
         response.tool_lag[lane],
@@ -192,7 +192,7 @@ def _begin(model, state, shapes, response, duration, wrench):
         response.tool_wrench[lane, :, :] = 0.0
         response.tool_lag[lane, :, :] = 0.0
         state.candidate_count[lane] = find_candidates(
-            _surface_of(model, lane), _touched_of(state, lane), _shapes_of(shapes, lane), duration
+            _surface_of(model, lane), _touched_of(state, lane), shapes_of(shapes, lane), duration
         )
     if stands:
         state.kept_force[:, :, :] = state.node_force
@@ -242,10 +242,10 @@ def _touch(model, state, shapes, law, response, dt, reference, wrench):
         if not state.volume_ratio_smallest[0, lane] > 0.0:
             _stop(state, lane, FAULT_INVERTED_TET)
             continue
-        surface, touched, moved = _surface_of(model, lane), _touched_of(state, lane), _shapes_of(shapes, lane)
+        surface, touched, moved = _surface_of(model, lane), _touched_of(state, lane), shapes_of(shapes, lane)
         count, about, push = state.candidate_count[lane], reference[lane], wrench[lane]
         add_contact_forces(surface, touched, moved, law, dt, count, about, push)
-        kept = guard_axes(surface, touched, moved, law, _response_of(response, lane), dt, count, about, push)
+        kept = guard_axes(surface, touched, moved, law, response_of(response, lane), dt, count, about, push)
         state.contact_kept[lane] = 1 if kept else 0
 
 
@@ -255,8 +255,8 @@ def _move_tools(state, shapes, response, dt, substep, wrench):
     for lane in range(state.lane_fault.shape[0]):
         if state.lane_fault[lane] != FAULT_NONE:
             continue
-        moved = _shapes_of(shapes, lane)
-        push_tools(moved, _response_of(response, lane), dt, substep, wrench[lane])
+        moved = shapes_of(shapes, lane)
+        push_tools(moved, response_of(response, lane), dt, substep, wrench[lane])
         move_shapes(moved, dt)
         if not math.isfinite(state.finite_sum[0, lane]):
             _stop(state, lane, FAULT_NOT_FINITE)
@@ -274,8 +274,8 @@ def _end(model, state, shapes, law, response, substep_count, wrench):
             continue
         if law.friction > 0.0:
             stretch_by_lag(
-                _surface_of(model, lane), _touched_of(state, lane), _shapes_of(shapes, lane),
-                _response_of(response, lane), state.candidate_count[lane],
+                _surface_of(model, lane), _touched_of(state, lane), shapes_of(shapes, lane),
+                response_of(response, lane), state.candidate_count[lane],
             )  # fmt: skip
         for tool in range(wrench.shape[1]):
             for part in range(6):

@@ -164,6 +164,7 @@ def _touched_of(state, lane):
 
 @njit(forceinline=True, error_model="numpy")
 def shapes_of(shapes, lane):
+    """One lane's contact shapes."""
     return ContactShapes(
         shapes.shape_ends[lane], shapes.shape_radius[lane], shapes.shape_tool[lane], shapes.tool_centre[lane],
         shapes.tool_twist[lane],
@@ -172,6 +173,7 @@ def shapes_of(shapes, lane):
 
 @njit(forceinline=True, error_model="numpy")
 def response_of(response, lane):
+    """How one lane's tools yield."""
     return ToolResponse(
         response.tool_acceleration[lane], response.tool_mobility[lane], response.tool_wrench[lane],
         response.tool_lag[lane],

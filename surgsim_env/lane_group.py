@@ -45,9 +45,12 @@ class LaneGroup:
         for lane, simulation in enumerate(self.simulations):
             self._load(lane, simulation, bool(active[lane]))
         first = self.simulations[0]
+        views = [one.instrument.views() for one in self.simulations]
+        # Always as many as there are lanes: another number would be compiled anew.
+        views += [views[-1]] * (len(self._taken) - len(views))
         advance_lane_haptic_steps(
             self._model, self._state, first.contact, self._shapes, self._response,
-            tuple(one.instrument.views() for one in self.simulations), first.substep_dt,
+            tuple(views), first.substep_dt,
             math.exp(-self._model.alpha * first.substep_dt), first.substep_count, self._wrench, count, force_limit,
             self._reference, self._mean, self._taken, self._fault, self._peak,
         )  # fmt: skip

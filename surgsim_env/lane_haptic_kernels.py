@@ -7,6 +7,18 @@ from msdm_core.lane_kernels import LANE_EMPTY, advance_lane_substeps, response_o
 from surgsim_env.haptic_kernels import begin_step, end_step, total_force
 
 
+@njit(nogil=True, error_model="numpy")
+def _begin_lane(tools, shapes, response, reference, lane):
+    begin_step(tools, shapes_of(shapes, lane), response_of(response, lane))
+    reference[lane] = tools.reference
+
+
+@njit(nogil=True, error_model="numpy")
+def _end_lane(tools, mean, wrench):
+    tools.wrench[:, :] = mean
+    return end_step(tools, wrench)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance_lane_haptic_steps(
     model, state, law, shapes, response, tools, dt, decay, substep_count, wrench, count, force_limit, reference, mean,
@@ -30,8 +42,7 @@ def advance_lane_haptic_steps(
         for lane in range(len(tools)):
             if state.lane_fault[lane] != FAULT_NONE:
                 continue
-            begin_step(tools[lane], shapes_of(shapes, lane), response_of(response, lane))
-            reference[lane] = tools[lane].reference
+            _begin_lane(tools[lane], shapes, response, reference, lane)
         advance_lane_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, mean)
         running = False
         for lane in range(len(tools)):
@@ -40,8 +51,7 @@ def advance_lane_haptic_steps(
             fault[lane] = state.lane_fault[lane]
             if fault[lane] != FAULT_NONE:
                 continue
-            tools[lane].wrench[:, :] = mean[lane]
-            fault[lane] = end_step(tools[lane], wrench[lane])
+            fault[lane] = _end_lane(tools[lane], mean[lane], wrench[lane])
             if fault[lane] != FAULT_NONE:
                 state.lane_fault[lane] = LANE_EMPTY
                 continue

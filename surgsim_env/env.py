@@ -123,7 +123,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     def step(self, action: Observation) -> tuple[Observation, float, bool, bool, Info]:
         """One control step: haptic steps until it is over, the hard limit is passed or the simulation faults."""
         self.command(action)
-        self.task.begin(action)
+        self.task.begin(self._checked(action))
         count = self.scene.timing.haptic_steps_per_control
         force_peak = self.simulation.control_step(count, self.task.force_limit)
         fault = self.simulation.fault

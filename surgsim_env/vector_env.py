@@ -45,8 +45,8 @@ class PalpateVectorEnv(SyncVectorEnv):
     ) -> None:
         def make() -> gym.Env:
             env = PalpateEnv(scene, render_mode=render_mode)
-            limited = max_episode_steps is not None and max_episode_steps < EPISODE_STEPS
-            return gym.wrappers.TimeLimit(env, max_episode_steps) if limited else env
+            steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
+            return gym.wrappers.TimeLimit(env, steps) if steps < EPISODE_STEPS else env
 
         super().__init__([make] * num_envs, autoreset_mode=autoreset_mode)
         self._palpations: list[PalpateEnv] = [env.unwrapped for env in self.envs]  # type: ignore[misc]

@@ -61,7 +61,11 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
     before: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
     place = next(place for place in _places(source_folders[0]) if _can_write(place))
     _remove_stale(place, keep=f"{FOLDER_PREFIX}{digest}")
-    config.CACHE_DIR = str(place / f"{FOLDER_PREFIX}{digest}")  # pyright: ignore[reportAttributeAccessIssue]
+    folder = place / f"{FOLDER_PREFIX}{digest}"
+    if folder.is_dir():
+        # In use: another package whose folder lies here too must not take it for stale.
+        os.utime(folder)
+    config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
     finally:
@@ -78,7 +82,7 @@ def _places(source_folder: Path) -> list[Path]:
 
 
 def _remove_stale(place: Path, *, keep: str) -> None:
-    """Remove folders of earlier texts that nobody has written to for STALE_AGE."""
+    """Remove folders of earlier texts that nobody has used for STALE_AGE."""
     for folder in place.glob(f"{FOLDER_PREFIX}*"):
         if folder.name != keep and time.time() - folder.stat().st_mtime > STALE_AGE:
             shutil.rmtree(folder, ignore_errors=True)

@@ -263,7 +263,7 @@ def advance_haptic_steps(
     """Advance an organ and its tools by `count` haptic steps, fewer where there is a fault or too much force.
 
     Model: model, law
-    In:    dt [s] of a substep, decay = exp(-alpha dt), substep_count, count, force_limit [N]: passing it ends
+    In:    dt [s] of a substep, decay = exp(-alpha dt), substep_count, count; beyond force_limit [N] a step is the last
     Out:   state, shapes, response, tools, wrench: of the last good haptic step (n_tool, 6)
     Returns how many steps were finished, a FAULT_ code and the largest `total_force` [N].
     """

@@ -17,6 +17,8 @@ LIBRARY_NAMES = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
 
 def load_library(folder: Path) -> str:
     """Make the library in MuJoCo's package folder known to the linker; why it is not, or an empty string."""
+    if not hasattr(mujoco.MjModel, "_address") or not hasattr(mujoco.MjData, "_address"):
+        return f"MuJoCo {mujoco.mj_versionString()} does not tell the addresses of its model and data"
     found = sorted(path for name in LIBRARY_NAMES for path in folder.glob(name))
     if not found:
         return f"no library of MuJoCo in {folder} ({', '.join(LIBRARY_NAMES)})"

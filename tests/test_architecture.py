@@ -40,7 +40,7 @@ LONGER_FUNCTIONS = {
 }  # one contact law, unrolled: calls cost there
 
 EMPTY_NAMES = {"util", "utils", "helper", "helpers", "manager", "managers", "misc", "common"}
-ADVANCING = re.compile(r"mj_step\w*|step|haptic_step|control_step|advance\w*")
+ADVANCING = re.compile(r"mj_step\w*|step|haptic_step|control_step|compiled_steps|begin_step|end_step|advance\w*")
 JIT = {"jit", "njit", "vectorize", "guvectorize", "cfunc", "stencil", "generated_jit"}
 ALLOCATING = {
     *("array", "asarray", "ascontiguousarray", "zeros", "ones", "empty", "full", "arange", "linspace", "eye"),
@@ -227,6 +227,9 @@ PLANTED = [
     (compiled_code_in_kernels, "msdm_core/numba_cache.py", "@numba.njit\ndef f(): pass"),
     (kernels_import_little, "msdm_core/kernels.py", "from msdm_core.mesh import TetMesh"),
     (kernels_import_little, "msdm_core/kernels.py", "import scipy.sparse"),
+    (kernels_import_little, "surgsim_env/haptic_kernels.py", "import mujoco"),
+    (kernels_import_little, "surgsim_env/haptic_kernels.py", "from surgsim_env.tool_bodies import ToolBodies"),
+    (kernels_allocate_nothing, "surgsim_env/haptic_kernels.py", HOT + "return np.zeros(3)"),
     (kernels_allocate_nothing, "msdm_core/kernels.py", HOT + "return np.zeros(3)"),
     (kernels_allocate_nothing, "msdm_core/kernels.py", HOT + "y = x.copy()"),
     (kernels_allocate_nothing, "msdm_core/kernels.py", HOT + "return [x]"),
@@ -238,6 +241,8 @@ PLANTED = [
     (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "def f(x):\n    return np.arctan2(x, x)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "def judge(simulation):\n    simulation.haptic_step()"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "env.step(action)"),
+    (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "simulation.control_step(50)"),
+    (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "compiled_steps(model, state)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "mujoco.mj_step1(model, data)"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
     (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
@@ -249,6 +254,7 @@ ALLOWED = [
     (compiled_code_in_kernels, "msdm_core/numba_cache.py", "from numba.core import config"),
     (kernels_import_little, "msdm_core/kernels.py", "from numpy.typing import NDArray\nimport math"),
     (kernels_import_little, "msdm_core/kernels.py", "from msdm_core.vector import root"),
+    (kernels_import_little, "surgsim_env/haptic_kernels.py", "from msdm_core.kernels import advance_substeps"),
     (kernels_allocate_nothing, "msdm_core/kernels.py", "TABLE = np.array([1.0])"),
     (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(fastmath={'contract'})\ndef f(x): return math.sqrt(x)"),
     (tasks_do_not_advance, "surgsim_env/env.py", "simulation.haptic_step()"),

@@ -87,7 +87,7 @@ def test_tools_yield_as_mujoco_will(tool):
 
 
 def test_the_response_follows_the_pose():
-    """Kept from the step before only while inertia and Jacobian are the same to the bit."""
+    """Nothing is kept from the step before."""
     arm = damped_arm()
     mujoco.mj_forward(arm.model, arm.data)
     arm.read_response()

@@ -1,0 +1,448 @@
+"""The compiled control step against the plain Python loop, to the bit; and what happens where it cannot be had."""
+
+import copy
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from functools import cache
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from numba.core.runtime import _nrt_python, rtsys
+
+import surgsim_env  # noqa: F401
+from msdm_core.errors import OrganDivergedError
+from msdm_core.kernels import FAULT_NONE
+from surgsim_env import mujoco_library, simulation
+from surgsim_env.exchange import compiled_steps, haptic_step
+from surgsim_env.haptic_kernels import (
+    FAULT_FORCE_CAP,
+    FAULT_WRENCH_NOT_FINITE,
+    MUJOCO_FUNCTIONS,
+    advance_haptic_steps,
+    end_step,
+    factorise,
+    yield_tool,
+)
+from surgsim_env.tool_bodies import ToolBodies
+from tests.coupling.test_exchange import LAW, driven_probe, free_ball, free_organ, lopsided_body
+from tests.coupling.test_passivity import damped_arm
+
+
+def made(scene, compiled):
+    env = gym.make("SurgSim/Palpate-v0", scene=scene).unwrapped
+    env.simulation.compiled = compiled
+    return env
+
+
+@cache
+def pair(scene):
+    """The same environment with the compiled step and with the plain loop."""
+    return made(scene, True), made(scene, False)
+
+
+def assert_same(compiled, plain, action):
+    """One control step of both; everything that can be seen or saved is the same to the bit."""
+    one, other = compiled.step(action), plain.step(action)
+    assert one[0].tobytes() == other[0].tobytes()
+    assert one[1:] == other[1:]
+    ours, theirs = compiled.simulation, plain.simulation
+    assert ours.contact_wrench.tobytes() == theirs.contact_wrench.tobytes()
+    assert (ours.time, ours.fault) == (theirs.time, theirs.fault)
+    for name in ("qpos", "qvel", "qacc", "ctrl", "xfrc_applied", "sensordata", "xipos"):
+        mine, reference = getattr(ours.instrument.data, name), getattr(theirs.instrument.data, name)
+        assert mine.tobytes() == reference.tobytes(), name
+    for name, array in theirs.get_state().items():
+        assert ours.get_state()[name].tobytes() == array.tobytes(), name
+    assert compiled.save_state() == plain.save_state()
+    return one
+
+
+def press(both, seed, count):
+    """Control steps from the surface on: in along its normal, then a random walk that presses and never declares."""
+    scene, face = both[1].scene, both[1].simulation.anatomy.face
+    rng = np.random.default_rng(seed)
+    point, normal = face.random_point(rng, scene.palpation.face_margin)
+    for env in both:
+        env.simulation.restart(point + normal * scene.instrument.tip_radius)
+    for step in range(count):
+        velocity = -0.7 * normal if step < 5 else rng.uniform(-0.5, 0.5, 3) - 0.1 * normal
+        yield assert_same(*both, np.append(velocity, 0.0).astype(np.float32))[-1]["force_peak"]
+
+
+@pytest.mark.parametrize(("scene", "seed", "count"), [("phantom", 3, 30), ("phantom", 11, 20), ("liver", 5, 20)])
+def test_whole_episodes_are_the_same(scene, seed, count):
+    compiled, plain = pair(scene)
+    assert compiled.simulation.compiled and not plain.simulation.compiled
+    assert compiled.reset(seed=seed)[0].tobytes() == plain.reset(seed=seed)[0].tobytes()
+    assert max(press((compiled, plain), seed, count)) > 0.1, "the walk must press to prove anything"
+    assert np.abs(plain.simulation.organ_state.contact_stretch).max() > 0.0
+
+
+def on_phantom(seed=3, gap=0.0005):
+    """Both at rest over the phantom's lesion."""
+    both = pair("phantom")
+    for env in both:
+        env.reset(seed=seed)
+        x, y = env.task.lesion.centre[:2]
+        env.simulation.restart(np.array([x, y, 0.038 + gap]))
+    return both
+
+
+DOWN = np.array([0.0, 0.0, -1.0, 0.0], dtype=np.float32)
+
+
+def test_the_hard_limit_stops_both_in_the_same_haptic_step():
+    compiled, plain = on_phantom()
+    for _ in range(40):
+        _, _, terminated, _, info = assert_same(compiled, plain, DOWN)
+        if terminated:
+            break
+    assert info["hard_limit"] and 0.8 < info["force_peak"] < 0.81
+    steps = round(compiled.simulation.time / 0.001)
+    assert steps % 50 != 0, "in the middle of a control step"
+
+
+def spoil(env):
+    env.simulation.organ_state.node_velocity[700, 1] = np.nan
+
+
+def stiffen(env):
+    env.simulation.contact = env.simulation.contact._replace(stiffness=1e12)
+
+
+def fling(env):
+    env.simulation.instrument.data.qvel[0] = 1e12
+
+
+def lose_control(env):
+    env.simulation.instrument.data.ctrl[0] = np.nan
+
+
+FAULTS = [
+    (spoil, "no longer finite"),
+    (stiffen, "turned inside out"),
+    (fling, "turned inside out|MuJoCo warning"),
+    (lose_control, "MuJoCo warning"),
+]
+
+
+@pytest.mark.parametrize(("harm", "message"), FAULTS, ids=[harm.__name__ for harm, _ in FAULTS])
+def test_faults_are_the_same(harm, message):
+    """The same words, and the last good step's wrench; afterwards both are clean."""
+    both = on_phantom(gap=-0.001)
+    law = both[0].simulation.contact
+    for _ in range(2):
+        assert_same(*both, np.zeros(4, dtype=np.float32))
+    assert both[0].simulation.contact_wrench.any()
+    try:
+        for env in both:
+            harm(env)
+        record = assert_same(*both, 0.3 * DOWN)
+    finally:
+        for env in both:
+            env.simulation.contact = law
+    assert record[2] and re.search(message, record[-1]["sim_fault"]), record[-1]["sim_fault"]
+    for env in both:
+        env.reset(seed=4)
+    assert not assert_same(*both, DOWN)[2]
+
+
+def test_a_fault_in_mid_step_is_the_same():
+    """A ram at 0.3 m/s turns a tet inside out after some 65 haptic steps: those count, with their largest force."""
+    compiled, plain = (env.simulation for env in on_phantom())
+    for one in (compiled, plain):
+        one.instrument.command_velocity(np.array([0.0, 0.0, -0.3]))
+    peaks = [one.control_step(600) for one in (compiled, plain)]
+    assert peaks[0] == peaks[1] > 2.0
+    assert "turned inside out" in compiled.fault and 0.05 < compiled.time < 0.1
+    for name, array in plain.get_state().items():
+        assert compiled.get_state()[name].tobytes() == array.tobytes(), name
+
+
+def test_the_workspace_limit_is_the_same():
+    compiled, plain = on_phantom()
+    for env in (compiled, plain):
+        env.simulation.restart(env.simulation.instrument.upper - 0.0025)
+    seen = []
+    for action in ([1.0, -1.0, 0.5, 0.0], [1.0, 0.5, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [-1.0, -0.2, -0.1, 0.0]):
+        for _ in range(2):
+            seen.append(assert_same(compiled, plain, np.array(action, dtype=np.float32))[-1]["workspace_limited"])
+    assert seen[0] is False and True in seen and seen[-1] is False
+
+
+TWO_ARMS = """
+<mujoco>
+  <option timestep="0.001" integrator="implicitfast" jacobian="dense"><flag autoreset="disable"/></option>
+  <default><geom contype="0" conaffinity="0" group="3"/></default>
+  <worldbody>
+    <body pos="0.008 0.015 0.06"><joint axis="0 1 0" damping="0.002"/>
+      <inertial pos="0 0 0" mass="0.01" diaginertia="1e-6 1e-6 1e-6"/>
+      <body pos="0.005 0 -0.02"><joint axis="1 0 0" damping="0.001" armature="1e-6"/>
+        <inertial pos="0 0 -0.01" mass="0.03" diaginertia="4e-6 3e-6 2e-6"/>
+        <geom type="capsule" fromto="0 0 -0.02 0.002 0 0" size="0.004"/></body></body>
+    <body pos="0.022 0.015 0.0195"><freejoint/><inertial pos="0.001 0 0" mass="0.02" diaginertia="1e-6 2e-6 3e-6"/>
+      <geom type="sphere" size="0.005"/><geom type="sphere" size="0.003" pos="0.003 0.002 0"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def two_arms() -> ToolBodies:
+    return ToolBodies(mujoco.MjModel.from_xml_string(TWO_ARMS))
+
+
+TOOLS = [free_ball, lopsided_body, driven_probe, damped_arm, two_arms]
+
+
+@pytest.mark.parametrize("tool", TOOLS, ids=[tool.__name__ for tool in TOOLS])
+def test_any_tools_move_the_same(tool):
+    """Free, jointed, driven, one or two, on a block that flies: exchange.haptic_step in a loop, to the bit."""
+    tools, others = tool(), tool()
+    model, state = free_organ()
+    state = state._replace(
+        contact_engaged=np.zeros((4, state.contact_engaged.shape[1]), dtype=np.uint8),
+        contact_stretch=np.zeros((4, *state.contact_stretch.shape[1:])),
+        contact_candidates=np.zeros((4, state.contact_candidates.shape[1]), dtype=np.int32),
+    )
+    reference = type(state)(*(array.copy() for array in state))
+    wrench, wanted = np.zeros((tools.tool_count, 6)), np.zeros((tools.tool_count, 6))
+    peak = 0.0
+    for _ in range(60):
+        haptic_step(model, reference, others, LAW, 2e-4, 5, wanted)
+        peak = max(peak, float(np.linalg.norm(wanted[:, :3].sum(axis=0))))
+    taken = compiled_steps(model, state, tools, LAW, 2e-4, 5, wrench, 60, np.inf)
+    assert (taken.count, taken.fault) == (60, "")
+    assert taken.force_peak == pytest.approx(peak, rel=1e-14)
+    assert wrench.tobytes() == wanted.tobytes()
+    assert tools.data.qpos.tobytes() == others.data.qpos.tobytes()
+    for name, array in reference._asdict().items():
+        assert getattr(state, name).tobytes() == array.tobytes(), name
+    for name, array in (others.shapes._asdict() | others.response._asdict()).items():
+        assert getattr(tools.shapes, name, getattr(tools.response, name, None)).tobytes() == array.tobytes(), name
+    if tool is not damped_arm:
+        assert peak > 0.01
+
+
+def test_a_step_beyond_the_limit_is_the_last():
+    model, state = free_organ()
+    tools, wrench = free_ball(), np.zeros((1, 6))
+    taken = compiled_steps(model, state, tools, LAW, 2e-4, 5, wrench, 100, 0.05)
+    assert 1 < taken.count < 100
+    assert taken.force_peak > 0.05
+    assert taken.force_peak == pytest.approx(np.linalg.norm(wrench[0, :3]), rel=1e-14)
+    assert tools.data.time == pytest.approx(taken.count * 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("value", "fault"),
+    [
+        (np.nan, FAULT_WRENCH_NOT_FINITE),
+        (np.inf, FAULT_WRENCH_NOT_FINITE),
+        (120.0, FAULT_FORCE_CAP),
+        (99.0, FAULT_NONE),
+    ],
+)
+def test_a_bad_wrench_never_reaches_mujoco(value, fault):
+    """Nor the wrench that is kept; a good one reaches both."""
+    probe = driven_probe()
+    mujoco.mj_step1(probe.model, probe.data)
+    tools, kept, place = probe.views(), np.full((1, 6), 0.25), probe.data.qpos.copy()
+    tools.wrench[0, 1] = value
+    assert end_step(tools, kept) == fault
+    reached = fault == FAULT_NONE
+    assert probe.data.xfrc_applied.any() == reached
+    assert (probe.data.qpos != place).any() == reached
+    np.testing.assert_array_equal(kept[0], [0.0, value, 0.0, 0.0, 0.0, 0.0] if reached else np.full(6, 0.25))
+
+
+def test_the_solve_is_that_of_linear_algebra():
+    """J A^-1 J^T and J A^-1 q against LAPACK, for one to nine joints."""
+    rng = np.random.default_rng(2)
+    for count in range(1, 10):
+        root = rng.normal(size=(count, count))
+        matrix = root @ root.T + 0.1 * np.eye(count)
+        jacobian, force = rng.normal(size=(6, count)), rng.normal(size=count)
+        factors, yielded, mobility, rate = matrix.copy(), np.zeros((count, 6)), np.zeros((6, 6)), np.zeros(6)
+        factorise(factors)
+        yield_tool(factors, jacobian, force, yielded, mobility, rate)
+        wanted = np.linalg.solve(matrix, jacobian.T)
+        accuracy = 1e-13 * np.linalg.cond(matrix)
+        np.testing.assert_allclose(yielded, wanted, rtol=0, atol=accuracy * np.abs(wanted).max())
+        np.testing.assert_allclose(mobility, jacobian @ wanted, rtol=0, atol=accuracy * np.abs(mobility).max())
+        np.testing.assert_allclose(rate, force @ wanted, rtol=0, atol=accuracy * np.abs(mobility).max())
+
+
+def test_a_copy_goes_on_by_itself():
+    """Views are made for each call: a deep copy steps its own MuJoCo data, not that of the original."""
+    original = on_phantom()[0].simulation
+    original.instrument.command_velocity(np.array([0.0, 0.0, -0.02]))
+    original.control_step(60)
+    twin = copy.deepcopy(original, {id(original.anatomy): original.anatomy})
+    stood = original.get_state()
+    assert twin.control_step(60) > 0.0
+    moved = twin.get_state()
+    assert all(array.tobytes() == stood[name].tobytes() for name, array in original.get_state().items())
+    original.control_step(60)
+    assert all(array.tobytes() == moved[name].tobytes() for name, array in original.get_state().items())
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "message"),
+    [(np.nan, "no longer finite"), (np.inf, "no longer finite|not finite"), (1e11, "beyond the physical cap of 100 N")],
+)
+def test_a_fault_raised_by_one_is_told_by_the_other(stiffness, message):
+    """The words of `haptic_step`'s error are those of `compiled_steps`; an organ that cannot yield meets the cap."""
+    model, state = free_organ()
+    if stiffness == 1e11:
+        held = np.zeros_like(model.node_inverse_mass)
+        held.setflags(write=False)
+        model = model._replace(node_inverse_mass=held)
+    bad = LAW._replace(stiffness=stiffness)
+    tools, others = driven_probe(), driven_probe()
+    for probe in (tools, others):
+        probe.place(np.array([0.014, 0.016, 0.0215]))
+    with pytest.raises(OrganDivergedError, match=message) as raised:
+        haptic_step(model, state, others, bad, 2e-4, 5, np.zeros((1, 6)))
+    _, state = free_organ()
+    wrench = np.full((1, 6), 0.5)
+    taken = compiled_steps(model, state, tools, bad, 2e-4, 5, wrench, 10, np.inf)
+    assert (taken.count, taken.fault) == (0, str(raised.value))
+    assert (wrench == 0.5).all()
+    assert not tools.data.xfrc_applied.any() and tools.data.time == others.data.time == 0.0
+
+
+# ---- without allocation, without the lock --------------------------------------------------------------------------
+
+
+def steps_of(env, count):
+    """A call of the compiled loop, ready to be made."""
+    sim = env.simulation
+    decay, tools = float(np.exp(-sim.organ_model.alpha * sim.substep_dt)), sim.instrument.views()
+    shapes, response, wrench = sim.instrument.shapes, sim.instrument.response, np.zeros((1, 6))
+    return lambda: advance_haptic_steps(
+        sim.organ_model, sim.organ_state, sim.contact, shapes, response, tools, sim.substep_dt, decay,
+        sim.substep_count, wrench, count, np.inf,
+    )  # fmt: skip
+
+
+def test_nothing_is_allocated_within_the_loop():
+    """What the call itself takes (a reference to each array handed in) does not grow with the number of steps."""
+    env = on_phantom(gap=-0.001)[0]
+    if not _nrt_python.memsys_stats_enabled():
+        _nrt_python.memsys_enable_stats()
+    counts = []
+    for count in (1, 3, 30):
+        call = steps_of(env, count)
+        before = rtsys.get_allocation_stats()
+        assert call()[:2] == (count, FAULT_NONE)
+        after = rtsys.get_allocation_stats()
+        counts.append((after.alloc - before.alloc, after.mi_alloc - before.mi_alloc))
+    assert counts[0][1] > 0, "the counters do not count"
+    assert counts[0] == counts[1] == counts[2]
+
+
+def test_other_threads_run_meanwhile():
+    """With Python's own switching put off for good, another thread advances only where the call gives up the lock."""
+    call = steps_of(on_phantom()[0], 100)
+    call()
+    count, taken, done = 0, [], threading.Event()
+
+    def work():
+        before = count
+        call()
+        taken.append(count - before)
+        done.set()
+
+    interval = sys.getswitchinterval()
+    worker = threading.Thread(target=work)
+    try:
+        sys.setswitchinterval(1000.0)
+        worker.start()
+        while not done.is_set():
+            count += 1
+            time.sleep(0.0005)
+    finally:
+        sys.setswitchinterval(interval)
+    worker.join()
+    assert taken[0] > 0
+
+
+# ---- where it cannot be had ----------------------------------------------------------------------------------------
+
+
+def test_a_missing_library_has_a_reason(tmp_path):
+    assert "no library of MuJoCo" in mujoco_library.load_library(tmp_path)
+    (tmp_path / "libmujoco.so.9").write_text("no library")
+    assert "cannot be loaded" in mujoco_library.load_library(tmp_path)
+    assert mujoco_library.missing() == ""
+
+
+def test_functions_are_asked_for_before_any_is_called(monkeypatch):
+    assert mujoco_library.check_functions(MUJOCO_FUNCTIONS) == ""
+    assert "no function mj_stepp, mj_leap" in mujoco_library.check_functions(("mj_step1", "mj_stepp", "mj_leap"))
+    assert set(MUJOCO_FUNCTIONS) >= {"mj_step1", "mj_step2", "mj_fullM"}
+    monkeypatch.setattr(mujoco, "mj_version", lambda: 123)
+    assert "another MuJoCo" in mujoco_library.check_functions(MUJOCO_FUNCTIONS)
+
+
+def test_without_the_library_the_plain_loop_runs_and_says_so_once(monkeypatch):
+    reason = "no library of MuJoCo in /nowhere"
+    monkeypatch.setattr(mujoco_library, "_missing", reason)
+    simulation._warn_of_missing_library.cache_clear()
+    with pytest.warns(RuntimeWarning, match=f"plain Python loop, more slowly: {reason}"):
+        env = gym.make("SurgSim/Palpate-v0").unwrapped
+    assert env.simulation.compiled is False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is False
+    plain = pair("phantom")[1]
+    for one in (env, plain):
+        one.reset(seed=6)
+        one.step(DOWN)
+    assert env.save_state() == plain.save_state()
+    model, state = free_organ()
+    with pytest.raises(RuntimeError, match=reason):
+        compiled_steps(model, state, free_ball(), LAW, 2e-4, 5, np.zeros((1, 6)), 1, np.inf)
+
+
+def test_the_loop_can_be_chosen(monkeypatch):
+    monkeypatch.setenv(simulation.LOOP_VARIABLE, "python")
+    assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is False
+    monkeypatch.setenv(simulation.LOOP_VARIABLE, "compiled")
+    assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is True
+    monkeypatch.setenv(simulation.LOOP_VARIABLE, "fast")
+    with pytest.raises(ValueError, match="SURGSIM_LOOP is 'fast'"):
+        gym.make("SurgSim/Palpate-v0")
+
+
+FRESH = """
+import gymnasium as gym, numpy as np
+import surgsim_env
+from surgsim_env.haptic_kernels import advance_haptic_steps
+env = gym.make("SurgSim/Palpate-v0").unwrapped
+env.reset(seed=9)
+env.step(np.array([0.1, 0.2, -0.9, 0.0], dtype=np.float32))
+hits, misses = advance_haptic_steps.stats.cache_hits, advance_haptic_steps.stats.cache_misses
+print(sum(hits.values()), sum(misses.values()), env.simulation.get_state()["organ_node_position"].tobytes().hex()[:400])
+print(env.simulation.instrument.data.qpos.tobytes().hex())
+"""
+
+
+def test_a_fresh_process_runs_what_the_cache_holds():
+    """Machine code from disk calls MuJoCo by address: the library must be there before."""
+    env = pair("phantom")[0]
+    env.reset(seed=9)
+    env.step(np.array([0.1, 0.2, -0.9, 0.0], dtype=np.float32))
+    done = subprocess.run([sys.executable, "-c", FRESH], env=dict(os.environ), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    hits, misses, nodes, place = done.stdout.split()
+    assert (hits, misses) == ("1", "0")
+    assert nodes == env.simulation.organ_state.node_position.tobytes().hex()[:400]
+    assert place == env.simulation.instrument.data.qpos.tobytes().hex()

@@ -82,11 +82,14 @@ def compiled_steps(
     """`haptic_step` up to `count` times in one compiled call without the interpreter's lock, equal to the bit.
 
     It ends with the step whose total force passes `force_limit` [N]; a fault is told, not raised, and leaves `wrench`
-    as the last good step had it. Tools move by their `servo`: a `drive` written anew in Python is not seen.
+    as the last good step had it.
 
     Raises:
         RuntimeError: MuJoCo's functions are not known to the linker (says why).
+        TypeError: tools with a `drive` of their own: compiled code knows the `servo` alone.
     """
+    if type(instrument).drive is not ToolBodies.drive:
+        raise TypeError(f"{type(instrument).__name__} drives itself in Python; call haptic_step in a loop")
     if missing := mujoco_library.missing():
         raise RuntimeError(f"haptic steps cannot be compiled: {missing}; call haptic_step in a loop")
     tools = instrument.views()

@@ -142,7 +142,7 @@ def yield_tool(factors, jacobian, smooth_force, yielded, mobility, acceleration)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _drive(tools):
-    """`Instrument.drive`: the servo's target moves on by one step and stops at the workspace."""
+    """`ToolBodies.drive`: the servo's target moves on by one step and stops at the workspace."""
     servo, control = tools.servo, tools.control
     count = servo.command.shape[0]
     servo.limited[0] = False

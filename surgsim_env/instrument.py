@@ -53,15 +53,6 @@ class Instrument(ToolBodies):
         """Set the tip velocity that the servo follows from now on [m/s], shape (3,)."""
         self.servo.command[:] = velocity
 
-    def drive(self) -> None:
-        """Move the servo's target by one step of the commanded velocity; it stops at the workspace, and says so."""
-        target = self.data.ctrl[:3] + self.servo.command * self.model.opt.timestep
-        held = np.clip(target, self.lower, self.upper)
-        stopped = held != target
-        self.servo.limited[0] = stopped.any()
-        self.data.ctrl[:3] = held
-        self.data.ctrl[3:6] = np.where(stopped, 0.0, self.servo.command)
-
     def refresh(self) -> None:
         """Bring poses and velocities up to the current coordinates (after mj_step2 they are one step old)."""
         mujoco.mj_kinematics(self.model, self.data)

@@ -13,7 +13,7 @@ CONTACT_GROUP = 3
 
 
 class ToolBodies:
-    """The tools of a MuJoCo model: every body that carries contact shapes. Nothing drives them here.
+    """The tools of a MuJoCo model: every body that carries contact shapes. Their `servo` has no slides to drive here.
 
     Wrenches and twists refer to a body's centre of mass, which is what both `xfrc_applied` and `mj_objectVelocity` of
     a body mean. The order swap (MuJoCo gives angular before linear) happens here and nowhere else.
@@ -54,7 +54,15 @@ class ToolBodies:
         return [self.model.body(body).name for body in self._tools]
 
     def drive(self) -> None:
-        """Move what drives the tools by one step; nothing does here."""
+        """Move the servo's targets by one step of the commanded speed; they stop at the workspace, and it says so."""
+        servo, control = self.servo, self.data.ctrl
+        count = len(servo.command)
+        target = control[:count] + servo.command * self.model.opt.timestep
+        held = np.clip(target, servo.lower, servo.upper)
+        stopped = held != target
+        servo.limited[0] = stopped.any()
+        control[:count] = held
+        control[count : 2 * count] = np.where(stopped, 0.0, servo.command)
 
     def read_shapes(self) -> None:
         """Copy the current pose and twist of every contact shape into `shapes`; call after mj_step1."""

@@ -1,31 +1,21 @@
 """The compiled control step against the plain Python loop, to the bit; and what happens where it cannot be had."""
 
 import copy
-import os
 import re
-import subprocess
-import sys
-import threading
-import time
-import warnings
 from functools import cache
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from numba.core.runtime import _nrt_python, rtsys
 
 import surgsim_env  # noqa: F401
 from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels import FAULT_NONE
-from surgsim_env import mujoco_library, simulation
 from surgsim_env.exchange import compiled_steps, haptic_step
 from surgsim_env.haptic_kernels import (
     FAULT_FORCE_CAP,
     FAULT_WRENCH_NOT_FINITE,
-    MUJOCO_FUNCTIONS,
-    advance_haptic_steps,
     end_step,
     factorise,
     yield_tool,
@@ -316,133 +306,3 @@ def test_a_fault_raised_by_one_is_told_by_the_other(stiffness, message):
     assert (taken.count, taken.fault) == (0, str(raised.value))
     assert (wrench == 0.5).all()
     assert not tools.data.xfrc_applied.any() and tools.data.time == others.data.time == 0.0
-
-
-# ---- without allocation, without the lock --------------------------------------------------------------------------
-
-
-def steps_of(env, count):
-    """A call of the compiled loop, ready to be made."""
-    sim = env.simulation
-    decay, tools = float(np.exp(-sim.organ_model.alpha * sim.substep_dt)), sim.instrument.views()
-    shapes, response, wrench = sim.instrument.shapes, sim.instrument.response, np.zeros((1, 6))
-    return lambda: advance_haptic_steps(
-        sim.organ_model, sim.organ_state, sim.contact, shapes, response, tools, sim.substep_dt, decay,
-        sim.substep_count, wrench, count, np.inf,
-    )  # fmt: skip
-
-
-def test_nothing_is_allocated_within_the_loop():
-    """What the call itself takes (a reference to each array handed in) does not grow with the number of steps."""
-    env = on_phantom(gap=-0.001)[0]
-    if not _nrt_python.memsys_stats_enabled():
-        _nrt_python.memsys_enable_stats()
-    counts = []
-    for count in (1, 3, 30):
-        call = steps_of(env, count)
-        before = rtsys.get_allocation_stats()
-        assert call()[:2] == (count, FAULT_NONE)
-        after = rtsys.get_allocation_stats()
-        counts.append((after.alloc - before.alloc, after.mi_alloc - before.mi_alloc))
-    assert counts[0][1] > 0, "the counters do not count"
-    assert counts[0] == counts[1] == counts[2]
-
-
-def test_other_threads_run_meanwhile():
-    """With Python's own switching put off for good, another thread advances only where the call gives up the lock."""
-    call = steps_of(on_phantom()[0], 100)
-    call()
-    count, taken, done = 0, [], threading.Event()
-
-    def work():
-        before = count
-        call()
-        taken.append(count - before)
-        done.set()
-
-    interval = sys.getswitchinterval()
-    worker = threading.Thread(target=work)
-    try:
-        sys.setswitchinterval(1000.0)
-        worker.start()
-        while not done.is_set():
-            count += 1
-            time.sleep(0.0005)
-    finally:
-        sys.setswitchinterval(interval)
-    worker.join()
-    assert taken[0] > 0
-
-
-# ---- where it cannot be had ----------------------------------------------------------------------------------------
-
-
-def test_a_missing_library_has_a_reason(tmp_path):
-    assert "no library of MuJoCo" in mujoco_library.load_library(tmp_path)
-    (tmp_path / "libmujoco.so.9").write_text("no library")
-    assert "cannot be loaded" in mujoco_library.load_library(tmp_path)
-    assert mujoco_library.missing() == ""
-
-
-def test_functions_are_asked_for_before_any_is_called(monkeypatch):
-    assert mujoco_library.check_functions(MUJOCO_FUNCTIONS) == ""
-    assert "no function mj_stepp, mj_leap" in mujoco_library.check_functions(("mj_step1", "mj_stepp", "mj_leap"))
-    assert set(MUJOCO_FUNCTIONS) >= {"mj_step1", "mj_step2", "mj_fullM"}
-    monkeypatch.setattr(mujoco, "mj_version", lambda: 123)
-    assert "another MuJoCo" in mujoco_library.check_functions(MUJOCO_FUNCTIONS)
-
-
-def test_without_the_library_the_plain_loop_runs_and_says_so_once(monkeypatch):
-    reason = "no library of MuJoCo in /nowhere"
-    monkeypatch.setattr(mujoco_library, "_missing", reason)
-    simulation._warn_of_missing_library.cache_clear()
-    with pytest.warns(RuntimeWarning, match=f"plain Python loop, more slowly: {reason}"):
-        env = gym.make("SurgSim/Palpate-v0").unwrapped
-    assert env.simulation.compiled is False
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is False
-    plain = pair("phantom")[1]
-    for one in (env, plain):
-        one.reset(seed=6)
-        one.step(DOWN)
-    assert env.save_state() == plain.save_state()
-    model, state = free_organ()
-    with pytest.raises(RuntimeError, match=reason):
-        compiled_steps(model, state, free_ball(), LAW, 2e-4, 5, np.zeros((1, 6)), 1, np.inf)
-
-
-def test_the_loop_can_be_chosen(monkeypatch):
-    monkeypatch.setenv(simulation.LOOP_VARIABLE, "python")
-    assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is False
-    monkeypatch.setenv(simulation.LOOP_VARIABLE, "compiled")
-    assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is True
-    monkeypatch.setenv(simulation.LOOP_VARIABLE, "fast")
-    with pytest.raises(ValueError, match="SURGSIM_LOOP is 'fast'"):
-        gym.make("SurgSim/Palpate-v0")
-
-
-FRESH = """
-import gymnasium as gym, numpy as np
-import surgsim_env
-from surgsim_env.haptic_kernels import advance_haptic_steps
-env = gym.make("SurgSim/Palpate-v0").unwrapped
-env.reset(seed=9)
-env.step(np.array([0.1, 0.2, -0.9, 0.0], dtype=np.float32))
-hits, misses = advance_haptic_steps.stats.cache_hits, advance_haptic_steps.stats.cache_misses
-print(sum(hits.values()), sum(misses.values()), env.simulation.get_state()["organ_node_position"].tobytes().hex()[:400])
-print(env.simulation.instrument.data.qpos.tobytes().hex())
-"""
-
-
-def test_a_fresh_process_runs_what_the_cache_holds():
-    """Machine code from disk calls MuJoCo by address: the library must be there before."""
-    env = pair("phantom")[0]
-    env.reset(seed=9)
-    env.step(np.array([0.1, 0.2, -0.9, 0.0], dtype=np.float32))
-    done = subprocess.run([sys.executable, "-c", FRESH], env=dict(os.environ), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    hits, misses, nodes, place = done.stdout.split()
-    assert (hits, misses) == ("1", "0")
-    assert nodes == env.simulation.organ_state.node_position.tobytes().hex()[:400]
-    assert place == env.simulation.instrument.data.qpos.tobytes().hex()

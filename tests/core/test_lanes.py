@@ -306,6 +306,24 @@ def test_a_fault_stops_its_lane_and_no_other(spoil, expected: int, words: str):
     assert other.lane_fault[3] == FAULT_NONE, "a restart forgets the fault"
 
 
+def test_a_lane_that_is_told_to_wait_goes_on_where_it_was():
+    """Lane 3 waits 30 haptic steps in mid-press (LANE_EMPTY): nothing of it changes; then it runs on as if at once."""
+    organs = pressed_organs()
+    model, state, shapes, response, wrench = pressing(organs)
+    unbroken = pressing(organs)
+    before = get_lane(state, 3)
+    state.lane_fault[3] = LANE_EMPTY
+    for _ in range(30):
+        advance_lanes(model, state, shapes, LAW, SUBSTEP, SUBSTEPS, wrench, response)
+    assert same(get_lane(state, 3), before) == [] and not wrench[3].any()
+    state.lane_fault[3] = FAULT_NONE
+    for _ in range(30):
+        assert not advance_lanes(model, state, shapes, LAW, SUBSTEP, SUBSTEPS, wrench, response).any()
+        advance_lanes(*unbroken[:3], LAW, SUBSTEP, SUBSTEPS, unbroken[4], unbroken[3])
+    assert wrench[3, 0, 2] != 0.0
+    assert same(get_lane(state, 3), get_lane(unbroken[1], 3)) == []
+
+
 def test_swapping_one_lanes_organ_leaves_the_others():
     """A new lesion and a restart of lane 2 in mid-press: it runs as that organ alone from rest, the others go on."""
     organs = pressed_organs()

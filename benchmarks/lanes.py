@@ -67,6 +67,7 @@ class Group:
         self.call = lambda: advance(model, state, shapes, law, HAPTIC_STEP / substeps, substeps, self.wrench)
         for _ in range(round(PRESS_DEPTH / PRESS_SPEED / HAPTIC_STEP)):
             fault = self.call()
+        self.pressed = self.wrench.copy()
         if np.any(fault != FAULT_NONE):
             raise SystemExit(f"a press of {PRESS_DEPTH * 1e3:g} mm ended in fault {fault}")
         shapes.tool_twist[:] = 0.0
@@ -109,8 +110,12 @@ def main() -> None:
         print(f"substep_{name} {value * 1e6:.2f} us")
     for name in ("lanes_float64", "lanes_float32"):
         print(f"ratio_{name} {median['single_float64'] / median[name]:.2f} -")
+    exact, rounded = groups["lanes_float64"].pressed[:, 0, :3], groups["lanes_float32"].pressed[:8, 0, :3]
+    error = np.linalg.norm(rounded - exact, axis=1) / np.linalg.norm(exact, axis=1)
+    print(f"force_error_float32 {100.0 * error.max():.4f} %")
+    print(f"force_difference_float64 {np.abs(exact[0] - groups['single_float64'].pressed[0, :3]).max():g} N")
     state = groups["lanes_float32"].state
-    print(f"memory_lanes_float32 {sum(array.nbytes for array in state) / ROOM / 1e6:.2f} MB_per_organ_state")
+    print(f"memory_lanes_float32 {sum(array.nbytes for array in state) / ROOM / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

@@ -71,7 +71,19 @@ def find_candidates(model, state, shapes, duration):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
-    """Contact of every shape with its candidate triangles; adds the reaction to the tools' wrench."""
+    """Contact of every shape with its candidate triangles; adds the reaction to the tools' wrench.
+
+    Each quadrature point is held off by a penetration that keeps rising with depth. With d from the shape's axis to the
+    point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2) the half chord, the line through the
+    point along n leaves the ball t + s below the point. The energy per area is (k_p / 2) g^2 with g = s (s + t) / r: to
+    first order the radial penetration r - |d|, yet growing without bound as the ball sinks below the surface, where a
+    radial one falls again and lets the ball tunnel. Forces are its exact gradient, the turning of n with the corners
+    included, so that action and reaction balance, torque too.
+    A point engages where the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays
+    engaged until it parts, so that the far side of a thin organ is never taken for the near one.
+    """
+    # Branches stand in this one body: a function with branches that is given arrays counts references at each call,
+    # which took three times as long as all the rest.
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
     surface, rest_area = model.surface_triangles, model.surface_rest_area
@@ -93,12 +105,8 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 limit = 0.5 * math.sqrt(size_squared) + radius
                 if (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 > limit * limit:
                     continue
-            bx = position[b, 0] - position[a, 0]
-            by = position[b, 1] - position[a, 1]
-            bz = position[b, 2] - position[a, 2]
-            cx = position[c, 0] - position[a, 0]
-            cy = position[c, 1] - position[a, 1]
-            cz = position[c, 2] - position[a, 2]
+            bx, by, bz = _span(position, a, b)
+            cx, cy, cz = _span(position, a, c)
             nx = by * cz - bz * cy
             ny = bz * cx - bx * cz
             nz = bx * cy - by * cx
@@ -106,11 +114,108 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
             nx /= twice_area
             ny /= twice_area
             nz /= twice_area
+            weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
             for point in range(QUADRATURE_COUNT):
-                _add_point_contact(
-                    surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist,
-                    law, dt, reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
-                )  # fmt: skip
+                item = triangle * QUADRATURE_COUNT + point
+                wa = QUADRATURE_BARYCENTRIC[point, 0]
+                wb = QUADRATURE_BARYCENTRIC[point, 1]
+                wc = QUADRATURE_BARYCENTRIC[point, 2]
+                x, y, z = _mean(position, a, b, c, wa, wb, wc)
+                px, py, pz = closest_on_axis(ends, shape, x, y, z)
+                t = (x - px) * nx + (y - py) * ny + (z - pz) * nz
+                rx = x - px - t * nx
+                ry = y - py - t * ny
+                rz = z - pz - t * nz
+                chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
+                if chord_squared <= 0.0:
+                    _release(engaged, stretch_memory, shape, item)
+                    continue
+                s = math.sqrt(chord_squared)
+                depth = s + t
+                if depth <= 0.0 or (not engaged[shape, item] and t > 0.0):
+                    _release(engaged, stretch_memory, shape, item)
+                    continue
+                engaged[shape, item] = 1
+                vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
+                ux, uy, uz = _tool_velocity(twist, centre, tool, x, y, z)
+                vx -= ux
+                vy -= uy
+                vz -= uz
+                # e: unit vector against the ball's own normal where the line along n leaves the ball.
+                ex = (s * nx - rx) / radius
+                ey = (s * ny - ry) / radius
+                ez = (s * nz - rz) / radius
+                load = law.stiffness * depth + law.damping * (ex * vx + ey * vy + ez * vz)
+                if load < 0.0:
+                    load = 0.0
+                scale = -weighted_area * load / (radius * radius)
+
+                # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the axis' direction inside
+                # a capsule.
+                gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
+                gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
+                gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
+                gx, gy, gz = _without_axis(ends, shape, px, py, pz, gx, gy, gz)
+
+                # Friction: a tangential spring that sticks until mu times the pressure, then slips.
+                ux = stretch_memory[shape, item, 0] + dt * vx
+                uy = stretch_memory[shape, item, 1] + dt * vy
+                uz = stretch_memory[shape, item, 2] + dt * vz
+                out_of_plane = ux * ex + uy * ey + uz * ez
+                ux -= out_of_plane * ex
+                uy -= out_of_plane * ey
+                uz -= out_of_plane * ez
+                stretch = math.sqrt(ux * ux + uy * uy + uz * uz)
+                longest = law.friction * load * s / radius / law.tangential_stiffness
+                if stretch > longest:
+                    ux *= longest / stretch
+                    uy *= longest / stretch
+                    uz *= longest / stretch
+                stretch_memory[shape, item, 0] = ux
+                stretch_memory[shape, item, 1] = uy
+                stretch_memory[shape, item, 2] = uz
+                drag = law.tangential_stiffness * weighted_area
+                gx -= drag * ux
+                gy -= drag * uy
+                gz -= drag * uz
+
+                # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the gradient
+                # is along n. rho . grad(lambda_b) = rho . (c x n) / (2 A), for the corner c rho . (n x b) / (2 A).
+                turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
+                turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
+                turn = -scale * depth * depth
+                tb = turn * turn_b
+                tc = turn * turn_c
+                _push_corner(position, force, reference, wrench, tool, a, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
+                _push_corner(position, force, reference, wrench, tool, b, wb, tb, gx, gy, gz, nx, ny, nz)
+                _push_corner(position, force, reference, wrench, tool, c, wc, tc, gx, gy, gz, nx, ny, nz)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _span(position, a, b):
+    """From one node to another [m]."""
+    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
+
+
+@njit(forceinline=True, error_model="numpy")
+def _mean(values, a, b, c, wa, wb, wc):
+    """Three nodes' values by their weights."""
+    x = wa * values[a, 0] + wb * values[b, 0] + wc * values[c, 0]
+    y = wa * values[a, 1] + wb * values[b, 1] + wc * values[c, 1]
+    z = wa * values[a, 2] + wb * values[b, 2] + wc * values[c, 2]
+    return x, y, z
+
+
+@njit(forceinline=True, error_model="numpy")
+def _tool_velocity(twist, centre, tool, x, y, z):
+    """Velocity of a tool at a point [m/s]."""
+    ox = x - centre[tool, 0]
+    oy = y - centre[tool, 1]
+    oz = z - centre[tool, 2]
+    vx = twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy
+    vy = twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz
+    vz = twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox
+    return vx, vy, vz
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -135,7 +240,7 @@ def _is_held(engaged, shape, triangle):
     return False
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def closest_on_axis(ends, shape, x, y, z):
     """The point of a capsule's axis nearest to (x, y, z) [m]."""
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
@@ -151,145 +256,36 @@ def closest_on_axis(ends, shape, x, y, z):
     return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _release(engaged, stretch_memory, shape, item):
     """Forget the contact of one quadrature point with one shape."""
     engaged[shape, item] = 0
-    for axis in range(3):
-        stretch_memory[shape, item, axis] = 0.0
+    stretch_memory[shape, item, 0] = 0.0
+    stretch_memory[shape, item, 1] = 0.0
+    stretch_memory[shape, item, 2] = 0.0
 
 
-@njit(inline="always", error_model="numpy")
-def _add_point_contact(
-    surface, rest_area, position, velocity, force, engaged, stretch_memory, ends, radius, centre, twist, law, dt,
-    reference, wrench, shape, tool, triangle, point, nx, ny, nz, twice_area,
-):  # fmt: skip
-    """Contact of one quadrature point with one shape, by a penetration that keeps rising with depth.
-
-    With d from the shape's axis to the point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2)
-    the half chord, the line through the point along n leaves the ball t + s below the point. The energy per area is
-    (k_p / 2) g^2 with g = s (s + t) / r: to first order the radial penetration r - |d|, yet growing without bound as
-    the ball sinks below the surface, where a radial one falls again and lets the ball tunnel. Forces are its exact
-    gradient, the turning of n with the corners included, so that action and reaction balance, torque too.
-    A point engages where the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays
-    engaged until it parts, so that the far side of a thin organ is never taken for the near one.
-    """
-    item = triangle * QUADRATURE_COUNT + point
-    a = surface[triangle, 0]
-    b = surface[triangle, 1]
-    c = surface[triangle, 2]
-    wa = QUADRATURE_BARYCENTRIC[point, 0]
-    wb = QUADRATURE_BARYCENTRIC[point, 1]
-    wc = QUADRATURE_BARYCENTRIC[point, 2]
-    x = wa * position[a, 0] + wb * position[b, 0] + wc * position[c, 0]
-    y = wa * position[a, 1] + wb * position[b, 1] + wc * position[c, 1]
-    z = wa * position[a, 2] + wb * position[b, 2] + wc * position[c, 2]
-    px, py, pz = closest_on_axis(ends, shape, x, y, z)
-    dx = x - px
-    dy = y - py
-    dz = z - pz
-    t = dx * nx + dy * ny + dz * nz
-    rx = dx - t * nx
-    ry = dy - t * ny
-    rz = dz - t * nz
-    chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
-    if chord_squared <= 0.0:
-        _release(engaged, stretch_memory, shape, item)
-        return
-    s = math.sqrt(chord_squared)
-    depth = s + t
-    if depth <= 0.0 or (not engaged[shape, item] and t > 0.0):
-        _release(engaged, stretch_memory, shape, item)
-        return
-    engaged[shape, item] = 1
-
-    ox = x - centre[tool, 0]
-    oy = y - centre[tool, 1]
-    oz = z - centre[tool, 2]
-    vx = wa * velocity[a, 0] + wb * velocity[b, 0] + wc * velocity[c, 0]
-    vy = wa * velocity[a, 1] + wb * velocity[b, 1] + wc * velocity[c, 1]
-    vz = wa * velocity[a, 2] + wb * velocity[b, 2] + wc * velocity[c, 2]
-    vx -= twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy
-    vy -= twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz
-    vz -= twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox
-    # e: unit vector against the ball's own normal where the line along n leaves the ball.
-    ex = (s * nx - rx) / radius
-    ey = (s * ny - ry) / radius
-    ez = (s * nz - rz) / radius
-    closing = ex * vx + ey * vy + ez * vz
-    load = law.stiffness * depth + law.damping * closing
-    if load < 0.0:
-        load = 0.0
-    weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
-    scale = -weighted_area * load / (radius * radius)
-
-    # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the axis' direction inside a capsule.
-    gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
-    gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
-    gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
-    gx, gy, gz = _without_axis(ends, shape, px, py, pz, gx, gy, gz)
-
-    # Friction: a tangential spring that sticks until mu times the pressure, then slips.
-    ux = stretch_memory[shape, item, 0] + dt * vx
-    uy = stretch_memory[shape, item, 1] + dt * vy
-    uz = stretch_memory[shape, item, 2] + dt * vz
-    out_of_plane = ux * ex + uy * ey + uz * ez
-    ux -= out_of_plane * ex
-    uy -= out_of_plane * ey
-    uz -= out_of_plane * ez
-    stretch = math.sqrt(ux * ux + uy * uy + uz * uz)
-    longest = law.friction * load * s / radius / law.tangential_stiffness
-    if stretch > longest:
-        ux *= longest / stretch
-        uy *= longest / stretch
-        uz *= longest / stretch
-    stretch_memory[shape, item, 0] = ux
-    stretch_memory[shape, item, 1] = uy
-    stretch_memory[shape, item, 2] = uz
-    drag = law.tangential_stiffness * weighted_area
-    gx -= drag * ux
-    gy -= drag * uy
-    gz -= drag * uz
-
-    # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the gradient is along n.
-    bx = position[b, 0] - position[a, 0]
-    by = position[b, 1] - position[a, 1]
-    bz = position[b, 2] - position[a, 2]
-    cx = position[c, 0] - position[a, 0]
-    cy = position[c, 1] - position[a, 1]
-    cz = position[c, 2] - position[a, 2]
-    # rho . grad(lambda_b) = rho . (c x n) / (2 A) for the corner b, rho . (n x b) / (2 A) for the corner c.
-    turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
-    turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
-    turn = -scale * depth * depth
-    tb = turn * turn_b
-    tc = turn * turn_c
-    ta = -tb - tc
-    for corner in range(3):
-        if corner == 0:
-            node, weight, along_n = a, wa, ta
-        elif corner == 1:
-            node, weight, along_n = b, wb, tb
-        else:
-            node, weight, along_n = c, wc, tc
-        fx = weight * gx + along_n * nx
-        fy = weight * gy + along_n * ny
-        fz = weight * gz + along_n * nz
-        force[node, 0] += fx
-        force[node, 1] += fy
-        force[node, 2] += fz
-        ax = position[node, 0] - reference[tool, 0]
-        ay = position[node, 1] - reference[tool, 1]
-        az = position[node, 2] - reference[tool, 2]
-        wrench[tool, 0] -= fx
-        wrench[tool, 1] -= fy
-        wrench[tool, 2] -= fz
-        wrench[tool, 3] -= ay * fz - az * fy
-        wrench[tool, 4] -= az * fx - ax * fz
-        wrench[tool, 5] -= ax * fy - ay * fx
+@njit(forceinline=True, error_model="numpy")
+def _push_corner(position, force, reference, wrench, tool, node, weight, along_n, gx, gy, gz, nx, ny, nz):
+    """One corner's share of a point's force, weight g + along_n n, and the reaction to it."""
+    fx = weight * gx + along_n * nx
+    fy = weight * gy + along_n * ny
+    fz = weight * gz + along_n * nz
+    force[node, 0] += fx
+    force[node, 1] += fy
+    force[node, 2] += fz
+    ax = position[node, 0] - reference[tool, 0]
+    ay = position[node, 1] - reference[tool, 1]
+    az = position[node, 2] - reference[tool, 2]
+    wrench[tool, 0] -= fx
+    wrench[tool, 1] -= fy
+    wrench[tool, 2] -= fz
+    wrench[tool, 3] -= ay * fz - az * fy
+    wrench[tool, 4] -= az * fx - ax * fz
+    wrench[tool, 5] -= ax * fy - ay * fx
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
     """Drop the part along a capsule's axis where the nearest axis point lies strictly between the ends."""
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
@@ -300,7 +296,9 @@ def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
         along = (px - ends[shape, 0, 0]) * ux + (py - ends[shape, 0, 1]) * uy + (pz - ends[shape, 0, 2]) * uz
         if 0.0 < along < length_squared:
             share = (gx * ux + gy * uy + gz * uz) / length_squared
-            return gx - share * ux, gy - share * uy, gz - share * uz
+            gx -= share * ux
+            gy -= share * uy
+            gz -= share * uz
     return gx, gy, gz
 
 

@@ -87,7 +87,7 @@ def guard_axes(model, state, shapes, law, response, dt, candidate_count, referen
     return kept
 
 
-@njit(inline="always", error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def _hold_off(
     position, velocity, force, inverse_mass, twist, centre, mobility, dt, reference, wrench, tool, reach, stiffness,
     distance, ex, ey, ez, x, y, z, a, b, c, wb, wc,

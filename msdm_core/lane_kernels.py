@@ -244,11 +244,14 @@ def _touch(model, state, shapes, law, response, dt, reference, wrench):
         if not state.volume_ratio_smallest[0, lane] > 0.0:
             _stop(state, lane, FAULT_INVERTED_TET)
             continue
+        state.contact_kept[lane] = 1
+        if state.candidate_count[lane] == 0:
+            continue
         surface, touched, moved = _surface_of(model, lane), _touched_of(state, lane), shapes_of(shapes, lane)
         count, about, push = state.candidate_count[lane], reference[lane], wrench[lane]
         add_contact_forces(surface, touched, moved, law, dt, count, about, push)
-        kept = guard_axes(surface, touched, moved, law, response_of(response, lane), dt, count, about, push)
-        state.contact_kept[lane] = 1 if kept else 0
+        if not guard_axes(surface, touched, moved, law, response_of(response, lane), dt, count, about, push):
+            state.contact_kept[lane] = 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -13,7 +13,7 @@ WITH_AGENTS := --editable=.[dev,agents]
 
 PYTEST_ARGS ?= -n 2
 
-.PHONY: help demo test test-all test-agents lint clean distclean
+.PHONY: help demo test test-all test-agents bench lint clean distclean
 .NOTPARALLEL:
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo "make test         the tests (PYTEST_ARGS='-n 2' is the default)"
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
+	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
 	@echo "make lint         ruff and pyright"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
 	@echo "PYTHON=/path/to/python picks the interpreter (3.11 or newer) that $(VENV) is made from"
@@ -36,6 +37,9 @@ test-all: $(VENV)/.ready-dev
 
 test-agents: $(VENV)/.ready-agents
 	$(PY) -m pytest $(PYTEST_ARGS) -m "agents and not slow"
+
+bench: $(VENV)/.ready-bench
+	$(VENV)/bin/surgsim bench --out docs
 
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .
@@ -71,6 +75,10 @@ $(VENV)/.ready-dev: pyproject.toml $(VENV)/.made
 $(VENV)/.ready-agents: pyproject.toml $(VENV)/.made
 	$(call install,$(TORCH) $(WITH_AGENTS))
 	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
+
+$(VENV)/.ready-bench: pyproject.toml $(VENV)/.made
+	$(call install,--editable=.[bench])
+	@touch $(VENV)/.ready-demo
 
 ifneq ($(wildcard $(VENV)/.installing),)
 .PHONY: $(VENV)/.made

@@ -1,4 +1,4 @@
-"""The command line: `surgsim palpate`, `surgsim organ`, `surgsim scenes`, `surgsim validate`."""
+"""The command line: `surgsim palpate`, `surgsim organ`, `surgsim scenes`, `surgsim validate`, `surgsim bench`."""
 
 import contextlib
 import io
@@ -109,11 +109,25 @@ class Validate:
     """Folder for validation.md and images/. Default: docs/ of a checkout; runs/validation elsewhere or with --quick."""
 
 
+@dataclass(frozen=True)
+class Bench:
+    """Time the tissue, the environments and the start, beside MuJoCo flex and Newton; print and write the figures.
+
+    Prints `name value unit` lines and writes benchmarks.md. What is not installed is said to be absent.
+    """
+
+    quick: bool = False
+    """Smaller blocks and fewer repetitions: minutes instead of a quarter of an hour."""
+    out: MaybePath = None
+    """Folder for benchmarks.md. Default: docs/ of a checkout; runs/benchmarks elsewhere or with --quick."""
+
+
 Command = (
     Annotated[Palpate, tyro.conf.subcommand("palpate")]
     | Annotated[Organ, tyro.conf.subcommand("organ")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
 
@@ -143,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run(command: Palpate | Organ | Scenes | Validate) -> int:
+def _run(command: Palpate | Organ | Scenes | Validate | Bench) -> int:
     console = Console()
     if isinstance(command, Palpate):
         _palpate(command, console)
@@ -151,6 +165,10 @@ def _run(command: Palpate | Organ | Scenes | Validate) -> int:
         from surgsim_env.validation.command import validate
 
         return validate(quick=command.quick, folder=command.out, console=console)
+    elif isinstance(command, Bench):
+        from surgsim_env.bench.command import bench
+
+        return bench(quick=command.quick, folder=command.out, console=console)
     elif isinstance(command, Organ):
         from surgsim_env.organ_report import report_organ
 

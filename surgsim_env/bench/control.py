@@ -1,0 +1,122 @@
+"""Control steps a second of the palpation environment: one, and many in vector environments."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from surgsim_env.bench.effort import Effort
+from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
+from surgsim_env.bench.machine import core_count
+from surgsim_env.bench.statistics import median, spread
+
+SCENE = "phantom"
+ENV_ID = "SurgSim/Palpate-v0"
+# Control steps before the clock starts: at 20 mm/s the tip is on the tissue by then, from up to 6 mm above it.
+WARM_UP = 9
+METHOD = f"""Control steps of all environments together per second of wall clock, `{ENV_ID}` on `{SCENE}`, each
+environment with its own lesion and place. A policy presses until it feels 0.1 N and then strokes to and fro, so that
+nearly every haptic step is one in contact; resets are in the time where episodes end. "processes" is AsyncVectorEnv,
+one process an environment; "in turn" SyncVectorEnv, one core; {{cores}} cores here."""
+
+
+def make_env() -> gym.Env:
+    """One environment of the benchmark."""
+    import surgsim_env  # noqa: F401  registers the ids, also in a process of its own
+
+    return gym.make(ENV_ID, scene=SCENE)
+
+
+def stroke(observation: NDArray[Any], step: int) -> NDArray[np.float32]:
+    """Actions for observations (..., 10): down until 0.1 N, then to and fro."""
+    action = np.zeros((*observation.shape[:-1], 4), dtype=np.float32)
+    touching = np.linalg.norm(observation[..., 6:9], axis=-1) > 0.1
+    action[..., 2] = np.where(touching, 0.0, -1.0)
+    action[..., 0] = np.where(touching, 0.25 * (-1) ** step, 0.0)
+    return action
+
+
+class One:
+    """A single environment, stepped and reset as a vector environment would be."""
+
+    num_envs = 1
+
+    def __init__(self) -> None:
+        self.env = make_env()
+
+    def reset(self, *, seed: int) -> tuple[Any, Any]:
+        """Start an episode."""
+        return self.env.reset(seed=seed)
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Any, ...]:
+        """One control step; a reset where the episode is over."""
+        result = self.env.step(action)
+        return (self.env.reset()[0], *result[1:]) if result[2] or result[3] else result
+
+    def close(self) -> None:
+        """Nothing is held."""
+        self.env.close()
+
+
+def in_turn(count: int) -> Any:
+    """Gymnasium's SyncVectorEnv."""
+    return gym.vector.SyncVectorEnv([make_env] * count)
+
+
+def processes(count: int) -> Any:
+    """Gymnasium's AsyncVectorEnv."""
+    return gym.vector.AsyncVectorEnv([make_env] * count)
+
+
+def abreast(count: int) -> Any:
+    """Environments side by side in vector registers, one process."""
+    raise AbsentError("the lane-parallel environment is not in this version")
+
+
+def one(count: int) -> Any:
+    """No vector environment around it; of one only."""
+    assert count == 1
+    return One()
+
+
+# A row each; a way that this version lacks raises AbsentError.
+WAYS: dict[str, Callable[[int], Any]] = {"single": one, "in turn": in_turn, "processes": processes, "abreast": abreast}
+
+
+def rate(make: Callable[[], Any], steps: int) -> float:
+    """Control steps a second, all environments together."""
+    envs = make()
+    try:
+        observation = envs.reset(seed=0)[0]
+        for step in range(WARM_UP):
+            observation = envs.step(stroke(observation, step))[0]
+        begin = time.perf_counter()
+        for step in range(steps):
+            observation = envs.step(stroke(observation, step))[0]
+        return envs.num_envs * steps / (time.perf_counter() - begin)
+    finally:
+        envs.close()
+
+
+def measure(effort: Effort) -> Section:
+    """The rate of every way and count."""
+    section = Section("control_steps", "Control steps a second", METHOD.format(cores=core_count()))
+    for count in effort.env_counts:
+        steps = max(2, effort.control_steps // count)
+        quantity = f"{count} envs" if count > 1 else "1 env"
+        ways = {way: partial(make, count) for way, make in WAYS.items() if count == 1 or way != "single"}
+        rates: dict[str, list[float]] = {}
+        for _ in range(effort.control_rounds):
+            for way, make in list(ways.items()):
+                try:
+                    rates.setdefault(way, []).append(rate(make, steps))
+                except AbsentError as why:
+                    section.figures.append(absent(way, quantity, "1/s", why))
+                    del ways[way], rates[way]
+        for way, values in rates.items():
+            section.figures.append(Figure(way, quantity, median(values), "1/s", f"{quantity}: {spread(values)}"))
+    return section

@@ -1,0 +1,115 @@
+"""The press that every simulator is put to: a ball on a bonded block, the elements' force, this project's."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from msdm_core.kernels import OrganModel
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.bench.effort import Cells
+from surgsim_env.palpation.scan import press
+from surgsim_env.scenes import BlockMesh, MeshSource, make_scene
+from surgsim_env.simulation import Simulation
+from surgsim_env.validation.layer_fem import ball_force, layer
+from surgsim_env.validation.punch import DISC
+
+SIZE = (0.06, 0.06, 0.03)  # [m] of the block, x and y around 0, bottom at z = 0
+MODULUS, POISSON, DENSITY = 5000.0, 0.45, 1060.0
+RADIUS, DEPTH = 0.008, 0.004  # [m] of the ball, of the press
+SPEED, HOLD = 0.04, 0.1  # [m/s] on the way in, [s] at depth
+# So stiff a contact [N/m^3] is rigid to 0.4 % of the force.
+RIGID = 2e9
+# Where the ball is pressed: over the block's middle, and half a cell of the simulator's own mesh to its side.
+PLACES = (0.0, 0.5)
+
+
+class DivergedError(Exception):
+    """A peer's simulation came to grief; the message says how."""
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """One press: force at its end [N], time on the clock and of the processor [s], simulated time [s]."""
+
+    force: float
+    wall: float
+    processor: float
+    simulated: float
+
+
+class Clock:
+    """Wall clock and processor time since it was made."""
+
+    def __init__(self) -> None:
+        self._begin = time.perf_counter(), time.process_time()
+
+    def read(self) -> tuple[float, float]:
+        """Seconds of the one and the other."""
+        return time.perf_counter() - self._begin[0], time.process_time() - self._begin[1]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A simulator at one setting: its name, what it is set to, its mesh, and how it presses.
+
+    `press(offset)` takes the ball's place in cells of its own mesh, the same along x and y. `contact` is the stiffness
+    of contact [N/m^3] of the reference that its force is held against.
+    """
+
+    name: str
+    setting: str
+    mesh: str
+    press: Callable[[float], Pressed]
+    contact: float = RIGID
+
+
+def ball_height(when: float) -> float:
+    """Height of the ball's lowest point above the resting surface at a time of the press [m]."""
+    return -min(SPEED * when, DEPTH)
+
+
+def step_count(dt: float) -> int:
+    """How many steps of dt [s] a press takes."""
+    return round((DEPTH / SPEED + HOLD) / dt)
+
+
+@lru_cache(maxsize=4)
+def reference_force(contact: float) -> float:
+    """Force of the press by axisymmetric quadratic elements, small strains [N]; ImportError without scikit-fem."""
+    body = layer(DISC, SIZE[2], lambda r, _: np.full_like(r, MODULUS), POISSON)
+    return ball_force(body, RADIUS, DEPTH, contact)
+
+
+def organ_press(cells: Cells) -> Contender:
+    """This project: the scene `phantom` without its lesion, the whole product with its instrument in MuJoCo."""
+    scene = make_scene("phantom")
+    scene = replace(scene, mesh=MeshSource(block=BlockMesh(SIZE, cells)))
+    anatomy = load_anatomy(scene)
+    organ = anatomy.organ()
+    simulation = Simulation(anatomy)
+    # Compiles, or reads what was compiled.
+    _press_organ(simulation, organ, 0.0)
+    timing = scene.timing
+    return Contender(
+        "surgsim",
+        f"phantom, {timing.substep_count} explicit substeps in 1 ms, k_p {scene.contact.stiffness:g} N/m3, "
+        "alpha 25 1/s, force read every 1 ms",
+        f"{len(organ.node_mass)} nodes, {len(organ.tet_nodes)} tets",
+        lambda offset: _press_organ(simulation, organ, offset * SIZE[0] / cells[0]),
+        scene.contact.stiffness,
+    )
+
+
+def _press_organ(simulation: Simulation, organ: OrganModel, offset: float) -> Pressed:
+    up = np.array([0.0, 0.0, 1.0])
+    site = np.array([0.5 * SIZE[0] + offset, 0.5 * SIZE[1] + offset, SIZE[2]])
+    simulation.reset(organ, site + 0.03 * up)
+    clock = Clock()
+    pressed = press(simulation, site, up)
+    times = clock.read()
+    if pressed.end:
+        raise DivergedError(pressed.end)
+    return Pressed(pressed.force, *times, pressed.duration)

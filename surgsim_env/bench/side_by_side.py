@@ -1,0 +1,151 @@
+"""The same press in this project, in MuJoCo's flex and in Newton: time for a simulated second, and the force."""
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from surgsim_env.bench.effort import Effort
+from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
+from surgsim_env.bench.flex import Flex, fastest_within, longest_explicit
+from surgsim_env.bench.limits import LIMITS
+from surgsim_env.bench.newton_peer import Newton
+from surgsim_env.bench.presses import PLACES, Contender, DivergedError, organ_press, reference_force
+from surgsim_env.bench.statistics import median, spread
+
+# Flex at its own fastest step stays within this share of its force at 1 ms.
+SHARE = 0.02
+# What takes longer than this in a round [s] is not repeated.
+LONGEST_ROUND = 60.0
+NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] the explicit solver's, the longest that bears the press is taken
+METHOD = """One press of a frictionless ball of 8 mm, 4 mm deep at 40 mm/s and 0.1 s of rest, on a block of
+60 x 60 x 30 mm, E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each
+round. `wall` and `processor` are seconds of wall clock and of processor time per simulated second (1 is real time),
+medians; they differ where other processes took the core, and `ratio`, over this project's, is that of processor time.
+What takes longer than a minute a round is not repeated. Force is the mean of two places, over a node of the block's
+middle and half a cell aside; `error` is against axisymmetric quadratic finite elements with small strains:
+{references}. This project presses with its friction of 0.2
+(which a straight press barely feels), through its own contact law, with its instrument in MuJoCo and its force read
+at every haptic step; of a peer the force is read once, at the end. Grids of peers have their nodes on a cubic or
+nearly cubic grid, this project's on a body-centred lattice: as many nodes as the grid allows, not the same ones."""
+WALL, PROCESSOR, RATIO = ("wall", "s/s"), ("processor", "s/s"), ("ratio to surgsim", "1")
+FORCE, ERROR = ("force", "N"), ("error", "%")
+
+
+@dataclass
+class Tally:
+    """What a contender's presses took and gave."""
+
+    contender: Contender
+    walls: list[float] = field(default_factory=list)
+    processors: list[float] = field(default_factory=list)
+    forces: dict[float, float] = field(default_factory=dict)
+    fault: str = ""
+    longest: float = 0.0
+
+    def press(self) -> None:
+        """One round: a press at each place."""
+        if self.fault or (self.walls and self.longest > LONGEST_ROUND):
+            return
+        wall = processor = simulated = 0.0
+        for place in PLACES:
+            try:
+                pressed = self.contender.press(place)
+            except DivergedError as fault:
+                self.fault = f"diverged: {fault}"
+                return
+            wall, processor = wall + pressed.wall, processor + pressed.processor
+            simulated += pressed.simulated
+            self.forces[place] = pressed.force
+        self.longest = wall
+        self.walls.append(wall / simulated)
+        self.processors.append(processor / simulated)
+
+
+def measure(effort: Effort) -> Section:
+    """All contenders that are here, round by round; those that are not are named with the reason."""
+    references = "scikit-fem is absent, no error is given"
+    if importlib.util.find_spec("skfem") is not None:
+        references = f"{reference_force(organ_press(effort.organ_cells).contact):.4f} N with this project's contact "
+        references += f"stiffness, {reference_force(2e9):.4f} N with a rigid one, for the peers"
+    section = Section("side_by_side", "Beside MuJoCo flex and Newton", METHOD.format(references=references))
+    tallies = [Tally(organ_press(effort.organ_cells))]
+    for name, make in peers(effort):
+        try:
+            tallies.append(Tally(make()))
+        except (AbsentError, DivergedError) as why:
+            section.figures.append(absent(name, *WALL, why))
+    for _ in range(effort.press_rounds):
+        for tally in tallies:
+            tally.press()
+    section.figures[:0] = [figure for tally in tallies for figure in _figures(tally, tallies[0])]
+    return Section(section.key, section.heading, section.method, section.figures, LIMITS)
+
+
+def peers(effort: Effort) -> Iterator[tuple[str, Callable[[], Contender]]]:
+    """Name and maker of each peer at each setting; a maker may search for the setting, or find the peer absent."""
+    grid = effort.grid
+    yield "MuJoCo flex full, discrete 1 ms", lambda: _compiled(Flex(grid))
+    yield "MuJoCo flex full, discrete, fastest step", lambda: _fastest(grid, effort)
+    yield "MuJoCo flex full, Euler", lambda: _compiled(longest_explicit(grid))
+    for cells in ((1, 1, 1), (4, 4, 2), (6, 6, 3)):
+        name = "MuJoCo flex trilinear " + "x".join(map(str, cells))
+        yield name, lambda cells=cells: _compiled(Flex(grid, trilinear=cells))
+    yield "Newton explicit", lambda: _newton_explicit(grid)
+    yield "Newton vbd", lambda: Newton(grid, "vbd", 1e-3, damping=0.001).contender()
+
+
+def _compiled(flex: Flex) -> Contender:
+    try:
+        return flex.contender()
+    except ValueError as refused:
+        raise AbsentError(f"this MuJoCo refuses the model: {refused}") from None
+
+
+def _fastest(grid: tuple[int, int, int], effort: Effort) -> Contender:
+    """Flex at the step that is fastest while its force stays near that of 1 ms."""
+    base = Flex(grid)
+    force = _compiled(base).press(0.0).force
+    best, tried = fastest_within(base, force, effort.longer_steps, SHARE)
+    if best is None:
+        raise AbsentError(f"no longer step stays within {100 * SHARE:g} %: {'; '.join(tried)}")
+    found = best.contender()
+    setting = f"{found.setting}; against 1 ms: {', '.join(tried)}"
+    return Contender(
+        f"MuJoCo flex full, discrete, fastest step, {1e3 * best.dt:g} ms", setting, found.mesh, found.press
+    )
+
+
+def _newton_explicit(grid: tuple[int, int, int]) -> Contender:
+    """Newton's explicit solver at the longest step that bears the press."""
+    tried = []
+    for dt in NEWTON_STEPS:
+        contender = Newton(grid, "explicit", dt).contender()
+        try:
+            contender.press(0.0)
+        except DivergedError as fault:
+            tried.append(str(fault))
+            continue
+        setting = "; ".join([contender.setting, *tried])
+        return Contender(contender.name, setting, contender.mesh, contender.press)
+    raise DivergedError("diverged: " + "; ".join(tried))
+
+
+def _figures(tally: Tally, own: Tally) -> list[Figure]:
+    contender = tally.contender
+    if tally.fault or not tally.walls:
+        return [absent(contender.name, *WALL, f"{tally.fault}; {contender.setting}")]
+    processor = median(tally.processors)
+    force = sum(tally.forces.values()) / len(tally.forces)
+    places = " and ".join(f"{one:.4f}" for one in tally.forces.values())
+    note = f"{contender.mesh}; {contender.setting}; force {places} N; processor {spread(tally.processors)} s/s"
+    figures = [
+        Figure(contender.name, WALL[0], median(tally.walls), WALL[1], note),
+        Figure(contender.name, PROCESSOR[0], processor, PROCESSOR[1]),
+        Figure(contender.name, FORCE[0], force, FORCE[1]),
+    ]
+    if own.processors:
+        figures.append(Figure(contender.name, RATIO[0], processor / median(own.processors), RATIO[1]))
+    if importlib.util.find_spec("skfem") is not None:
+        error = 100.0 * (force / reference_force(contender.contact) - 1.0)
+        figures.append(Figure(contender.name, ERROR[0], error, ERROR[1]))
+    return figures

@@ -1,0 +1,80 @@
+"""How long a first step takes from a fresh interpreter, cold and warm, and what another environment costs in memory."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from surgsim_env.bench.effort import Effort
+from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
+from surgsim_env.bench.statistics import median, spread
+
+SCENE = "phantom"
+# A process that hangs is given up after so long [s].
+LIMIT = 600.0
+METHOD = f"""A fresh interpreter from its first import to the end of the first `step` of `SurgSim/Palpate-v0` on
+`{SCENE}`; cold is with an empty numba cache, warm with a full one. Memory is the growth of the process (resident set)
+per environment made and reset after the first two, each with its own lesion."""
+START = f"""
+import time; begin = time.perf_counter()
+import gymnasium as gym
+env = gym.make("surgsim_env:SurgSim/Palpate-v0", scene="{SCENE}")
+env.reset(seed=0); env.step(env.action_space.sample())
+print(time.perf_counter() - begin)
+"""
+GROWTH = f"""
+import gc, os
+import gymnasium as gym
+def resident():
+    gc.collect()
+    with open("/proc/self/statm") as stream:
+        return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def more(count):
+    for seed in range(count):
+        env = gym.make("surgsim_env:SurgSim/Palpate-v0", scene="{SCENE}")
+        env.reset(seed=seed); env.step(env.action_space.sample())
+        envs.append(env)
+envs = []
+more(2); before = resident(); more({{count}})
+print((resident() - before) / {{count}})
+"""
+
+
+def printed_number(code: str, environment: dict[str, str] | None = None) -> float:
+    """The number that a fresh interpreter prints last."""
+    # Python looks for modules in the folder where `-c` begins: that of the packages that run here.
+    folder = Path(__file__).resolve().parents[2]
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env={**os.environ, **(environment or {})}, capture_output=True,
+        text=True, timeout=LIMIT,
+    )  # fmt: skip
+    if run.returncode != 0:
+        raise AbsentError(f"a fresh interpreter ended with status {run.returncode}: {run.stderr.strip()[-200:]}")
+    return float(run.stdout.split()[-1])
+
+
+def measure(effort: Effort) -> Section:
+    """Cold and warm start, memory per environment."""
+    section = Section("start", "Start and memory", METHOD)
+    try:
+        with tempfile.TemporaryDirectory() as cache:
+            environment = {"NUMBA_CACHE_DIR": cache}
+            section.figures.append(Figure("start", "cold", printed_number(START, environment), "s"))
+            warm = [printed_number(START, environment) for _ in range(effort.starts)]
+        section.figures.append(Figure("start", "warm", median(warm), "s", f"warm: {spread(warm)}"))
+    except AbsentError as why:
+        section.figures.append(absent("start", "cold", "s", why))
+    section.figures.append(_memory(effort.memory_envs))
+    return section
+
+
+def _memory(count: int) -> Figure:
+    case, quantity = "memory", "per further env"
+    if not Path("/proc/self/statm").is_file():
+        return absent(case, quantity, "MB", "only measured where /proc tells the resident set (Linux)")
+    try:
+        growth = printed_number(GROWTH.format(count=count))
+    except AbsentError as why:
+        return absent(case, quantity, "MB", why)
+    return Figure(case, quantity, 1e-6 * growth, "MB", f"mean of {count}")

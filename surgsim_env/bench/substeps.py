@@ -1,0 +1,100 @@
+"""What one substep of an organ costs against its number of nodes: springs, volume term and integration."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from msdm_core.damping import Damping
+from msdm_core.kernels import FAULT_NONE, OrganModel
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, compile_organ, rest_state
+from msdm_core.regions import Material
+from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+from surgsim_env.bench.effort import Cells, Effort
+from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
+from surgsim_env.bench.statistics import exponent, interleaved, median, seconds_per_call, spread
+
+CELL = 0.005  # [m]
+# The exponent is that of blocks from so many nodes on: below, calls and start-up count.
+LEAST_NODES = 600
+METHOD = """Blocks of cubic 5 mm cells, E 5 kPa, nu 0.45, springs and volume term, no contact, one thread, bottom held,
+slightly sheared so that every force is at work. Microseconds of processor time per substep AND organ; medians, all
+sizes in turn in each round. A node or spring update is one node or spring in one substep."""
+
+Substep = Callable[[], float]
+
+
+def block(cells: Cells) -> OrganModel:
+    """A block of cubic cells, its bottom held."""
+    mesh = box_mesh(np.array(cells) * CELL, cells)
+    anchors = np.flatnonzero(mesh.points[:, 2] < 1e-9)
+    return compile_organ(OrganSpec(mesh, Material(5000.0, 1060.0, 0.45), anchors=anchors, damping=Damping(alpha=25.0)))
+
+
+def single(model: OrganModel) -> Substep:
+    """Seconds of one substep of one organ, float64."""
+    state = rest_state(model)
+    state.node_position[:, 0] += 0.01 * state.node_position[:, 2]
+    dt = 0.5 * model.stable_step
+    wrench = np.zeros((0, 6))
+
+    def advance(count: int) -> None:
+        if advance_organ(model, state, NO_SHAPES, NO_CONTACT, dt, count, wrench) != FAULT_NONE:
+            raise ValueError("the block that is timed came to grief: its substeps mean nothing")
+
+    advance(3)
+    return lambda: seconds_per_call(advance)
+
+
+def abreast(model: OrganModel) -> Substep:
+    """Seconds of one substep of each of many organs side by side in vector registers."""
+    raise AbsentError("organs side by side (lanes) are not in this version")
+
+
+# Ways of stepping: a column each. A way that this version or machine lacks raises AbsentError.
+WAYS: dict[str, Callable[[OrganModel], Substep]] = {"single": single, "abreast": abreast}
+
+
+def measure(effort: Effort) -> Section:
+    """The cost of a substep for every block and way, and how it grows."""
+    section = Section("substep", "Substep cost against node count", METHOD)
+    models = {f"{len(model.node_mass)} nodes": model for model in map(block, effort.blocks)}
+    runs: dict[str, Substep] = {}
+    lacking: dict[str, str] = {}
+    for way, make in WAYS.items():
+        for name, model in models.items():
+            try:
+                runs[f"{way} {name}"] = make(model)
+            except AbsentError as why:
+                lacking[way] = f"{way}: {why}"
+    times = interleaved(runs, effort.substep_rounds)
+    for way in WAYS:
+        for name, model in models.items():
+            if way in lacking:
+                section.figures.append(absent(name, way, "us", lacking[way]))
+            else:
+                section.figures.extend(_figures(way, name, model, times[f"{way} {name}"]))
+        if way not in lacking:
+            costs = {len(model.node_mass): median(times[f"{way} {name}"]) for name, model in models.items()}
+            section.figures.extend(_growth(way, costs))
+    return section
+
+
+def _figures(way: str, name: str, model: OrganModel, times: list[float]) -> list[Figure]:
+    """Cost and rates of one block."""
+    cost, nodes, springs = median(times), len(model.node_mass), len(model.spring_stiffness)
+    note = f"{springs} springs, {len(model.tet_nodes)} tets; {way}: {spread([1e6 * one for one in times])}"
+    return [
+        Figure(name, way, 1e6 * cost, "us", note),
+        Figure(name, f"node updates, {way}", 1e-6 * nodes / cost, "1e6/s"),
+        Figure(name, f"spring updates, {way}", 1e-6 * springs / cost, "1e6/s"),
+    ]
+
+
+def _growth(way: str, costs: dict[int, float]) -> list[Figure]:
+    """The exponent of cost against nodes, where there are two blocks that are large enough."""
+    sizes = [nodes for nodes in costs if nodes >= LEAST_NODES]
+    if len(sizes) < 2:
+        return []
+    note = f"p of cost ~ nodes^p, {min(sizes)} to {max(sizes)} nodes"
+    return [Figure("exponent", f"exponent, {way}", exponent(sizes, [costs[nodes] for nodes in sizes]), "1", note)]

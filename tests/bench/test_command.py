@@ -1,0 +1,53 @@
+"""`surgsim bench` as a user meets it, on the smallest of everything: lines, report, absent peers, exit status."""
+
+import re
+
+import pytest
+
+from surgsim_env.bench import effort, newton_peer, side_by_side, start
+from surgsim_env.bench.effort import Effort
+from surgsim_env.bench.figures import AbsentError
+from surgsim_env.cli import main
+
+TINY = Effort(
+    blocks=((4, 4, 4), (7, 7, 5), (8, 8, 5)), substep_rounds=1, scenes=("bovine_liver_block",), haptic_steps=20,
+    env_counts=(1, 2), control_steps=2, control_rounds=1, organ_cells=(6, 6, 3), grid=(4, 4, 3), press_rounds=1,
+    longer_steps=(2,), starts=1, memory_envs=1,
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:scene:UserWarning")
+def test_bench(tmp_path, monkeypatch, capsys):
+    def missing(name: str):
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(effort, "QUICK", TINY)
+    monkeypatch.setattr(newton_peer, "import_module", missing)
+    monkeypatch.setattr(side_by_side, "reference_force", lambda contact: 0.2)
+    # Starts from an empty cache take half a minute.
+    monkeypatch.setattr(start, "printed_number", lambda code, environment=None: 1.5)
+    assert main(["bench", "--quick", "--out", str(tmp_path / "deep")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith("written: ")
+    for line in lines[:-1]:
+        assert re.fullmatch(r"\S+ (-?[\d.e+-]+|nan|absent) \S+( \(.*\))?", line), line
+    for name in ("substep/189_nodes/single", "substep/exponent", "haptic_step/bovine_liver_block/p99",
+                 "control_steps/single/1_env", "control_steps/processes/2_envs", "side_by_side/surgsim/force",
+                 "start/start/warm 1.5 s"):  # fmt: skip
+        assert any(line.startswith(name) for line in lines), name
+    report = (tmp_path / "deep" / "benchmarks.md").read_text(encoding="utf-8")
+    for name in ("Newton explicit", "Newton vbd"):
+        assert re.search(rf"\| {name} \| absent \|.*not installed", report)
+    assert "trilinear 1x1x1" in report and "What each can give" in report
+
+
+def test_no_folder_can_be_made_of_a_file(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["bench", "--quick", "--out", str(tmp_path / "file")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_fresh_interpreter_prints_a_number_or_is_absent():
+    assert start.printed_number("import os; print('noise'); print(os.environ['MARK'])", {"MARK": "2.5"}) == 2.5
+    with pytest.raises(AbsentError, match="status 1"):
+        start.printed_number("raise SystemExit('no')")

@@ -1,0 +1,55 @@
+"""Figures as lines and tables: names without blanks, what is absent said with its reason, notes kept."""
+
+from surgsim_env.bench.figures import Figure, Section, absent
+from surgsim_env.bench.machine import describe, version
+from surgsim_env.bench.report import NOTES_NAME, REPORT_NAME, write_report
+
+SECTION = Section(
+    "press",
+    "Presses",
+    "A method.",
+    [
+        Figure("one peer", "wall", 12.3456, "s/s", "its setting"),
+        Figure("one peer", "force", 0.25, "N"),
+        absent("another", "wall", "s/s", "not\n installed"),
+    ],
+    "A closing.",
+)
+
+
+def test_lines():
+    assert SECTION.lines() == [
+        "press/one_peer/wall 12.35 s/s",
+        "press/one_peer/force 0.25 N",
+        "press/another/wall absent s/s (not installed)",
+    ]
+
+
+def test_table():
+    text = SECTION.markdown()
+    assert "## Presses\n\nA method.\n" in text
+    assert "|  | wall [s/s] | force [N] | note |" in text
+    assert "| one peer | 12.35 | 0.25 | its setting |" in text
+    assert "| another | absent |  | not installed |" in text
+    assert text.endswith("A closing.\n")
+
+
+def test_table_without_notes_has_no_column_for_them():
+    assert "| a | 1 |\n" in Section("k", "h", "m", [Figure("a", "q", 1.0, "1")]).markdown()
+
+
+def test_notes_by_hand_are_kept(tmp_path):
+    (tmp_path / NOTES_NAME).write_text("## What was tried\n\nNothing.\n", encoding="utf-8")
+    for _ in range(2):
+        write_report([SECTION], "* machine: this one", tmp_path, quick=True)
+    text = (tmp_path / REPORT_NAME).read_text(encoding="utf-8")
+    assert text.count("## What was tried") == 1
+    assert text.index("machine: this one") < text.index("## Presses") < text.index("## What was tried")
+    assert "`surgsim bench --quick`" in text
+
+
+def test_machine_names_versions_and_absent_packages():
+    text = describe("0.5")
+    assert f"mujoco {version('mujoco')}" in text
+    assert version("no-such-package-as-this") == "absent"
+    assert "cores of" in text and "date: 20" in text

@@ -116,8 +116,9 @@ class Newton:
             times = clock.read()
             # After the swap `then` is the state whose forces made the last step.
             total = then.body_f.numpy()[ball, 2] if force is None else force.contact_f.numpy()[:, 2].sum()
-        if not math.isfinite(total) or not np.isfinite(now.particle_q.numpy()).all():
-            raise DivergedError(f"not finite at steps of {1e3 * self.dt:g} ms")
+        fault = _fault(now.particle_q.numpy(), model.tet_indices.numpy())
+        if fault or not math.isfinite(total):
+            raise DivergedError(f"{fault or 'the force is not finite'} at steps of {1e3 * self.dt:g} ms")
         return Pressed(abs(float(total)), *times, steps * self.dt)
 
     def _place(self, now: Any, then: Any, ball: int, centre: tuple[float, float, float], step: int) -> None:
@@ -125,6 +126,18 @@ class Newton:
         for state in (now, then):
             state.body_q.numpy()[ball] = (*centre, 0.0, 0.0, 0.0, 1.0)
             state.body_qd.numpy()[ball] = (0.0, 0.0, -SPEED if going else 0.0, 0.0, 0.0, 0.0)
+
+
+def _fault(points: Any, tets: Any) -> str:
+    """What is wrong with a state: numbers that are not finite, tets inside out; "" where nothing is.
+
+    The explicit solver says nothing when its step is too long: what it has left may be finite, and means nothing.
+    """
+    if not np.isfinite(points).all():
+        return "positions are not finite"
+    corners = points[tets].astype(np.float64)
+    inverted = int((np.linalg.det(corners[:, 1:] - corners[:, :1]) <= 0.0).sum())
+    return f"{inverted} tets inside out" if inverted else ""
 
 
 def modules() -> tuple[Any, Any]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import mujoco
+import numpy as np
 import pytest
 
 from surgsim_env.bench import newton_peer, side_by_side
@@ -97,3 +98,10 @@ def test_a_peer_that_diverges_is_named_with_its_setting(monkeypatch):
     assert by_name["wall"] == 2.0 and by_name["ratio to surgsim"] == 1.0
     if "error" in by_name:
         assert by_name["error"] == pytest.approx(50.0)
+
+
+def test_a_tet_inside_out_is_a_fault():
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert newton_peer._fault(points, np.array([[0, 1, 2, 3]])) == ""
+    assert newton_peer._fault(points, np.array([[0, 1, 2, 3], [0, 2, 1, 3]])) == "1 tets inside out"
+    assert newton_peer._fault(points * np.nan, np.array([[0, 1, 2, 3]])) == "positions are not finite"

@@ -7,10 +7,10 @@ import pytest
 import surgsim_env  # noqa: F401
 
 pytestmark = pytest.mark.agents
+pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 
 
 def vector(mode: str = "SameStep"):
-    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
     return gym.make_vec(
         "SurgSim/Palpate-v0", num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}
     )

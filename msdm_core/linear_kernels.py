@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def multiply_stiffness(
     rest, nodes, stiffness, tets, rest_volume, bulk, node_rest_volume, node_bulk, displacement, pressure, force
 ):
@@ -54,7 +54,7 @@ def multiply_stiffness(
             force[a, 2] -= scale * gz
 
 
-@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, inline="always", nogil=True, error_model="numpy")
 def _volume_change(rest, tets, tet, displacement):
     """Change of one tet's volume to first order in a displacement [m^3]."""
     a = np.uint32(tets[tet, 0])
@@ -70,7 +70,7 @@ def _volume_change(rest, tets, tet, displacement):
     return change
 
 
-@njit(cache=True, inline="always", nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, inline="always", nogil=True, error_model="numpy")
 def _corner_gradient(position, tets, tet, corner):
     """dV/dx of corner 1, 2 or 3 of one tet [m^2]: a sixth of the cross product of the edges to the next two."""
     a = np.uint32(tets[tet, 0])

@@ -113,6 +113,7 @@ class Simulation:
         self._wrench[:] = 0.0
         self._step = 0
         self.fault = ""
+        self._taken = None
 
     def haptic_step(self) -> bool:
         """Advance by one haptic step; False, with `fault` saying why, where the organ or MuJoCo came to grief."""

@@ -35,14 +35,15 @@ def compiled_copy(folder: Path, name: str, text: str) -> ModuleType:
 
 
 def volume_arguments(model: Any) -> tuple:
-    """Arguments of `add_volume_forces` for a scene's organ at rest."""
+    """Arguments of `add_tet_forces` for a scene's organ at rest."""
     from msdm_core.organ import rest_state
 
     state = rest_state(model)
     state.row_position[:, :3] = model.node_rest_position
     return (
-        state.row_position, state.row_force, state.node_tension, model.tet_nodes, model.tet_rest_volume, model.tet_bulk,
-        model.tet_averaged_bulk, state.volume_ratio_smallest,
+        state.row_position, state.row_force, state.node_tension, model.tet_nodes, model.tet_inverse_volume,
+        model.tet_bulk, model.tet_averaged_bulk, model.spring_stiffness, model.spring_rest_length,
+        state.volume_ratio_smallest,
     )  # fmt: skip
 
 
@@ -77,7 +78,7 @@ def main() -> None:
     dt = 0.5 * model.stable_step
     with tempfile.TemporaryDirectory() as folder:
         runs = {
-            name: (compiled_copy(Path(folder), f"{name}_kernels", source).add_volume_forces, volume_arguments(model))
+            name: (compiled_copy(Path(folder), f"{name}_kernels", source).add_tet_forces, volume_arguments(model))
             for name, source in (("watching", text), ("blind", text.replace(WATCH, "")))
         }
         runs["substep"] = (advance_organ, (model, state, NO_SHAPES, NO_CONTACT, dt, 1, wrench))

@@ -6,7 +6,7 @@ to the bit as far as the order of their sums does.
 
 from numba import njit
 
-from msdm_core.vector import below_zero, root
+from msdm_core.vector import any_below, below_zero, root
 
 # Below this volume ratio s a tet also bears the share K' of its volume term that is averaged at nodes, and ever more of
 # it: an average lets single tets collapse between swollen neighbours. Its energy K' s V0 ((J - s) - s ln(J / s)) has no
@@ -71,15 +71,23 @@ def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     That is K (J - 1) of its own; the mean of the volumes averaged at its corners; and,
     where it is squeezed below s = SQUEEZED_RATIO, K' (J - s) s / J of the share K' that is averaged.
     """
-    squeezed = below_zero(ratio - SQUEEZED_RATIO) * (SQUEEZED_RATIO / ratio)
-    tension = bulk * (ratio - 1.0) + averaged_tension + averaged_bulk * squeezed
+    tension = bulk * (ratio - 1.0) + averaged_tension
+    # A quotient takes as long as ten products: only where there is something to add.
+    if any_below(ratio, SQUEEZED_RATIO):
+        tension = tension + averaged_bulk * (below_zero(ratio - SQUEEZED_RATIO) * (SQUEEZED_RATIO / ratio))
     return tension * (-1.0 / 6.0)
 
 
 @njit(forceinline=True, error_model="numpy")
-def node_tension(sum_of_six_volumes, rest_volume, bulk):
+def volume_ratio(six_volume, inverse_volume):
+    """V / V0 of a tet from six times its volume and 1 / V0."""
+    return six_volume * (inverse_volume * (1.0 / 6.0))
+
+
+@njit(forceinline=True, error_model="numpy")
+def node_tension(sum_of_six_volumes, inverse_volume, bulk):
     """Tension of the volume averaged at a node, K_a (J_a - 1) [Pa] (averaged volumes: Bonet and Burton 1998).
 
     The sum holds 24 times that volume: six for the box product, four for the quarter that each tet gives.
     """
-    return bulk * (sum_of_six_volumes / (24.0 * rest_volume) - 1.0)
+    return bulk * (sum_of_six_volumes * (inverse_volume * (1.0 / 24.0)) - 1.0)

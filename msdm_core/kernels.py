@@ -17,8 +17,8 @@ from msdm_core.guard_kernels import guard_axes
 from msdm_core.tissue_kernels import (
     add_spring_damping,
     add_spring_forces,
+    add_tet_forces,
     add_volume_damping,
-    add_volume_forces,
     add_volume_rates,
     integrate,
     set_gravity,
@@ -41,14 +41,16 @@ class OrganModel(NamedTuple):
         node_rest_position: undeformed position [m]                              (n_node, 3)
         node_mass: lumped mass [kg]                                              (n_node,)
         node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node,)
-        spring_nodes: the two nodes of each spring                               (n_spring, 2)
+        spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
         spring_stiffness: [N/m]                                                  (n_spring,)
         spring_rest_length: [m]                                                  (n_spring,)
         tet_nodes: corners of each tet                                           (n_tet, 4)
         tet_rest_volume: [m^3]                                                   (n_tet,)
+        tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,)
         tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet,)
         tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet,)
         node_rest_volume: volume averaged at a node, a quarter of its tets [m^3] (n_node,)
+        node_inverse_volume: 1 / that [1/m^3]                                    (n_node,)
         node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node,)
         averages_volume: whether any node_bulk is above 0                        scalar
         surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
@@ -67,9 +69,11 @@ class OrganModel(NamedTuple):
     spring_rest_length: FloatArray
     tet_nodes: NDArray[np.int32]
     tet_rest_volume: FloatArray
+    tet_inverse_volume: FloatArray
     tet_bulk: FloatArray
     tet_averaged_bulk: FloatArray
     node_rest_volume: FloatArray
+    node_inverse_volume: FloatArray
     node_bulk: FloatArray
     averages_volume: bool
     surface_triangles: NDArray[np.int32]
@@ -225,7 +229,9 @@ def _evaluate(model, rows):
     position, velocity, force, tension = rows.node_position, rows.node_velocity, rows.node_force, rows.node_tension
     tets, beta = model.tet_nodes, model.beta
     set_gravity(force, model.node_mass, model.gravity)
-    add_spring_forces(position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length)
+    add_spring_forces(
+        position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0]
+    )
     if beta > 0.0:
         add_spring_damping(position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
     tension[:] = 0.0
@@ -233,13 +239,13 @@ def _evaluate(model, rows):
         sum_volumes(position, tension, tets)
         if beta > 0.0:
             add_volume_rates(position, velocity, tension, tets, beta)
-        set_node_tension(tension, model.node_rest_volume, model.node_bulk)
-    add_volume_forces(
-        position, force, tension, tets, model.tet_rest_volume, model.tet_bulk, model.tet_averaged_bulk,
-        rows.volume_ratio_smallest,
+        set_node_tension(tension, model.node_inverse_volume, model.node_bulk)
+    add_tet_forces(
+        position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
+        model.spring_stiffness, model.spring_rest_length, rows.volume_ratio_smallest,
     )  # fmt: skip
     if beta > 0.0:
-        add_volume_damping(position, velocity, force, tets, model.tet_rest_volume, model.tet_bulk, beta)
+        add_volume_damping(position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

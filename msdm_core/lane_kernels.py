@@ -29,8 +29,8 @@ from msdm_core.kernels import (
 from msdm_core.lane_tissue_kernels import (
     add_spring_damping,
     add_spring_forces,
+    add_tet_forces,
     add_volume_damping,
-    add_volume_forces,
     average_volumes,
     integrate,
     put_back,
@@ -50,14 +50,14 @@ class LaneModel(NamedTuple):
     Fields:
         node_mass: lumped mass [kg]                                              (n_node, n_lane)
         node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node, n_lane)
-        spring_nodes: the two nodes of each spring                               (n_spring, 2)
+        spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
         spring_stiffness: [N/m]                                                  (n_spring, n_lane)
         spring_rest_length: [m]                                                  (n_spring,)
         tet_nodes: corners of each tet                                           (n_tet, 4)
-        tet_rest_volume: [m^3]                                                   (n_tet,)
+        tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,)
         tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet, n_lane)
         tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet, n_lane)
-        node_rest_volume: volume averaged at a node [m^3]                        (n_node,)
+        node_inverse_volume: 1 / volume averaged at a node [1/m^3]               (n_node,)
         node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node, n_lane)
         averages_volume: whether any node_bulk of the lane is above 0            (n_lane,)
         node_rest_position: undeformed position [m]                              (n_node, 3)
@@ -75,10 +75,10 @@ class LaneModel(NamedTuple):
     spring_stiffness: LaneArray
     spring_rest_length: FloatArray
     tet_nodes: NDArray[np.int32]
-    tet_rest_volume: FloatArray
+    tet_inverse_volume: FloatArray
     tet_bulk: LaneArray
     tet_averaged_bulk: LaneArray
-    node_rest_volume: FloatArray
+    node_inverse_volume: FloatArray
     node_bulk: LaneArray
     averages_volume: NDArray[np.bool_]
     node_rest_position: FloatArray
@@ -217,22 +217,24 @@ def _evaluate(model, state):
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     tension, tets, beta = state.node_tension, model.tet_nodes, model.beta
     set_gravity(force, model.node_mass, model.gravity)
-    add_spring_forces(position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length)
+    add_spring_forces(
+        position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0]
+    )
     if beta > 0.0:
         add_spring_damping(position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
     averages = False
     for lane in range(model.averages_volume.shape[0]):
         averages = averages or model.averages_volume[lane]
     if averages:
-        average_volumes(position, velocity, tension, tets, model.node_rest_volume, model.node_bulk, beta)
+        average_volumes(position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
     else:
         tension[:, :] = 0.0
-    add_volume_forces(
-        position, force, tension, tets, model.tet_rest_volume, model.tet_bulk, model.tet_averaged_bulk,
-        state.volume_ratio_smallest, state.moving,
+    add_tet_forces(
+        position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
+        model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
     )  # fmt: skip
     if beta > 0.0:
-        add_volume_damping(position, velocity, force, tets, model.tet_rest_volume, model.tet_bulk, beta)
+        add_volume_damping(position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -15,6 +15,7 @@ from msdm_core.element_kernels import (
     spring_scale,
     tet_scale,
     tet_shape,
+    volume_ratio,
 )
 from msdm_core.vector import keep_lower, load_lanes, spread_like, store_lanes
 
@@ -99,9 +100,9 @@ def put_back(values, kept, moving):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_forces(position, force, nodes, stiffness, rest_length):
-    """Springs: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
-    for spring in range(nodes.shape[0]):
+def add_spring_forces(position, force, nodes, stiffness, rest_length, begin):
+    """Springs from one on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
+    for spring in range(begin, nodes.shape[0]):
         x, y, z = _difference(position, nodes, spring, 1)
         scale = spring_scale(x, y, z, load_lanes(stiffness, spring), spread_like(position, rest_length[spring]))
         x, y, z = x * scale, y * scale, z * scale
@@ -128,7 +129,7 @@ def _three_edges(values, tets, tet):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def average_volumes(position, velocity, tension, tets, node_rest_volume, node_bulk, beta):
+def average_volumes(position, velocity, tension, tets, node_inverse_volume, node_bulk, beta):
     """Tension of the volumes averaged at nodes [Pa], K_a (J_a - 1), with beta's share."""
     tension[:, :] = 0.0
     for tet in range(tets.shape[0]):
@@ -139,14 +140,14 @@ def average_volumes(position, velocity, tension, tets, node_rest_volume, node_bu
             gradients, _ = tet_shape(*_three_edges(position, tets, tet))
             _share(tension, tets, tet, beta * six_rates(*_three_edges(velocity, tets, tet), gradients))
     for node in range(tension.shape[0]):
-        rest = spread_like(position, node_rest_volume[node])
-        store_lanes(tension, node, node_tension(load_lanes(tension, node), rest, load_lanes(node_bulk, node)))
+        inverse = spread_like(position, node_inverse_volume[node])
+        store_lanes(tension, node, node_tension(load_lanes(tension, node), inverse, load_lanes(node_bulk, node)))
 
 
 @njit(forceinline=True, error_model="numpy")
-def _push(force, tets, tet, scale, g):
-    """Forces of a tet on its corners."""
-    bx, by, bz = scale * g[0], scale * g[1], scale * g[2]
+def _push(force, tets, tet, scale, g, pull, edge):
+    """Forces of a tet on its corners, and of the spring along its first edge."""
+    bx, by, bz = scale * g[0] - pull * edge[0], scale * g[1] - pull * edge[1], scale * g[2] - pull * edge[2]
     cx, cy, cz = scale * g[3], scale * g[4], scale * g[5]
     dx, dy, dz = scale * g[6], scale * g[7], scale * g[8]
     _subtract(force, tets[tet, 0], bx + cx + dx, by + cy + dy, bz + cz + dz)
@@ -156,30 +157,32 @@ def _push(force, tets, tet, scale, g):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_forces(position, force, tension, tets, rest_volume, bulk, averaged_bulk, low, moving):
+def add_tet_forces(
+    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving
+):  # fmt: skip
     """Volume terms, as in `tissue_kernels`; keeps the smallest V / V0 seen of every organ that moves, (1, organ)."""
     lowest = load_lanes(low, 0)
     for tet in range(tets.shape[0]):
-        gradients, six = tet_shape(*_three_edges(position, tets, tet))
-        ratio = six / spread_like(position, 6.0 * rest_volume[tet])
+        edge, third, fourth = _three_edges(position, tets, tet)
+        gradients, six = tet_shape(edge, third, fourth)
+        ratio = volume_ratio(six, spread_like(position, inverse_volume[tet]))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
         averaged = 0.25 * (
             load_lanes(tension, a) + load_lanes(tension, b) + load_lanes(tension, c) + load_lanes(tension, d)
         )
         scale = tet_scale(ratio, load_lanes(bulk, tet), load_lanes(averaged_bulk, tet), averaged)
-        _push(force, tets, tet, scale, gradients)
+        length = spread_like(position, rest_length[tet])
+        pull = spring_scale(edge[0], edge[1], edge[2], load_lanes(stiffness, tet), length)
+        _push(force, tets, tet, scale, gradients, pull, edge)
     store_lanes(low, 0, _where_moving(load_lanes(moving, 0), lowest, load_lanes(low, 0)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta):
+def add_volume_damping(position, velocity, force, tets, inverse_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
     for tet in range(tets.shape[0]):
         gradients, _ = tet_shape(*_three_edges(position, tets, tet))
-        rate = (
-            beta
-            * six_rates(*_three_edges(velocity, tets, tet), gradients)
-            / spread_like(position, 6.0 * rest_volume[tet])
-        )
-        _push(force, tets, tet, load_lanes(bulk, tet) * rate * (-1.0 / 6.0), gradients)
+        six_rate = six_rates(*_three_edges(velocity, tets, tet), gradients)
+        rate = beta * volume_ratio(six_rate, spread_like(position, inverse_volume[tet]))
+        _push(force, tets, tet, load_lanes(bulk, tet) * rate * (-1.0 / 6.0), gradients, rate * 0.0, gradients)

@@ -23,6 +23,7 @@ from msdm_core.grading import (
 from msdm_core.lattice import lattice_around
 from msdm_core.mesh import TET_FACES, TetMesh, tet_volumes
 from msdm_core.octree import balanced_levels, octree_tets
+from msdm_core.ordering import swept
 from msdm_core.stuffing import stuff
 from msdm_core.surface import check_surface, surface_volume
 
@@ -74,7 +75,7 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
     centre_places = (np.stack(np.unravel_index(np.arange(centres.size), centres.shape), axis=1) + 0.5) / counts
     points = np.concatenate([corner_places, centre_places]) * lengths
     tets = np.concatenate([_face_tets(corners, centres, axis) for axis in range(3)])
-    return TetMesh(points, _positive(points, tets))
+    return _swept_mesh(points, tets)
 
 
 def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Array]:
@@ -117,7 +118,7 @@ def _graded_box(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_l
     used, renumbered = np.unique(octree_tets(balanced_levels(permitted)), return_inverse=True)
     grid_places = np.stack(np.unravel_index(used, tuple(2 * counts + 1)), axis=1)
     points = grid_places / (2 * counts) * lengths
-    return TetMesh(points, _positive(points, renumbered.reshape(-1, 4)))
+    return _swept_mesh(points, renumbered.reshape(-1, 4))
 
 
 def _face_tets(corners: Int64Array, centres: Int64Array, axis: int) -> Int64Array:
@@ -186,7 +187,7 @@ def mesh_surface(
     finer = f"a coarse_cell_size below {coarse_cell_size:g} m" if coarsest else f"a cell_size below {size:g} m"
     tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), finer)
     used, renumbered = np.unique(tets, return_inverse=True)
-    mesh = TetMesh(nodes[used], renumbered.reshape(-1, 4))
+    mesh = _swept_mesh(nodes[used], renumbered.reshape(-1, 4))
     _warn_of_pinches(mesh, finer)
     return mesh
 
@@ -208,6 +209,11 @@ def _check_cell_size(points: FloatArray, corners: Int64Array, size: float) -> No
             f"cell_size {size:g} m would give about {tet_count:.3g} tets in {grid_count / 8:.3g} cells; the rule is "
             f"at most {TET_LIMIT:g} tets: use {1.05 * finest:.2g} m or more (is the surface in metres?)"
         )
+
+
+def _swept_mesh(points: FloatArray, tets: Int64Array) -> TetMesh:
+    """The mesh of tets turned right side out, in the kernels' favourite order."""
+    return TetMesh(points, _positive(points, tets)[swept(points, tets)])
 
 
 def _positive(points: FloatArray, tets: Int64Array) -> Int64Array:

@@ -15,6 +15,7 @@ from msdm_core.kernels import FAULT_NONE, OrganModel, OrganState, evaluate_force
 from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.ordering import spring_order
 from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
 from msdm_core.stability import largest_frequency, step_limit
 from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
@@ -68,6 +69,8 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     if spec.capsule is not None and spec.capsule.thickness is not None:
         stiffness = stiffness + membrane_stiffness(mesh, spec.capsule.youngs_modulus, spec.capsule.thickness)
     mass = lump_mass(mesh, density, scheme=spec.mass_scheme)
+    order = spring_order(mesh)
+    nodes, stiffness = nodes[order.springs], stiffness[order.springs]
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
     corners = mesh.points[surface]
@@ -79,11 +82,13 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         spring_nodes=_read_only(nodes),
         spring_stiffness=_read_only(stiffness),
         spring_rest_length=_read_only(np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
-        tet_nodes=_read_only(mesh.tets),
+        tet_nodes=_read_only(order.tet_nodes),
         tet_rest_volume=_read_only(mesh.volumes),
+        tet_inverse_volume=_read_only(1.0 / mesh.volumes),
         tet_bulk=_read_only(bulk - averaged_bulk),
         tet_averaged_bulk=_read_only(averaged_bulk),
         node_rest_volume=_read_only(node_volume),
+        node_inverse_volume=_read_only(1.0 / node_volume),
         node_bulk=_read_only(node_bulk),
         averages_volume=bool(node_bulk.any()),
         surface_triangles=_read_only(np.ascontiguousarray(surface)),

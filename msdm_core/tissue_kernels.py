@@ -15,6 +15,7 @@ from msdm_core.element_kernels import (
     tet_gradients,
     tet_scale,
     tet_shape,
+    volume_ratio,
 )
 from msdm_core.vector import (
     define_extract,
@@ -129,10 +130,10 @@ def integrate(position, velocity, force, inverse_mass, dt, decay):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_forces(position, force, nodes, stiffness, rest_length):
-    """Springs: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
-    whole = nodes.shape[0] // GROUP * GROUP
-    for first in range(0, whole, GROUP):
+def add_spring_forces(position, force, nodes, stiffness, rest_length, begin):
+    """Springs from one on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
+    whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
+    for first in range(begin, whole, GROUP):
         r0, r1 = _edge(position, nodes, first, 1), _edge(position, nodes, first + 1, 1)
         r2, r3 = _edge(position, nodes, first + 2, 1), _edge(position, nodes, first + 3, 1)
         r4, r5 = _edge(position, nodes, first + 4, 1), _edge(position, nodes, first + 5, 1)
@@ -200,10 +201,10 @@ def _three_edges(values, tets, tet):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def set_node_tension(total, node_rest_volume, node_bulk):
+def set_node_tension(total, node_inverse_volume, node_bulk):
     """From the sums at nodes to the tension of the volumes averaged there, K_a (J_a - 1) [Pa]."""
     for node in range(total.shape[0]):
-        total[node] = node_tension(total[node], node_rest_volume[node], node_bulk[node])
+        total[node] = node_tension(total[node], node_inverse_volume[node], node_bulk[node])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -215,12 +216,12 @@ def add_volume_rates(position, velocity, total, tets, beta):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_damping(position, velocity, force, tets, rest_volume, bulk, beta):
+def add_volume_damping(position, velocity, force, tets, inverse_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
     for tet in range(tets.shape[0]):
         gradients, _ = tet_shape(*_three_edges(position, tets, tet))
-        rate = beta * six_rates(*_three_edges(velocity, tets, tet), gradients) / (6.0 * rest_volume[tet])
-        _push_one(force, tets, tet, bulk[tet] * rate * (-1.0 / 6.0), gradients)
+        rate = beta * volume_ratio(six_rates(*_three_edges(velocity, tets, tet), gradients), inverse_volume[tet])
+        _push_one(force, tets, tet, bulk[tet] * rate * (-1.0 / 6.0), gradients, 0.0, gradients)
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -230,20 +231,22 @@ def _corner_tension(tension, tets, tet):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_forces(position, force, tension, tets, rest_volume, bulk, averaged_bulk, low):
+def add_tet_forces(
+    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low
+):  # fmt: skip
     """Volume terms: a tet pulls its corners with its tension times dV/dx; keeps the smallest V / V0 seen.
 
     K (J - 1) per tet adds K to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020); the
     mean tension of the volumes averaged at its corners comes on top.
     """
     whole = tets.shape[0] // GROUP * GROUP
-    lowest = spread_like(rest_volume, low[0])
+    lowest = spread_like(inverse_volume, low[0])
     for first in range(0, whole, GROUP):
         bx, by, bz = _edges(position, tets, first, 1)
         cx, cy, cz = _edges(position, tets, first, 2)
         dx, dy, dz = _edges(position, tets, first, 3)
         gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
-        ratio = six_volumes(bx, by, bz, gbx, gby, gbz) / (6.0 * load_full(rest_volume, first))
+        ratio = volume_ratio(six_volumes(bx, by, bz, gbx, gby, gbz), load_full(inverse_volume, first))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         averaged = pack(
             _corner_tension(tension, tets, first), _corner_tension(tension, tets, first + 1),
@@ -252,7 +255,8 @@ def add_volume_forces(position, force, tension, tets, rest_volume, bulk, average
             _corner_tension(tension, tets, first + 6), _corner_tension(tension, tets, first + 7),
         )  # fmt: skip
         scale = tet_scale(ratio, load_full(bulk, first), load_full(averaged_bulk, first), averaged)
-        gbx, gby, gbz = scale * gbx, scale * gby, scale * gbz
+        pull = spring_scale(bx, by, bz, load_full(stiffness, first), load_full(rest_length, first))
+        gbx, gby, gbz = scale * gbx - pull * bx, scale * gby - pull * by, scale * gbz - pull * bz
         gcx, gcy, gcz = scale * gcx, scale * gcy, scale * gcz
         gdx, gdy, gdz = scale * gdx, scale * gdy, scale * gdz
         a = _rows(gbx + gcx + gdx, gby + gcy + gdy, gbz + gcz + gdz)
@@ -274,11 +278,13 @@ def add_volume_forces(position, force, tension, tets, rest_volume, bulk, average
     _keep(low, _at_6(lowest))
     _keep(low, _at_7(lowest))
     for tet in range(whole, tets.shape[0]):
-        gradients, six = tet_shape(*_three_edges(position, tets, tet))
-        ratio = six / (6.0 * rest_volume[tet])
+        edge, c, d = _three_edges(position, tets, tet)
+        gradients, six = tet_shape(edge, c, d)
+        ratio = volume_ratio(six, inverse_volume[tet])
         _keep(low, ratio)
         scale = tet_scale(ratio, bulk[tet], averaged_bulk[tet], _corner_tension(tension, tets, tet))
-        _push_one(force, tets, tet, scale, gradients)
+        pull = spring_scale(edge[0], edge[1], edge[2], stiffness[tet], rest_length[tet])
+        _push_one(force, tets, tet, scale, gradients, pull, edge)
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -289,10 +295,10 @@ def _keep(low, ratio):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _push_one(force, tets, tet, scale, gradients):
-    """Forces of one tet, corner by corner."""
+def _push_one(force, tets, tet, scale, gradients, pull, edge):
+    """Forces of one tet, corner by corner, and of the spring along its first edge."""
     for axis in range(3):
-        b, c, d = scale * gradients[axis], scale * gradients[3 + axis], scale * gradients[6 + axis]
+        b, c, d = scale * gradients[axis] - pull * edge[axis], scale * gradients[3 + axis], scale * gradients[6 + axis]
         force[tets[tet, 0], axis] -= b + c + d
         force[tets[tet, 1], axis] += b
         force[tets[tet, 2], axis] += c

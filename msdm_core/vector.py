@@ -157,6 +157,22 @@ def below_zero(_typing: Any, value: Any) -> Any:
     return value(value), generate
 
 
+@intrinsic
+def any_below(_typing: Any, value: Any, limit: Any) -> Any:
+    """Whether a number, or any number of a vector, is below a limit."""
+    if not isinstance(value, VectorType | types.Float) or not isinstance(limit, types.Number):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        if not isinstance(value, VectorType):
+            return builder.fcmp_ordered("<", values[0], context.cast(builder, values[1], limit, value))
+        is_below = builder.fcmp_ordered("<", values[0], _operand(context, builder, values[1], limit, value))
+        bits = ir.IntType(value.width)
+        return builder.icmp_unsigned("!=", builder.bitcast(is_below, bits), bits(0))
+
+    return types.boolean(value, limit), generate
+
+
 # ---- memory -------------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from msdm_core.geodesic import SurfaceDistance
 from msdm_core.kernels import OrganModel
 from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing import box_mesh, mesh_surface
+from msdm_core.ordering import in_sweep_order
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.regions import Lesion
 from msdm_core.surface import triangles_facing
@@ -169,7 +170,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
             *read_surface(scene.folder / source.surface.file, length_unit=source.surface.length_unit),
         )
     assert source.tets is not None
-    return read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit)
+    return in_sweep_order(read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit))
 
 
 def _filled_surface(scene: Scene, source: SurfaceMesh, vertices: FloatArray, triangles: NDArray) -> TetMesh:

@@ -12,6 +12,7 @@ from msdm_core.damping import Damping
 from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.mesh import TetMesh
 from msdm_core.meshing import box_mesh
+from msdm_core.ordering import spring_order
 from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material
 from msdm_core.stability import largest_frequency, step_limit
@@ -24,6 +25,13 @@ QUADRATURE = np.array([[1 / 3, 1 / 3, 1 / 3], [2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 /
 
 TISSUE = Material(youngs_modulus=5000.0, density=1000.0, poisson_ratio=0.45)
 UNDAMPED = Damping(alpha=0.0)
+
+
+def edge_stiffness(mesh: TetMesh, model: OrganModel) -> FloatArray:
+    """An organ's spring stiffness in the order of `mesh.edges` [N/m], shape (n_edge,)."""
+    stiffness = np.empty_like(model.spring_stiffness)
+    stiffness[spring_order(mesh).springs] = model.spring_stiffness
+    return stiffness
 
 
 # ---- the oracle -------------------------------------------------------------------------------------------------

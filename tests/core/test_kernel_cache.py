@@ -46,8 +46,8 @@ def test_an_edit_in_another_file_is_seen(tmp_path):
     assert run(tmp_path) == ["1.0", "1"], "the second start compiled again"
     equations = package / "element_kernels.py"
     text = equations.read_text(encoding="utf-8")
-    assert text.count("rest_volume) - 1.0)") == 1
-    equations.write_text(text.replace("rest_volume) - 1.0)", "rest_volume) - 0.5)"), encoding="utf-8")
+    assert text.count("24.0)) - 1.0)") == 1
+    equations.write_text(text.replace("24.0)) - 1.0)", "24.0)) - 0.5)"), encoding="utf-8")
     assert run(tmp_path) == ["1.5", "0"], "stale machine code was run"
 
 

@@ -43,7 +43,7 @@ def volume_arguments(model: Any) -> tuple:
     return (
         state.row_position, state.row_force, state.node_tension, model.tet_nodes, model.tet_inverse_volume,
         model.tet_bulk, model.tet_averaged_bulk, model.spring_stiffness, model.spring_rest_length,
-        state.volume_ratio_smallest,
+        state.volume_ratio_smallest, state.squeezed_tets,
     )  # fmt: skip
 
 

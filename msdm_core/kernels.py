@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from msdm_core.contact_kernels import add_contact_forces, find_candidates, stretch_by_lag
 from msdm_core.guard_kernels import guard_axes
+from msdm_core.squeeze_kernels import hold_squeezed
 from msdm_core.tissue_kernels import (
+    GROUP,
     add_spring_damping,
     add_spring_forces,
     add_tet_forces,
@@ -95,6 +97,7 @@ class OrganState(NamedTuple):
         row_position: scratch: position in rows of four, which load as one       (n_node, 4)
         row_velocity: scratch: likewise                                          (n_node, 4)
         row_force: scratch: likewise                                             (n_node, 4)
+        squeezed_tets: scratch: where tets are squeezed below SQUEEZED_RATIO     (n_tet,)
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
@@ -109,6 +112,7 @@ class OrganState(NamedTuple):
     row_position: FloatArray
     row_velocity: FloatArray
     row_force: FloatArray
+    squeezed_tets: NDArray[np.int32]
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
@@ -117,7 +121,7 @@ class OrganState(NamedTuple):
 
 
 # Written anew in every call: need not be saved.
-SCRATCH_FIELDS = ("node_tension", "row_position", "row_velocity", "row_force", "contact_candidates")
+SCRATCH_FIELDS = ("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets", "contact_candidates")
 
 
 class ContactShapes(NamedTuple):
@@ -209,7 +213,7 @@ def _in_rows(state):
     """The state with rows of four in place of its node arrays; contact reads x, y and z of either."""
     return OrganState(
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
-        state.row_position, state.row_velocity, state.row_force,
+        state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
         state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
         state.volume_ratio_smallest,
     )  # fmt: skip
@@ -225,7 +229,7 @@ def _copy_rows(source, target):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(model, rows):
-    """Gravity, springs and volume term into the rows' force."""
+    """Gravity, springs and volume term into the rows' force; returns how many groups have a squeezed tet."""
     position, velocity, force, tension = rows.node_position, rows.node_velocity, rows.node_force, rows.node_tension
     tets, beta = model.tet_nodes, model.beta
     set_gravity(force, model.node_mass, model.gravity)
@@ -240,12 +244,14 @@ def _evaluate(model, rows):
         if beta > 0.0:
             add_volume_rates(position, velocity, tension, tets, beta)
         set_node_tension(tension, model.node_inverse_volume, model.node_bulk)
-    add_tet_forces(
+    squeezed_count = add_tet_forces(
         position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
         model.spring_stiffness, model.spring_rest_length, rows.volume_ratio_smallest,
+        rows.squeezed_tets,
     )  # fmt: skip
     if beta > 0.0:
         add_volume_damping(position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
+    return squeezed_count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -267,13 +273,17 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
     position, velocity, force = rows.node_position, rows.node_velocity, rows.node_force
     fault = FAULT_NONE
     for substep in range(substep_count):
-        _evaluate(model, rows)
+        squeezed_count = _evaluate(model, rows)
         if not state.volume_ratio_smallest[0] > 0.0:
             # Before anything moves: the state shows which tet it was.
             fault = FAULT_INVERTED_TET
             break
         add_contact_forces(model, rows, shapes, law, dt, candidate_count, reference, wrench)
         kept = guard_axes(model, rows, shapes, law, response, dt, candidate_count, reference, wrench)
+        hold_squeezed(
+            position, velocity, force, model.node_inverse_mass, model.tet_nodes, model.tet_inverse_volume,
+            model.tet_averaged_bulk, state.squeezed_tets, squeezed_count, GROUP, dt,
+        )  # fmt: skip
         total = integrate(position, velocity, force, model.node_inverse_mass, dt, decay)
         push_tools(shapes, response, dt, substep, wrench)
         move_shapes(shapes, dt)

@@ -36,6 +36,7 @@ from msdm_core.lane_tissue_kernels import (
     put_back,
     set_gravity,
 )
+from msdm_core.squeeze_kernels import hold_squeezed
 
 # In place of a fault: no organ is in this lane, or it is to stand still.
 LANE_EMPTY = -1
@@ -104,6 +105,7 @@ class LaneState(NamedTuple):
         contact_candidates: scratch: triangles in reach, shape by shape          (n_lane, n_shape, n_surface)
         contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
+        squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
         kept_force: scratch: node_force of the lanes that stand still [N]        (n_node, 3, n_lane)
         moving: scratch: 1 where a lane moves, else 0                            (1, n_lane)
         finite_sum: scratch: finite where a lane's positions and velocities are  (1, n_lane)
@@ -121,6 +123,7 @@ class LaneState(NamedTuple):
     contact_candidates: NDArray[np.int32]
     contact_passed: NDArray[np.int32]
     node_tension: LaneArray
+    squeezed_tets: NDArray[np.int32]
     kept_force: LaneArray
     moving: LaneArray
     finite_sum: LaneArray
@@ -213,7 +216,7 @@ def _stop(state, lane, fault):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(model, state):
-    """Gravity, springs and volume term of all lanes."""
+    """Gravity, springs and volume term of all lanes; returns how many tets are squeezed in one of them."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     tension, tets, beta = state.node_tension, model.tet_nodes, model.beta
     set_gravity(force, model.node_mass, model.gravity)
@@ -229,17 +232,19 @@ def _evaluate(model, state):
         average_volumes(position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
     else:
         tension[:, :] = 0.0
-    add_tet_forces(
+    squeezed_count = add_tet_forces(
         position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
         model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
+        state.squeezed_tets,
     )  # fmt: skip
     if beta > 0.0:
         add_volume_damping(position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
+    return squeezed_count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _touch(model, state, shapes, law, response, dt, reference, wrench):
-    """Contact and guard, lane by lane; a lane with an inverted tet stops before anything of it moves."""
+def _touch(model, state, shapes, law, response, dt, squeezed_count, reference, wrench):
+    """Contact, squeezed tets and guard, lane by lane; a lane with an inverted tet stops before anything of it moves."""
     for lane in range(state.lane_fault.shape[0]):
         if state.lane_fault[lane] != FAULT_NONE:
             continue
@@ -247,13 +252,18 @@ def _touch(model, state, shapes, law, response, dt, reference, wrench):
             _stop(state, lane, FAULT_INVERTED_TET)
             continue
         state.contact_kept[lane] = 1
-        if state.candidate_count[lane] == 0:
+        count, about, push = state.candidate_count[lane], reference[lane], wrench[lane]
+        if count == 0 and squeezed_count == 0:
             continue
         surface, touched, moved = _surface_of(model, lane), _touched_of(state, lane), shapes_of(shapes, lane)
-        count, about, push = state.candidate_count[lane], reference[lane], wrench[lane]
         add_contact_forces(surface, touched, moved, law, dt, count, about, push)
         if not guard_axes(surface, touched, moved, law, response_of(response, lane), dt, count, about, push):
             state.contact_kept[lane] = 0
+        hold_squeezed(
+            touched.node_position, touched.node_velocity, touched.node_force, surface.node_inverse_mass,
+            model.tet_nodes, model.tet_inverse_volume, model.tet_averaged_bulk[:, lane], state.squeezed_tets,
+            squeezed_count, 1, dt,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -304,8 +314,8 @@ def advance_lane_substeps(model, state, shapes, law, response, dt, decay, subste
     """
     _begin(model, state, shapes, response, dt * substep_count, wrench)
     for substep in range(substep_count):
-        _evaluate(model, state)
-        _touch(model, state, shapes, law, response, dt, reference, wrench)
+        squeezed_count = _evaluate(model, state)
+        _touch(model, state, shapes, law, response, dt, squeezed_count, reference, wrench)
         integrate(
             state.node_position, state.node_velocity, state.node_force, model.node_inverse_mass, dt, decay,
             state.moving, state.finite_sum,

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from msdm_core.element_kernels import (
+    SQUEEZED_RATIO,
     node_tension,
     six_rates,
     spring_drag,
@@ -17,7 +18,7 @@ from msdm_core.element_kernels import (
     tet_shape,
     volume_ratio,
 )
-from msdm_core.vector import keep_lower, load_lanes, spread_like, store_lanes
+from msdm_core.vector import any_below, keep_lower, load_lanes, spread_like, store_lanes
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -158,15 +159,19 @@ def _push(force, tets, tet, scale, g, pull, edge):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_tet_forces(
-    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving
+    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving, squeezed
 ):  # fmt: skip
     """Volume terms, as in `tissue_kernels`; keeps the smallest V / V0 seen of every organ that moves, (1, organ)."""
     lowest = load_lanes(low, 0)
+    count = 0
     for tet in range(tets.shape[0]):
         edge, third, fourth = _three_edges(position, tets, tet)
         gradients, six = tet_shape(edge, third, fourth)
         ratio = volume_ratio(six, spread_like(position, inverse_volume[tet]))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
+        if any_below(ratio, SQUEEZED_RATIO):
+            squeezed[count] = tet
+            count += 1
         a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
         averaged = 0.25 * (
             load_lanes(tension, a) + load_lanes(tension, b) + load_lanes(tension, c) + load_lanes(tension, d)
@@ -176,6 +181,7 @@ def add_tet_forces(
         pull = spring_scale(edge[0], edge[1], edge[2], load_lanes(stiffness, tet), length)
         _push(force, tets, tet, scale, gradients, pull, edge)
     store_lanes(low, 0, _where_moving(load_lanes(moving, 0), lowest, load_lanes(low, 0)))
+    return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -109,6 +109,7 @@ def rest_lanes(organs: Sequence[OrganModel], *, shape_count: int = 0, dtype: Any
         contact_candidates=np.zeros((count, shape_count, surface), dtype=np.int32),
         contact_passed=np.zeros((count, 2), dtype=np.int32),
         node_tension=aligned_zeros((nodes, count), dtype),
+        squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
         moving=aligned_zeros((1, count), dtype),
         finite_sum=aligned_zeros((1, count), dtype),
         candidate_count=np.zeros(count, dtype=np.int32),
@@ -158,6 +159,7 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
         **{name: getattr(state, name)[lane].copy() for name in CONTACT_FIELDS},
         **rows,
         node_tension=np.zeros(nodes),
+        squeezed_tets=np.zeros_like(state.squeezed_tets),
         contact_candidates=state.contact_candidates[lane].copy(),
         volume_ratio_smallest=state.volume_ratio_smallest[:, lane].astype(np.float64),
     )

@@ -116,6 +116,7 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         row_position=aligned_zeros((len(model.node_mass), 4)),
         row_velocity=aligned_zeros((len(model.node_mass), 4)),
         row_force=aligned_zeros((len(model.node_mass), 4)),
+        squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
         contact_stretch=np.zeros((shape_count, point_count, 3)),
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),

@@ -7,6 +7,7 @@ The rows of eight items are loaded, turned into vectors of eight x, y and z, wor
 from numba import njit
 
 from msdm_core.element_kernels import (
+    SQUEEZED_RATIO,
     node_tension,
     six_rates,
     six_volumes,
@@ -18,6 +19,7 @@ from msdm_core.element_kernels import (
     volume_ratio,
 )
 from msdm_core.vector import (
+    any_below,
     define_extract,
     define_shuffle,
     keep_lower,
@@ -232,14 +234,16 @@ def _corner_tension(tension, tets, tet):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_tet_forces(
-    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low
+    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed
 ):  # fmt: skip
     """Volume terms: a tet pulls its corners with its tension times dV/dx; keeps the smallest V / V0 seen.
 
     K (J - 1) per tet adds K to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020); the
-    mean tension of the volumes averaged at its corners comes on top.
+    mean tension of the volumes averaged at its corners comes on top. Spring t comes with tet t, whose first edge it is.
+    Returns how many groups of eight have a squeezed tet; `squeezed` holds the first tet of each.
     """
     whole = tets.shape[0] // GROUP * GROUP
+    count = 0
     lowest = spread_like(inverse_volume, low[0])
     for first in range(0, whole, GROUP):
         bx, by, bz = _edges(position, tets, first, 1)
@@ -248,6 +252,9 @@ def add_tet_forces(
         gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
         ratio = volume_ratio(six_volumes(bx, by, bz, gbx, gby, gbz), load_full(inverse_volume, first))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
+        if any_below(ratio, SQUEEZED_RATIO):
+            squeezed[count] = first
+            count += 1
         averaged = pack(
             _corner_tension(tension, tets, first), _corner_tension(tension, tets, first + 1),
             _corner_tension(tension, tets, first + 2), _corner_tension(tension, tets, first + 3),
@@ -282,9 +289,13 @@ def add_tet_forces(
         gradients, six = tet_shape(edge, c, d)
         ratio = volume_ratio(six, inverse_volume[tet])
         _keep(low, ratio)
+        if any_below(ratio, SQUEEZED_RATIO) and not (count > 0 and squeezed[count - 1] == whole):
+            squeezed[count] = whole
+            count += 1
         scale = tet_scale(ratio, bulk[tet], averaged_bulk[tet], _corner_tension(tension, tets, tet))
         pull = spring_scale(edge[0], edge[1], edge[2], stiffness[tet], rest_length[tet])
         _push_one(force, tets, tet, scale, gradients, pull, edge)
+    return count
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -101,11 +101,34 @@ def total_forces(model: OrganModel, position: FloatArray, velocity: FloatArray) 
     return spring_forces(model, position, velocity) + volume_forces(model, position, velocity) + gravity
 
 
+def hold_squeezed(
+    model: OrganModel, position: FloatArray, velocity: FloatArray, force: FloatArray, dt: float
+) -> FloatArray:
+    """The forces with the pressures of squeezed tets taken implicitly, one tet after the other [N], shape (n_node, 3).
+
+    p' dt dJ/dt more tension at the rate of the step's end: dJ/dt = w (1 - x dt sum |dV/dx|^2 / m / V0), solved for x.
+    """
+    force = force.copy()
+    for nodes, rest_volume, bulk in zip(model.tet_nodes, model.tet_rest_volume, model.tet_averaged_bulk):
+        volume, _, gradient = tet_volume(position[nodes], velocity[nodes])
+        ratio = volume / rest_volume
+        if ratio >= 0.6:
+            continue
+        response = dt * model.node_inverse_mass[nodes][:, None]
+        rate = float((gradient * (velocity[nodes] + response * force[nodes])).sum()) / rest_volume
+        slope = dt * bulk * 0.6**2 / ratio**2
+        give = float((gradient**2 * response).sum()) / rest_volume
+        tension = min(slope * rate / (1.0 + slope * give), bulk * (0.6 - ratio) * 0.6 / ratio)
+        force[nodes] -= tension * gradient
+    return force
+
+
 def symplectic_step(
     model: OrganModel, position: FloatArray, velocity: FloatArray, dt: float
 ) -> tuple[FloatArray, FloatArray]:
     """v' = exp(-alpha dt) v + dt f(x, v) / m, then x' = x + dt v'; anchored nodes (1/m = 0) stay."""
-    acceleration = total_forces(model, position, velocity) * model.node_inverse_mass[:, None]
+    force = hold_squeezed(model, position, velocity, total_forces(model, position, velocity), dt)
+    acceleration = force * model.node_inverse_mass[:, None]
     after = math.exp(-model.alpha * dt) * velocity + dt * acceleration
     return position + dt * after, after
 

@@ -47,18 +47,23 @@ class End(NamedTuple):
     centre: NDArray
 
 
-def press(model: OrganModel, site: str, radius: float, depth: float) -> End:
-    """Push a ball straight down to a depth, or until a fault."""
-    timing, law = phantom().scene.timing, phantom().scene.contact.law
+def press(
+    model: OrganModel, site: str, radius: float, depth: float, *, substeps: int | None = None, hold: float = 0.0
+) -> End:
+    """Push a ball straight down to a depth, or until a fault, and let it stand there for `hold` [s]."""
+    law = phantom().scene.contact.law
+    count = substeps or phantom().scene.timing.substep_count
     state = rest_state(model, shape_count=1)
     start = np.array(SITES[site]) + np.array([0.0, 0.0, radius])
     shapes = oracle.ball(start, radius, velocity=(0.0, 0.0, -SPEED))
     force: list[float] = []
     fault = ""
-    dt = HAPTIC_STEP / timing.substep_count
-    for _ in range(round(depth / SPEED / HAPTIC_STEP)):
+    down = round(depth / SPEED / HAPTIC_STEP)
+    for step in range(down + round(hold / HAPTIC_STEP)):
+        if step == down:
+            shapes.tool_twist[:] = 0.0
         try:
-            wrench = advance(model, state, dt=dt, substep_count=timing.substep_count, shapes=shapes, contact=law)
+            wrench = advance(model, state, dt=HAPTIC_STEP / count, substep_count=count, shapes=shapes, contact=law)
         except OrganDivergedError as error:
             fault = str(error)
             break

@@ -14,6 +14,7 @@ from msdm_core.damping import Damping
 from msdm_core.errors import OrganError
 from msdm_core.kernels import (
     FAULT_NONE,
+    SCRATCH_FIELDS,
     ContactLaw,
     ContactShapes,
     OrganModel,
@@ -41,13 +42,11 @@ LAW = ContactLaw(stiffness=2e7, damping=500.0, friction=0.4, tangential_stiffnes
 DAMPED = Damping(alpha=20.0, beta=2e-5)
 RADIUS = 0.004
 SUBSTEP, SUBSTEPS = 5e-5, 5
-# Scratch of the single organ's loop, which says nothing about the organ.
-SCRATCH = {"node_tension", "row_position", "row_velocity", "row_force", "contact_candidates"}
 
 
 def same(a: OrganState, b: OrganState) -> list[str]:
     """The fields in which two states differ in any bit (a number that is not one equals itself)."""
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in OrganState._fields if name not in SCRATCH}
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in OrganState._fields if name not in SCRATCH_FIELDS}
     return [name for name, (left, right) in pairs.items() if left.tobytes() != right.tobytes()]
 
 

@@ -40,21 +40,20 @@ def find_candidates(model, state, shapes, duration):
             # An angular part moves a point by at most its lever, taken as one metre: generous for a hand-held tool.
             speed += abs(twist[tool, part])
         margin = CANDIDATE_MARGIN + 2.0 * speed * duration
+        low_x, high_x = _extent(ends, shape, 0, radius + margin)
+        low_y, high_y = _extent(ends, shape, 1, radius + margin)
+        low_z, high_z = _extent(ends, shape, 2, radius + margin)
         count = 0
         for triangle in range(surface.shape[0]):
             a = surface[triangle, 0]
             b = surface[triangle, 1]
             c = surface[triangle, 2]
-            # Cheap first: from one corner, with the longer of its edges; then from the middle.
-            reach = 0.0
-            other = 0.0
-            for axis in range(3):
-                reach += (position[b, axis] - position[a, axis]) ** 2
-                other += (position[c, axis] - position[a, axis]) ** 2
-            limit = math.sqrt(max(reach, other)) + radius + margin
-            px, py, pz = closest_on_axis(ends, shape, position[a, 0], position[a, 1], position[a, 2])
-            gap = (position[a, 0] - px) ** 2 + (position[a, 1] - py) ** 2 + (position[a, 2] - pz) ** 2
-            near = gap <= limit * limit
+            # Cheap first: box against box; then the sphere around the triangle against the axis.
+            near = (
+                _overlap(position, 0, a, b, c, low_x, high_x)
+                and _overlap(position, 1, a, b, c, low_y, high_y)
+                and _overlap(position, 2, a, b, c, low_z, high_z)
+            )
             if near:
                 x, y, z, size_squared = _middle(position, a, b, c)
                 px, py, pz = closest_on_axis(ends, shape, x, y, z)
@@ -189,6 +188,20 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 _push_corner(position, force, reference, wrench, tool, a, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
                 _push_corner(position, force, reference, wrench, tool, b, wb, tb, gx, gy, gz, nx, ny, nz)
                 _push_corner(position, force, reference, wrench, tool, c, wc, tc, gx, gy, gz, nx, ny, nz)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _extent(ends, shape, axis, around):
+    """Lowest and highest coordinate of a shape's axis, and so much around it [m]."""
+    first, second = ends[shape, 0, axis], ends[shape, 1, axis]
+    return min(first, second) - around, max(first, second) + around
+
+
+@njit(forceinline=True, error_model="numpy")
+def _overlap(position, axis, a, b, c, low, high):
+    """Whether a triangle reaches into an interval of one coordinate."""
+    first, second, third = position[a, axis], position[b, axis], position[c, axis]
+    return max(first, second, third) >= low and min(first, second, third) <= high
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -96,7 +96,7 @@ def main() -> None:
     alone = rest_state(organs[0], shape_count=1)
     groups = {"single_float64": Group(advance_organ, organs[0], alone, ball(sites[0], radius), law, substeps, 1)}
     for name, dtype, count in (("lanes_float64", np.float64, 8), ("lanes_float32", np.float32, 16)):
-        shapes = stack_shapes([ball(site, radius) for site in sites[:count]], dtype=dtype)
+        shapes = stack_shapes([ball(site, radius) for site in sites[:count]], count)
         model = stack_organs(organs[:count], dtype=dtype)
         state = rest_lanes(organs[:count], shape_count=1, dtype=dtype)
         groups[name] = Group(advance_lanes, model, state, shapes, law, substeps, count)

@@ -49,6 +49,7 @@ class LaneModel(NamedTuple):
     """What organs side by side are: read-only arrays, SI units; the mesh is shared, the lane is the last index.
 
     Fields:
+        lanes: as many zeros as there are lanes; their number is part of the compiled type
         node_mass: lumped mass [kg]                                              (n_node, n_lane)
         node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node, n_lane)
         spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
@@ -70,6 +71,7 @@ class LaneModel(NamedTuple):
         stable_step: largest stable step without contact [s]                     (n_lane,)
     """
 
+    lanes: tuple[int, ...]
     node_mass: LaneArray
     node_inverse_mass: LaneArray
     spring_nodes: NDArray[np.int32]
@@ -218,27 +220,33 @@ def _stop(state, lane, fault):
 def _evaluate(model, state):
     """Gravity, springs and volume term of all lanes; returns how many tets are squeezed in one of them."""
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
-    tension, tets, beta = state.node_tension, model.tet_nodes, model.beta
-    set_gravity(force, model.node_mass, model.gravity)
+    lanes, tension, tets, beta = model.lanes, state.node_tension, model.tet_nodes, model.beta
+    set_gravity(lanes, force, model.node_mass, model.gravity)
     add_spring_forces(
-        position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0]
+        model.lanes,
+        position,
+        force,
+        model.spring_nodes,
+        model.spring_stiffness,
+        model.spring_rest_length,
+        tets.shape[0],
     )
     if beta > 0.0:
-        add_spring_damping(position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
+        add_spring_damping(lanes, position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
     averages = False
     for lane in range(model.averages_volume.shape[0]):
         averages = averages or model.averages_volume[lane]
     if averages:
-        average_volumes(position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
+        average_volumes(lanes, position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
     else:
         tension[:, :] = 0.0
     squeezed_count = add_tet_forces(
-        position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
+        lanes, position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
         model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
         state.squeezed_tets,
     )  # fmt: skip
     if beta > 0.0:
-        add_volume_damping(position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
+        add_volume_damping(lanes, position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
     return squeezed_count
 
 
@@ -298,7 +306,7 @@ def _end(model, state, shapes, law, response, substep_count, wrench):
             for part in range(6):
                 wrench[lane, tool, part] /= substep_count
     if stands:
-        put_back(state.node_force, state.kept_force, state.moving)
+        put_back(model.lanes, state.node_force, state.kept_force, state.moving)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -317,7 +325,7 @@ def advance_lane_substeps(model, state, shapes, law, response, dt, decay, subste
         squeezed_count = _evaluate(model, state)
         _touch(model, state, shapes, law, response, dt, squeezed_count, reference, wrench)
         integrate(
-            state.node_position, state.node_velocity, state.node_force, model.node_inverse_mass, dt, decay,
+            model.lanes, state.node_position, state.node_velocity, state.node_force, model.node_inverse_mass, dt, decay,
             state.moving, state.finite_sum,
         )  # fmt: skip
         _move_tools(state, shapes, response, dt, substep, wrench)

@@ -18,44 +18,44 @@ from msdm_core.element_kernels import (
     tet_shape,
     volume_ratio,
 )
-from msdm_core.vector import any_below, keep_lower, load_lanes, spread_like, store_lanes
+from msdm_core.vector import any_below, keep_lower, load_lanes, spread_lanes, store_lanes
 
 
 @njit(forceinline=True, error_model="numpy")
-def _difference(values, items, item, corner):
+def _difference(lanes, values, items, item, corner):
     """From corner 0 of an item to another of its corners, as three vectors."""
     i, j = 3 * np.intp(items[item, 0]), 3 * np.intp(items[item, corner])
     return (
-        load_lanes(values, j) - load_lanes(values, i),
-        load_lanes(values, j + 1) - load_lanes(values, i + 1),
-        load_lanes(values, j + 2) - load_lanes(values, i + 2),
+        load_lanes(lanes, values, j) - load_lanes(lanes, values, i),
+        load_lanes(lanes, values, j + 1) - load_lanes(lanes, values, i + 1),
+        load_lanes(lanes, values, j + 2) - load_lanes(lanes, values, i + 2),
     )
 
 
 @njit(forceinline=True, error_model="numpy")
-def _add(force, node, x, y, z):
+def _add(lanes, force, node, x, y, z):
     """Add to a node's force."""
     place = 3 * np.intp(node)
-    store_lanes(force, place, load_lanes(force, place) + x)
-    store_lanes(force, place + 1, load_lanes(force, place + 1) + y)
-    store_lanes(force, place + 2, load_lanes(force, place + 2) + z)
+    store_lanes(force, place, load_lanes(lanes, force, place) + x)
+    store_lanes(force, place + 1, load_lanes(lanes, force, place + 1) + y)
+    store_lanes(force, place + 2, load_lanes(lanes, force, place + 2) + z)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _subtract(force, node, x, y, z):
+def _subtract(lanes, force, node, x, y, z):
     """Take from a node's force."""
     place = 3 * np.intp(node)
-    store_lanes(force, place, load_lanes(force, place) - x)
-    store_lanes(force, place + 1, load_lanes(force, place + 1) - y)
-    store_lanes(force, place + 2, load_lanes(force, place + 2) - z)
+    store_lanes(force, place, load_lanes(lanes, force, place) - x)
+    store_lanes(force, place + 1, load_lanes(lanes, force, place + 1) - y)
+    store_lanes(force, place + 2, load_lanes(lanes, force, place + 2) - z)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _share(total, items, item, value):
+def _share(lanes, total, items, item, value):
     """Add to each corner of a tet."""
     for corner in range(4):
         node = items[item, corner]
-        store_lanes(total, node, load_lanes(total, node) + value)
+        store_lanes(total, node, load_lanes(lanes, total, node) + value)
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -65,24 +65,24 @@ def _where_moving(moving, after, before):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def set_gravity(force, mass, gravity):
+def set_gravity(lanes, force, mass, gravity):
     """F = m g."""
     for node in range(force.shape[0]):
         for axis in range(3):
-            store_lanes(force, 3 * node + axis, load_lanes(mass, node) * gravity[axis])
+            store_lanes(force, 3 * node + axis, load_lanes(lanes, mass, node) * gravity[axis])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def integrate(position, velocity, force, inverse_mass, dt, decay, moving, total):
+def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving, total):
     """Symplectic Euler of the organs that move, as in `tissue_kernels`; `total` (1, organ) is finite where all is."""
-    moves = load_lanes(moving, 0)
+    moves = load_lanes(lanes, moving, 0)
     check = moves * 0.0
     for node in range(position.shape[0]):
-        rate = load_lanes(inverse_mass, node) * dt
+        rate = load_lanes(lanes, inverse_mass, node) * dt
         for axis in range(3):
             part = 3 * node + axis
-            speed_before, place_before = load_lanes(velocity, part), load_lanes(position, part)
-            speed = speed_before * decay + load_lanes(force, part) * rate
+            speed_before, place_before = load_lanes(lanes, velocity, part), load_lanes(lanes, position, part)
+            speed = speed_before * decay + load_lanes(lanes, force, part) * rate
             place = place_before + speed * dt
             store_lanes(velocity, part, _where_moving(moves, speed, speed_before))
             store_lanes(position, part, _where_moving(moves, place, place_before))
@@ -91,104 +91,125 @@ def integrate(position, velocity, force, inverse_mass, dt, decay, moving, total)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def put_back(values, kept, moving):
+def put_back(lanes, values, kept, moving):
     """Give the organs that stand still the values that were kept of them."""
-    moves = load_lanes(moving, 0)
+    moves = load_lanes(lanes, moving, 0)
     for node in range(values.shape[0]):
         for axis in range(3):
             part = 3 * node + axis
-            store_lanes(values, part, _where_moving(moves, load_lanes(values, part), load_lanes(kept, part)))
+            store_lanes(
+                values, part, _where_moving(moves, load_lanes(lanes, values, part), load_lanes(lanes, kept, part))
+            )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_forces(position, force, nodes, stiffness, rest_length, begin):
+def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, begin):
     """Springs from one on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1)."""
     for spring in range(begin, nodes.shape[0]):
-        x, y, z = _difference(position, nodes, spring, 1)
-        scale = spring_scale(x, y, z, load_lanes(stiffness, spring), spread_like(position, rest_length[spring]))
+        x, y, z = _difference(lanes, position, nodes, spring, 1)
+        scale = spring_scale(
+            x, y, z, load_lanes(lanes, stiffness, spring), spread_lanes(lanes, position, rest_length[spring])
+        )
         x, y, z = x * scale, y * scale, z * scale
-        _add(force, nodes[spring, 0], x, y, z)
-        _subtract(force, nodes[spring, 1], x, y, z)
+        _add(lanes, force, nodes[spring, 0], x, y, z)
+        _subtract(lanes, force, nodes[spring, 1], x, y, z)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_damping(position, velocity, force, nodes, stiffness, beta):
+def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta):
     """Rayleigh's beta along the springs: f = k beta dl/dt."""
     for spring in range(nodes.shape[0]):
-        x, y, z = _difference(position, nodes, spring, 1)
-        vx, vy, vz = _difference(velocity, nodes, spring, 1)
-        scale = spring_drag(x, y, z, vx, vy, vz, load_lanes(stiffness, spring), beta)
+        x, y, z = _difference(lanes, position, nodes, spring, 1)
+        vx, vy, vz = _difference(lanes, velocity, nodes, spring, 1)
+        scale = spring_drag(x, y, z, vx, vy, vz, load_lanes(lanes, stiffness, spring), beta)
         x, y, z = x * scale, y * scale, z * scale
-        _add(force, nodes[spring, 0], x, y, z)
-        _subtract(force, nodes[spring, 1], x, y, z)
+        _add(lanes, force, nodes[spring, 0], x, y, z)
+        _subtract(lanes, force, nodes[spring, 1], x, y, z)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _three_edges(values, tets, tet):
+def _three_edges(lanes, values, tets, tet):
     """From corner 0 of a tet to its other three."""
-    return _difference(values, tets, tet, 1), _difference(values, tets, tet, 2), _difference(values, tets, tet, 3)
+    return (
+        _difference(lanes, values, tets, tet, 1),
+        _difference(lanes, values, tets, tet, 2),
+        _difference(lanes, values, tets, tet, 3),
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def average_volumes(position, velocity, tension, tets, node_inverse_volume, node_bulk, beta):
+def average_volumes(lanes, position, velocity, tension, tets, node_inverse_volume, node_bulk, beta):
     """Tension of the volumes averaged at nodes [Pa], K_a (J_a - 1), with beta's share."""
     tension[:, :] = 0.0
     for tet in range(tets.shape[0]):
-        _, six = tet_shape(*_three_edges(position, tets, tet))
-        _share(tension, tets, tet, six)
+        _, six = tet_shape(*_three_edges(lanes, position, tets, tet))
+        _share(lanes, tension, tets, tet, six)
     if beta > 0.0:
         for tet in range(tets.shape[0]):
-            gradients, _ = tet_shape(*_three_edges(position, tets, tet))
-            _share(tension, tets, tet, beta * six_rates(*_three_edges(velocity, tets, tet), gradients))
+            gradients, _ = tet_shape(*_three_edges(lanes, position, tets, tet))
+            _share(lanes, tension, tets, tet, beta * six_rates(*_three_edges(lanes, velocity, tets, tet), gradients))
     for node in range(tension.shape[0]):
-        inverse = spread_like(position, node_inverse_volume[node])
-        store_lanes(tension, node, node_tension(load_lanes(tension, node), inverse, load_lanes(node_bulk, node)))
+        inverse = spread_lanes(lanes, position, node_inverse_volume[node])
+        store_lanes(
+            tension, node, node_tension(load_lanes(lanes, tension, node), inverse, load_lanes(lanes, node_bulk, node))
+        )
 
 
 @njit(forceinline=True, error_model="numpy")
-def _push(force, tets, tet, scale, g, pull, edge):
+def _push(lanes, force, tets, tet, scale, g, pull, edge):
     """Forces of a tet on its corners, and of the spring along its first edge."""
     bx, by, bz = scale * g[0] - pull * edge[0], scale * g[1] - pull * edge[1], scale * g[2] - pull * edge[2]
     cx, cy, cz = scale * g[3], scale * g[4], scale * g[5]
     dx, dy, dz = scale * g[6], scale * g[7], scale * g[8]
-    _subtract(force, tets[tet, 0], bx + cx + dx, by + cy + dy, bz + cz + dz)
-    _add(force, tets[tet, 1], bx, by, bz)
-    _add(force, tets[tet, 2], cx, cy, cz)
-    _add(force, tets[tet, 3], dx, dy, dz)
+    _subtract(lanes, force, tets[tet, 0], bx + cx + dx, by + cy + dy, bz + cz + dz)
+    _add(lanes, force, tets[tet, 1], bx, by, bz)
+    _add(lanes, force, tets[tet, 2], cx, cy, cz)
+    _add(lanes, force, tets[tet, 3], dx, dy, dz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_tet_forces(
-    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving, squeezed
+    lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving,
+    squeezed,
 ):  # fmt: skip
     """Volume terms, as in `tissue_kernels`; keeps the smallest V / V0 seen of every organ that moves, (1, organ)."""
-    lowest = load_lanes(low, 0)
+    lowest = load_lanes(lanes, low, 0)
     count = 0
     for tet in range(tets.shape[0]):
-        edge, third, fourth = _three_edges(position, tets, tet)
+        edge, third, fourth = _three_edges(lanes, position, tets, tet)
         gradients, six = tet_shape(edge, third, fourth)
-        ratio = volume_ratio(six, spread_like(position, inverse_volume[tet]))
+        ratio = volume_ratio(six, spread_lanes(lanes, position, inverse_volume[tet]))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         if any_below(ratio, SQUEEZED_RATIO):
             squeezed[count] = tet
             count += 1
-        a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
         averaged = 0.25 * (
-            load_lanes(tension, a) + load_lanes(tension, b) + load_lanes(tension, c) + load_lanes(tension, d)
-        )
-        scale = tet_scale(ratio, load_lanes(bulk, tet), load_lanes(averaged_bulk, tet), averaged)
-        length = spread_like(position, rest_length[tet])
-        pull = spring_scale(edge[0], edge[1], edge[2], load_lanes(stiffness, tet), length)
-        _push(force, tets, tet, scale, gradients, pull, edge)
-    store_lanes(low, 0, _where_moving(load_lanes(moving, 0), lowest, load_lanes(low, 0)))
+            load_lanes(lanes, tension, tets[tet, 0]) + load_lanes(lanes, tension, tets[tet, 1])
+            + load_lanes(lanes, tension, tets[tet, 2]) + load_lanes(lanes, tension, tets[tet, 3])
+        )  # fmt: skip
+        own, shared = load_lanes(lanes, bulk, tet), load_lanes(lanes, averaged_bulk, tet)
+        scale = tet_scale(ratio, own, shared, averaged)
+        length = spread_lanes(lanes, position, rest_length[tet])
+        pull = spring_scale(edge[0], edge[1], edge[2], load_lanes(lanes, stiffness, tet), length)
+        _push(lanes, force, tets, tet, scale, gradients, pull, edge)
+    store_lanes(low, 0, _where_moving(load_lanes(lanes, moving, 0), lowest, load_lanes(lanes, low, 0)))
     return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_damping(position, velocity, force, tets, inverse_volume, bulk, beta):
+def add_volume_damping(lanes, position, velocity, force, tets, inverse_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
     for tet in range(tets.shape[0]):
-        gradients, _ = tet_shape(*_three_edges(position, tets, tet))
-        six_rate = six_rates(*_three_edges(velocity, tets, tet), gradients)
-        rate = beta * volume_ratio(six_rate, spread_like(position, inverse_volume[tet]))
-        _push(force, tets, tet, load_lanes(bulk, tet) * rate * (-1.0 / 6.0), gradients, rate * 0.0, gradients)
+        gradients, _ = tet_shape(*_three_edges(lanes, position, tets, tet))
+        six_rate = six_rates(*_three_edges(lanes, velocity, tets, tet), gradients)
+        rate = beta * volume_ratio(six_rate, spread_lanes(lanes, position, inverse_volume[tet]))
+        _push(
+            lanes,
+            force,
+            tets,
+            tet,
+            load_lanes(lanes, bulk, tet) * rate * (-1.0 / 6.0),
+            gradients,
+            rate * 0.0,
+            gradients,
+        )

@@ -17,30 +17,29 @@ from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel,
 from msdm_core.lane_kernels import LANE_EMPTY, LaneModel, LaneState, advance_lane_substeps
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
-from msdm_core.vector import aligned_zeros, lane_count
+from msdm_core.vector import aligned_zeros, lane_counts
 
 # Of an organ's arrays, those that each lane has of its own; all others are shared.
 OWN_FIELDS = ("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk")
 OWN_NUMBERS = ("averages_volume", "stable_step")
-SHARED_FIELDS = tuple(name for name in LaneModel._fields if name not in OWN_FIELDS + OWN_NUMBERS)
+SHARED_FIELDS = tuple(name for name in LaneModel._fields if name not in (*OWN_FIELDS, *OWN_NUMBERS, "lanes"))
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
 CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed")
 
 
-def stack_organs(organs: Sequence[OrganModel], *, dtype: Any = np.float64) -> LaneModel:
+def stack_organs(organs: Sequence[OrganModel], *, dtype: Any = np.float64, lanes: int | None = None) -> LaneModel:
     """Organs of one mesh side by side, in the given order; lanes that are left over have copies of the last one.
 
     Args:
-        organs: at most 8 in float64, 16 in float32.
+        organs: at most as many as there are lanes.
         dtype: np.float64 or np.float32.
+        lanes: 8 in float64; 16 (the default) or 8 in float32, where two groups on two cores may be worth more.
 
     Raises:
-        OrganError: no organ or too many, another dtype, or an organ that differs from the first in what they share: its
-            mesh, anchors, damping or gravity. Names the lane and the field.
+        OrganError: no organ or too many, another dtype or number of lanes, or an organ that differs from the first in
+            what they share: its mesh, anchors, damping or gravity. Names the lane and the field.
     """
-    if np.dtype(dtype) not in (np.float64, np.float32):
-        raise OrganError(f"dtype is {np.dtype(dtype)}; lanes are float64 (8 organs) or float32 (16 organs)")
-    count = lane_count(dtype)
+    count = _lane_count(dtype, lanes)
     if not 1 <= len(organs) <= count:
         raise OrganError(
             f"{len(organs)} organs for the {count} lanes of {np.dtype(dtype)}: stack them in several groups"
@@ -49,12 +48,21 @@ def stack_organs(organs: Sequence[OrganModel], *, dtype: Any = np.float64) -> La
     own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in OWN_FIELDS}
     numbers = {"averages_volume": np.zeros(count, dtype=np.bool_), "stable_step": np.zeros(count)}
     shared = {name: getattr(first, name) for name in SHARED_FIELDS}
-    model = LaneModel(**own, **numbers, **shared)
+    model = LaneModel(lanes=(0,) * count, **own, **numbers, **shared)
     for lane in range(count):
         organ = organs[min(lane, len(organs) - 1)]
         _check_shared(model, lane, organ, first.node_inverse_mass == 0.0)
         _write_lane(model, lane, organ)
     return model
+
+
+def _lane_count(dtype: Any, lanes: int | None) -> int:
+    if np.dtype(dtype) not in (np.float64, np.float32):
+        raise OrganError(f"dtype is {np.dtype(dtype)}; lanes are float64 (8 organs) or float32 (16 or 8 organs)")
+    known = lane_counts(dtype)
+    if lanes is not None and lanes not in known:
+        raise OrganError(f"lanes is {lanes}; in {np.dtype(dtype)} there are {' or '.join(map(str, known))}")
+    return known[0] if lanes is None else lanes
 
 
 def set_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
@@ -92,12 +100,14 @@ def _write_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
         array.setflags(write=False)
 
 
-def rest_lanes(organs: Sequence[OrganModel], *, shape_count: int = 0, dtype: Any = np.float64) -> LaneState:
+def rest_lanes(
+    organs: Sequence[OrganModel], *, shape_count: int = 0, dtype: Any = np.float64, lanes: int | None = None
+) -> LaneState:
     """The state at rest of organs side by side, with contact memory for `shape_count` shapes each.
 
     Lanes that are left over stand still (LANE_EMPTY). Under gravity each organ is settled, as `rest_state` does.
     """
-    first, count = organs[0], lane_count(dtype)
+    first, count = organs[0], _lane_count(dtype, lanes)
     nodes, surface = len(first.node_mass), len(first.surface_triangles)
     vectors = {name: aligned_zeros((nodes, 3, count), dtype) for name in (*NODE_FIELDS, "kept_force")}
     state = LaneState(
@@ -170,13 +180,13 @@ def _check_lane(lane: int, count: int) -> None:
         raise OrganError(f"lane {lane} does not exist; there are lanes 0 to {count - 1}")
 
 
-def stack_shapes(shapes: Sequence[ContactShapes], *, dtype: Any = np.float64) -> ContactShapes:
+def stack_shapes(shapes: Sequence[ContactShapes], lanes: int = 8) -> ContactShapes:
     """The contact shapes of several lanes, equally many each, with the lane as first index; the last one fills up.
 
     `lane_shapes` gives one lane of it to write to.
     """
-    lanes = [shapes[min(lane, len(shapes) - 1)] for lane in range(lane_count(dtype))]
-    return ContactShapes(*(np.stack(arrays) for arrays in zip(*lanes, strict=True)))
+    filled = [shapes[min(lane, len(shapes) - 1)] for lane in range(lanes)]
+    return ContactShapes(*(np.stack(arrays) for arrays in zip(*filled, strict=True)))
 
 
 def lane_shapes(shapes: ContactShapes, lane: int) -> ContactShapes:
@@ -184,10 +194,10 @@ def lane_shapes(shapes: ContactShapes, lane: int) -> ContactShapes:
     return ContactShapes(*(array[lane] for array in shapes))
 
 
-def lane_responses(tool_count: int, *, dtype: Any = np.float64) -> ToolResponse:
+def lane_responses(tool_count: int, lanes: int = 8) -> ToolResponse:
     """The responses of every lane's tools, with the lane as first index; zeros: tools that move as told."""
     sizes = ((6,), (6, 6), (6,), (6,))
-    return ToolResponse(*(np.zeros((lane_count(dtype), tool_count, *size)) for size in sizes))
+    return ToolResponse(*(np.zeros((lanes, tool_count, *size)) for size in sizes))
 
 
 def advance_lanes(
@@ -220,7 +230,7 @@ def advance_lanes(
     """
     lanes, tools = len(state.lane_fault), shapes.tool_centre.shape[1]
     if response is None:
-        response = lane_responses(tools, dtype=state.node_position.dtype)
+        response = lane_responses(tools, lanes)
     _check_fit(model, state, shapes, wrench, response)
     limit = float(model.stable_step.min())
     if substep_count < 1 or not 0.0 < dt <= limit:
@@ -243,7 +253,7 @@ def _check_fit(
     tools = shapes.tool_centre.shape[1]
     nodes, surface = len(model.node_mass), len(model.surface_triangles)
     fits = {
-        "node_position": (state.node_position, (nodes, 3, model.node_mass.shape[1])),
+        "node_position": (state.node_position, (nodes, 3, len(model.lanes))),
         "contact_engaged": (state.contact_engaged, (lanes, count, surface * QUADRATURE_COUNT)),
         "shape_ends": (shapes.shape_ends, (len(state.lane_fault), count, 2, 3)),
         "tool_twist": (shapes.tool_twist, (lanes, tools, 6)),

@@ -48,9 +48,9 @@ class VectorModel(PrimitiveModel):
         super().__init__(manager, kind, ir.VectorType(element, kind.width))
 
 
-def lane_count(dtype: Any) -> int:
-    """How many numbers of a numpy type one register holds."""
-    return REGISTER_SIZE // np.dtype(dtype).itemsize
+def lane_counts(dtype: Any) -> tuple[int, ...]:
+    """How many organs of a numpy type may stand side by side: as many as a register holds first, then half of them."""
+    return (8,) if np.dtype(dtype) == np.float64 else (16, 8)
 
 
 def aligned_zeros(shape: tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
@@ -221,24 +221,48 @@ def _full_width(dtype: Any) -> int:
     return REGISTER_SIZE * 8 // dtype.bitwidth
 
 
-# A full register from place `index` of an array; a full register as the `index`-th of an array that is made of them;
-# the four numbers of row `index` of an array (n, 4).
+# A full register from place `index` of an array; the four numbers of row `index` of an array (n, 4).
 load_full = _define_load(_full_width, lambda _: 1)
-load_lanes = _define_load(_full_width, lambda width: width)
 load_row = _define_load(lambda _: 4, lambda _: 4)
+# The `index`-th vector of an array that is made of them.
 store_lanes = _define_store(lambda width: width)
 store_row = _define_store(lambda _: 4)
 
 
 @intrinsic
+def load_lanes(_typing: Any, lanes: Any, array: Any, index: Any) -> Any:
+    """The `index`-th vector of an array that is made of them, as wide as the tuple `lanes` is long."""
+    vector = VectorType(array.dtype, len(lanes))
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
+        place = builder.mul(values[2], ir.Constant(values[2].type, vector.width))
+        loaded = builder.load(_pointer(context, builder, signature.args[1], values[1], place, vector))
+        loaded.align = array.dtype.bitwidth // 8
+        return loaded
+
+    return vector(lanes, array, types.intp), generate
+
+
+@intrinsic
 def spread_like(_typing: Any, array: Any, value: Any) -> Any:
-    """A number in every lane of a register of an array's type."""
+    """A number in every place of a full register of an array's type."""
     vector = VectorType(array.dtype, _full_width(array.dtype))
 
     def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         return _operand(context, builder, values[1], value, vector)
 
     return vector(array, value), generate
+
+
+@intrinsic
+def spread_lanes(_typing: Any, lanes: Any, array: Any, value: Any) -> Any:
+    """A number in every lane of a vector of an array's type, as wide as the tuple `lanes` is long."""
+    vector = VectorType(array.dtype, len(lanes))
+
+    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        return _operand(context, builder, values[2], value, vector)
+
+    return vector(lanes, array, value), generate
 
 
 # ---- shuffles -----------------------------------------------------------------------------------------------------

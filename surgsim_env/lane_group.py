@@ -15,27 +15,28 @@ from surgsim_env.simulation import Simulation
 
 
 class LaneGroup:
-    """As many simulations as a register has lanes: 8 in float64, 16 in float32.
+    """As many simulations as there are lanes: 8 in float64, 16 or 8 in float32.
 
     Between control steps every simulation holds its own state, so that tasks, saving and loading see no difference; a
     control step copies them into the lanes and back, which costs a hundredth of it.
     """
 
-    def __init__(self, simulations: Sequence[Simulation], dtype: type = np.float64) -> None:
+    def __init__(self, simulations: Sequence[Simulation], dtype: type = np.float64, lanes: int | None = None) -> None:
         """Take simulations of one scene, at most as many as there are lanes."""
         self.simulations = list(simulations)
         first = self.simulations[0]
         self._organs: list[OrganModel] = [one.organ_model for one in self.simulations]
-        self._model = stack_organs(self._organs, dtype=dtype)
+        self._model = stack_organs(self._organs, dtype=dtype, lanes=lanes)
+        count = len(self._model.lanes)
         shapes = first.instrument.shapes
-        self._state = rest_lanes(self._organs, shape_count=len(shapes.shape_radius), dtype=dtype)
-        self._shapes = stack_shapes([one.instrument.shapes for one in self.simulations], dtype=dtype)
-        tools, lanes = first.instrument.tool_count, len(self._state.lane_fault)
-        self._response = lane_responses(tools, dtype=dtype)
-        self._wrench, self._mean = np.zeros((2, lanes, tools, 6))
-        self._reference = np.zeros((lanes, tools, 3))
-        self._taken, self._fault = np.zeros((2, lanes), dtype=np.int64)
-        self._peak = np.zeros(lanes)
+        self._state = rest_lanes(self._organs, shape_count=len(shapes.shape_radius), dtype=dtype, lanes=count)
+        self._shapes = stack_shapes([one.instrument.shapes for one in self.simulations], count)
+        tools = first.instrument.tool_count
+        self._response = lane_responses(tools, count)
+        self._wrench, self._mean = np.zeros((2, count, tools, 6))
+        self._reference = np.zeros((count, tools, 3))
+        self._taken, self._fault = np.zeros((2, count), dtype=np.int64)
+        self._peak = np.zeros(count)
 
     def control_step(self, active: NDArray[np.bool_], count: int, force_limit: float) -> None:
         """Advance the active simulations (n,) by up to `count` haptic steps; each is told what came of it.

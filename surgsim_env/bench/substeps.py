@@ -12,7 +12,7 @@ from msdm_core.meshing import box_mesh
 from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material
 from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
-from msdm_core.vector import lane_count
+from msdm_core.vector import lane_counts
 from surgsim_env.bench.effort import Cells, Effort
 from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
 from surgsim_env.bench.statistics import exponent, interleaved, median, seconds_per_call, spread
@@ -51,15 +51,11 @@ def single(model: OrganModel) -> Substep:
 
 def abreast(model: OrganModel, dtype: type = np.float64) -> Substep:
     """Seconds of one substep of each of many organs side by side in vector registers."""
-    lanes = lane_count(dtype)
+    lanes = lane_counts(dtype)[0]
     organs = stack_organs([model] * lanes, dtype=dtype)
     state = rest_lanes([model] * lanes, dtype=dtype)
     state.node_position[:, 0] += 0.01 * state.node_position[:, 2]
-    shapes, wrench, dt = (
-        stack_shapes([NO_SHAPES] * lanes, dtype=dtype),
-        np.zeros((lanes, 0, 6)),
-        0.5 * model.stable_step,
-    )
+    shapes, wrench, dt = stack_shapes([NO_SHAPES] * lanes, lanes), np.zeros((lanes, 0, 6)), 0.5 * model.stable_step
 
     def advance(count: int) -> None:
         if (advance_lanes(organs, state, shapes, NO_CONTACT, dt, count, wrench) != FAULT_NONE).any():

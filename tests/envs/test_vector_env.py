@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.vector_env import PalpateVectorEnv
+from surgsim_env.vector_env import PalpateVectorEnv, group_width
 
 ID = "SurgSim/Palpate-v0"
 COUNT = 3  # five lanes stay empty
@@ -107,6 +107,20 @@ def test_single_precision_feels_the_same_force():
     print(f"\nlargest force {largest:.3f} N, float32 off by {error:.2e} N, {100.0 * error / largest:.4f} %")
     assert largest > 0.1
     assert 0.0 < error < 0.005 * largest
+
+
+@pytest.mark.parametrize(
+    ("envs", "dtype", "threads", "lanes"),
+    [
+        (16, "float32", 2, 8),
+        (17, "float32", 2, 16),
+        (3, "float32", 1, 8),
+        (16, "float32", 1, 16),
+        (16, "float64", 2, 8),
+    ],
+)
+def test_groups_are_as_wide_as_keeps_the_threads_busy(envs: int, dtype: str, threads: int, lanes: int):
+    assert group_width(envs, np.dtype(dtype), threads) == lanes
 
 
 def test_states_are_saved_and_loaded_as_alone():

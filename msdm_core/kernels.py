@@ -61,6 +61,7 @@ class OrganModel(NamedTuple):
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
         stable_step: largest stable step without contact [s]                     scalar
+        added_mass: how much of node_mass `mass_scaling.scale_mass` added [kg]   scalar
     """
 
     node_rest_position: FloatArray
@@ -84,6 +85,7 @@ class OrganModel(NamedTuple):
     alpha: float
     beta: float
     stable_step: float
+    added_mass: float
 
 
 class OrganState(NamedTuple):

@@ -97,6 +97,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         alpha=float(spec.damping.alpha),
         beta=float(spec.damping.beta),
         stable_step=0.0,
+        added_mass=0.0,
     )
     return model._replace(stable_step=step_limit(largest_frequency(model), model.alpha, model.beta))
 

@@ -164,9 +164,10 @@ def lesion_fraction(mesh: TetMesh, lesion: Lesion) -> FloatArray:
 
 def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: FloatArray) -> None:
     node = int(np.argmin(np.linalg.norm(mesh.points - np.asarray(lesion.centre), axis=1)))
-    nearest = mesh.node_tets.of(node)[0]
-    corners = mesh.points[mesh.tets[nearest]]
-    cell = float(np.linalg.norm(corners[TET_EDGES[:, 0]] - corners[TET_EDGES[:, 1]], axis=1).max())
+    # The smallest of the tets around: those at an outer face are cut along its diagonal.
+    corners = mesh.points[mesh.tets[mesh.node_tets.of(node)]]
+    edges = np.linalg.norm(corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]], axis=2)
+    cell = float(edges.max(axis=1).min())
     if 2.0 * axes.min() < cell:
         raise OrganError(
             f"{lesion.name}: radius {axes.min() * 1000:.3g} mm is less than half of the {cell * 1000:.3g} mm cells "

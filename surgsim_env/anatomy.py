@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.geodesic import SurfaceDistance
 from msdm_core.kernels import OrganModel
+from msdm_core.mass_scaling import scale_mass
 from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing import box_mesh, mesh_surface
 from msdm_core.ordering import in_sweep_order
@@ -19,6 +20,7 @@ from msdm_core.triangles import nearest_triangle
 from surgsim_env.cell_share import surface_cell, warn_of_coarse_cells
 from surgsim_env.palpable_face import PalpableFace, find_palpable_face
 from surgsim_env.scenes import Anchor, FixedLesion, Scene, SurfaceMesh
+from surgsim_env.timing import step_needed
 
 # How exactly a drawn lesion's cover is met [m].
 COVER_TOLERANCE = 1e-4
@@ -44,12 +46,15 @@ class Anatomy:
         return SurfaceDistance(self.mesh.points, self.mesh.boundary_triangles)
 
     def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
-        """The organ with given lesions, every modulus of the healthy tissue and its capsule times a factor."""
+        """The organ with given lesions, every modulus of the healthy tissue and its capsule times a factor.
+
+        Where the scene says `mass_scaling`, with the mass that its number of substeps needs (`OrganModel.added_mass`).
+        """
         scene, capsule = self.scene, self.scene.capsule
         material = replace(scene.material, youngs_modulus=scene.material.youngs_modulus * modulus_factor)
         if capsule is not None:
             capsule = replace(capsule, youngs_modulus=capsule.youngs_modulus * modulus_factor)
-        return compile_organ(
+        organ = compile_organ(
             OrganSpec(
                 mesh=self.mesh,
                 materials=material,
@@ -60,6 +65,10 @@ class Anatomy:
                 stiffness_rule=scene.stiffness_rule,
             )
         )
+        timing = scene.timing
+        if not timing.mass_scaling:
+            return organ
+        return scale_mass(organ, step_needed(timing.haptic_step, timing.substep_count), scene.contact.law)
 
     def random_lesion(self, rng: np.random.Generator) -> Lesion:
         """A lesion drawn from the scene's ranges, below a random point of the palpable face.

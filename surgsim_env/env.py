@@ -107,6 +107,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         self._observation = values.astype(np.float32)
         self._running = True
         info = self._info("", saturated, self.task.blank_info(), self.task.blank_rewards())
+        info["added_mass"] = organ.added_mass
         return self._observation.copy(), info
 
     def command(self, action: Observation) -> None:

@@ -129,11 +129,15 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Timing:
-    """Rates: haptic_step [s], organ substeps in one, haptic steps in one control step."""
+    """Rates: haptic_step [s], organ substeps in one, haptic steps in one control step.
+
+    With mass_scaling, nodes that would need more substeps get some mass (`msdm_core.mass_scaling`).
+    """
 
     haptic_step: float = 0.001
     substep_count: int = 5
     haptic_steps_per_control: int = 50
+    mass_scaling: bool = False
 
     def __post_init__(self) -> None:
         _require("timing.haptic_step", self.haptic_step, 0.0, "s", above=True)

@@ -219,7 +219,7 @@ class Simulation:
             raise OrganError(
                 f"scene {self.anatomy.scene.name!r}: {self.substep_count} substeps of {self.substep_dt * 1e3:.3g} ms "
                 f"are too long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: "
-                f"set timing.substep_count = {needed} or use softer lesions"
+                f"set timing.substep_count = {needed}, timing.mass_scaling = true, or use softer lesions"
             )
 
 

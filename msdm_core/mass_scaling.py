@@ -82,4 +82,4 @@ def _node_stiffness(model: OrganModel, contact: ContactLaw | None) -> FloatArray
             block, model.tet_nodes[:, corner], modulus[:, None, None] * np.einsum("ti,tj->tij", gradient, gradient)
         )
     held = 0.0 if contact is None else contact_node_stiffness(model, contact)
-    return np.linalg.eigvalsh(block)[:, -1] + held
+    return np.linalg.eigvalsh(block)[:, -1].astype(np.float64) + held

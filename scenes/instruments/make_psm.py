@@ -43,7 +43,7 @@ SHAFT_RADIUS = 0.004  # an 8 mm instrument
 TIP_LENGTH = {"palpator": 0.020, "grasper": 0.0102}  # beyond the wrist's yaw axis [m]
 LIGHT, METAL, DARK = "0.86 0.87 0.89 1", "0.72 0.74 0.78 1", "0.13 0.14 0.16 1"
 BRIGHT, GREY, ACCENT = "0.90 0.91 0.94 1", "0.45 0.47 0.50 1", "0.10 0.42 0.60 1"
-ARC_RADIUS, ARC_SIDE = 0.285, 0.058  # of the arc about the remote centre, beside the shaft [m]
+ARC_RADIUS, ARC_SIDE, RAIL_SIDE = 0.285, 0.078, 0.048  # arc about the remote centre; beside the shaft [m]
 
 FRAMES = dict(zip([link.joint for link in PSM_LINKS], psm_frames(np.zeros(6)), strict=True))
 
@@ -53,7 +53,7 @@ def numbers(values) -> str:
 
 
 def quaternion(rotation) -> str:
-    """(w, x, y, z) of a rotation matrix by its eigenvector to 1, exact for right angles too."""
+    """(w, x, y, z) of a rotation matrix, an eigenvector (Bar-Itzhack 2000), to 15 digits: the same on any machine."""
     m = rotation
     k = np.array(
         [
@@ -64,7 +64,7 @@ def quaternion(rotation) -> str:
         ]
     )
     value = np.linalg.eigh(k)[1][:, -1]
-    return numbers(value if value[np.argmax(np.abs(value))] > 0.0 else -value)
+    return numbers(np.round(value if value[np.argmax(np.abs(value))] > 0.0 else -value, 15))
 
 
 def local(link: str, point) -> str:
@@ -116,9 +116,10 @@ def yaw_parts() -> list[str]:
         capsule("yaw", f"arc_{k}", on_arc(a), on_arc(b), 0.011, LIGHT, 2) for k, (a, b) in enumerate(pairwise(angles))
     ]
     foot = on_arc(84.0)
-    knee = np.array([0.058, 0.33, 0.0])
+    knee = np.array([ARC_SIDE, 0.33, 0.0])
     return [
         *arc,
+        capsule("yaw", "", on_arc(-63.0), on_arc(-61.0), 0.0125, DARK),
         capsule("yaw", "strut", foot, knee, 0.016, LIGHT, 2),
         capsule("yaw", "bracket", knee, (0.0, 0.40, 0.0), 0.018, LIGHT, 2),
         capsule("yaw", "", (0.0, 0.385, 0.0), (0.0, 0.50, 0.0), 0.042, GREY, kind="cylinder"),
@@ -128,14 +129,14 @@ def yaw_parts() -> list[str]:
 
 
 def pitch_parts() -> list[str]:
-    side = ARC_SIDE
+    side, rail = ARC_SIDE, RAIL_SIDE
     return [
         box("pitch", (side, 0.0, ARC_RADIUS), (0.024, 0.042, 0.026), GREY),
         box("pitch", (side, 0.0, ARC_RADIUS), (0.0245, 0.030, 0.006), ACCENT),
-        capsule("pitch", "rail", (0.034, 0.0, 0.115), (0.034, 0.0, 0.60), 0.010, METAL, 2),
-        capsule("pitch", "", (0.034, 0.0, 0.10), (0.034, 0.0, 0.118), 0.013, DARK, kind="cylinder"),
-        capsule("pitch", "", (0.034, 0.0, 0.597), (0.034, 0.0, 0.615), 0.013, DARK, kind="cylinder"),
-        capsule("pitch", "", (0.034, 0.0, 0.108), (0.0, 0.0, 0.075), 0.006, METAL),
+        capsule("pitch", "rail", (rail, 0.0, 0.115), (rail, 0.0, 0.52), 0.010, METAL, 2),
+        capsule("pitch", "", (rail, 0.0, 0.10), (rail, 0.0, 0.118), 0.013, DARK, kind="cylinder"),
+        capsule("pitch", "", (rail, 0.0, 0.515), (rail, 0.0, 0.535), 0.013, DARK, kind="cylinder"),
+        capsule("pitch", "", (rail, 0.0, 0.108), (0.0, 0.0, 0.075), 0.006, METAL),
         # The cannula: a funnel above the body wall and a thin tube through it.
         capsule("pitch", "", (0.0, 0.0, 0.055), (0.0, 0.0, 0.085), 0.013, METAL, kind="cylinder"),
         capsule("pitch", "", (0.0, 0.0, -0.025), (0.0, 0.0, 0.055), 0.0055, METAL, kind="cylinder"),
@@ -144,9 +145,9 @@ def pitch_parts() -> list[str]:
 
 def insertion_parts() -> list[str]:
     return [
-        capsule("insertion", "sled", (0.030, 0.0, 0.405), (0.030, 0.0, 0.475), 0.017, GREY, 2),
-        box("insertion", (0.012, 0.0, 0.440), (0.020, 0.024, 0.036), LIGHT),
-        box("insertion", (0.012, 0.0, 0.440), (0.0205, 0.0245, 0.004), ACCENT),
+        capsule("insertion", "sled", (0.020, 0.0, 0.410), (0.020, 0.0, 0.470), 0.017, GREY, 2),
+        box("insertion", (0.013, 0.0, 0.440), (0.026, 0.024, 0.036), LIGHT),
+        box("insertion", (0.013, 0.0, 0.440), (0.0264, 0.0245, 0.004), ACCENT),
         capsule("insertion", "", (0.0, 0.0, 0.395), (0.0, 0.0, 0.408), 0.010, DARK, kind="cylinder"),
     ]
 
@@ -213,7 +214,7 @@ def model(tool: str) -> str:
         still = link.transform(0.0)
         pad = "  " * depth
         lines.append(
-            f'{pad}<body name="{link.joint}" pos="{numbers(still[:3, 3])}" quat="{quaternion(still[:3, :3])}">'
+            f'{pad}<body name="{link.joint}" pos="{numbers(np.round(still[:3, 3], 15))}" quat="{quaternion(still[:3, :3])}">'
         )
         kind = "slide" if link.prismatic else "hinge"
         lines.append(f"{pad}  {joint(link.joint, link.joint, link.lower, link.upper, link.effort, kind)}")

@@ -8,7 +8,7 @@ import numpy as np
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.arms.arm import load_arm
-from surgsim_env.arms.inverse_kinematics import PoseSolution, follow, reach_pose, solve_pose, turn_towards
+from surgsim_env.arms.inverse_kinematics import PoseSolution, follow, reach_pose, turn_towards
 from surgsim_env.arms.model import position_actuator, speed_actuator
 from surgsim_env.arms.port_placement import check_port_outside, default_port
 from surgsim_env.arms.wrist_sensor import WristSensor
@@ -18,7 +18,7 @@ from surgsim_env.tool_bodies import make_servo
 # A place counts as reached by the tip within this [m]; how it points is as the joints allow.
 PLACE_TOLERANCE = 1e-6
 # Where the tip waits before the first reset: this far above the middle of the palpable face [m].
-PARKED_ABOVE = 0.03
+PARKED_GAP = 0.010
 # How many places of the palpable face are tried when an arm is set up.
 PLACES_TRIED = 24
 
@@ -59,7 +59,7 @@ class ArmInstrument(Instrument):
         self.direction = self._approach.copy()
         self._short = False
         self.wrist = WristSensor.of(model)
-        self.parked = np.clip(_middle(anatomy) - PARKED_ABOVE * self._approach, lower, upper)
+        self.parked = _middle(anatomy) - (scene.instrument.tip_radius + PARKED_GAP) * self._approach
         self._check_reach(anatomy)
         self.place(self.parked)
 
@@ -149,7 +149,7 @@ class ArmInstrument(Instrument):
         found = reach_pose(self.arm, position, direction=self._approach, starts=2)
         if _placed(found):
             return found
-        return solve_pose(self.arm, position)
+        return reach_pose(self.arm, position, starts=4)
 
     def _check_reach(self, anatomy: Anatomy) -> None:
         """The tip comes to the parking place and to places all over the palpable face."""

@@ -213,9 +213,8 @@ def model(tool: str) -> str:
     for link, link_parts in zip(PSM_LINKS, drawn, strict=True):
         still = link.transform(0.0)
         pad = "  " * depth
-        lines.append(
-            f'{pad}<body name="{link.joint}" pos="{numbers(np.round(still[:3, 3], 15))}" quat="{quaternion(still[:3, :3])}">'
-        )
+        place, turn = numbers(np.round(still[:3, 3], 15)), quaternion(still[:3, :3])
+        lines.append(f'{pad}<body name="{link.joint}" pos="{place}" quat="{turn}">')
         kind = "slide" if link.prismatic else "hinge"
         lines.append(f"{pad}  {joint(link.joint, link.joint, link.lower, link.upper, link.effort, kind)}")
         lines.append(f"{pad}  {inertial(link.joint, link.joint)}")

@@ -176,7 +176,7 @@ def _placed(found: PoseSolution) -> bool:
 
 def _missing(found: PoseSolution) -> str:
     away, off = found.position_error * 1e3, found.trocar_error * 1e3
-    return f"its tip stays {away:.3g} mm away, its shaft {off:.3g} mm off the trocar"
+    return f"its tip stays {away:.3f} mm away, its shaft {off:.3f} mm off the trocar"
 
 
 def _millimetres(point: FloatArray) -> str:

@@ -10,9 +10,10 @@ from msdm_core.damping import Damping
 from msdm_core.kernels import ContactLaw
 from msdm_core.regions import Capsule, Material
 from msdm_core.stiffness import check_stiffness_rule
+from surgsim_env.arms.description import list_arms
 from surgsim_env.arms.port import Port
 from surgsim_env.scene_files import scenes_folder
-from surgsim_env.toml_tables import fill, read_toml
+from surgsim_env.toml_tables import fill, nearest, read_toml
 
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
@@ -329,8 +330,8 @@ def make_scene(name: str | Path) -> Scene:
         return load_scene(Path(name))
     known = list_scenes()
     if name not in known:
-        nearest = get_close_matches(name, known, n=1, cutoff=0.4)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        close = get_close_matches(name, known, n=1, cutoff=0.4)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"scene {name!r} is unknown; the scenes are {', '.join(known)}{hint}")
     return load_scene(scenes_folder() / "organs" / f"{name}.toml")
 
@@ -341,6 +342,12 @@ def with_instrument(scene: Scene, instrument: str | None) -> Scene:
         return scene
     if not isinstance(instrument, str | Path):
         raise ValueError(f'instrument is {instrument!r}; it must be "probe", an arm\'s name or the path of a TOML file')
+    known = ["probe", *list_arms()]
+    if Path(instrument).suffix != ".toml" and instrument not in known:
+        raise ValueError(
+            f"instrument {str(instrument)!r} is unknown{nearest(str(instrument), known)}; the instruments are "
+            f"{', '.join(known)}, or the path of an arm's TOML file"
+        )
     model = "probe.xml" if instrument == "probe" else str(instrument)
     return replace(scene, instrument=replace(scene.instrument, model=model))
 

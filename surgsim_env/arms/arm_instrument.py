@@ -45,8 +45,12 @@ class ArmInstrument(Instrument):
         scene = anatomy.scene
         port = scene.port or default_port(anatomy.face)
         check_port_outside(port, f"scene {scene.name!r}", anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+        beside = scene.folder / scene.instrument.model
         self.arm = load_arm(
-            scene.instrument.model, port, tip_radius=scene.instrument.tip_radius, timestep=scene.timing.haptic_step
+            beside if beside.is_file() else scene.instrument.model,
+            port,
+            tip_radius=scene.instrument.tip_radius,
+            timestep=scene.timing.haptic_step,
         )
         arm, model = self.arm, self.arm.model
         super().__init__(model, lower, upper, arm.tip_site)

@@ -64,14 +64,18 @@ def _read_spec(description: ArmDescription) -> mujoco.MjSpec:
 
 
 def _check_repeated_names(root: ElementTree.Element) -> None:
-    """Two parts of one kind and name, such as two sites "tip"; defaults may repeat names."""
+    """Two parts of one kind and name, such as two sites "tip"."""
+    if root.tag == "robot":
+        parts = [part for part in root if part.tag in ("link", "joint")]
+    else:
+        worlds = root.findall("worldbody")
+        parts = [part for kind in ("body", "joint", "geom", "site") for world in worlds for part in world.iter(kind)]
     seen: set[tuple[str, str]] = set()
-    for part in ("body", "joint", "geom", "site", "link"):
-        for element in root.iter(part):
-            name = element.get("name")
-            if name and (part, name) in seen and element.get("joint") is None:
-                raise ValueError(f"two parts <{part}> are named {name!r}; names must differ: rename one")
-            seen.add((part, name or ""))
+    for part in parts:
+        name = part.get("name")
+        if name and (part.tag, name) in seen:
+            raise ValueError(f"two parts <{part.tag}> are named {name!r}; names must differ: rename one")
+        seen.add((part.tag, name or ""))
 
 
 def _check_meshes(spec: mujoco.MjSpec, path: Path) -> None:

@@ -7,10 +7,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from surgsim_env.anatomy import load_anatomy
 from surgsim_env.arms.arm import load_arm
 from surgsim_env.arms.description import list_arms, read_description
 from surgsim_env.arms.port import Port
 from surgsim_env.scene_files import scenes_folder
+from surgsim_env.scenes import make_scene, with_instrument
+from surgsim_env.simulation import Simulation
 
 INSTRUMENTS = scenes_folder() / "instruments"
 
@@ -199,6 +202,23 @@ def test_unknown_arms_and_files_are_named(tmp_path):
     (tmp_path / "folder.toml").mkdir()
     with pytest.raises(ValueError, match="cannot be read"):
         load_arm(tmp_path / "folder.toml")
+
+
+def test_an_unknown_instrument_of_a_scene_is_named(tmp_path):
+    scene = make_scene("phantom")
+    with pytest.raises(ValueError, match=r"instrument 'psm_palpater' is unknown; did you mean 'psm_palpator'"):
+        with_instrument(scene, "psm_palpater")
+    with pytest.raises(ValueError, match=r"arm file .*mine.toml cannot be read"):
+        Simulation(load_anatomy(with_instrument(scene, str(tmp_path / "mine.toml"))))
+
+
+def test_an_arm_beside_its_scene_file_is_found(tmp_path):
+    table, model = texts()
+    written(tmp_path, table, model)
+    scene = (scenes_folder() / "organs" / "phantom.toml").read_text()
+    (tmp_path / "scene.toml").write_text(swap(scene, 'model = "probe.xml"', 'model = "mine.toml"'))
+    instrument = Simulation(load_anatomy(make_scene(tmp_path / "scene.toml"))).instrument
+    assert instrument.arm.description.folder == tmp_path  # type: ignore[attr-defined]
 
 
 def test_ports_are_checked():

@@ -149,6 +149,23 @@ def test_it_presses_and_holds_still(simulation):
     assert instrument.tip_position == pytest.approx([0.03, 0.03, 0.034], abs=1e-4)
 
 
+def test_a_load_bends_the_servo_and_not_the_path(instrument):
+    """1 N across while the tip moves 10 mm: it gives way, and comes back onto its line when the load goes."""
+    instrument.place(ABOVE)
+    body = instrument.model.site_bodyid[instrument.arm.tip_site]
+    for _ in range(20):
+        instrument.data.xfrc_applied[body, 1] = 1.0
+        instrument.command_velocity(np.array([0.01, 0.0, 0.0]))
+        for _ in let_run(instrument, 50):
+            pass
+    assert instrument.tip_position[1] - ABOVE[1] > 1e-5
+    instrument.data.xfrc_applied[body] = 0.0
+    instrument.command_velocity(np.zeros(3))
+    for _ in let_run(instrument, 500):
+        pass
+    assert instrument.tip_position == pytest.approx(ABOVE + [0.01, 0.0, 0.0], abs=5e-6)
+
+
 def test_the_wrist_feels_what_the_tissue_does(simulation):
     """At rest in contact the tared wrist reads the tissue's force on what lies beyond it."""
     test_it_presses_and_holds_still(simulation)
@@ -240,7 +257,8 @@ def test_a_state_is_restored_to_the_bit(instrument):
         pass
     saved = instrument.get_state()
     tips = []
-    for _ in range(2):
+    for direction in (instrument.direction, np.array([0.6, 0.0, -0.8])):
+        instrument.direction = direction.copy()
         instrument.set_state(saved)
         assert instrument.get_state().tobytes() == saved.tobytes()
         for _ in range(3):

@@ -150,20 +150,20 @@ def test_it_presses_and_holds_still(simulation):
 
 
 def test_a_load_bends_the_servo_and_not_the_path(instrument):
-    """1 N across while the tip moves 10 mm: it gives way, and comes back onto its line when the load goes."""
+    """3 N across while the tip moves 10 mm: it gives way, and comes back onto its line when the load goes."""
     instrument.place(ABOVE)
     body = instrument.model.site_bodyid[instrument.arm.tip_site]
     for _ in range(20):
-        instrument.data.xfrc_applied[body, 1] = 1.0
+        instrument.data.xfrc_applied[body, 1] = 3.0
         instrument.command_velocity(np.array([0.01, 0.0, 0.0]))
         for _ in let_run(instrument, 50):
             pass
-    assert instrument.tip_position[1] - ABOVE[1] > 1e-5
+    assert instrument.tip_position[1] - ABOVE[1] > 3e-5
     instrument.data.xfrc_applied[body] = 0.0
     instrument.command_velocity(np.zeros(3))
     for _ in let_run(instrument, 500):
         pass
-    assert instrument.tip_position == pytest.approx(ABOVE + [0.01, 0.0, 0.0], abs=5e-6)
+    assert instrument.tip_position == pytest.approx(np.add(ABOVE, [0.01, 0.0, 0.0]), abs=1e-7)
 
 
 def test_the_wrist_feels_what_the_tissue_does(simulation):
@@ -211,8 +211,11 @@ def test_the_box_stops_the_tip_and_says_so(instrument):
             pass
     assert instrument.workspace_limited
     assert instrument.tip_position[2] == pytest.approx(instrument.upper[2], abs=1e-4)
+    saved = instrument.get_state()
     instrument.command_velocity(np.array([0.0, 0.0, -0.02]))
     assert not instrument.workspace_limited
+    instrument.set_state(saved)
+    assert instrument.workspace_limited
 
 
 def test_a_joints_limit_stops_the_tip_and_says_so():

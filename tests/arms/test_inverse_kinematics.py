@@ -158,7 +158,7 @@ def test_a_speed_beyond_the_joints_limits_is_cut_along_the_line(psm):
 
 def test_the_tip_turns_no_faster_than_1_rad_per_second(psm):
     """Told to point 0.64 rad aside it gets there in 13 control steps of at most 0.05 rad, its place unmoved."""
-    joints, place = psm.home + [0.0, 0.0, 0.0, 0.0, 0.1, 0.1], None
+    joints, place = np.add(psm.home, [0.0, 0.0, 0.0, 0.0, 0.1, 0.1]), None
     wanted = np.array([0.6, 0.0, -0.8])
     for _ in range(30):
         before = psm.tip_direction(joints)

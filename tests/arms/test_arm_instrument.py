@@ -10,6 +10,7 @@ from surgsim_env.anatomy import load_anatomy
 from surgsim_env.arms.arm_instrument import ArmInstrument
 from surgsim_env.arms.port import Port
 from surgsim_env.arms.port_placement import default_port, inside_surface
+from surgsim_env.palpation.scan import press
 from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 
@@ -147,6 +148,21 @@ def test_it_presses_and_holds_still(simulation):
     assert 0.2 < simulation.contact_force[2] < 0.3
     assert np.linalg.norm(instrument.tip_velocity) < 1e-6
     assert instrument.tip_position == pytest.approx([0.03, 0.03, 0.034], abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_press_of_the_scan_feels_what_the_probe_feels(name):
+    """The same ball, the same path: forces differ by what the servos give way, 0.1 mm of 4 at most."""
+    forces, depths = [], []
+    for instrument in ("probe", name):
+        anatomy = phantom(instrument)
+        simulation = Simulation(anatomy)
+        found = press(simulation, np.array([0.025, 0.03, 0.03]), np.array([0.0, 0.0, 1.0]))
+        assert not found.end
+        forces.append(found.force)
+        depths.append(found.depth)
+    assert depths[1] == pytest.approx(depths[0], abs=1e-4)
+    assert forces[1] == pytest.approx(forces[0], rel=0.04)
 
 
 def test_a_load_bends_the_servo_and_not_the_path(instrument):

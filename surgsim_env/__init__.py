@@ -8,9 +8,12 @@ from msdm_core import numba_cache
 with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
     # First of all: what is compiled is cached where it was decorated.
     from surgsim_env import haptic_kernels, lane_haptic_kernels  # noqa: F401
+from surgsim_env.arms.arm import load_arm
+from surgsim_env.arms.description import list_arms
+from surgsim_env.arms.port import Port
 from surgsim_env.env import register
 from surgsim_env.scenes import list_scenes, make_scene
 
-__all__ = ["list_scenes", "make_scene", "register"]
+__all__ = ["Port", "list_arms", "list_scenes", "load_arm", "make_scene", "register"]
 
 register()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import load_anatomy
-from surgsim_env.scenes import make_scene
+from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.tasks.palpate import EPISODE_STEPS, PalpateTask
 
@@ -66,11 +66,16 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     observation is the last finite one). Truncated: 600 control steps (30 s).
 
     ## Info
-    Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`, `hard_limit`,
-    `declared`, `success` (bool), `force_peak` [N], `error_mm` (-1 if nothing was declared), one `reward_<term>` each.
+    Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited` (the box, or an arm's
+    joint and speed limits), `hard_limit`, `declared`, `success` (bool), `force_peak` [N], `error_mm` (-1 if nothing was
+    declared), `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through
+    none), one `reward_<term>` each.
 
     ## Arguments
     * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
+    * `instrument`: "probe", the name of an arm (`surgsim_env.list_arms()`, such as "psm_palpator") or the path of an
+      arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
+      its tip points along the scene's approach as far as its joints allow.
 
     `env.unwrapped.save_state()` and `load_state()` cover organ, robot, task, counters and random generator; wrappers'
     own counts (TimeLimit) they cannot reach: load a state into an environment that was just reset.
@@ -81,11 +86,11 @@ class PalpateEnv(gym.Env[Observation, Observation]):
 
     metadata: ClassVar[Info] = {"render_modes": [], "render_fps": 20}
 
-    def __init__(self, scene: str = "phantom", render_mode: str | None = None) -> None:
+    def __init__(self, scene: str = "phantom", instrument: str | None = None, render_mode: str | None = None) -> None:
         if render_mode is not None:
             raise ValueError(f"render_mode {render_mode!r} is not offered; this environment has none yet: use None")
         self.render_mode = None
-        self.scene = make_scene(scene)
+        self.scene = with_instrument(make_scene(scene), instrument)
         anatomy = load_anatomy(self.scene)
         self.simulation = Simulation(anatomy)
         self.task = PalpateTask(anatomy)
@@ -119,7 +124,9 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         """
         if not self._running:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
-        self.simulation.instrument.command_velocity(self.task.velocity(self._checked(action)))
+        values = self._checked(action)
+        if not self.simulation.taken_over:
+            self.simulation.instrument.command_velocity(self.task.velocity(values))
 
     def step(self, action: Observation) -> tuple[Observation, float, bool, bool, Info]:
         """One control step: haptic steps until it is over, the hard limit is passed or the simulation faults."""
@@ -218,10 +225,12 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         return f"observation[{bad[0]}] = {values[bad[0]]:g} left its bounds" if bad.size else ""
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
+        residual = self.simulation.instrument.trocar_residual
         return {
             "sim_fault": fault,
             "sensor_saturated": saturated,
             "workspace_limited": self.simulation.instrument.workspace_limited,
+            "trocar_error_mm": -1.0 if residual is None else residual * 1000.0,
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }

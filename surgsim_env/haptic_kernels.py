@@ -41,17 +41,21 @@ MUJOCO_FUNCTIONS = tuple(
 
 
 class Servo(NamedTuple):
-    """What drives an instrument's slides: MuJoCo's first controls are their positions, the next ones their speeds.
+    """What drives an instrument's joints, slides or hinges: position targets that move on at the commanded speeds.
 
     Fields:
-        command: speed asked for [m/s]                                           (n_slide,)
-        lower, upper: the workspace [m]                                          (n_slide,)
-        limited: whether the last step was stopped by it                         (1,)
+        command: speed asked for [m/s or rad/s]                                  (n_joint,)
+        lower, upper: the workspace, or the joints' limits [m or rad]            (n_joint,)
+        position: which of MuJoCo's controls are the positions                   (n_joint,)
+        speed: which are the speeds; -1 where a joint has none                   (n_joint,)
+        limited: whether the last step was stopped by the limits                 (1,)
     """
 
     command: FloatArray
     lower: FloatArray
     upper: FloatArray
+    position: NDArray[np.int64]
+    speed: NDArray[np.int64]
     limited: NDArray[np.bool_]
 
 
@@ -142,22 +146,24 @@ def yield_tool(factors, jacobian, smooth_force, yielded, mobility, acceleration)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _drive(tools):
-    """`ToolBodies.drive`: the servo's target moves on by one step and stops at the workspace."""
+    """`ToolBodies.drive`: the servo's targets move on by one step and stop at their limits."""
     servo, control = tools.servo, tools.control
-    count = servo.command.shape[0]
     servo.limited[0] = False
-    for slide in range(count):
-        target = control[slide] + servo.command[slide] * tools.timestep
+    for joint in range(servo.command.shape[0]):
+        place, pace = servo.position[joint], servo.speed[joint]
+        target = control[place] + servo.command[joint] * tools.timestep
         held = target
-        if held < servo.lower[slide]:
-            held = servo.lower[slide]
-        if held > servo.upper[slide]:
-            held = servo.upper[slide]
-        control[slide] = held
-        control[count + slide] = servo.command[slide]
+        if held < servo.lower[joint]:
+            held = servo.lower[joint]
+        if held > servo.upper[joint]:
+            held = servo.upper[joint]
+        control[place] = held
+        if pace >= 0:
+            control[pace] = servo.command[joint]
         if held != target:
             servo.limited[0] = True
-            control[count + slide] = 0.0
+            if pace >= 0:
+                control[pace] = 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

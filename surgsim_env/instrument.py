@@ -1,4 +1,4 @@
-"""An instrument simulated in MuJoCo: its model made for a scene, its tip and its velocity servo."""
+"""An instrument simulated in MuJoCo: what a simulation and a task ask of any, and the Cartesian probe of a scene."""
 
 from pathlib import Path
 
@@ -6,28 +6,40 @@ import mujoco
 import numpy as np
 
 from msdm_core.mesh import FloatArray
-from surgsim_env.haptic_kernels import Servo
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene
-from surgsim_env.tool_bodies import ToolBodies
+from surgsim_env.tool_bodies import ToolBodies, make_servo
 
 SLIDES = ("x", "y", "z")
 
 
 class Instrument(ToolBodies):
-    """A Cartesian probe of a scene, placed in the world frame: slide coordinates are the tip's position."""
+    """A tool with a ball tip that is steered by the tip's velocity within a box; its servo moves joint targets.
 
-    def __init__(self, scene: Scene, lower: FloatArray, upper: FloatArray) -> None:
-        """Load the scene's model; the tip may move in the box from lower to upper [m]."""
-        super().__init__(_compile(scene, lower, upper))
+    Fields:
+        lower, upper: the box that the tip may move in [m]                       (3,)
+        parked: where the tip waits before the first reset [m]                   (3,)
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    parked: FloatArray
+
+    def __init__(self, model: mujoco.MjModel, lower: FloatArray, upper: FloatArray, tip_site: int) -> None:
+        """Take a compiled model, the tip's box [m] and the index of the site at its tip."""
+        super().__init__(model)
         self.lower, self.upper = lower, upper
-        self._tip = self.model.site("tip").id
-        self.servo = Servo(np.zeros(3), lower, upper, np.zeros(1, dtype=bool))
+        self._tip = tip_site
 
     @property
     def workspace_limited(self) -> bool:
-        """Whether the servo's target was stopped at the edge of the workspace in the last haptic step."""
+        """Whether the servo's targets were stopped at a limit in the last haptic step."""
         return bool(self.servo.limited[0])
+
+    @property
+    def trocar_residual(self) -> float | None:
+        """Distance of the shaft's axis from the trocar [m]; None for an instrument that passes through none."""
+        return None
 
     @property
     def tip_position(self) -> FloatArray:
@@ -42,16 +54,11 @@ class Instrument(ToolBodies):
 
     def place(self, position: FloatArray) -> None:
         """Put the tip at rest at a position [m], everything else as when loaded."""
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:3] = position
-        self.data.ctrl[:3] = position
-        self.servo.command[:] = 0.0
-        self.servo.limited[0] = False
-        mujoco.mj_forward(self.model, self.data)
+        raise NotImplementedError
 
     def command_velocity(self, velocity: FloatArray) -> None:
         """Set the tip velocity that the servo follows from now on [m/s], shape (3,)."""
-        self.servo.command[:] = velocity
+        raise NotImplementedError
 
     def refresh(self) -> None:
         """Bring poses and velocities up to the current coordinates (after mj_step2 they are one step old)."""
@@ -71,15 +78,45 @@ class Instrument(ToolBodies):
         signature = mujoco.mjtState.mjSTATE_INTEGRATION
         state = np.empty(mujoco.mj_stateSize(self.model, signature))
         mujoco.mj_getState(self.model, self.data, state, signature)
-        return np.concatenate([state, self.servo.command, [float(self.workspace_limited)]])
+        return np.concatenate([state, self.servo.command, [float(self.servo.limited[0])]])
 
     def set_state(self, state: FloatArray) -> None:
         """Restore what `get_state` gave, to the bit."""
+        size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION)
+        joints = len(self.servo.command)
         mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_setState(self.model, self.data, state[:-4], mujoco.mjtState.mjSTATE_INTEGRATION)
-        self.servo.command[:] = state[-4:-1]
-        self.servo.limited[0] = bool(state[-1])
+        mujoco.mj_setState(self.model, self.data, state[:size], mujoco.mjtState.mjSTATE_INTEGRATION)
+        self.servo.command[:] = state[size : size + joints]
+        self.servo.limited[0] = bool(state[size + joints])
         self.refresh()
+
+    def _rest(self) -> None:
+        """Everything as when loaded, the servo still."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.servo.command[:] = 0.0
+        self.servo.limited[0] = False
+
+
+class Probe(Instrument):
+    """A Cartesian probe of a scene, placed in the world frame: slide coordinates are the tip's position."""
+
+    def __init__(self, scene: Scene, lower: FloatArray, upper: FloatArray) -> None:
+        """Load the scene's model; the tip may move in the box from lower to upper [m], and waits in its far corner."""
+        model = _compile(scene, lower, upper)
+        super().__init__(model, lower, upper, model.site("tip").id)
+        self.parked = upper
+        self.servo = make_servo(lower, upper, np.arange(3), np.arange(3, 6))
+
+    def place(self, position: FloatArray) -> None:
+        """Put the tip at rest at a position [m], everything else as when loaded."""
+        self._rest()
+        self.data.qpos[:3] = position
+        self.data.ctrl[:3] = position
+        mujoco.mj_forward(self.model, self.data)
+
+    def command_velocity(self, velocity: FloatArray) -> None:
+        """Set the tip velocity that the servo follows from now on [m/s], shape (3,)."""
+        self.servo.command[:] = velocity
 
 
 def _compile(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco.MjModel:

@@ -1,20 +1,19 @@
 """Scenes: one TOML file each, read into frozen dataclasses. All values SI; the file's comments give their sources."""
 
 import math
-import tomllib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-import dacite
-
 from msdm_core.damping import Damping
-from msdm_core.errors import OrganError
 from msdm_core.kernels import ContactLaw
 from msdm_core.regions import Capsule, Material
 from msdm_core.stiffness import check_stiffness_rule
+from surgsim_env.arms.description import list_arms
+from surgsim_env.arms.port import Port
 from surgsim_env.scene_files import scenes_folder
+from surgsim_env.toml_tables import fill, nearest, read_toml
 
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
@@ -112,7 +111,7 @@ class Instrument:
     """The instrument that touches the organ.
 
     Args:
-        model: MJCF file in scenes/instruments.
+        model: MJCF file of a probe in scenes/instruments, a shipped arm's name or the path of an arm's TOML file.
         tip_radius: of the ball tip [m].
         approach: direction in which it comes to the organ; the shaft lies along it.
     """
@@ -275,7 +274,10 @@ class Contact:
 
 @dataclass(frozen=True)
 class Scene:
-    """A whole scene; `name` is the file's stem, `stiffness_rule` one of msdm_core.stiffness.STIFFNESS_RULES."""
+    """A whole scene; `name` is the file's stem, `stiffness_rule` one of msdm_core.stiffness.STIFFNESS_RULES.
+
+    `port` is where an arm enters the body; if it is not given, `arms.port_placement.default_port` finds one.
+    """
 
     name: str
     description: str
@@ -294,6 +296,7 @@ class Scene:
     capsule: Capsule | None = None
     demonstration: tuple[FixedLesion, ...] = field(default=())
     stiffness_rule: str = "lloyd"
+    port: Port | None = None
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
@@ -306,12 +309,11 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
         raise ValueError(f"{what} is {value:g} {unit}".rstrip() + f"; it must be finite and {rule}")
 
 
-# Every entry that a scene file may have, to suggest the nearest one to a misspelt one.
+# The tables that a scene file may have.
 _TABLES = (
     *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
-    *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion),
+    *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Port),
 )
-_ENTRIES = sorted({entry.name for table in _TABLES for entry in fields(table)})
 
 
 def list_scenes() -> list[str]:
@@ -332,45 +334,33 @@ def make_scene(name: str | Path) -> Scene:
         return load_scene(Path(name))
     known = list_scenes()
     if name not in known:
-        nearest = get_close_matches(name, known, n=1, cutoff=0.4)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        close = get_close_matches(name, known, n=1, cutoff=0.4)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"scene {name!r} is unknown; the scenes are {', '.join(known)}{hint}")
     return load_scene(scenes_folder() / "organs" / f"{name}.toml")
 
 
+def with_instrument(scene: Scene, instrument: str | None) -> Scene:
+    """The scene with another instrument: "probe", an arm's name or the path of its TOML file; None keeps its own."""
+    if instrument is None:
+        return scene
+    if not isinstance(instrument, str | Path):
+        raise ValueError(f'instrument is {instrument!r}; it must be "probe", an arm\'s name or the path of a TOML file')
+    known = ["probe", *list_arms()]
+    if Path(instrument).suffix != ".toml" and instrument not in known:
+        raise ValueError(
+            f"instrument {str(instrument)!r} is unknown{nearest(str(instrument), known)}; the instruments are "
+            f"{', '.join(known)}, or the path of an arm's TOML file"
+        )
+    model = "probe.xml" if instrument == "probe" else str(instrument)
+    return replace(scene, instrument=replace(scene.instrument, model=model))
+
+
 def load_scene(path: Path) -> Scene:
     """Read one scene file; ValueError names the file, the entry and what is wrong with it."""
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"scene file {path} cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"scene file {path} is not valid TOML: {error}") from None
-    return scene_from_table(table, name=path.stem, folder=path.parent)
+    return scene_from_table(read_toml(path, "scene"), name=path.stem, folder=path.parent)
 
 
 def scene_from_table(table: dict[str, Any], *, name: str, folder: Path) -> Scene:
     """A scene from a table such as a TOML file holds; paths in it are relative to `folder`."""
-    config = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _real, int: _whole})
-    try:
-        return dacite.from_dict(Scene, {**table, "name": name, "folder": folder}, config)
-    except dacite.UnexpectedDataError as error:
-        entry = sorted(map(str, error.keys))[0]
-        nearest = get_close_matches(entry, _ENTRIES, n=1)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        raise ValueError(f"scene {name!r}: entry {entry!r} is unknown there{hint}") from None
-    except (dacite.DaciteError, OrganError, ValueError, TypeError) as error:
-        raise ValueError(f"scene {name!r}: {error}") from None
-
-
-def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"{value!r} is not a whole number")
-    return value
-
-
-def _real(value: Any) -> float:
-    """TOML tells 5000 from 5000.0; a scene does not."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{value!r} is not a number")
-    return float(value)
+    return fill(Scene, {**table, "name": name, "folder": folder}, f"scene {name!r}", _TABLES)

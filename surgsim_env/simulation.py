@@ -15,8 +15,9 @@ from msdm_core.organ import rest_state
 from msdm_core.stability import stable_dt
 from surgsim_env import mujoco_library
 from surgsim_env.anatomy import Anatomy
+from surgsim_env.arms.arm_instrument import ArmInstrument, is_arm
 from surgsim_env.exchange import StepsTaken, compiled_steps, haptic_step
-from surgsim_env.instrument import Instrument
+from surgsim_env.instrument import Instrument, Probe
 from surgsim_env.timing import substeps_needed
 from surgsim_env.tool_mass import check_tool_masses
 
@@ -35,10 +36,11 @@ class Simulation:
     """
 
     def __init__(self, anatomy: Anatomy) -> None:
-        """Set up a scene's healthy organ and its instrument, the tip in the far corner of its workspace.
+        """Set up a scene's healthy organ and its instrument, the tip parked away from the organ.
 
         Raises:
             OrganError: the scene's number of substeps is too small for its organ, or a tool too light for its contact.
+            ValueError: an arm that is wrongly described, or whose port does not let it reach the palpable face.
         """
         scene = anatomy.scene
         self.anatomy = anatomy
@@ -48,7 +50,9 @@ class Simulation:
         self.substep_dt = self.haptic_dt / self.substep_count
         margin = WORKSPACE_MARGIN + scene.instrument.tip_radius
         points = anatomy.mesh.points
-        self.instrument = Instrument(scene, points.min(axis=0) - margin, points.max(axis=0) + margin)
+        lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+        arm = is_arm(scene.instrument.model)
+        self.instrument: Instrument = ArmInstrument(anatomy, lower, upper) if arm else Probe(scene, lower, upper)
         healthy = anatomy.organ()
         check_tool_masses(scene.name, self.instrument, self.contact, float(healthy.surface_rest_area.sum()))
         self._wrench = np.zeros((self.instrument.tool_count, 6))
@@ -58,12 +62,17 @@ class Simulation:
         self._taken: StepsTaken | None = None
         self.organ_model: OrganModel
         self.organ_state: OrganState
-        self.reset(healthy, self.instrument.upper)
+        self.reset(healthy, self.instrument.parked)
 
     @property
     def time(self) -> float:
         """Simulated time since the reset [s]."""
         return self._step * self.haptic_dt
+
+    @property
+    def taken_over(self) -> bool:
+        """Whether the next `control_step` has been made already, among others."""
+        return self._taken is not None
 
     @property
     def contact_wrench(self) -> FloatArray:

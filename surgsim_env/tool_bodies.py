@@ -2,18 +2,26 @@
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.kernels import ContactShapes
 from msdm_core.mesh import FloatArray
 from msdm_core.stepping import unyielding
 from surgsim_env.haptic_kernels import Servo, ToolViews, factorise, yield_tool
 
+IndexArray = NDArray[np.int64]
+
 # Geoms of this group are what tissue feels: spheres and capsules.
 CONTACT_GROUP = 3
 
 
+def make_servo(lower: FloatArray, upper: FloatArray, position: IndexArray, speed: IndexArray) -> Servo:
+    """A servo at rest: limits of its joints [m or rad] and which of MuJoCo's controls hold and pace them, each (n,)."""
+    return Servo(np.zeros(len(lower)), lower, upper, position, speed, np.zeros(1, dtype=bool))
+
+
 class ToolBodies:
-    """The tools of a MuJoCo model: every body that carries contact shapes. Their `servo` has no slides to drive here.
+    """The tools of a MuJoCo model: every body that carries contact shapes. Their `servo` has no joints to drive here.
 
     Wrenches and twists refer to a body's centre of mass, which is what both `xfrc_applied` and `mj_objectVelocity` of
     a body mean. The order swap (MuJoCo gives angular before linear) happens here and nowhere else.
@@ -37,7 +45,7 @@ class ToolBodies:
             tool_twist=np.zeros((count, 6)),
         )
         self.response = unyielding(count)
-        self.servo = Servo(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(1, dtype=bool))
+        self.servo = make_servo(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
         self._velocity = np.zeros(6)
         self._jacobian = np.zeros((6, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
@@ -54,15 +62,15 @@ class ToolBodies:
         return [self.model.body(body).name for body in self._tools]
 
     def drive(self) -> None:
-        """Move the servo's targets by one step of the commanded speed; they stop at the workspace, and it says so."""
+        """Move the servo's targets by one step of the commanded speeds; they stop at their limits, and it says so."""
         servo, control = self.servo, self.data.ctrl
-        count = len(servo.command)
-        target = control[:count] + servo.command * self.model.opt.timestep
+        target = control[servo.position] + servo.command * self.model.opt.timestep
         held = np.clip(target, servo.lower, servo.upper)
         stopped = held != target
         servo.limited[0] = stopped.any()
-        control[:count] = held
-        control[count : 2 * count] = np.where(stopped, 0.0, servo.command)
+        control[servo.position] = held
+        paced = servo.speed >= 0
+        control[servo.speed[paced]] = np.where(stopped, 0.0, servo.command)[paced]
 
     def read_shapes(self) -> None:
         """Copy the current pose and twist of every contact shape into `shapes`; call after mj_step1."""

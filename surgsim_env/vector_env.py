@@ -28,6 +28,7 @@ class PalpateVectorEnv(SyncVectorEnv):
         num_envs: how many; multiples of 8 (float64) or 16 (float32) leave no lane empty. In float32 groups are of 8
             where groups of 16 would leave a thread idle.
         scene: a scene's name or the path of a scene file.
+        instrument: "probe", an arm's name or the path of its TOML file; the scene's own by default.
         autoreset_mode: "NextStep", "SameStep" or "Disabled" (reset with `options={"reset_mask": ...}`).
         dtype: "float64", or "float32" for twice the speed and forces within 0.5 %.
         threads: groups of organs that advance at the same time; as many as there are cores by default.
@@ -39,6 +40,7 @@ class PalpateVectorEnv(SyncVectorEnv):
         self,
         num_envs: int = 1,
         scene: str = "phantom",
+        instrument: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         dtype: Literal["float64", "float32"] = "float64",
         threads: int | None = None,
@@ -46,7 +48,7 @@ class PalpateVectorEnv(SyncVectorEnv):
         render_mode: str | None = None,
     ) -> None:
         def make() -> gym.Env:
-            env = PalpateEnv(scene, render_mode=render_mode)
+            env = PalpateEnv(scene, instrument, render_mode=render_mode)
             steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
             return gym.wrappers.TimeLimit(env, steps) if steps < EPISODE_STEPS else env
 

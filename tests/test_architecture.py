@@ -165,6 +165,14 @@ def tasks_do_not_advance(source: Source) -> Iterator[str]:
                 yield f"line {node.lineno} calls {last_name(node)}"
 
 
+def arms_know_no_task(source: Source) -> Iterator[str]:
+    """An arm is an instrument: it knows neither tasks nor environments nor the simulation that holds it."""
+    if source.path.startswith("surgsim_env/arms/"):
+        for name, line in imported(source.tree):
+            if name.split(".")[0] == "gymnasium" or re.match(r"surgsim_env\.(tasks|env|vector_env|simulation)\b", name):
+                yield f"line {line} imports {name}"
+
+
 def short_enough(source: Source) -> Iterator[str]:
     """A file is read at one sitting, a function at one glance."""
     lines, limit = len(source.text.splitlines()), LONGER_FILES.get(source.path, LINES_PER_FILE)
@@ -192,6 +200,7 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     kernels_allocate_nothing,
     kernels_repeat_to_the_bit,
     tasks_do_not_advance,
+    arms_know_no_task,
     short_enough,
     named_for_what_it_does,
 )
@@ -243,6 +252,8 @@ PLANTED = [
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "simulation.control_step(50)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "compiled_steps(model, state)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "mujoco.mj_step1(model, data)"),
+    (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.tasks.palpate import PalpateTask"),
+    (arms_know_no_task, "surgsim_env/arms/arm.py", "def late():\n    import gymnasium"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
     (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),
@@ -257,6 +268,7 @@ ALLOWED = [
     (kernels_allocate_nothing, "msdm_core/kernels.py", "TABLE = np.array([1.0])"),
     (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(fastmath=False)\ndef f(x): return math.sqrt(x)"),
     (tasks_do_not_advance, "surgsim_env/env.py", "simulation.haptic_step()"),
+    (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.environment_words import WORDS"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * LINES_PER_FILE),
     (named_for_what_it_does, "msdm_core/mesh_io.py", ""),
 ]

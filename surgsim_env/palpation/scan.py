@@ -57,10 +57,10 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
     average = round(AVERAGE_TIME / dt)
     curve = np.zeros((go_in + hold, 2))
     end, force_peak, taken = "", 0.0, 0
-    simulation.instrument.command_velocity(-PRESS_SPEED * normal)
     for step in range(go_in + hold):
-        if step == go_in:
-            simulation.instrument.command_velocity(np.zeros(3))
+        # A velocity is good for one control step: an arm's joint speeds are found anew.
+        if step == go_in or step % scene.timing.haptic_steps_per_control == 0:
+            simulation.instrument.command_velocity(-PRESS_SPEED * normal if step < go_in else np.zeros(3))
         if not simulation.haptic_step():
             end = simulation.fault
             break

@@ -25,16 +25,16 @@ from tests.coupling.test_exchange import LAW, driven_probe, free_ball, free_orga
 from tests.coupling.test_passivity import damped_arm
 
 
-def made(scene, compiled):
-    env = gym.make("SurgSim/Palpate-v0", scene=scene).unwrapped
+def made(scene, compiled, instrument=None):
+    env = gym.make("SurgSim/Palpate-v0", scene=scene, instrument=instrument).unwrapped
     env.simulation.compiled = compiled
     return env
 
 
 @cache
-def pair(scene):
+def pair(scene, instrument=None):
     """The same environment with the compiled step and with the plain loop."""
-    return made(scene, True), made(scene, False)
+    return made(scene, True, instrument), made(scene, False, instrument)
 
 
 def assert_same(compiled, plain, action):
@@ -66,9 +66,19 @@ def press(both, seed, count):
         yield assert_same(*both, np.append(velocity, 0.0).astype(np.float32))[-1]["force_peak"]
 
 
-@pytest.mark.parametrize(("scene", "seed", "count"), [("phantom", 3, 30), ("phantom", 11, 20), ("liver", 5, 20)])
-def test_whole_episodes_are_the_same(scene, seed, count):
-    compiled, plain = pair(scene)
+EPISODES = [
+    ("phantom", "probe", 3, 30),
+    ("phantom", "probe", 11, 20),
+    ("liver", "probe", 5, 20),
+    ("phantom", "psm_palpator", 3, 30),
+    ("liver", "psm_palpator", 5, 20),
+    ("phantom", "six_axis", 3, 20),
+]
+
+
+@pytest.mark.parametrize(("scene", "instrument", "seed", "count"), EPISODES)
+def test_whole_episodes_are_the_same(scene, instrument, seed, count):
+    compiled, plain = pair(scene, instrument)
     assert compiled.simulation.compiled and not plain.simulation.compiled
     assert compiled.reset(seed=seed)[0].tobytes() == plain.reset(seed=seed)[0].tobytes()
     assert max(press((compiled, plain), seed, count)) > 0.1, "the walk must press to prove anything"

@@ -16,7 +16,7 @@ from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from surgsim_env import exchange
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.exchange import FORCE_CAP, haptic_step
-from surgsim_env.instrument import Instrument
+from surgsim_env.instrument import Probe
 from surgsim_env.scenes import Scene, make_scene
 from surgsim_env.simulation import Simulation
 from surgsim_env.tool_bodies import ToolBodies
@@ -76,8 +76,8 @@ def lopsided_body() -> ToolBodies:
     return FreeBody(LOPSIDED, (0.014, 0.016, 0.0215), np.array([0.03, -0.02, -0.15, 3.0, -2.0, 5.0]))
 
 
-def driven_probe() -> Instrument:
-    probe = Instrument(scene(), np.full(3, -0.1), np.full(3, 0.1))
+def driven_probe() -> Probe:
+    probe = Probe(scene(), np.full(3, -0.1), np.full(3, 0.1))
     probe.place(np.array([0.014, 0.016, 0.0235]))
     probe.command_velocity(np.array([0.02, 0.01, -0.05]))
     return probe
@@ -169,7 +169,7 @@ def test_the_wrench_acts_in_the_same_step(monkeypatch: pytest.MonkeyPatch):
 # ---- faults -------------------------------------------------------------------------------------------------------
 
 
-def untouched(probe: Instrument) -> bool:
+def untouched(probe: Probe) -> bool:
     return not probe.data.xfrc_applied.any() and bool(np.isfinite(probe.data.qpos).all())
 
 

@@ -9,7 +9,7 @@ from msdm_core.kernels import ContactLaw, OrganModel
 from msdm_core.measure import contact_energy
 from msdm_core.organ import rest_state
 from msdm_core.stepping import advance_organ
-from surgsim_env.instrument import Instrument
+from surgsim_env.instrument import Probe
 from surgsim_env.scenes import make_scene
 from surgsim_env.tool_bodies import ToolBodies
 from surgsim_env.validation.free_tool import BLOCK, ELASTIC, FREE, Coupled, free_ball, small_block
@@ -40,7 +40,7 @@ def lopsided_body() -> ToolBodies:
 
 def probe_without_servo() -> ToolBodies:
     """Slides damped with 2 N s/m, which MuJoCo takes implicitly."""
-    probe = Instrument(make_scene("phantom"), np.full(3, -0.1), np.full(3, 0.1))
+    probe = Probe(make_scene("phantom"), np.full(3, -0.1), np.full(3, 0.1))
     probe.place(np.zeros(3))
     probe.model.actuator_gainprm[:] = 0.0
     probe.model.actuator_biasprm[:] = 0.0

@@ -12,11 +12,19 @@ import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.scene_files import scenes_folder
 
 IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
+# Every id with its scene's own instrument, and the palpation with an arm.
+CASES = [(env_id, {}) for env_id in IDS] + [("SurgSim/Palpate-v0", {"instrument": "psm_palpator"})]
 
 
-@pytest.fixture(params=IDS)
-def env_id(request):
-    return request.param
+@pytest.fixture(params=CASES, ids=lambda case: "-".join([case[0], *case[1].values()]))
+def made(request):
+    """A function that makes the environment, alone or, given `num_envs`, many of them."""
+    env_id, settings = request.param
+
+    def make(**more):
+        return (gym.make_vec if "num_envs" in more else gym.make)(env_id, **settings, **more)
+
+    return make
 
 
 def rollout(env, seed, steps, action_seed=7):
@@ -43,37 +51,37 @@ def test_there_are_ids():
     assert "SurgSim/Palpate-v0" in IDS
 
 
-def test_passes_gymnasiums_checker_without_a_warning(env_id):
+def test_passes_gymnasiums_checker_without_a_warning(made):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gym.make(env_id).unwrapped)
+        check_env(made().unwrapped)
 
 
 @pytest.mark.agents
-def test_passes_stable_baselines3s_checker_without_a_warning(env_id):
+def test_passes_stable_baselines3s_checker_without_a_warning(made):
     checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the `agents` extra")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        checker.check_env(gym.make(env_id).unwrapped)
+        checker.check_env(made().unwrapped)
 
 
-def test_same_seed_repeats_to_the_bit_also_after_other_episodes(env_id):
-    env = gym.make(env_id)
+def test_same_seed_repeats_to_the_bit_also_after_other_episodes(made):
+    env = made()
     first = rollout(env, seed=3, steps=30)
     rollout(env, seed=11, steps=12, action_seed=8)
     assert_same(first, rollout(env, seed=3, steps=30))
-    assert_same(first, rollout(gym.make(env_id), seed=3, steps=30))
+    assert_same(first, rollout(made(), seed=3, steps=30))
     assert any(record[-1]["force_peak"] > 0.0 for record in first), "the walk must touch the organ to prove anything"
 
 
-def test_seeds_that_differ_differ(env_id):
-    env = gym.make(env_id)
+def test_seeds_that_differ_differ(made):
+    env = made()
     starts = [env.reset(seed=seed)[0].tobytes() for seed in range(5)]
     assert len(set(starts)) == 5
 
 
-def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(env_id):
-    env = gym.make(env_id).unwrapped
+def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(made):
+    env = made().unwrapped
     rollout(env, seed=5, steps=25)
     saved = env.save_state()
     actions = np.random.default_rng(1).uniform(-0.4, 0.4, (15, *env.action_space.shape)).astype(np.float32)
@@ -83,7 +91,7 @@ def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(e
 
     expected = go_on(env)
     next_start = env.reset()
-    other = gym.make(env_id).unwrapped
+    other = made().unwrapped
     other.reset(seed=99)
     for one in (env, other):
         one.load_state(saved)
@@ -93,15 +101,15 @@ def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(e
         assert_same([next_start], [one.reset()])
 
 
-def test_foreign_or_broken_states_are_refused(env_id, tmp_path):
-    env = gym.make(env_id).unwrapped
+def test_foreign_or_broken_states_are_refused(made, tmp_path):
+    env = made().unwrapped
     with pytest.raises(gym.error.ResetNeeded):
         env.save_state()
     env.reset(seed=0)
     saved = env.save_state()
     text = (scenes_folder() / "organs" / "phantom.toml").read_text().replace("[12, 12, 6]", "[6, 6, 3]")
     (tmp_path / "phantom.toml").write_text(text)
-    other = gym.make(env_id, scene=str(tmp_path / "phantom.toml")).unwrapped
+    other = made(scene=str(tmp_path / "phantom.toml")).unwrapped
     other.reset(seed=0)
     with pytest.raises(ValueError, match=r"saved by .*2047 nodes.*, this is .*304 nodes.* use the same scene"):
         other.load_state(saved)
@@ -119,25 +127,25 @@ def test_foreign_or_broken_states_are_refused(env_id, tmp_path):
     assert env.save_state() == saved, "nothing was changed by what was refused"
 
 
-def test_info_has_fixed_keys_and_types(env_id):
-    records = rollout(gym.make(env_id), seed=2, steps=5)
+def test_info_has_fixed_keys_and_types(made):
+    records = rollout(made(), seed=2, steps=5)
     shapes = [{key: type(value) for key, value in record[-1].items()} for record in records]
     assert all(shape == shapes[0] for shape in shapes)
     assert shapes[0]["sim_fault"] is str
     assert set(shapes[0].values()) <= {str, bool, float}
 
 
-def test_observation_has_no_constant_entry(env_id):
-    observations = np.array([record[0] for record in rollout(gym.make(env_id), seed=4, steps=40)])
+def test_observation_has_no_constant_entry(made):
+    observations = np.array([record[0] for record in rollout(made(), seed=4, steps=40)])
     assert (np.ptp(observations, axis=0) > 0.0).all()
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_works_in_make_vec(env_id, mode):
-    envs = gym.make_vec(env_id, num_envs=2, vectorization_mode=mode)
+def test_works_in_make_vec(made, mode):
+    envs = made(num_envs=2, vectorization_mode=mode)
     observations, _ = envs.reset(seed=[3, 4])
     assert observations.shape == (2, *envs.single_observation_space.shape)
-    alone = gym.make(env_id).reset(seed=4)[0]
+    alone = made().reset(seed=4)[0]
     np.testing.assert_array_equal(observations[1], alone)
     for _ in range(3):
         envs.step(envs.action_space.sample())

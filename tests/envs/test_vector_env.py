@@ -16,8 +16,9 @@ def side_by_side(**settings) -> gym.vector.VectorEnv:
     return gym.make_vec(ID, num_envs=COUNT, vectorization_mode="vector_entry_point", **settings)
 
 
-def one_after_the_other(mode: str) -> gym.vector.VectorEnv:
-    return gym.make_vec(ID, num_envs=COUNT, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
+def one_after_the_other(mode: str, **settings) -> gym.vector.VectorEnv:
+    kwargs = {"autoreset_mode": mode}
+    return gym.make_vec(ID, num_envs=COUNT, vectorization_mode="sync", vector_kwargs=kwargs, **settings)
 
 
 def actions(step: int) -> np.ndarray:
@@ -41,10 +42,13 @@ def assert_equal(one: object, other: object) -> None:
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_equals_environments_one_after_the_other(mode: str):
-    """Observations, rewards, ends and infos of 45 control steps with several episodes each."""
-    together, apart = side_by_side(autoreset_mode=mode), one_after_the_other(mode)
+@pytest.mark.parametrize(
+    ("mode", "instrument"), [("NextStep", "probe"), ("SameStep", "probe"), ("SameStep", "psm_palpator")]
+)
+def test_equals_environments_one_after_the_other(mode: str, instrument: str):
+    """Observations, rewards, ends and infos of 45 control steps with several episodes each, and all that is saved."""
+    together = side_by_side(autoreset_mode=mode, instrument=instrument)
+    apart = one_after_the_other(mode, instrument=instrument)
     assert isinstance(together, PalpateVectorEnv)
     assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
     assert_equal(together.reset(seed=11), apart.reset(seed=11))
@@ -55,6 +59,8 @@ def test_equals_environments_one_after_the_other(mode: str):
         assert_equal(found[4], expected[4])
         ends += int((found[2] | found[3]).sum())
     assert ends >= 3
+    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
+        assert one.unwrapped.save_state() == other.unwrapped.save_state()
     together.close()
     apart.close()
 

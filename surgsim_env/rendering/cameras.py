@@ -1,0 +1,93 @@
+"""Where the cameras stand: derived from the organ, its palpable face and the side from which the instrument comes."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.palpable_face import tangent_axes
+
+# The organ takes this share of the overview's picture, which is aimed above its middle by a share of half its height.
+OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
+# How high the overview stands, and how far it goes round to the side [degrees].
+OVERVIEW_HEIGHT, OVERVIEW_SIDE = 32.0, 28.0
+# The endoscope looks at the palpable face from this far [m] (as far as the face is wide, within bounds) and so oblique.
+ENDOSCOPE_FOV, ENDOSCOPE_TILT = 60.0, 38.0
+ENDOSCOPE_DISTANCES = (0.10, 0.20)
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera.
+
+    Fields:
+        position: [m]                                                               (3,)
+        rotation: columns are the picture's right, its up and the way back          (3, 3)
+        fov: vertical field of view [degrees]                                       scalar
+    """
+
+    position: FloatArray
+    rotation: FloatArray
+    fov: float
+
+    @classmethod
+    def looking(cls, position: FloatArray, target: FloatArray, up: FloatArray, fov: float) -> "Camera":
+        """A camera at a position that looks at a target [m], with `up` upright in the picture."""
+        back = (position - target) / np.linalg.norm(position - target)
+        right = np.cross(up, back)
+        right /= np.linalg.norm(right)
+        return cls(position, np.column_stack([right, np.cross(back, right), back]), fov)
+
+    def project(self, points: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
+        """Column and row of points (n, 3) in a picture [pixels] (n, 2), and their depth along the view [m] (n,)."""
+        x, y, z = ((points - self.position) @ self.rotation).T
+        focal = 0.5 * height / math.tan(math.radians(0.5 * self.fov))
+        return np.column_stack([0.5 * width - focal * x / z, 0.5 * height + focal * y / z]), -z
+
+
+def scene_cameras(anatomy: Anatomy) -> dict[str, Camera]:
+    """The scene's cameras by name, those of `options.CAMERAS`."""
+    points, face = anatomy.mesh.points, anatomy.face
+    up = -face.approach
+    across, along = tangent_axes(face.approach)
+    side = math.radians(OVERVIEW_SIDE)
+    front = across * math.sin(side) - along * math.cos(side)
+    return {
+        "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, OVERVIEW_SHIFT),
+        "endoscope": _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
+        "above": _framing(points, up, along, 0.0),
+    }
+
+
+def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, shift: float) -> Camera:
+    """A camera in a direction that has all points in the middle OVERVIEW_SHARE of a 4:3 picture.
+
+    It looks above their middle by a share of the picture's height, so that an instrument finds room.
+    """
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    camera = Camera.looking(middle + direction, middle, up, OVERVIEW_FOV)
+    seen = (points - middle) @ camera.rotation
+    offset = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) * [1.0, 1.0, 0.0]
+    middle, seen = middle + camera.rotation @ offset, seen - offset
+    half = math.tan(math.radians(0.5 * OVERVIEW_FOV))
+    room = OVERVIEW_SHARE * half * np.array([4.0 / 3.0, 1.0])
+    distance = float((np.abs(seen[:, :2]) / room + seen[:, 2:]).max())
+    target = middle + camera.rotation[:, 1] * shift * half * distance
+    return Camera.looking(target + distance * camera.rotation[:, 2], target, up, OVERVIEW_FOV)
+
+
+def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
+    """A level unit direction raised towards up by an angle [degrees]."""
+    return level * math.cos(math.radians(angle)) + up * math.sin(math.radians(angle))
+
+
+def _endoscope(anatomy: Anatomy, direction: FloatArray, up: FloatArray) -> Camera:
+    """A camera in a direction from the palpable face, as far from it as the face is wide within bounds."""
+    face = anatomy.mesh.points[np.unique(anatomy.face.triangles)]
+    middle = 0.5 * (face.min(axis=0) + face.max(axis=0))
+    seen = (face - middle) @ Camera.looking(middle + direction, middle, up, ENDOSCOPE_FOV).rotation
+    distance = float(np.clip(np.ptp(seen[:, :2], axis=0).max(), *ENDOSCOPE_DISTANCES))
+    target, _ = anatomy.face.project(middle)
+    return Camera.looking(target + distance * direction, target, up, ENDOSCOPE_FOV)

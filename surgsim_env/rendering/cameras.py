@@ -23,12 +23,15 @@ class Camera:
     """A pinhole camera.
 
     Fields:
-        position: [m]                                                               (3,)
+        position, target: where it is and what is in the middle of its picture [m]  (3,) each
+        up: unit vector that is upright in the picture                              (3,)
         rotation: columns are the picture's right, its up and the way back          (3, 3)
         fov: vertical field of view [degrees]                                       scalar
     """
 
     position: FloatArray
+    target: FloatArray
+    up: FloatArray
     rotation: FloatArray
     fov: float
 
@@ -38,7 +41,7 @@ class Camera:
         back = (position - target) / np.linalg.norm(position - target)
         right = np.cross(up, back)
         right /= np.linalg.norm(right)
-        return cls(position, np.column_stack([right, np.cross(back, right), back]), fov)
+        return cls(position, target, up, np.column_stack([right, np.cross(back, right), back]), fov)
 
     def project(self, points: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
         """Column and row of points (n, 3) in a picture [pixels] (n, 2), and their depth along the view [m] (n,)."""

@@ -46,11 +46,11 @@ class OrganRenderer:
         self._tissue: Tissue | None = None
         self._tissue_lesions: tuple[Lesion, ...] = ()
 
-    def rgb(self, camera: str | None = None) -> NDArray[np.uint8]:
+    def rgb(self, camera: str | Camera | None = None) -> NDArray[np.uint8]:
         """The picture, shape (height, width, 3), its first row on top.
 
         Args:
-            camera: one of `cameras`; that of the options if left out.
+            camera: the name of one of `cameras`, or a camera of your own; that of the options if left out.
 
         Raises:
             ValueError: an unknown camera (lists those there are).
@@ -66,7 +66,7 @@ class OrganRenderer:
             draw_forces(frame, self._simulation, view, self.options.force_mm_per_newton)
         return frame
 
-    def depth(self, camera: str | None = None) -> NDArray[np.float32]:
+    def depth(self, camera: str | Camera | None = None) -> NDArray[np.float32]:
         """Distance of each pixel from the camera's plane [m], infinite where there is nothing, shape (height, width).
 
         The surface of a translucent organ counts; the force arrow does not.
@@ -78,7 +78,7 @@ class OrganRenderer:
                 stage.show(self._picture(stage), view)
                 return stage.depth()
 
-    def segmentation(self, camera: str | None = None) -> NDArray[np.uint8]:
+    def segmentation(self, camera: str | Camera | None = None) -> NDArray[np.uint8]:
         """What each pixel shows, one of `stage.LABELS`, shape (height, width).
 
         Lesions have pixels where the options show them; in a translucent organ those that are seen through it.
@@ -100,8 +100,16 @@ class OrganRenderer:
         """A copy draws the same and loads graphics of its own."""
         return {**self.__dict__, "_stage": None, "_tissue": None, "_finalizer": None}
 
-    def _camera(self, name: str | None) -> Camera:
-        name = self.options.camera if name is None else name
+    def present(self, frame: NDArray[np.uint8]) -> None:
+        """Put a picture into the window whose context this renderer draws with."""
+        stage = self._ready_stage()
+        with LOCK, gl.current(stage.gl_context):
+            stage.present(frame)
+
+    def _camera(self, camera: str | Camera | None) -> Camera:
+        if isinstance(camera, Camera):
+            return camera
+        name = self.options.camera if camera is None else camera
         check_camera(name)
         return self.cameras[name]
 

@@ -111,6 +111,11 @@ class Stage:
             shown[(shown == LABELS["organ"]) & (inside == LABELS["lesion"])] = LABELS["lesion"]
         return shown
 
+    def present(self, frame: NDArray[np.uint8]) -> None:
+        """Copy a picture to the window that the context belongs to."""
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_WINDOW.value, self.context)
+        mujoco.mjr_drawPixels(np.ascontiguousarray(frame[::-1]).ravel(), None, self._rect, self.context)
+
     def close(self) -> None:
         """Give back what the graphics hold."""
         with gl.current(self.gl_context):

@@ -270,6 +270,22 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Endoscope:
+    """Where the endoscope camera stands and looks [m], and its vertical field of view [degrees]."""
+
+    position: Vector
+    target: Vector
+    fov_deg: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < math.dist(self.position, self.target) < math.inf or not 0.0 < self.fov_deg < 180.0:
+            raise ValueError(
+                f"endoscope: position {self.position}, target {self.target}, fov_deg {self.fov_deg:g}; the rule is two "
+                "places that differ and 0 < fov_deg < 180"
+            )
+
+
+@dataclass(frozen=True)
 class Scene:
     """A whole scene; `name` is the file's stem, `stiffness_rule` one of msdm_core.stiffness.STIFFNESS_RULES."""
 
@@ -290,6 +306,7 @@ class Scene:
     capsule: Capsule | None = None
     demonstration: tuple[FixedLesion, ...] = field(default=())
     stiffness_rule: str = "lloyd"
+    endoscope: Endoscope | None = None
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
@@ -305,7 +322,7 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
 # Every entry that a scene file may have, to suggest the nearest one to a misspelt one.
 _TABLES = (
     *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
-    *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion),
+    *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Endoscope),
 )
 _ENTRIES = sorted({entry.name for table in _TABLES for entry in fields(table)})
 

@@ -40,6 +40,9 @@ class Camera:
         """A camera at a position that looks at a target [m], with `up` upright in the picture."""
         back = (position - target) / np.linalg.norm(position - target)
         right = np.cross(up, back)
+        if np.linalg.norm(right) < 1e-6:
+            # It looks along `up`: any other way round will do.
+            right, _ = tangent_axes(back)
         right /= np.linalg.norm(right)
         return cls(position, target, up, np.column_stack([right, np.cross(back, right), back]), fov)
 
@@ -59,7 +62,7 @@ def scene_cameras(anatomy: Anatomy) -> dict[str, Camera]:
     front = across * math.sin(side) - along * math.cos(side)
     return {
         "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, OVERVIEW_SHIFT),
-        "endoscope": _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
+        "endoscope": _placed(anatomy, up) or _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
         "above": _framing(points, up, along, 0.0),
     }
 
@@ -84,6 +87,14 @@ def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, shift: f
 def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
     """A level unit direction raised towards up by an angle [degrees]."""
     return level * math.cos(math.radians(angle)) + up * math.sin(math.radians(angle))
+
+
+def _placed(anatomy: Anatomy, up: FloatArray) -> Camera | None:
+    """The endoscope where the scene puts it, None where it does not."""
+    place = anatomy.scene.endoscope
+    if place is None:
+        return None
+    return Camera.looking(np.asarray(place.position), np.asarray(place.target), up, place.fov_deg)
 
 
 def _endoscope(anatomy: Anatomy, direction: FloatArray, up: FloatArray) -> Camera:

@@ -14,7 +14,7 @@ from msdm_core.regions import Lesion
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.options import render_options
 from surgsim_env.rendering.renderer import OrganRenderer
-from surgsim_env.rendering.window import Window, WindowContext, has_display, require_display
+from surgsim_env.rendering.window import Window, WindowContext, require_display
 from surgsim_env.simulation import Simulation
 
 RENDER_MODES = ("human", "rgb_array")
@@ -77,7 +77,7 @@ class EpisodeView:
 def offered_modes() -> list[str]:
     """The render modes that this machine offers, as far as can be told without loading OpenGL."""
     switched_on = os.environ.get(gl.VARIABLE, "").lower().strip() not in gl.SWITCHED_OFF
-    offered = {"human": switched_on and has_display(), "rgb_array": switched_on and _has_library()}
+    offered = {"human": switched_on and gl.has_display(), "rgb_array": switched_on and _has_library()}
     return [mode for mode in RENDER_MODES if offered[mode]]
 
 

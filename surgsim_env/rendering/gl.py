@@ -13,12 +13,35 @@ VARIABLE = "MUJOCO_GL"
 SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
 MODULES = {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw", "glx": "mujoco.glfw"}
 
+# What says where windows go.
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+
 _context: Any = None
 _owner = 0
 
 
 class NoGLError(RuntimeError):
     """There is no OpenGL to draw with; the message says what is missing and how to get it."""
+
+
+def import_mujoco() -> None:
+    """Import MuJoCo, which loads OpenGL at once where MUJOCO_GL says so, and fails where that is missing.
+
+    Raises:
+        ImportError: names the packages that are missing.
+    """
+    try:
+        importlib.import_module("mujoco")
+    except Exception as error:  # what a missing library raises differs from library to library
+        kind = os.environ.get(VARIABLE, "").lower().strip()
+        if kind not in MODULES:
+            raise
+        raise ImportError(f"{VARIABLE} is {kind!r}, but there is {no_gl_message(kind, error)}") from error
+
+
+def has_display() -> bool:
+    """Whether a window can be opened, as far as the environment says."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in DISPLAYS)
 
 
 def context() -> Any:
@@ -67,6 +90,8 @@ def _kind() -> str:
 
 def _make_context(kind: str) -> Any:
     try:
+        if kind in ("glfw", "glx") and not has_display():
+            raise NoGLError(f"{' and '.join(DISPLAYS)} are not set")
         module = importlib.import_module(MODULES.get(kind, "mujoco.gl_context"))
         # EGL asks for no size, the others make a window that is never shown.
         return module.GLContext(64, 64)

@@ -60,7 +60,10 @@ class Stage:
         model = self.scene.model
         model.vis.quality.shadowsize = SHADOW_MAP if options.shadows else 0
         with gl.current(gl_context):
-            self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            try:
+                self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            except mujoco.FatalError as error:
+                raise gl.NoGLError(f"OpenGL is there, but MuJoCo cannot draw with it: {error}") from error
         self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._drawn = mujoco.MjvScene(model, model.ngeom + LESIONS_MOST)
         self._drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = options.shadows

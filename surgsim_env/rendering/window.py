@@ -2,8 +2,6 @@
 
 import contextlib
 import math
-import os
-import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -12,7 +10,7 @@ import numpy as np
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.rendering.cameras import Camera
-from surgsim_env.rendering.gl import NoGLError
+from surgsim_env.rendering.gl import DISPLAYS, NoGLError, has_display
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.rendering.renderer import OrganRenderer
 
@@ -20,13 +18,7 @@ from surgsim_env.rendering.renderer import OrganRenderer
 TURN, ZOOM = 0.008, 0.9
 # The view stays this far from straight up and down [rad].
 POLE = 0.05
-DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 KEYS = "drag: turn, wheel: zoom, C: next camera, Esc: close"
-
-
-def has_display() -> bool:
-    """Whether a window can be opened, as far as the environment says."""
-    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in DISPLAYS)
 
 
 def require_display() -> None:

@@ -13,6 +13,8 @@ from surgsim_env.palpable_face import tangent_axes
 OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
 # How high the overview stands, and how far it goes round to the side [degrees].
 OVERVIEW_HEIGHT, OVERVIEW_SIDE = 32.0, 28.0
+# How high the side view stands [degrees].
+SIDE_HEIGHT = 12.0
 # The endoscope looks at the palpable face from this far [m] (as far as the face is wide, within bounds) and so oblique.
 ENDOSCOPE_FOV, ENDOSCOPE_TILT = 60.0, 38.0
 ENDOSCOPE_DISTANCES = (0.10, 0.20)
@@ -63,6 +65,7 @@ def scene_cameras(anatomy: Anatomy) -> dict[str, Camera]:
     return {
         "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, OVERVIEW_SHIFT),
         "endoscope": _placed(anatomy, up) or _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
+        "side": _framing(points, _raised(across, up, SIDE_HEIGHT), up, OVERVIEW_SHIFT),
         "above": _framing(points, up, along, 0.0),
     }
 

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from typing import Any
 
 # The cameras that every scene has.
-CAMERAS = ("overview", "endoscope", "above")
+CAMERAS = ("overview", "endoscope", "side", "above")
 # The largest side of a picture [pixels]: what any OpenGL driver can draw.
 PIXELS_MOST = 4096
 
@@ -16,8 +16,8 @@ class RenderOptions:
     """What `gym.make(..., render_mode=...)` takes besides the scene; every option has a default.
 
     Args:
-        camera: "overview" (organ and instrument), "endoscope" (the palpable face, near and oblique) or "above" (along
-            the instrument's approach).
+        camera: "overview" (organ and instrument), "endoscope" (the palpable face, near and oblique), "side" (level) or
+            "above" (along the instrument's approach).
         width, height: of the picture [pixels].
         show_force: draw the tissue's force on each tool as an arrow with its size in newtons; none where it is 0.
         force_mm_per_newton: length of that arrow in the scene [mm/N].

@@ -13,8 +13,8 @@ from surgsim_env.palpable_face import tangent_axes
 OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
 # How high the overview stands, and how far it goes round to the side [degrees].
 OVERVIEW_HEIGHT, OVERVIEW_SIDE = 32.0, 28.0
-# How high the side view stands [degrees].
-SIDE_HEIGHT = 12.0
+# How high the side view stands [degrees], and how far above the organ's middle it is aimed, likewise.
+SIDE_HEIGHT, SIDE_SHIFT = 10.0, 0.25
 # The endoscope looks at the palpable face from this far [m] (as far as the face is wide, within bounds) and so oblique.
 ENDOSCOPE_FOV, ENDOSCOPE_TILT = 60.0, 38.0
 ENDOSCOPE_DISTANCES = (0.10, 0.20)
@@ -48,6 +48,11 @@ class Camera:
         right /= np.linalg.norm(right)
         return cls(position, target, up, np.column_stack([right, np.cross(back, right), back]), fov)
 
+    def sees_above_level(self) -> bool:
+        """Whether some ray of its picture rises against `up`: there the drape below ends."""
+        climb = math.degrees(math.asin(float(np.clip(-self.rotation[:, 2] @ self.up, -1.0, 1.0))))
+        return climb + 0.5 * self.fov > -1.0
+
     def project(self, points: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
         """Column and row of points (n, 3) in a picture [pixels] (n, 2), and their depth along the view [m] (n,)."""
         x, y, z = ((points - self.position) @ self.rotation).T
@@ -65,7 +70,7 @@ def scene_cameras(anatomy: Anatomy) -> dict[str, Camera]:
     return {
         "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, OVERVIEW_SHIFT),
         "endoscope": _placed(anatomy, up) or _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
-        "side": _framing(points, _raised(across, up, SIDE_HEIGHT), up, OVERVIEW_SHIFT),
+        "side": _framing(points, _raised(across, up, SIDE_HEIGHT), up, SIDE_SHIFT),
         "above": _framing(points, up, along, 0.0),
     }
 

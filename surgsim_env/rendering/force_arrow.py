@@ -67,10 +67,11 @@ def _paint(frame: NDArray[np.uint8], ends: FloatArray, label: str) -> None:
     # Beyond the head, to the right of it where the arrow points up or down.
     place = end + np.array([14.0, 5.0 if end[1] > start[1] else -23.0]) * scale * many
     box = np.array(draw.textbbox(tuple(place), label, font=font))
-    inside = np.clip(place, place - box[:2], np.maximum(size - (box[2:] - place), place - box[:2]))
-    box = box + np.tile(inside - place, 2) + np.array([-5, -4, 5, 4]) * scale * many
-    draw.rounded_rectangle(box.tolist(), radius=4 * scale * many, fill=LABEL_BACK)
-    draw.text(tuple(inside), label, font=font, fill=COLOUR)
+    box += np.array([-5, -4, 5, 4]) * scale * many
+    # Back into the picture where it would be cut off.
+    shift = np.maximum(-box[:2], 0.0) + np.minimum(size - box[2:], 0.0)
+    draw.rounded_rectangle((box + np.tile(shift, 2)).tolist(), radius=4 * scale * many, fill=LABEL_BACK)
+    draw.text(tuple(place + shift), label, font=font, fill=COLOUR)
     small = layer.resize(tuple((upper - lower).tolist()), Image.Resampling.BOX)
     part = (slice(lower[1], upper[1]), slice(lower[0], upper[0]))
     below = Image.fromarray(frame[part]).convert("RGBA")

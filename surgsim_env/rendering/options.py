@@ -34,7 +34,7 @@ class RenderOptions:
     width: int = 640
     height: int = 480
     show_force: bool = True
-    force_mm_per_newton: float = 80.0
+    force_mm_per_newton: float = 60.0
     show_lesion: bool = False
     cut_away: bool = False
     shadows: bool = False

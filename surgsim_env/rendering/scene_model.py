@@ -26,7 +26,7 @@ class Look:
 
 # The organ, where it is held by ligaments or a tray, its cut faces, and its shadow on the drape.
 LOOKS = {
-    "organ": Look((0.455, 0.130, 0.100), 0.85, 0.55),
+    "organ": Look((0.455, 0.130, 0.100), 0.75, 0.80),
     "held": Look((0.560, 0.235, 0.185), 0.60, 0.45),
     "section": Look((0.590, 0.235, 0.195), 0.10, 0.20, 0.25),
     "section_lesion": Look((0.980, 0.860, 0.500), 0.10, 0.20, 0.25),
@@ -36,6 +36,7 @@ LESION_COLOUR = (0.98, 0.84, 0.42)
 # The drape's squares are this wide [m]: a scale to read sizes off.
 DRAPE_SQUARE = 0.02
 DRAPE_COLOURS = (0.115, 0.315, 0.355), (0.128, 0.345, 0.385)
+BACKGROUND_COLOUR = (0.045, 0.105, 0.120)
 # Half the drape's width in radii of the organ, and its distance below it [m].
 DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
@@ -122,7 +123,7 @@ def _add_lights(spec: mujoco.MjSpec, anatomy: Anatomy, options: RenderOptions) -
         light.castshadow = options.shadows and name == "lamp"
         light.diffuse, light.specular, light.ambient = [strength] * 3, [strength] * 3, [0.0] * 3
     head = spec.visual.headlight
-    head.ambient, head.diffuse, head.specular = [0.30] * 3, [0.36] * 3, [0.30] * 3
+    head.ambient, head.diffuse, head.specular = [0.30] * 3, [0.36] * 3, [0.10] * 3
     towards = directions["lamp"][0]
     return towards / np.linalg.norm(towards)
 
@@ -133,6 +134,10 @@ def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     radius = float(np.linalg.norm(points - centre, axis=1).max())
     ground = centre + (float((points @ approach).max()) + DRAPE_GAP - centre @ approach) * approach
+    # Where a camera sees beyond the drape.
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96)
+    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+    sky.rgb1 = sky.rgb2 = BACKGROUND_COLOUR
     across, _ = tangent_axes(approach)
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.column_stack([across, np.cross(-approach, across), -approach]).ravel())

@@ -85,6 +85,7 @@ class Stage:
             scene.meshes[name].upload(shape, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._visible, None, self._camera, everything, self._drawn)
+        self._drawn.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = camera.sees_above_level()
         for centre, half_axes in picture.lesions[:LESIONS_MOST]:
             self._add_lesion(centre, half_axes)
 

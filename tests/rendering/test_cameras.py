@@ -11,7 +11,6 @@ from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.rendering.window import orbited
 from surgsim_env.scenes import make_scene, scene_from_table
 
-
 pytestmark = pytest.mark.filterwarnings("ignore:scene")
 
 
@@ -87,7 +86,7 @@ def test_scene_may_place_the_endoscope():
     ],
 )
 def test_impossible_endoscopes_are_refused(place):
-    with pytest.raises(ValueError, match="scene 'placed'.*endoscope: .*the rule is"):
+    with pytest.raises(ValueError, match=r"scene 'placed'.*endoscope: .*the rule is"):
         with_endoscope(place)
 
 

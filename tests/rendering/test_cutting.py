@@ -70,8 +70,9 @@ def test_lesion_in_the_section_has_its_circles_area():
         large = np.linalg.norm(area_vectors(part.vertices, part.faces), axis=1) > 1e-14
         np.testing.assert_allclose(part.normals[part.faces[large]] @ towards, 1.0, atol=1e-9)
     # The section is made of the tissue's own points: it follows it.
-    moved = tissue.shapes(anatomy.mesh.points + [0.0, 0.0, 0.004])["section"]
-    np.testing.assert_allclose(moved.vertices, at_rest["section"].vertices + [0.0, 0.0, 0.004], atol=1e-15)
+    up = np.array([0.0, 0.0, 0.004])
+    moved = tissue.shapes(anatomy.mesh.points + up)["section"]
+    np.testing.assert_allclose(moved.vertices, at_rest["section"].vertices + up, atol=1e-15)
     assert np.ptp(tissue.shapes(bent(anatomy.mesh.points))["section"].vertices @ towards) > 1e-3
 
 
@@ -82,7 +83,7 @@ def test_lesion_moves_with_the_mean_of_its_nodes():
     tissue = Tissue(anatomy, drawn_surface(points, anatomy.mesh.boundary_triangles), [lesion], False)
     np.testing.assert_array_equal(tissue.lesion_centres(points)[0], centre)
     inside = np.linalg.norm(points - centre, axis=1) <= lesion.radius
-    moved = points.copy()
-    moved[inside] += [0.001, 0.002, -0.003]
+    moved, shift = points.copy(), np.array([0.001, 0.002, -0.003])
+    moved[inside] += shift
     moved[~inside] += 1.0
-    np.testing.assert_allclose(tissue.lesion_centres(moved)[0], centre + [0.001, 0.002, -0.003], atol=1e-15)
+    np.testing.assert_allclose(tissue.lesion_centres(moved)[0], centre + shift, atol=1e-15)

@@ -7,7 +7,7 @@ import pytest
 from surgsim_env.rendering.options import RenderOptions, render_options
 
 BAD = [
-    ({"camera": "side"}, "camera 'side' is unknown; the cameras are overview, endoscope, side, above"),
+    ({"camera": "front"}, "camera 'front' is unknown; the cameras are overview, endoscope, side, above"),
     ({"width": 0}, "width is 0; it must be a whole number of pixels from 1 to 4096"),
     ({"width": True}, "width is True"),
     ({"height": 480.0}, "height is 480.0"),

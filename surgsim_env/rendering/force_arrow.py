@@ -15,6 +15,8 @@ SMALLEST_FORCE = 0.005
 COLOUR, OUTLINE, LABEL_BACK = (255, 214, 10, 255), (25, 22, 0, 255), (10, 14, 18, 165)
 # Half width of the shaft, half width and length of the head, outline, at a picture height of 480 [pixels].
 SHAFT, HEAD_WIDTH, HEAD_LENGTH, EDGE, TEXT_SIZE = 3.0, 8.0, 16.0, 1.3, 15.0
+# Room for head and label beyond the arrow's ends: to the left and up, to the right and down, likewise [pixels].
+ROOM = np.array([[20.0, 36.0], [95.0, 36.0]])
 # The arrow is painted this many times as large and then made smaller, so that its edges are smooth.
 OVERSAMPLING = 3
 
@@ -50,9 +52,8 @@ def _paint(frame: NDArray[np.uint8], ends: FloatArray, label: str) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
     scale = frame.shape[0] / 480.0
-    reach = 130.0 * scale
-    lower = np.maximum(np.floor(ends.min(axis=0) - reach), 0.0).astype(int)
-    upper = np.minimum(np.ceil(ends.max(axis=0) + reach), [frame.shape[1], frame.shape[0]]).astype(int)
+    lower = np.maximum(np.floor(ends.min(axis=0) - ROOM[0] * scale), 0.0).astype(int)
+    upper = np.minimum(np.ceil(ends.max(axis=0) + ROOM[1] * scale), [frame.shape[1], frame.shape[0]]).astype(int)
     if (upper <= lower).any():
         return
     many = OVERSAMPLING

@@ -11,7 +11,7 @@ from msdm_core.mesh import FloatArray, IntArray
 # Neighbours whose resting normals differ by more than this meet at a crease, as the faces of a block do [degrees].
 CREASE_ANGLE = 50.0
 # Each triangle is drawn as splits^2 smaller ones; as many as stay below this number of triangles.
-TRIANGLES_MOST = 30_000
+TRIANGLES_MOST = 15_000
 SPLITS_MOST = 4
 # How far the small triangles are bent towards the tangent planes of their corners (Boubekeur & Alexa 2008).
 BEND = 0.6

@@ -15,6 +15,8 @@ TRIANGLES_MOST = 15_000
 SPLITS_MOST = 4
 # How far the small triangles are bent towards the tangent planes of their corners (Boubekeur & Alexa 2008).
 BEND = 0.6
+# No vertex is moved off its flat triangle by more than this [m]: that is what the simulation touches.
+BEND_MOST = 0.0008
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class DrawnSurface:
 
     A corner is a node, once for each of the smooth parts of the surface that meet there. With w a vertex's weights of
     corners, x and n their positions and normals, a vertex is drawn at
-    p - BEND sum_i w_i n_i n_i . (p - x_i), p = w . x.
+    p - BEND sum_i w_i n_i n_i . (p - x_i), p = w . x, and within BEND_MOST of p.
 
     Fields:
         corner_node: node of each corner                                            (n_corner,)
@@ -58,8 +60,9 @@ class DrawnSurface:
         tensor = (normal[:, :, None] * normal[:, None, :]).reshape(-1, 9)
         offset = normal * (corner * normal).sum(axis=1)[:, None]
         mixed = self.weights @ np.concatenate([tensor, offset, normal], axis=1)
-        out = np.einsum("vij,vj->vi", mixed[:, :9].reshape(-1, 3, 3), flat) - mixed[:, 9:12]
-        return flat - self.bend * out, _unit(mixed[:, 12:])
+        out = self.bend * (np.einsum("vij,vj->vi", mixed[:, :9].reshape(-1, 3, 3), flat) - mixed[:, 9:12])
+        out *= np.minimum(1.0, BEND_MOST / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300))
+        return flat - out, _unit(mixed[:, 12:])
 
 
 def drawn_surface(points: FloatArray, triangles: IntArray) -> DrawnSurface:

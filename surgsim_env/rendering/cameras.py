@@ -11,6 +11,8 @@ from surgsim_env.palpable_face import tangent_axes
 
 # The organ takes this share of the overview's picture, which is aimed above its middle by a share of half its height.
 OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
+# Nothing of the organ comes nearer to the edge of that picture than this share of half its height.
+EDGE = 0.96
 # How high the overview stands, and how far it goes round to the side [degrees].
 OVERVIEW_HEIGHT, OVERVIEW_SIDE = 32.0, 28.0
 # How high the side view stands [degrees], and how far above the organ's middle it is aimed, likewise.
@@ -88,6 +90,9 @@ def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, shift: f
     half = math.tan(math.radians(0.5 * OVERVIEW_FOV))
     room = OVERVIEW_SHARE * half * np.array([4.0 / 3.0, 1.0])
     distance = float((np.abs(seen[:, :2]) / room + seen[:, 2:]).max())
+    # Aimed higher, it shall not lose the lower edge.
+    lowest = (EDGE * seen[:, 2] - seen[:, 1] / half) / (EDGE - shift)
+    distance = max(distance, float(lowest.max()))
     target = middle + camera.rotation[:, 1] * shift * half * distance
     return Camera.looking(target + distance * camera.rotation[:, 2], target, up, OVERVIEW_FOV)
 

@@ -62,23 +62,29 @@ class Camera:
         return np.column_stack([0.5 * width - focal * x / z, 0.5 * height + focal * y / z]), -z
 
 
-def scene_cameras(anatomy: Anatomy) -> dict[str, Camera]:
-    """The scene's cameras by name, those of `options.CAMERAS`."""
+def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Camera]:
+    """The scene's cameras by name, those of `options.CAMERAS`, for pictures so many times as wide as high."""
     points, face = anatomy.mesh.points, anatomy.face
     up = -face.approach
     across, along = tangent_axes(face.approach)
-    side = math.radians(OVERVIEW_SIDE)
-    front = across * math.sin(side) - along * math.cos(side)
+    front = cut_direction(anatomy)
     return {
-        "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, OVERVIEW_SHIFT),
+        "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, aspect, OVERVIEW_SHIFT),
         "endoscope": _placed(anatomy, up) or _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
-        "side": _framing(points, _raised(across, up, SIDE_HEIGHT), up, SIDE_SHIFT),
-        "above": _framing(points, up, along, 0.0),
+        "side": _framing(points, _raised(across, up, SIDE_HEIGHT), up, aspect, SIDE_SHIFT),
+        "above": _framing(points, up, along, aspect, 0.0),
     }
 
 
-def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, shift: float) -> Camera:
-    """A camera in a direction that has all points in the middle OVERVIEW_SHARE of a 4:3 picture.
+def cut_direction(anatomy: Anatomy) -> FloatArray:
+    """The level unit direction towards the overview, the side from which an organ is cut open, shape (3,)."""
+    across, along = tangent_axes(anatomy.face.approach)
+    side = math.radians(OVERVIEW_SIDE)
+    return across * math.sin(side) - along * math.cos(side)
+
+
+def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, aspect: float, shift: float) -> Camera:
+    """A camera in a direction that has all points in the middle OVERVIEW_SHARE of a picture.
 
     It looks above their middle by a share of the picture's height, so that an instrument finds room.
     """
@@ -88,7 +94,7 @@ def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, shift: f
     offset = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) * [1.0, 1.0, 0.0]
     middle, seen = middle + camera.rotation @ offset, seen - offset
     half = math.tan(math.radians(0.5 * OVERVIEW_FOV))
-    room = OVERVIEW_SHARE * half * np.array([4.0 / 3.0, 1.0])
+    room = OVERVIEW_SHARE * half * np.array([aspect, 1.0])
     distance = float((np.abs(seen[:, :2]) / room + seen[:, 2:]).max())
     # Aimed higher, it shall not lose the lower edge.
     lowest = (EDGE * seen[:, 2] - seen[:, 1] / half) / (EDGE - shift)

@@ -70,6 +70,14 @@ def cut_tets(mesh: TetMesh, values: FloatArray) -> tuple[csr_array, IntArray]:
     return _split(*_without_unused(mix, faces))
 
 
+def most_tets_cut(mesh: TetMesh, direction: FloatArray) -> int:
+    """How many tets any plane across a direction cuts at most."""
+    height = (mesh.points @ direction)[mesh.tets]
+    lower, upper = np.sort(height.min(axis=1)), np.sort(height.max(axis=1))
+    begun = np.arange(1, len(lower) + 1)
+    return int((begun - np.searchsorted(upper, lower)).max())
+
+
 def _gradient(points: FloatArray, values: FloatArray) -> FloatArray:
     """The gradient of a linear function given at points, shape (3,)."""
     centred = points - points.mean(axis=0)

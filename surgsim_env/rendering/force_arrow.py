@@ -30,7 +30,8 @@ def draw_forces(frame: NDArray[np.uint8], simulation: Simulation, camera: Camera
         start = contact_point(simulation, tool)
         ends = np.stack([start, start + force * mm_per_newton * 1e-3])
         pixels, depth = camera.project(ends, frame.shape[1], frame.shape[0])
-        if (depth > 0.0).all():
+        # After a fault there may be no place to draw it.
+        if (depth > 0.0).all() and np.isfinite(pixels).all():
             _paint(frame, pixels, f"{size:.2f} N")
 
 
@@ -64,7 +65,7 @@ def _paint(frame: NDArray[np.uint8], ends: FloatArray, label: str) -> None:
     outline = _arrow(start, end, scale * many, EDGE * scale * many)
     draw.polygon([tuple(point) for point in outline], fill=OUTLINE)
     draw.polygon([tuple(point) for point in _arrow(start, end, scale * many, 0.0)], fill=COLOUR)
-    font = ImageFont.load_default(size=TEXT_SIZE * scale * many)
+    font = ImageFont.load_default(size=max(TEXT_SIZE * scale * many, 1.0))
     # Beyond the head, to the right of it where the arrow points up or down.
     place = end + np.array([14.0, 5.0 if end[1] > start[1] else -23.0]) * scale * many
     box = np.array(draw.textbbox(tuple(place), label, font=font))

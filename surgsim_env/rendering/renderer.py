@@ -38,7 +38,8 @@ class OrganRenderer:
     ) -> None:
         """Nothing is loaded yet; `gl_context` is a window's, None for pictures off screen."""
         self.options = options or RenderOptions()
-        self.cameras: dict[str, Camera] = scene_cameras(simulation.anatomy)
+        aspect = self.options.width / self.options.height
+        self.cameras: dict[str, Camera] = scene_cameras(simulation.anatomy, aspect)
         self.lesions: tuple[Lesion, ...] = tuple(lesions)
         self._simulation = simulation
         self._gl_context = gl_context

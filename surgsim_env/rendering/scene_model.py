@@ -8,6 +8,8 @@ import numpy as np
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.palpable_face import tangent_axes
+from surgsim_env.rendering.cameras import cut_direction
+from surgsim_env.rendering.cutting import SECTION_SPLITS, most_tets_cut
 from surgsim_env.rendering.drawn_mesh import DrawnMesh, add_mesh
 from surgsim_env.rendering.instrument_geoms import InstrumentGeoms, add_instrument, find_instrument
 from surgsim_env.rendering.options import RenderOptions
@@ -42,9 +44,6 @@ DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
 # Clipping planes of the cameras [m].
 NEAR, FAR = 0.005, 5.0
-# A plane through an organ cuts at most so many triangles for each tet; small organs have more of them at once.
-SECTION_FACES_PER_TET = 9
-SECTION_FACES_LEAST = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +103,9 @@ def _room(anatomy: Anatomy, surface: DrawnSurface, options: RenderOptions) -> di
     whole = many * surface.vertex_count, many * len(surface.faces)
     room = {"organ": whole, "held": whole}
     if options.cut_away:
-        most = max(SECTION_FACES_PER_TET * anatomy.mesh.tet_count, SECTION_FACES_LEAST)
-        room |= {"section": (2 * most, most), "section_lesion": (2 * most, most)}
+        # A cut tet is a quadrangle at most, whose triangles are split and may each be parted by a lesion's outline.
+        small = 2 * SECTION_SPLITS**2 * most_tets_cut(anatomy.mesh, cut_direction(anatomy))
+        room |= {"section": (6 * small, 2 * small), "section_lesion": (6 * small, 2 * small)}
     elif not (options.shadows or options.show_lesion):
         room["shadow"] = (anatomy.mesh.node_count, len(surface.triangles))
     return room

@@ -4,6 +4,7 @@ import contextlib
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import mujoco
@@ -186,8 +187,7 @@ def borrow_stage(anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOp
     """The stage that all simulations of one anatomy share, for pictures of one size and kind; to be given back."""
     key = _key(anatomy, instrument, options, gl_context)
     with LOCK:
-        if not _stages:
-            gl.at_exit(_close_all)
+        _close_all_at_exit()
         if key not in _stages:
             _stages[key] = Stage(anatomy, instrument, options, gl_context)
         _stages[key].users += 1
@@ -207,6 +207,11 @@ def give_back_stage(stage: Stage) -> None:
 def _key(anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> tuple:
     drawn = replace(options, camera="overview", show_force=True, force_mm_per_newton=1.0)
     return anatomy, int(instrument.signature), drawn, id(gl_context)
+
+
+@cache
+def _close_all_at_exit() -> None:
+    gl.at_exit(_close_all)
 
 
 def _close_all() -> None:

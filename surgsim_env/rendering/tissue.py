@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from msdm_core.mesh import FloatArray, IntArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.rendering.cameras import scene_cameras
+from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.cutting import clip_triangles, cut_tets
 from surgsim_env.rendering.drawn_mesh import Shape
 from surgsim_env.rendering.surface import DrawnSurface, smooth_normals
@@ -94,11 +94,9 @@ class _CutAway:
 
 
 def cut_plane(anatomy: Anatomy, lesions: Sequence[LesionBall]) -> tuple[FloatArray, FloatArray]:
-    """A point of the plane [m] and its unit normal, which is level and points at the overview: that side is taken."""
-    overview, approach = scene_cameras(anatomy)["overview"], anatomy.face.approach
-    level = overview.rotation[:, 2] - (overview.rotation[:, 2] @ approach) * approach
+    """A point of the plane [m] and its unit normal: the side to which it points is taken away."""
     face = anatomy.mesh.points[anatomy.face.triangles].mean(axis=(0, 1))
-    return (lesions[0].centre if lesions else face), level / np.linalg.norm(level)
+    return (lesions[0].centre if lesions else face), cut_direction(anatomy)
 
 
 def _ball(rest: FloatArray, lesion: Lesion) -> LesionBall:

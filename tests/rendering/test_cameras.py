@@ -30,12 +30,13 @@ def test_projection_is_a_pinholes():
     assert np.linalg.det(camera.rotation) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("size", [(640, 480), (84, 84), (480, 640), (1280, 320)])
 @pytest.mark.parametrize("name", ["overview", "side", "above"])
-def test_sees_the_whole_organ_and_not_much_else(anatomy, name):
-    pixels, depth = scene_cameras(anatomy)[name].project(anatomy.mesh.points, 640, 480)
+def test_sees_the_whole_organ_and_not_much_else(anatomy, name, size):
+    pixels, depth = scene_cameras(anatomy, size[0] / size[1])[name].project(anatomy.mesh.points, *size)
     assert (depth > 0.0).all()
-    assert (pixels >= 0.0).all() and (pixels <= [640.0, 480.0]).all()
-    assert (np.ptp(pixels, axis=0) / [640.0, 480.0]).max() > 0.5
+    assert (pixels >= 0.0).all() and (pixels <= size).all()
+    assert (np.ptp(pixels, axis=0) / size).max() > 0.5
 
 
 def test_endoscope_looks_obliquely_at_the_palpable_face_from_near(anatomy):

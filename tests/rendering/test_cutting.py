@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.anatomy import load_anatomy
-from surgsim_env.rendering.cutting import clip_triangles, cut_tets
+from surgsim_env.rendering.cutting import clip_triangles, cut_tets, most_tets_cut
 from surgsim_env.rendering.surface import drawn_surface
 from surgsim_env.rendering.tissue import Tissue, cut_plane
 from surgsim_env.scenes import make_scene
@@ -44,6 +44,14 @@ def test_section_closes_what_is_left_of_the_surface(scene):
     total = area_vectors(left, faces).sum(axis=0) + area_vectors(section @ mesh.points, section_faces).sum(axis=0)
     size = np.linalg.norm(area_vectors(left, faces).sum(axis=0))
     assert np.linalg.norm(total) < (1e-12 if scene == "phantom" else 0.01) * size
+
+
+def test_no_plane_cuts_more_tets_than_the_most():
+    mesh = load_anatomy(make_scene("liver")).mesh
+    height = (mesh.points @ TILTED)[mesh.tets]
+    places = np.linspace(height.min(), height.max(), 400)
+    cut = [((height.min(axis=1) < place) & (height.max(axis=1) > place)).sum() for place in places]
+    assert 0.9 * most_tets_cut(mesh, TILTED) < max(cut) <= most_tets_cut(mesh, TILTED)
 
 
 def test_clipping_keeps_all_or_nothing_away_from_the_plane():

@@ -232,6 +232,20 @@ def test_every_option_changes_the_picture(phantom, draw):
     assert small.rgb().shape == (61, 97, 3) and small.depth().shape == small.segmentation().shape == (61, 97)
 
 
+def test_whatever_a_fault_leaves_can_be_drawn(phantom, draw):
+    """Nodes that are no numbers any more: a video of the episode goes on to its end."""
+    phantom.press(0.003)
+    phantom.simulation.organ_state.node_position[:] = np.nan
+    for options in ({}, {"show_lesion": True}, {"cut_away": True}):
+        assert draw(phantom, **options).rgb().shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 200), (2000, 40)])
+def test_strange_sizes_are_drawn(phantom, draw, size):
+    phantom.press(0.003)
+    assert draw(phantom, width=size[0], height=size[1]).rgb().shape == (size[1], size[0], 3)
+
+
 def test_renderers_share_their_meshes_and_give_them_back(make_press, draw):
     held = len(stage._stages)
     presses = [make_press("phantom") for _ in range(4)]

@@ -215,6 +215,34 @@ def test_lesion_is_seen_where_it_is_and_only_when_asked(press, draw, options):
     assert green[1] > green[0] + 40
 
 
+def test_lesion_is_a_ball_inside_and_a_disc_in_the_section(phantom, draw):
+    """Where the centre is seen: the ball's front is nearer by its radius or more, the section is at the centre."""
+    lesion = phantom.lesion
+    for options, ball in (({"show_lesion": True}, True), ({"cut_away": True}, False)):
+        renderer = draw(phantom, camera="overview", **options)
+        view = renderer.cameras["overview"]
+        (place,), (distance,) = view.project(np.array([lesion.centre]), 640, 480)
+        column, row = np.floor(place).astype(int)
+        assert renderer.segmentation()[row, column] == LESION
+        # The drawn organ is in front of a ball, so its depth is looked at without: the section has none.
+        if ball:
+            assert renderer.depth()[row, column] < distance - lesion.radius
+        else:
+            assert renderer.depth()[row, column] == pytest.approx(distance, abs=1e-3)
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_block_throws_its_shadow_on_the_drape(phantom, draw, shadows):
+    """Just beyond the block where the light goes on; the drape on the other side is lit."""
+    renderer = draw(phantom, show_force=False, shadows=shadows)
+    frame = renderer.rgb().astype(float).sum(axis=2)
+    places = np.array([[0.065, 0.035, -0.0005], [-0.02, 0.0, -0.0005]])
+    pixels, _ = renderer.cameras["overview"].project(places, 640, 480)
+    (shade_x, shade_y), (lit_x, lit_y) = np.floor(pixels).astype(int)
+    assert (renderer.segmentation()[[shade_y, lit_y], [shade_x, lit_x]] == BACKGROUND).all()
+    assert frame[shade_y, shade_x] < 0.75 * frame[lit_y, lit_x]
+
+
 def test_cut_away_takes_the_near_side(press, draw):
     """Behind the cut the picture is farther away: nearest organ pixel of the whole and of the cut organ."""
     whole, cut = draw(press), draw(press, cut_away=True)

@@ -1,19 +1,54 @@
-"""Make the README's picture: python docs/make_pictures.py (about a minute)."""
+"""Make the README's pictures: python docs/make_pictures.py (about a minute)."""
 
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
 from rich.console import Console
 
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.palpation.figures import write_organ_picture
 from surgsim_env.palpation.job import run_palpation
+from surgsim_env.rendering.options import RenderOptions
+from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scenes import make_scene
+from surgsim_env.simulation import Simulation
 
 IMAGES = Path(__file__).parent / "images"
+# Options and camera of each quarter of the picture of the views.
+VIEWS = (
+    ({}, "overview"),
+    ({}, "endoscope"),
+    ({"show_lesion": True}, "overview"),
+    ({"cut_away": True}, "overview"),
+)
+
+
+def write_views(path: Path) -> None:
+    """The liver under a press on its second lesion, four times: whole, by endoscope, translucent, cut open."""
+    anatomy = load_anatomy(make_scene("liver"))
+    lesions = anatomy.demonstration_lesions()
+    pressed = lesions[1]
+    simulation = Simulation(anatomy)
+    point, outward = anatomy.face.project(pressed.centre)
+    simulation.reset(anatomy.organ(lesions), point + outward * (anatomy.scene.instrument.tip_radius + 0.001))
+    simulation.instrument.command_velocity(-0.02 * outward)
+    simulation.control_step(450)
+    simulation.end_control_step()
+    pictures = []
+    for options, camera in VIEWS:
+        shown = RenderOptions(width=960, height=720, **options)
+        renderer = OrganRenderer(simulation, shown, lesions=[pressed, *lesions[:1], *lesions[2:]])
+        small = Image.fromarray(renderer.rgb(camera)).resize((480, 360), Image.Resampling.LANCZOS)
+        pictures.append(np.asarray(small))
+        renderer.close()
+    rows = [np.concatenate(pictures[:2], axis=1), np.concatenate(pictures[2:], axis=1)]
+    Image.fromarray(np.concatenate(rows)).save(path, optimize=True)
 
 
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
+    write_views(IMAGES / "views.png")
     palpation = run_palpation(load_anatomy(make_scene("liver")), console=Console())
     write_organ_picture(palpation, IMAGES / "palpation.png")
 

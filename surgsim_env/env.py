@@ -13,7 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
+from msdm_core.regions import Lesion
 from surgsim_env.anatomy import load_anatomy
+from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView
+from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.tasks.palpate import EPISODE_STEPS, PalpateTask
@@ -76,6 +79,10 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     * `instrument`: "probe", the name of an arm (`surgsim_env.list_arms()`, such as "psm_palpator") or the path of an
       arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
       its tip points along the scene's approach as far as its joints allow.
+    * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
+    * `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of
+      `surgsim_env.rendering.options.RenderOptions`: what pictures show. `env.unwrapped.renderer` also draws depth and
+      the label of each pixel.
 
     `env.unwrapped.save_state()` and `load_state()` cover organ, robot, task, counters and random generator; wrappers'
     own counts (TimeLimit) they cannot reach: load a state into an environment that was just reset.
@@ -84,15 +91,18 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     * v0: first version.
     """
 
-    metadata: ClassVar[Info] = {"render_modes": [], "render_fps": 20}
+    metadata: ClassVar[Info] = {"render_modes": list(RENDER_MODES), "render_fps": 20}
 
-    def __init__(self, scene: str = "phantom", instrument: str | None = None, render_mode: str | None = None) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode {render_mode!r} is not offered; this environment has none yet: use None")
-        self.render_mode = None
+    def __init__(
+        self, scene: str = "phantom", instrument: str | None = None, render_mode: str | None = None, **pictures: Any
+    ) -> None:
         self.scene = with_instrument(make_scene(scene), instrument)
         anatomy = load_anatomy(self.scene)
         self.simulation = Simulation(anatomy)
+        self._view = EpisodeView(self.simulation, render_mode, pictures)
+        self.render_mode = render_mode
+        # The modes that this machine offers; the class names all that there are.
+        self.metadata = self._view.metadata()  # type: ignore[misc]
         self.task = PalpateTask(anatomy)
         low, high = self.task.bounds(self.simulation.instrument.lower, self.simulation.instrument.upper)
         self.observation_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
@@ -113,6 +123,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         self._running = True
         info = self._info("", saturated, self.task.blank_info(), self.task.blank_rewards())
         info["added_mass"] = organ.added_mass
+        self._show()
         return self._observation.copy(), info
 
     def command(self, action: Observation) -> None:
@@ -145,7 +156,39 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         verdict = self.task.judge(self.simulation, force_peak, fault)
         self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
+        self._show()
         return self._observation.copy(), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The picture of this moment in mode "rgb_array", shape (height, width, 3); a window shows each step by itself.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to show.
+            NoGLError: there is no OpenGL to draw with; names the packages that are missing.
+        """
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() without a render_mode shows nothing: make the environment with "
+                f'gym.make("{self.spec.id if self.spec else "SurgSim/Palpate-v0"}", render_mode="rgb_array")'
+            )
+            return None
+        if self.render_mode == "human":
+            self._lesions()
+            return None
+        return self._view.frame(self._lesions())
+
+    @property
+    def renderer(self) -> OrganRenderer:
+        """Draws the episode in any render_mode: `rgb(camera)`, `depth(camera)` [m], `segmentation(camera)`.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to show.
+        """
+        return self._view.renderer(self._lesions())
+
+    def close(self) -> None:
+        """Close the window and give back the graphics; more than once is no harm."""
+        self._view.close()
 
     def save_state(self) -> bytes:
         """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed.
@@ -187,6 +230,15 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
         self._observation = arrays["observation"]
         self._running = bool(arrays["running"])
+
+    def _lesions(self) -> tuple[Lesion, ...]:
+        if self.task.lesion is None:
+            raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
+        return (self.task.lesion,)
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._view.show(self._lesions())
 
     def _check_entries(self, arrays: dict[str, np.ndarray]) -> None:
         """Refuse an archive that lacks an entry or has one of another shape, before anything is changed."""

@@ -273,6 +273,22 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Endoscope:
+    """Where the endoscope camera stands and looks [m], and its vertical field of view [degrees]."""
+
+    position: Vector
+    target: Vector
+    fov_deg: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < math.dist(self.position, self.target) < math.inf or not 0.0 < self.fov_deg < 180.0:
+            raise ValueError(
+                f"endoscope: position {self.position}, target {self.target}, fov_deg {self.fov_deg:g}; the rule is two "
+                "places that differ and 0 < fov_deg < 180"
+            )
+
+
+@dataclass(frozen=True)
 class Scene:
     """A whole scene; `name` is the file's stem, `stiffness_rule` one of msdm_core.stiffness.STIFFNESS_RULES.
 
@@ -297,6 +313,7 @@ class Scene:
     demonstration: tuple[FixedLesion, ...] = field(default=())
     stiffness_rule: str = "lloyd"
     port: Port | None = None
+    endoscope: Endoscope | None = None
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
@@ -312,7 +329,7 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
 # The tables that a scene file may have.
 _TABLES = (
     *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
-    *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Port),
+    *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Endoscope, Port),
 )
 
 

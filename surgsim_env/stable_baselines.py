@@ -67,6 +67,10 @@ class VectorEnvForStableBaselines(VecEnv):
         """Close the environments."""
         self.envs.close()
 
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture of each environment, shape (height, width, 3); made with render_mode "rgb_array"."""
+        return list(self.envs.render() or ())  # type: ignore[arg-type]
+
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Values of an attribute of some environments."""
         return [env.get_wrapper_attr(attr_name) for env in self._chosen(indices)]

@@ -33,7 +33,8 @@ class PalpateVectorEnv(SyncVectorEnv):
         dtype: "float64", or "float32" for twice the speed and forces within 0.5 %.
         threads: groups of organs that advance at the same time; as many as there are cores by default.
         max_episode_steps: truncate after so many control steps, at most the environment's own number.
-        render_mode: None.
+        render_mode: None, or "rgb_array": `render()` gives a tuple of pictures, drawn with shared graphics.
+        pictures: what the pictures show, as for a single environment.
     """
 
     def __init__(
@@ -46,9 +47,13 @@ class PalpateVectorEnv(SyncVectorEnv):
         threads: int | None = None,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        **pictures: Any,
     ) -> None:
+        if render_mode == "human" and num_envs != 1:
+            raise ValueError(f'render_mode "human" shows one environment, not {num_envs}: use "rgb_array"')
+
         def make() -> gym.Env:
-            env = PalpateEnv(scene, instrument, render_mode=render_mode)
+            env = PalpateEnv(scene, instrument, render_mode=render_mode, **pictures)
             steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
             return gym.wrappers.TimeLimit(env, steps) if steps < EPISODE_STEPS else env
 

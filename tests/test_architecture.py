@@ -46,7 +46,7 @@ ALLOCATING = {
     *("zeros_like", "ones_like", "empty_like", "full_like", "copy", "concatenate", "stack", "vstack", "hstack"),
     *("column_stack", "cross", "outer", "append", "repeat", "tile", "where", "nonzero", "unique", "astype", "flatten"),
 }
-HEAVY = {"matplotlib", "meshio", "sb3_contrib", "skfem", "stable_baselines3", "torch", "trimesh", "tyro"}
+HEAVY = {"PIL", "matplotlib", "meshio", "sb3_contrib", "skfem", "stable_baselines3", "torch", "trimesh", "tyro"}
 
 
 class Source(NamedTuple):
@@ -158,8 +158,8 @@ def kernels_repeat_to_the_bit(source: Source) -> Iterator[str]:
 
 
 def tasks_do_not_advance(source: Source) -> Iterator[str]:
-    """A task reads the simulation and never advances it."""
-    if source.path.startswith("surgsim_env/tasks/"):
+    """A task, and what draws, reads the simulation and never advances it."""
+    if source.path.startswith(("surgsim_env/tasks/", "surgsim_env/rendering/")):
         for node in ast.walk(source.tree):
             if isinstance(node, ast.Call) and ADVANCING.fullmatch(last_name(node)):
                 yield f"line {node.lineno} calls {last_name(node)}"
@@ -170,6 +170,15 @@ def arms_know_no_task(source: Source) -> Iterator[str]:
     if source.path.startswith("surgsim_env/arms/"):
         for name, line in imported(source.tree):
             if name.split(".")[0] == "gymnasium" or re.match(r"surgsim_env\.(tasks|env|vector_env|simulation)\b", name):
+                yield f"line {line} imports {name}"
+
+
+def pictures_are_asked_for(source: Source) -> Iterator[str]:
+    """Only environments and the command line draw: the simulation and its tasks do not know how they look."""
+    may = ("surgsim_env/rendering/", "surgsim_env/__init__.py", "surgsim_env/env.py", "surgsim_env/cli.py")
+    if not source.path.startswith(may):
+        for name, line in imported(source.tree):
+            if name.startswith("surgsim_env.rendering"):
                 yield f"line {line} imports {name}"
 
 
@@ -201,6 +210,7 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     kernels_repeat_to_the_bit,
     tasks_do_not_advance,
     arms_know_no_task,
+    pictures_are_asked_for,
     short_enough,
     named_for_what_it_does,
 )
@@ -254,6 +264,8 @@ PLANTED = [
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "mujoco.mj_step1(model, data)"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.tasks.palpate import PalpateTask"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "def late():\n    import gymnasium"),
+    (tasks_do_not_advance, "surgsim_env/rendering/stage.py", "mujoco.mj_step(model, data)"),
+    (pictures_are_asked_for, "surgsim_env/simulation.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
     (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),
@@ -269,6 +281,7 @@ ALLOWED = [
     (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(fastmath=False)\ndef f(x): return math.sqrt(x)"),
     (tasks_do_not_advance, "surgsim_env/env.py", "simulation.haptic_step()"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.environment_words import WORDS"),
+    (pictures_are_asked_for, "surgsim_env/env.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * LINES_PER_FILE),
     (named_for_what_it_does, "msdm_core/mesh_io.py", ""),
 ]

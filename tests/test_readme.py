@@ -5,15 +5,33 @@ from pathlib import Path
 
 import pytest
 
+from surgsim_env.rendering import gl
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+
+
 def test_python_example_runs_and_is_short(capsys):
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    code = EXAMPLES[0]
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
     exec(compile(code, "README.md", "exec"), {})
     assert re.search(r"contact force \[.*\] N, largest 0\.\d\d N", capsys.readouterr().out)
+
+
+def test_video_example_runs_and_writes_a_video(tmp_path, monkeypatch):
+    (code,) = (example for example in EXAMPLES if "RecordVideo" in example)
+    pytest.importorskip("moviepy", reason="needs the `video` extra")
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    (video,) = (tmp_path / "runs" / "videos").glob("*.mp4")
+    assert video.stat().st_size > 1000
 
 
 PLACES = sorted(set(re.findall(r"`((?:scenes|msdm_core|surgsim_env|agents|docs)/[^`*]*)`", README)))

@@ -55,6 +55,32 @@ def test_seeds_actions_and_ends_go_through():
     envs.close()
 
 
+def test_pictures_go_through():
+    from surgsim_env.rendering import gl
+    from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    many = gym.make_vec(
+        "SurgSim/Palpate-v0",
+        num_envs=3,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode="SameStep",
+        render_mode="rgb_array",
+        width=64,
+        height=48,
+    )
+    envs = VectorEnvForStableBaselines(many)
+    envs.reset()
+    assert envs.render_mode == "rgb_array"
+    assert [frame.shape for frame in envs.get_images()] == [(48, 64, 3)] * 3
+    # stable-baselines3 puts three into a square of four.
+    assert envs.render().shape == (96, 128, 3)
+    envs.close()
+
+
 def test_ppo_learns_on_them():
     from stable_baselines3 import PPO
 

@@ -1,0 +1,126 @@
+"""Where the cameras stand: derived from the organ, its palpable face and the side from which the instrument comes."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.palpable_face import tangent_axes
+
+# The organ takes this share of the overview's picture, which is aimed above its middle by a share of half its height.
+OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
+# Nothing of the organ comes nearer to the edge of that picture than this share of half its height.
+EDGE = 0.96
+# How high the overview stands, and how far it goes round to the side [degrees].
+OVERVIEW_HEIGHT, OVERVIEW_SIDE = 32.0, 28.0
+# How high the side view stands [degrees], and how far above the organ's middle it is aimed, likewise.
+SIDE_HEIGHT, SIDE_SHIFT = 10.0, 0.25
+# The endoscope looks at the palpable face from this far [m] (as far as the face is wide, within bounds) and so oblique.
+ENDOSCOPE_FOV, ENDOSCOPE_TILT = 60.0, 38.0
+ENDOSCOPE_DISTANCES = (0.10, 0.20)
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera.
+
+    Fields:
+        position, target: where it is and what is in the middle of its picture [m]  (3,) each
+        up: unit vector that is upright in the picture                              (3,)
+        rotation: columns are the picture's right, its up and the way back          (3, 3)
+        fov: vertical field of view [degrees]                                       scalar
+    """
+
+    position: FloatArray
+    target: FloatArray
+    up: FloatArray
+    rotation: FloatArray
+    fov: float
+
+    @classmethod
+    def looking(cls, position: FloatArray, target: FloatArray, up: FloatArray, fov: float) -> "Camera":
+        """A camera at a position that looks at a target [m], with `up` upright in the picture."""
+        back = (position - target) / np.linalg.norm(position - target)
+        right = np.cross(up, back)
+        if np.linalg.norm(right) < 1e-6:
+            # It looks along `up`: any other way round will do.
+            right, _ = tangent_axes(back)
+        right /= np.linalg.norm(right)
+        return cls(position, target, up, np.column_stack([right, np.cross(back, right), back]), fov)
+
+    def sees_above_level(self) -> bool:
+        """Whether some ray of its picture rises against `up`: there the drape below ends."""
+        climb = math.degrees(math.asin(float(np.clip(-self.rotation[:, 2] @ self.up, -1.0, 1.0))))
+        return climb + 0.5 * self.fov > -1.0
+
+    def project(self, points: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
+        """Column and row of points (n, 3) in a picture [pixels] (n, 2), and their depth along the view [m] (n,)."""
+        x, y, z = ((points - self.position) @ self.rotation).T
+        focal = 0.5 * height / math.tan(math.radians(0.5 * self.fov))
+        return np.column_stack([0.5 * width - focal * x / z, 0.5 * height + focal * y / z]), -z
+
+
+def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Camera]:
+    """The scene's cameras by name, those of `options.CAMERAS`, for pictures so many times as wide as high."""
+    points, face = anatomy.mesh.points, anatomy.face
+    up = -face.approach
+    across, along = tangent_axes(face.approach)
+    front = cut_direction(anatomy)
+    return {
+        "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, aspect, OVERVIEW_SHIFT),
+        "endoscope": _placed(anatomy, up) or _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
+        "side": _framing(points, _raised(across, up, SIDE_HEIGHT), up, aspect, SIDE_SHIFT),
+        "above": _framing(points, up, along, aspect, 0.0),
+    }
+
+
+def cut_direction(anatomy: Anatomy) -> FloatArray:
+    """The level unit direction towards the overview, the side from which an organ is cut open, shape (3,)."""
+    across, along = tangent_axes(anatomy.face.approach)
+    side = math.radians(OVERVIEW_SIDE)
+    return across * math.sin(side) - along * math.cos(side)
+
+
+def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, aspect: float, shift: float) -> Camera:
+    """A camera in a direction that has all points in the middle OVERVIEW_SHARE of a picture.
+
+    It looks above their middle by a share of the picture's height, so that an instrument finds room.
+    """
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    camera = Camera.looking(middle + direction, middle, up, OVERVIEW_FOV)
+    seen = (points - middle) @ camera.rotation
+    offset = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) * [1.0, 1.0, 0.0]
+    middle, seen = middle + camera.rotation @ offset, seen - offset
+    half = math.tan(math.radians(0.5 * OVERVIEW_FOV))
+    room = OVERVIEW_SHARE * half * np.array([aspect, 1.0])
+    distance = float((np.abs(seen[:, :2]) / room + seen[:, 2:]).max())
+    # Aimed higher, it shall not lose the lower edge.
+    lowest = (EDGE * seen[:, 2] - seen[:, 1] / half) / (EDGE - shift)
+    distance = max(distance, float(lowest.max()))
+    target = middle + camera.rotation[:, 1] * shift * half * distance
+    return Camera.looking(target + distance * camera.rotation[:, 2], target, up, OVERVIEW_FOV)
+
+
+def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
+    """A level unit direction raised towards up by an angle [degrees]."""
+    return level * math.cos(math.radians(angle)) + up * math.sin(math.radians(angle))
+
+
+def _placed(anatomy: Anatomy, up: FloatArray) -> Camera | None:
+    """The endoscope where the scene puts it, None where it does not."""
+    place = anatomy.scene.endoscope
+    if place is None:
+        return None
+    return Camera.looking(np.asarray(place.position), np.asarray(place.target), up, place.fov_deg)
+
+
+def _endoscope(anatomy: Anatomy, direction: FloatArray, up: FloatArray) -> Camera:
+    """A camera in a direction from the palpable face, as far from it as the face is wide within bounds."""
+    face = anatomy.mesh.points[np.unique(anatomy.face.triangles)]
+    middle = 0.5 * (face.min(axis=0) + face.max(axis=0))
+    seen = (face - middle) @ Camera.looking(middle + direction, middle, up, ENDOSCOPE_FOV).rotation
+    distance = float(np.clip(np.ptp(seen[:, :2], axis=0).max(), *ENDOSCOPE_DISTANCES))
+    target, _ = anatomy.face.project(middle)
+    return Camera.looking(target + distance * direction, target, up, ENDOSCOPE_FOV)

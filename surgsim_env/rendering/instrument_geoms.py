@@ -1,0 +1,116 @@
+"""The instrument's geoms in the drawn scene: whatever its model shows, posed as its data says."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.tool_bodies import CONTACT_GROUP
+
+PREFIX = "instrument"
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+_DRAWN_TYPES = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SPHERE", "CAPSULE", "ELLIPSOID")} | {
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("CYLINDER", "BOX", "MESH")
+}
+# MuJoCo's own colour of a geom that was given none: its material's counts then.
+_NO_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentGeoms:
+    """Which geoms of an instrument's model are drawn, and as which geoms of the drawn scene.
+
+    Fields:
+        source: geoms of the instrument's model                                     (n_geom,)
+        target: geoms of the drawn scene                                            (n_geom,)
+    """
+
+    source: np.ndarray
+    target: np.ndarray
+
+    def pose(self, data: mujoco.MjData, drawn: mujoco.MjData) -> None:
+        """Put the drawn geoms where the instrument's are."""
+        drawn.geom_xpos[self.target] = data.geom_xpos[self.source]
+        drawn.geom_xmat[self.target] = data.geom_xmat[self.source]
+
+
+def shown_geoms(model: mujoco.MjModel) -> list[int]:
+    """Geoms to draw: a body's visible ones (groups 0 to 2), or where it has none, those that tissue feels."""
+    shown = []
+    visible = set(model.geom_bodyid[model.geom_group < CONTACT_GROUP].tolist())
+    for geom in range(model.ngeom):
+        group, body = int(model.geom_group[geom]), int(model.geom_bodyid[geom])
+        wanted = group < CONTACT_GROUP or (group == CONTACT_GROUP and body not in visible)
+        if wanted and int(model.geom_type[geom]) in _DRAWN_TYPES and _colour(model, geom)[3] > 0.0:
+            shown.append(geom)
+    return shown
+
+
+def add_instrument(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Add every geom that is shown, and the meshes and materials of these."""
+    for geom in shown_geoms(model):
+        kind = int(model.geom_type[geom])
+        added = spec.worldbody.add_geom(
+            name=f"{PREFIX}_{geom}",
+            type=mujoco.mjtGeom(kind),
+            rgba=_colour(model, geom),
+            material=_material(spec, model, int(model.geom_matid[geom])),
+            contype=0,
+            conaffinity=0,
+        )
+        if kind == _MESH:
+            added.meshname = _mesh(spec, model, int(model.geom_dataid[geom]))
+        else:
+            added.size = model.geom_size[geom]
+
+
+def find_instrument(drawn: mujoco.MjModel, model: mujoco.MjModel) -> InstrumentGeoms:
+    """The geoms that `add_instrument` added, in the compiled scene; their meshes get the instrument's own frames."""
+    source = shown_geoms(model)
+    for mesh in {int(model.geom_dataid[geom]) for geom in source if model.geom_type[geom] == _MESH}:
+        target = drawn.mesh(f"{PREFIX}_mesh_{mesh}").id
+        _slice(drawn, target, "vert")[:] = _slice(model, mesh, "vert")
+        _slice(drawn, target, "normal")[:] = _slice(model, mesh, "normal")
+    return InstrumentGeoms(
+        source=np.array(source, dtype=np.int64),
+        target=np.array([drawn.geom(f"{PREFIX}_{geom}").id for geom in source], dtype=np.int64),
+    )
+
+
+def _colour(model: mujoco.MjModel, geom: int) -> FloatArray:
+    colour, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    if material >= 0 and np.array_equal(colour, _NO_COLOUR):
+        colour = model.mat_rgba[material]
+    return colour.astype(np.float64)
+
+
+def _material(spec: mujoco.MjSpec, model: mujoco.MjModel, material: int) -> str:
+    """A material like the instrument's own; polished metal where it has none."""
+    name = f"{PREFIX}_material_{material}"
+    if spec.material(name) is None:
+        added = spec.add_material(name=name, specular=0.9, shininess=0.7)
+        if material >= 0:
+            added.specular = float(model.mat_specular[material])
+            added.shininess = float(model.mat_shininess[material])
+            added.emission = float(model.mat_emission[material])
+    return name
+
+
+def _mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> str:
+    name = f"{PREFIX}_mesh_{mesh}"
+    if spec.mesh(name) is None:
+        added = spec.add_mesh(name=name)
+        added.uservert = _slice(model, mesh, "vert").ravel()
+        added.usernormal = _slice(model, mesh, "normal").ravel()
+        first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+        added.userface = model.mesh_face[first : first + count].ravel()
+        added.userfacenormal = model.mesh_facenormal[first : first + count].ravel()
+        added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    return name
+
+
+def _slice(model: mujoco.MjModel, mesh: int, what: str) -> FloatArray:
+    """The rows of one mesh in mesh_vert or mesh_normal."""
+    first = int(getattr(model, f"mesh_{what}adr")[mesh])
+    return getattr(model, f"mesh_{what}")[first : first + int(getattr(model, f"mesh_{what}num")[mesh])]

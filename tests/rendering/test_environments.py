@@ -1,0 +1,224 @@
+"""Pictures through Gymnasium: modes, checkers, vector environments, videos; the simulation is not touched."""
+
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.rendering import gl, stage
+from surgsim_env.rendering.episode_view import offered_modes
+
+IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
+needs_opengl = pytest.mark.usefixtures("opengl")
+
+
+@pytest.fixture(params=IDS)
+def env_id(request):
+    return request.param
+
+
+def pressing_walk(env, steps=40):
+    """Actions of a walk that presses."""
+    rng = np.random.default_rng(7)
+    for _ in range(steps):
+        action = rng.uniform(-0.5, 0.5, env.action_space.shape).astype(np.float32)
+        action[2] -= 0.3
+        yield action
+
+
+@needs_opengl
+def test_passes_gymnasiums_checker_without_a_warning(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
+
+
+@pytest.mark.agents
+@needs_opengl
+def test_passes_stable_baselines3s_checker_without_a_warning(env_id):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the `agents` extra")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(gym.make(env_id, render_mode="rgb_array").unwrapped, skip_render_check=False)
+
+
+@needs_opengl
+def test_pictures_change_no_bit_of_an_episode(env_id):
+    """Observations, rewards, infos and saved states with a picture of each kind after each step, and without any."""
+    plain, drawn = gym.make(env_id).unwrapped, gym.make(env_id, render_mode="rgb_array", show_lesion=True).unwrapped
+    start = [env.reset(seed=3) for env in (plain, drawn)]
+    assert start[0][0].tobytes() == start[1][0].tobytes()
+    touched = False
+    for action in pressing_walk(plain):
+        one, other = plain.step(action), drawn.step(action)
+        drawn.render()
+        drawn.renderer.depth("side")
+        drawn.renderer.segmentation("endoscope")
+        assert one[0].tobytes() == other[0].tobytes() and one[1:] == other[1:]
+        assert plain.save_state() == drawn.save_state()
+        touched |= bool(drawn.simulation.contact_force.any())
+        if one[2]:
+            break
+    assert touched, "the walk must touch the organ to prove anything"
+    drawn.close()
+
+
+@needs_opengl
+def test_loaded_state_looks_like_the_saved_one(env_id):
+    env, other = (gym.make(env_id, render_mode="rgb_array", show_lesion=True).unwrapped for _ in range(2))
+    env.reset(seed=5)
+    other.reset(seed=6)
+    for action in pressing_walk(env, 20):
+        env.step(action)
+    assert env.render().tobytes() != other.render().tobytes()
+    other.load_state(env.save_state())
+    assert env.render().tobytes() == other.render().tobytes()
+    env.close()
+    other.close()
+
+
+@needs_opengl
+def test_frames_are_what_was_asked_for(env_id):
+    env = gym.make(env_id, render_mode="rgb_array", width=200, height=100, camera="endoscope")
+    env.reset(seed=0)
+    frame = env.render()
+    assert isinstance(frame, np.ndarray) and frame.shape == (100, 200, 3) and frame.dtype == np.uint8
+    assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 50
+    env.close()
+    env.close()
+
+
+def test_nothing_to_show_before_the_first_reset(env_id):
+    env = gym.make(env_id, render_mode="rgb_array")
+    with pytest.raises(gym.error.ResetNeeded):
+        env.render()
+    for look in (env.unwrapped.render, lambda: env.unwrapped.renderer):
+        with pytest.raises(gym.error.ResetNeeded, match="nothing to show"):
+            look()
+
+
+def test_without_a_mode_render_warns_and_shows_nothing(env_id):
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without a render_mode shows nothing"):
+        assert env.unwrapped.render() is None
+
+
+def test_metadata_says_what_this_machine_offers(env_id, monkeypatch):
+    """All modes by the class; by an environment those that work here, and one frame for each control step."""
+    assert gym.spec(env_id).entry_point and type(gym.make(env_id).unwrapped).metadata["render_modes"] == [
+        "human",
+        "rgb_array",
+    ]
+    env = gym.make(env_id).unwrapped
+    assert env.metadata == {"render_modes": offered_modes(), "render_fps": 20}
+    assert env.metadata["render_fps"] == pytest.approx(1.0 / env.scene.timing.control_step)
+    for name in gl.DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    assert "human" not in offered_modes()
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.delenv(gl.VARIABLE, raising=False)
+    assert "human" in offered_modes()
+    monkeypatch.setenv(gl.VARIABLE, "disabled")
+    assert offered_modes() == [] == gym.make(env_id).unwrapped.metadata["render_modes"]
+
+
+def test_window_without_a_display_says_what_to_do(env_id, monkeypatch):
+    for name in gl.DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(gl.NoGLError, match=r'no display .*use render_mode="rgb_array"'):
+        gym.make(env_id, render_mode="human")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"camera": "front"}, "camera 'front' is unknown; the cameras are"),
+        ({"widht": 3}, "argument 'widht' is unknown; .*did you mean 'width'"),
+        ({"render_mode": "ansi"}, "render_mode 'ansi' is unknown; the modes are None, human, rgb_array"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*render_mode='ansi'")
+def test_bad_options_are_refused(env_id, options, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make(env_id, **options)
+
+
+@needs_opengl
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+def test_vector_environments_give_a_frame_for_each(mode):
+    """Frames equal those of single environments, and all are drawn by one stage."""
+    held = len(stage._stages)
+    envs = gym.make_vec(IDS[0], num_envs=3, vectorization_mode=mode, render_mode="rgb_array", width=160, height=120)
+    assert envs.render_mode == "rgb_array" and envs.metadata["render_fps"] == 20
+    envs.reset(seed=[3, 4, 5])
+    envs.step(np.tile(np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32), (3, 1)))
+    frames = envs.render()
+    assert isinstance(frames, tuple) and len(frames) == 3
+    assert len(stage._stages) == held + 1
+    alone = gym.make(IDS[0], render_mode="rgb_array", width=160, height=120)
+    alone.reset(seed=4)
+    alone.step(np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32))
+    assert alone.render().tobytes() == frames[1].tobytes() != frames[2].tobytes()
+    alone.close()
+    envs.close()
+    assert len(stage._stages) == held
+
+
+@needs_opengl
+def test_works_in_other_processes():
+    """Workers that are started anew draw by themselves; a fork of a process that has drawn says why it cannot."""
+    envs = gym.make_vec(
+        IDS[0],
+        num_envs=2,
+        vectorization_mode="async",
+        vector_kwargs={"context": "spawn"},
+        render_mode="rgb_array",
+        width=64,
+        height=48,
+    )
+    envs.reset(seed=[3, 4])
+    assert [frame.shape for frame in envs.render()] == [(48, 64, 3)] * 2
+    envs.close()
+
+
+def test_forked_process_is_told(monkeypatch):
+    monkeypatch.setattr(gl, "_context", object())
+    monkeypatch.setattr(gl, "_owner", -1)
+    with pytest.raises(gl.NoGLError, match=r"forked .*forkserver"):
+        gl.context()
+
+
+def test_windows_are_not_opened_by_the_dozen(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":0")
+    with pytest.raises(ValueError, match="shows one environment, not 4"):
+        gym.make_vec(IDS[0], num_envs=4, vectorization_mode="vector_entry_point", render_mode="human")
+
+
+@needs_opengl
+def test_drawn_environment_can_be_pickled_with_its_renderer(env_id):
+    env = gym.make(env_id, render_mode="rgb_array", width=64, height=48).unwrapped
+    env.reset(seed=1)
+    frame = env.render()
+    options = pickle.loads(pickle.dumps(env.renderer.options))
+    assert options == env.renderer.options and env.render().tobytes() == frame.tobytes()
+    env.close()
+    # A closed environment may be drawn again.
+    assert env.render().tobytes() == frame.tobytes()
+    env.close()
+
+
+@needs_opengl
+def test_videos_are_recorded(env_id, tmp_path):
+    pytest.importorskip("moviepy", reason="needs the `video` extra")
+    env = gym.wrappers.RecordVideo(gym.make(env_id, render_mode="rgb_array"), str(tmp_path / "videos"))
+    env.reset(seed=0)
+    for action in pressing_walk(env, 5):
+        env.step(action)
+    env.close()
+    (video,) = (tmp_path / "videos").glob("*.mp4")
+    assert video.stat().st_size > 1000

@@ -1,0 +1,35 @@
+"""Every bad option is a ValueError that says what, the value and the rule. Needs no OpenGL."""
+
+import math
+
+import pytest
+
+from surgsim_env.rendering.options import RenderOptions, render_options
+
+BAD = [
+    ({"camera": "front"}, "camera 'front' is unknown; the cameras are overview, endoscope, side, above"),
+    ({"width": 0}, "width is 0; it must be a whole number of pixels from 1 to 4096"),
+    ({"width": True}, "width is True"),
+    ({"height": 480.0}, "height is 480.0"),
+    ({"height": 5000}, "height is 5000"),
+    ({"show_force": 1}, "show_force is 1; it must be True or False"),
+    ({"show_lesion": "yes"}, "show_lesion is 'yes'"),
+    ({"cut_away": None}, "cut_away is None"),
+    ({"shadows": 0}, "shadows is 0"),
+    ({"smooth_edges": 4}, "smooth_edges is 4"),
+    ({"force_mm_per_newton": 0.0}, "force_mm_per_newton is 0.0; it must be finite and above 0"),
+    ({"force_mm_per_newton": math.inf}, "force_mm_per_newton is inf"),
+    ({"force_mm_per_newton": True}, "force_mm_per_newton is True"),
+    ({"show_lesions": True}, "argument 'show_lesions' is unknown; .*did you mean 'show_lesion'"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), BAD, ids=lambda part: str(part)[:30])
+def test_bad_options_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        render_options(given)
+
+
+def test_good_ones_are_kept():
+    assert render_options({}) == RenderOptions()
+    assert render_options({"camera": "above", "width": 1}).camera == "above"

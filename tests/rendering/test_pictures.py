@@ -1,0 +1,296 @@
+"""What pictures show, against geometry: where things are, how far, what they are called, and that they move."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from msdm_core.triangles import nearest_triangle
+from surgsim_env.rendering import stage
+from surgsim_env.rendering.force_arrow import COLOUR, contact_point
+from surgsim_env.rendering.options import CAMERAS, RenderOptions
+from surgsim_env.rendering.renderer import OrganRenderer
+from surgsim_env.rendering.stage import LABELS
+
+pytestmark = pytest.mark.usefixtures("opengl")
+ORGAN, INSTRUMENT, LESION, BACKGROUND = (LABELS[name] for name in ("organ", "instrument", "lesion", "background"))
+
+
+@pytest.fixture
+def draw():
+    """A function that makes renderers, all of which are closed after the test."""
+    made = []
+
+    def make(press, **options):
+        made.append(OrganRenderer(press.simulation, RenderOptions(**options), lesions=[press.lesion]))
+        return made[-1]
+
+    yield make
+    for renderer in made:
+        renderer.close()
+
+
+def reach(places, width, height, border=1):
+    """Whole pixels of places [pixels] that lie in the picture, and which places those are."""
+    pixels = np.floor(places).astype(int)
+    inside = ((pixels >= border) & (pixels < np.array([width, height]) - border)).all(axis=1)
+    return pixels[inside], inside
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_organ_is_where_its_nodes_project_to_and_nowhere_else(press, draw, camera):
+    """Every node's pixel shows the organ or an instrument before it; every organ pixel lies by a projected triangle."""
+    renderer = draw(press, camera=camera)
+    labels = renderer.segmentation()
+    assert labels.shape == (480, 640) and labels.dtype == np.uint8
+    mesh = press.simulation.anatomy.mesh
+    nodes = press.simulation.organ_state.node_position[mesh.boundary_nodes]
+    pixels, _ = renderer.cameras[camera].project(nodes, 640, 480)
+    seen, _ = reach(pixels, 640, 480)
+    # A node on the outline may show as its neighbour pixel does.
+    around = [labels[seen[:, 1] + dy, seen[:, 0] + dx] for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+    assert np.isin(around, (ORGAN, INSTRUMENT)).any(axis=0).all()
+    rows, columns = np.nonzero(labels == ORGAN)
+    corners = mesh.boundary_triangles
+    flat = renderer.cameras[camera].project(press.simulation.organ_state.node_position, 640, 480)[0]
+    flat = np.column_stack([flat, np.zeros(len(flat))])[corners]
+    for index in np.linspace(0, len(rows) - 1, 40).astype(int):
+        point = np.array([columns[index] + 0.5, rows[index] + 0.5, 0.0])
+        triangle, weights = nearest_triangle(flat, point)
+        assert np.linalg.norm(weights @ flat[triangle] - point) < 5.0
+
+
+def test_labels_count_up_to_the_picture_and_to_the_shapes(phantom, draw):
+    """Without a lesion shown there are three labels; the ball's pixels are those of its circle."""
+    renderer = draw(phantom, camera="above")
+    labels = renderer.segmentation()
+    counts = {name: int((labels == number).sum()) for name, number in LABELS.items()}
+    assert sum(counts.values()) == labels.size and counts["lesion"] == 0
+    assert counts["background"] > 1000 and counts["organ"] > 1000
+    # From above the shaft hides in the ball's circle or stands off it; the ball's centre is instrument, its rim too.
+    camera, tip = renderer.cameras["above"], phantom.simulation.instrument.tip_position
+    radius = phantom.simulation.anatomy.scene.instrument.tip_radius
+    angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(24)])
+    pixels, _ = camera.project(tip + np.concatenate([0.93 * radius * circle, 1.15 * radius * circle]), 640, 480)
+    inner, outer = np.split(np.floor(pixels).astype(int), 2)
+    assert (labels[inner[:, 1], inner[:, 0]] == INSTRUMENT).all()
+    assert (labels[outer[:, 1], outer[:, 0]] == INSTRUMENT).mean() < 0.6
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_depth_of_visible_nodes_is_their_distance(press, draw, camera):
+    """At a node's pixel the depth is the node's to 1 mm, unless something nearer hides it (and never is it farther)."""
+    renderer = draw(press, camera=camera)
+    depth, view = renderer.depth(), renderer.cameras[camera]
+    assert depth.shape == (480, 640) and depth.dtype == np.float32
+    anatomy = press.simulation.anatomy
+    vertices, normals = stage.drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles).follow(
+        press.simulation.organ_state.node_position
+    )
+    # Facing the camera within 60 degrees, so that a pixel's width does not matter.
+    towards = view.position - vertices
+    facing = (normals * towards).sum(axis=1) > 0.5 * np.linalg.norm(towards, axis=1)
+    pixels, distance = view.project(vertices[facing], 640, 480)
+    seen, inside = reach(pixels, 640, 480)
+    found, expected = depth[seen[:, 1], seen[:, 0]], distance[inside]
+    # On the outline the pixel beside it may be the one.
+    nearest = np.min([depth[seen[:, 1] + dy, seen[:, 0] + dx] for dx in (-1, 0, 1) for dy in (-1, 0, 1)], axis=0)
+    assert (nearest < expected + 1e-3).all()
+    labels = renderer.segmentation()[seen[:, 1], seen[:, 0]]
+    visible = (labels == ORGAN) & (found > expected - 5e-3)
+    assert visible.mean() > 0.7
+    np.testing.assert_allclose(found[visible], expected[visible], atol=1e-3)
+
+
+def test_depth_of_the_drape_is_that_of_its_plane(phantom, draw):
+    """Seen straight from above the drape is a plane of one depth, half a millimetre below the block."""
+    renderer = draw(phantom, camera="above")
+    depth, view = renderer.depth(), renderer.cameras["above"]
+    assert depth[2, 2] == pytest.approx(view.position[2] + 0.0005, abs=1e-4)
+    assert depth[2, 2] == pytest.approx(depth[2, -3], abs=1e-4)
+
+
+def test_depth_is_infinite_where_there_is_nothing(phantom, draw):
+    renderer = draw(phantom)
+    up = np.array([0.0, 0.0, 1.0])
+    place = np.array([0.03, -0.27, 0.115])
+    sky = type(renderer.cameras["overview"]).looking(place, np.array([0.03, -1.27, 0.715]), up, 30.0)
+    assert np.isinf(renderer.depth(sky)).all() and (renderer.segmentation(sky) == BACKGROUND).all()
+
+
+def test_pressed_organ_looks_and_measures_differently(press, draw):
+    """The surface in the picture goes down with the tissue under the tip, by as much as the nodes do."""
+    renderer = draw(press, camera="endoscope", show_force=False)
+    before, depth_before = renderer.rgb(), renderer.depth()
+    assert before.shape == (480, 640, 3) and before.dtype == np.uint8
+    press.press(1.4 * press.simulation.anatomy.scene.palpation.press_depth)
+    after, depth_after = renderer.rgb(), renderer.depth()
+    assert (before != after).any(axis=2).mean() > 0.002
+    nodes, rest = press.simulation.organ_state.node_position, press.simulation.anatomy.mesh.points
+    face = np.unique(press.simulation.anatomy.face.triangles)
+    moved = face[np.argsort(-np.linalg.norm((nodes - rest)[face], axis=1))][:12]
+    pixels, distance = renderer.cameras["endoscope"].project(nodes[moved], 640, 480)
+    column, row = np.floor(pixels).astype(int).T
+    visible = (renderer.segmentation()[row, column] == ORGAN) & (np.abs(depth_after[row, column] - distance) < 2e-3)
+    assert visible.any()
+    change = depth_after[row, column] - depth_before[row, column]
+    assert np.abs(change[visible]).max() > 0.3 * np.linalg.norm((nodes - rest)[moved], axis=1).max() * 0.5
+
+
+def test_moved_node_moves_the_outline(phantom, draw):
+    """A corner of the block pulled out by 10 mm gets organ pixels where background was."""
+    renderer = draw(phantom, show_force=False)
+    view = renderer.cameras["overview"]
+    nodes = phantom.simulation.organ_state.node_position
+    corner = int(np.argmax(phantom.simulation.anatomy.mesh.points @ [-1.0, 1.0, 1.0]))
+    out = np.array([-0.004, 0.004, 0.012])
+    (column, row), _ = (part[0] for part in view.project((nodes[corner] + 0.85 * out)[None], 640, 480))
+    place = int(row), int(column)
+    assert renderer.segmentation()[place] == BACKGROUND
+    nodes[corner] += out
+    assert renderer.segmentation()[place] == ORGAN
+    nodes[corner] -= out
+    assert renderer.segmentation()[place] == BACKGROUND
+
+
+def test_same_state_same_bytes(press, draw):
+    """Also with another renderer, after other pictures, and by a copy."""
+    press.press(0.003)
+    for options in ({}, {"show_lesion": True}, {"cut_away": True}):
+        renderer = draw(press, **options)
+        frame = renderer.rgb()
+        renderer.rgb("above")
+        renderer.depth()
+        assert renderer.rgb().tobytes() == frame.tobytes()
+        assert draw(press, **options).rgb().tobytes() == frame.tobytes()
+        twin = copy.deepcopy(renderer)
+        assert twin.rgb().tobytes() == frame.tobytes()
+        twin.close()
+
+
+def coloured(frame, colour=COLOUR[:3]):
+    return (np.abs(frame.astype(int) - colour).max(axis=2) < 3).sum()
+
+
+def test_force_arrow_comes_with_a_force_and_points_along_it(press, draw):
+    renderer = draw(press)
+    assert coloured(renderer.rgb()) == 0, "nothing is touched yet"
+    press.press(0.004)
+    simulation = press.simulation
+    force = simulation.contact_wrench[0, :3]
+    assert np.linalg.norm(force) > 0.05
+    assert coloured(draw(press, show_force=False).rgb()) == 0
+    frame = renderer.rgb()
+    assert coloured(frame) > 30
+    start = contact_point(simulation, 0)
+    radius = simulation.anatomy.scene.instrument.tip_radius
+    assert np.linalg.norm(start - simulation.instrument.tip_position) == pytest.approx(radius, abs=0.15 * radius)
+    # Along the arrow's shaft every picture point is the arrow's; twice its length beyond the head none is.
+    share = np.array([0.2, 0.4, 2.0])
+    places = start + share[:, None] * force * 0.06
+    (near, far, beyond), _ = renderer.cameras["overview"].project(places, 640, 480)
+    for place in (near, far):
+        assert np.abs(frame[int(place[1]), int(place[0])].astype(int) - COLOUR[:3]).max() < 12
+    assert np.abs(frame[int(beyond[1]), int(beyond[0])].astype(int) - COLOUR[:3]).max() > 12
+    longer = draw(press, force_mm_per_newton=120.0).rgb()
+    assert coloured(longer) > 1.3 * coloured(frame)
+
+
+@pytest.mark.parametrize("options", [{"show_lesion": True}, {"cut_away": True}])
+def test_lesion_is_seen_where_it_is_and_only_when_asked(press, draw, options):
+    plain, shown = draw(press, show_force=False), draw(press, show_force=False, **options)
+    assert (plain.segmentation() == LESION).sum() == 0
+    labels = shown.segmentation()
+    rows, columns = np.nonzero(labels == LESION)
+    view = plain.cameras["overview"]
+    (centre,), (depth,) = view.project(np.array([press.lesion.centre]), 640, 480)
+    radius = press.lesion.radius * 0.5 * 480 / np.tan(np.radians(0.5 * view.fov)) / depth
+    # A ball's outline (seen whole) or its section, seen aslant and partly behind the instrument.
+    full = np.pi * radius**2
+    assert 0.5 * full < len(rows) < 1.15 * full
+    assert np.hypot(rows - centre[1], columns - centre[0]).max() < 1.2 * radius
+    # Yellowish there, tissue elsewhere: the lesion's green is well above the tissue's.
+    green = [int(frame.rgb()[rows, columns, 1].mean()) for frame in (plain, shown)]
+    assert green[1] > green[0] + 40
+
+
+def test_lesion_is_a_ball_inside_and_a_disc_in_the_section(phantom, draw):
+    """Where the centre is seen: the ball's front is nearer by its radius or more, the section is at the centre."""
+    lesion = phantom.lesion
+    for options, ball in (({"show_lesion": True}, True), ({"cut_away": True}, False)):
+        renderer = draw(phantom, camera="overview", **options)
+        view = renderer.cameras["overview"]
+        (place,), (distance,) = view.project(np.array([lesion.centre]), 640, 480)
+        column, row = np.floor(place).astype(int)
+        assert renderer.segmentation()[row, column] == LESION
+        # The drawn organ is in front of a ball, so its depth is looked at without: the section has none.
+        if ball:
+            assert renderer.depth()[row, column] < distance - lesion.radius
+        else:
+            assert renderer.depth()[row, column] == pytest.approx(distance, abs=1e-3)
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_block_throws_its_shadow_on_the_drape(phantom, draw, shadows):
+    """Just beyond the block where the light goes on; the drape on the other side is lit."""
+    renderer = draw(phantom, show_force=False, shadows=shadows)
+    frame = renderer.rgb().astype(float).sum(axis=2)
+    places = np.array([[0.065, 0.035, -0.0005], [-0.02, 0.0, -0.0005]])
+    pixels, _ = renderer.cameras["overview"].project(places, 640, 480)
+    (shade_x, shade_y), (lit_x, lit_y) = np.floor(pixels).astype(int)
+    assert (renderer.segmentation()[[shade_y, lit_y], [shade_x, lit_x]] == BACKGROUND).all()
+    assert frame[shade_y, shade_x] < 0.75 * frame[lit_y, lit_x]
+
+
+def test_cut_away_takes_the_near_side(press, draw):
+    """Behind the cut the picture is farther away: nearest organ pixel of the whole and of the cut organ."""
+    whole, cut = draw(press), draw(press, cut_away=True)
+    labels = [one.segmentation() for one in (whole, cut)]
+    nearest = [one.depth()[label == ORGAN].min() for one, label in zip((whole, cut), labels)]
+    assert nearest[1] > nearest[0] + 0.005
+
+
+def test_every_option_changes_the_picture(phantom, draw):
+    phantom.press(0.003)
+    plain = draw(phantom).rgb()
+    for options in ({"shadows": True}, {"smooth_edges": False}, {"show_lesion": True}, {"cut_away": True}):
+        assert (draw(phantom, **options).rgb() != plain).any(), options
+    small = draw(phantom, width=97, height=61)
+    assert small.rgb().shape == (61, 97, 3) and small.depth().shape == small.segmentation().shape == (61, 97)
+
+
+def test_whatever_a_fault_leaves_can_be_drawn(phantom, draw):
+    """Nodes that are no numbers any more: a video of the episode goes on to its end."""
+    phantom.press(0.003)
+    phantom.simulation.organ_state.node_position[:] = np.nan
+    for options in ({}, {"show_lesion": True}, {"cut_away": True}):
+        assert draw(phantom, **options).rgb().shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 200), (2000, 40)])
+def test_strange_sizes_are_drawn(phantom, draw, size):
+    phantom.press(0.003)
+    assert draw(phantom, width=size[0], height=size[1]).rgb().shape == (size[1], size[0], 3)
+
+
+def test_renderers_share_their_meshes_and_give_them_back(make_press, draw):
+    held = len(stage._stages)
+    presses = [make_press("phantom") for _ in range(4)]
+    presses[1].press(0.004)
+    renderers = [draw(press) for press in presses]
+    frames = [renderer.rgb() for renderer in renderers]
+    assert len(stage._stages) == held + 1
+    assert frames[0].tobytes() == frames[2].tobytes() != frames[1].tobytes()
+    for renderer in renderers[:3]:
+        renderer.close()
+    assert len(stage._stages) == held + 1
+    assert renderers[3].rgb().tobytes() == frames[3].tobytes()
+    renderers.clear()
+    del frames
+    draw(presses[0]).close()
+
+
+def test_unknown_camera_is_refused(phantom, draw):
+    with pytest.raises(ValueError, match="camera 'front' is unknown; the cameras are overview, endoscope, side, above"):
+        draw(phantom).rgb("front")

@@ -36,12 +36,13 @@ class InstrumentGeoms:
 
 
 def shown_geoms(model: mujoco.MjModel) -> list[int]:
-    """Geoms to draw: a body's visible ones (groups 0 to 2), or where it has none, those that tissue feels."""
+    """Geoms to draw: the visible ones (groups 0 to 2), and those that tissue feels of bodies without a visible mesh."""
     shown = []
-    visible = set(model.geom_bodyid[model.geom_group < CONTACT_GROUP].tolist())
+    is_mesh = model.geom_type == int(mujoco.mjtGeom.mjGEOM_MESH)
+    dressed = set(model.geom_bodyid[is_mesh & (model.geom_group < CONTACT_GROUP)].tolist())
     for geom in range(model.ngeom):
         group, body = int(model.geom_group[geom]), int(model.geom_bodyid[geom])
-        wanted = group < CONTACT_GROUP or (group == CONTACT_GROUP and body not in visible)
+        wanted = group < CONTACT_GROUP or (group == CONTACT_GROUP and body not in dressed)
         if wanted and int(model.geom_type[geom]) in _DRAWN_TYPES and _colour(model, geom)[3] > 0.0:
             shown.append(geom)
     return shown

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from surgsim_env import Port, load_arm
 from surgsim_env.rendering.instrument_geoms import add_instrument, find_instrument, shown_geoms
+from surgsim_env.tool_bodies import CONTACT_GROUP
 
 
 @pytest.fixture
@@ -26,12 +28,13 @@ def arm():
     link.add_geom(name="unseen", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1] * 3, rgba=[1, 0, 0, 0])
     tip = link.add_body(name="tip", pos=[0.0, 0.0, -0.1])
     tip.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], group=3, rgba=[0.2, 0.9, 0.2, 1])
+    tip.add_geom(name="collar", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.006, 0.001, 0], group=1)
     tip.add_geom(name="helper", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], group=4)
     return spec.compile()
 
 
-def test_visible_geoms_are_shown_and_felt_ones_where_a_body_has_no_other(arm):
-    assert [arm.geom(geom).name for geom in shown_geoms(arm)] == ["visual", "ball"]
+def test_visible_geoms_are_shown_and_felt_ones_where_no_mesh_stands_for_them(arm):
+    assert [arm.geom(geom).name for geom in shown_geoms(arm)] == ["visual", "ball", "collar"]
 
 
 def test_drawn_where_and_as_the_instrument_is(arm):
@@ -46,7 +49,7 @@ def test_drawn_where_and_as_the_instrument_is(arm):
     shown = mujoco.MjData(drawn)
     geoms = find_instrument(drawn, arm)
     geoms.pose(data, shown)
-    assert len(geoms.source) == 2
+    assert len(geoms.source) == 3
 
     def world(model, state, geom):
         mesh = model.geom_dataid[geom]
@@ -65,3 +68,11 @@ def test_drawn_where_and_as_the_instrument_is(arm):
     np.testing.assert_allclose(drawn.geom_rgba[geoms.target[0]], [0.7, 0.7, 0.8, 1.0], atol=1e-6)
     np.testing.assert_allclose(drawn.geom_rgba[geoms.target[1]], [0.2, 0.9, 0.2, 1.0], atol=1e-6)
     assert drawn.mat_specular[drawn.geom_matid[geoms.target[0]]] == 0.25
+
+
+@pytest.mark.parametrize("name", ["psm_palpator", "psm_grasper", "six_axis"])
+def test_all_that_tissue_feels_of_an_arm_is_shown(name: str):
+    model = load_arm(name, Port()).model
+    shown = {model.geom(geom).name for geom in shown_geoms(model)}
+    felt = {model.geom(geom).name for geom in np.flatnonzero(model.geom_group == CONTACT_GROUP)}
+    assert len(felt) > 2 and felt <= shown

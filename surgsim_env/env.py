@@ -72,7 +72,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited` (the box, or an arm's
     joint and speed limits), `hard_limit`, `declared`, `success` (bool), `force_peak` [N], `error_mm` (-1 if nothing was
     declared), `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through
-    none), one `reward_<term>` each.
+    none), `added_mass` [kg] (of the scene's mass scaling, 0 without), one `reward_<term>` each.
 
     ## Arguments
     * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
@@ -122,7 +122,6 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         self._observation = values.astype(np.float32)
         self._running = True
         info = self._info("", saturated, self.task.blank_info(), self.task.blank_rewards())
-        info["added_mass"] = organ.added_mass
         self._show()
         return self._observation.copy(), info
 
@@ -282,6 +281,7 @@ class PalpateEnv(gym.Env[Observation, Observation]):
             "sim_fault": fault,
             "sensor_saturated": saturated,
             "workspace_limited": self.simulation.instrument.workspace_limited,
+            "added_mass": self.simulation.organ_model.added_mass,
             "trocar_error_mm": -1.0 if residual is None else residual * 1000.0,
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},

@@ -1,13 +1,14 @@
 """What an evaluation of two arms found: arrays over points, for the report, the tables and the pictures."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray, IntArray
+from surgsim_env.arms.port import Port
 
 # Why a point is out of an arm's reach, in the order of the tests; 0 is reachable.
 REASONS = ("reachable", "no joints put the tip there", "a joint limit", "the shaft misses its trocar",
@@ -71,6 +72,7 @@ class ArmsEvaluation:
         scene: name of the scene
         surface_points, surface_triangles: the organ's outer surface, for pictures            (n, 3), (m, 3)
         pictures: RGB images (height, width, 3) uint8 of the arms in the patient, by caption
+        ports: where the arms ("left", "right") and the camera ("endoscope") enter, for pictures; may be empty
     """
 
     points: FloatArray
@@ -86,3 +88,4 @@ class ArmsEvaluation:
     surface_points: FloatArray
     surface_triangles: IntArray
     pictures: Mapping[str, NDArray[np.uint8]]
+    ports: Mapping[str, Port] = field(default_factory=dict)

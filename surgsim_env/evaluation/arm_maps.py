@@ -165,7 +165,7 @@ class ArmMaps:
 
         groups = [panels] if shared else [[panel] for panel in panels]
         norms = [_norm(group, scale) for group in groups for _ in group]
-        figure = Figure(figsize=(0.6 + 3.7 * len(panels), 6.2), dpi=DPI, facecolor=PAPER, layout="constrained")
+        figure = Figure(figsize=(0.6 + 3.7 * len(panels), 5.6), dpi=DPI, facecolor=PAPER, layout="constrained")
         rows = figure.subplots(2, len(panels), squeeze=False)
         grey = np.array(to_rgb(NEITHER))
         for column, (title, mask, values, missed) in enumerate(panels):
@@ -248,7 +248,9 @@ def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: View) -> None:
         halo = [withStroke(linewidth=3.2, foreground="white")]
         axes.plot(*path.T, color=colour, lw=1.4, ls=(0, (4, 2)), zorder=4, path_effects=halo)
         axes.plot(*path[0], "o", ms=12, color=colour, mec="white", mew=1.2, zorder=5)
-        axes.text(*path[0], letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6)
+        axes.text(
+            path[0, 0], path[0, 1], letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6
+        )
 
 
 def _norm(panels: list[Panel], scale: float) -> Normalize:

@@ -55,8 +55,8 @@ def write_pictures(
         Picture(
             file,
             "The arms and the endoscope over the organ",
-            f"Close to the organ, whole from the front and above, and whole from the side: {told}. Left arm blue, right arm orange, endoscope grey, "
-            "dark balls the ports; the body wall is left out.",
+            f"Close to the organ, whole from the front and above, and whole from the side: {told}. Left arm blue, "
+            "right arm orange, endoscope grey, dark balls the ports; the body wall is left out.",
         )
     ]
 

@@ -55,9 +55,11 @@ QUANTITIES = (
              "Smallest distance between the surface of the arm's shaft and links and the organ's surface; the tip, "
              "which is to touch, is not counted."),
     Quantity("wall_clearance", "clearance from the body wall", "mm", 1e3, 1, "_m", True,
-             "Smallest distance between the surface of the arm's links and the body wall, the port itself left out."),
+             "Smallest distance between shaft and links and the body wall, a plate or dome through the ports; what "
+             "passes it through the hole of the arm's own port is left out."),
     Quantity("approach_share", "approach directions", "%", 100.0, 0, "", True,
-             "Share of 32 approach directions that the tip can take at the point within 10 degrees."),
+             "Share of 32 directions, spread evenly over the half space above the surface, from which the tip can "
+             "come to the point within 10 degrees."),
     Quantity("limit_margin", "distance from joint limits", "", 1.0, 2, "", True,
              "Product over the joints of 4 (q - low)(high - q) / (high - low)²: 1 in the middle of every joint's "
              "range, 0 at any limit."),
@@ -138,7 +140,7 @@ def extreme(evaluation: ArmsEvaluation, field: str, greatest: bool = False) -> E
     """The least (or greatest) value of a field of ArmReach over both arms and all points that they reach."""
     found = Extreme(math.nan, "", -1)
     for side, arm in sides(evaluation):
-        values = np.where(arm.reachable, getattr(arm, field), np.nan)
+        values = np.where(arm.reachable & np.isfinite(getattr(arm, field)), getattr(arm, field), np.nan)
         if np.isnan(values).all():
             continue
         index = int(np.nanargmax(values) if greatest else np.nanargmin(values))
@@ -155,8 +157,9 @@ def worst_clearance(evaluation: ArmsEvaluation) -> tuple[Extreme, str]:
 
 
 def median(values: FloatArray) -> float:
-    """The median of what is not NaN; NaN if nothing is left."""
-    return float(np.nanmedian(values)) if np.isfinite(values).any() else math.nan
+    """The median of what is finite; NaN if nothing is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
 
 
 def reason_counts(arm: ArmReach) -> list[tuple[str, int]]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import platform
 import shlex
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.arms.arm import Arm, load_arm
@@ -228,11 +226,9 @@ def _arm_input(source: str) -> dict[str, str]:
 
 
 def _print_ranking(ranking: Sequence[Ranked], console: Console) -> None:
-    table = Table(title="placements and robots, the best first")
-    for heading in ("place", "name", "both", "clearance\n[mm]", "force\n[N]", "reasons"):
-        table.add_column(heading)
     for one in ranking:
-        both = f"{100.0 * one.both:.0f} %" if math.isfinite(one.both) else "-"
-        figures = (number_text(one.clearance, 1e3, 1), number_text(one.force, 1.0, 2))
-        table.add_row(str(one.place), one.name, both, *figures, one.reasons)
-    console.print(table)
+        figures = (
+            f"both {100.0 * one.both:.0f} %, worst clearance {number_text(one.clearance, 1e3, 1, 'mm')}, "
+            f"smallest tip force {number_text(one.force, 1.0, 2, 'N')}"
+        )
+        console.print(f"{one.place}. {one.name}: {figures}; {one.reasons}", highlight=False)

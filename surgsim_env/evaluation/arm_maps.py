@@ -30,7 +30,13 @@ if TYPE_CHECKING:
 
 # Told apart whatever the kind of colour blindness: viridis, which has no grey in it, and Okabe & Ito's colours.
 COLOUR_MAP = "viridis"
-LEFT, RIGHT, BOTH, APART, NEITHER = "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#cfcfcf"
+LEFT, RIGHT, BOTH, APART, NEITHER = "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#bdbdbd"
+# Where no point was tried, nothing is claimed: the organ's own pale tone.
+UNTRIED = "#f4e6de"
+# Further from every point than this many of their usual distances, a part of the organ was not tried.
+TRIED_WITHIN = 2.0
+# The view from behind is left out if less of what it shows was tried.
+BEHIND_LEAST = 0.25
 PORT_MARKS = {"left": ("L", LEFT), "right": ("R", RIGHT), "endoscope": ("E", INK)}
 SPLITS = 2
 NEIGHBOURS = 4
@@ -72,8 +78,13 @@ class ArmMaps:
         distance, index = tree.query(places, k=count)
         self._distance = np.reshape(distance, (-1, count))
         self._nearest = self._surface[np.reshape(index, (-1, count))]
+        spacing = float(np.median(tree.query(tree.data, k=2)[0][:, -1]))
+        self._tried = self._distance[:, 0] <= TRIED_WITHIN * spacing
         front = camera_view(evaluation)
-        self._views = (front, View(-front.right, front.up, -front.towards))
+        back = View(-front.right, front.up, -front.towards)
+        self._views = [("from the camera", front)]
+        if self._tried[self._patches.normals @ back.towards > 0.0].mean() >= BEHIND_LEAST:
+            self._views.append(("from behind", back))
 
     def write_all(self, folder: Path) -> list[Picture]:
         """Write every map into a folder: who reaches what, one picture for each quantity, and the arms' distances."""
@@ -97,20 +108,21 @@ class ArmMaps:
         palette = np.array([to_rgb(colour) for colour in (LEFT, RIGHT, BOTH, NEITHER, APART)])
         names = ("left arm only", "right arm only", "both at once", "neither", "each, but not both at once")
         figure = Figure(figsize=(10.5, 4.2), dpi=DPI, facecolor=PAPER, layout="constrained")
-        for axes, view, title in zip(figure.subplots(1, 2), self._views, VIEW_TITLES, strict=True):
+        columns = figure.subplots(1, len(self._views), squeeze=False)[0]
+        for axes, (title, view) in zip(columns, self._views, strict=True):
             self._draw(axes, view, palette[kind[self._nearest[:, 0]]], palette[kind], title)
         shown = [index for index in (2, 0, 1, 4, 3) if (kind == index).any()]
-        labels = [f"{names[index]}: {share_text(kind == index)}" for index in shown]
+        labels = [f"{names[index]}: {share_text(kind[self._surface] == index)}" for index in shown]
         handles = [
             Line2D([], [], marker="s", ls="", ms=10, color=palette[index], label=label)
             for index, label in zip(shown, labels, strict=True)
         ]
+        if not self._tried.all():
+            handles.append(Line2D([], [], marker="s", ls="", ms=10, color=UNTRIED, label="no points there"))
         figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10)
         figure.suptitle("which arm reaches which part of the organ", fontsize=12, color=INK)
         save_png(figure, folder / "map_reach.png")
-        return Picture(
-            "map_reach.png", "Who reaches what", f"The organ from the camera and from behind: {', '.join(labels)}."
-        )
+        return Picture("map_reach.png", "Who reaches what", f"The organ's parts: {', '.join(labels)}.")
 
     def _write_quantity(self, folder: Path, quantity: Quantity) -> Picture:
         one = self.evaluation
@@ -121,10 +133,10 @@ class ArmMaps:
         panels.append(("both at once, the worse arm", one.both, worse_of_both(one, quantity), self._missed_by_both()))
         name = f"map_{quantity.field}.png"
         sense = "more is better" if quantity.more_is_better else "less is better"
-        label = f"{quantity.label}, {sense}"
+        label = f"{quantity.label}\n{sense}"
         self._write_panels(folder / name, quantity.title, label, quantity.scale, panels)
         told = "; ".join(
-            f"{title}: {_spread(values, quantity)} over {share_text(mask)} of the points"
+            f"{title}: {_spread(values, quantity)} over {share_text(mask[self._surface])} of the surface's points"
             for title, mask, values, _ in panels
         )
         title = quantity.title[0].upper() + quantity.title[1:]
@@ -143,7 +155,7 @@ class ArmMaps:
             place = title.removeprefix("distance between the arms ")
             panels.append((place, known, values, f"not reached by each arm: {int((~known).sum())}"))
         name, title = "map_arm_distance.png", "distance between the arms"
-        self._write_panels(folder / name, title, "distance [mm], more is better", 1e3, panels, shared=False)
+        self._write_panels(folder / name, title, "distance [mm]\nmore is better", 1e3, panels, shared=False)
         quantity = Quantity("", title, "mm", 1e3, 1, "_m", True, "")
         told = "; ".join(f"{panel[0]}: {_spread(panel[2], quantity)}" for panel in panels)
         return Picture(name, "Distance between the arms", f"{told}. Grey: not reached by each arm.")
@@ -165,20 +177,26 @@ class ArmMaps:
 
         groups = [panels] if shared else [[panel] for panel in panels]
         norms = [_norm(group, scale) for group in groups for _ in group]
-        figure = Figure(figsize=(0.6 + 3.7 * len(panels), 5.6), dpi=DPI, facecolor=PAPER, layout="constrained")
-        rows = figure.subplots(2, len(panels), squeeze=False)
+        figure = Figure(
+            figsize=(0.6 + 3.7 * len(panels), 1.9 + 2.25 * len(self._views)),
+            dpi=DPI,
+            facecolor=PAPER,
+            layout="constrained",
+        )
+        rows = figure.subplots(len(self._views), len(panels), squeeze=False)
         grey = np.array(to_rgb(NEITHER))
         for column, (title, mask, values, missed) in enumerate(panels):
-            norm, (upper, lower) = norms[column], rows[:, column]
+            norm = norms[column]
             tint = colormaps[COLOUR_MAP](norm(np.nan_to_num(values * scale)))[:, :3]
             dots = np.where(mask[:, None], tint, grey)
             colours = np.where(mask[self._nearest[:, :1]], self._painted(values * scale, mask, norm), grey)
-            self._draw(upper, self._views[0], colours, dots, title)
-            self._draw(lower, self._views[1], colours, dots, "")
-            lower.text(0.5, -0.02, missed, transform=lower.transAxes, ha="center", va="top", fontsize=8, color=INK)
+            for axes, (_, view) in zip(rows[:, column], self._views, strict=True):
+                self._draw(axes, view, colours, dots, title if axes is rows[0, column] else "")
+            axes = rows[-1, column]
+            axes.text(0.5, -0.02, missed, transform=axes.transAxes, ha="center", va="top", fontsize=8, color=INK)
             if not shared:
                 figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=rows[:, column], shrink=0.6, pad=0.02, label=label)
-        for row, side in zip(rows[:, 0], VIEW_TITLES, strict=True):
+        for row, (side, _) in zip(rows[:, 0], self._views, strict=True):
             row.text(-0.02, 0.5, side, transform=row.transAxes, ha="right", va="center", rotation=90, fontsize=9)
         if shared:
             figure.colorbar(ScalarMappable(norms[0], COLOUR_MAP), ax=rows, shrink=0.7, pad=0.02, label=label)
@@ -199,21 +217,20 @@ class ArmMaps:
     def _draw(self, axes: Axes, view: View, colours: FloatArray, dots: FloatArray, title: str) -> None:
         """The organ painted, its points as dots, inner targets as diamonds, and the ports where they are in front."""
         one = self.evaluation
-        _draw_organ(axes, self._patches, colours, view)
+        from matplotlib.colors import to_rgb
+
+        _draw_organ(axes, self._patches, np.where(self._tried[:, None], colours, to_rgb(UNTRIED)), view)
         facing = ~one.inner & (one.normals @ view.towards > 0.1)
         axes.scatter(*view.flat(one.points[facing]).T, s=3.0, color=INK, alpha=0.45, linewidths=0, zorder=2)
         if one.inner.any():
             places = view.flat(one.points[one.inner])
             axes.scatter(*places.T, s=26, marker="D", c=dots[one.inner], edgecolors=INK, linewidths=0.8, zorder=3)
-        if view is self._views[0]:
+        if view is self._views[0][1]:
             _mark_ports(axes, one, view)
         axes.set_title(title, fontsize=10, color=INK)
         axes.set_aspect("equal")
         axes.margins(0.03)
         axes.set_axis_off()
-
-
-VIEW_TITLES = ("from the camera", "from behind")
 
 
 def camera_view(evaluation: ArmsEvaluation) -> View:

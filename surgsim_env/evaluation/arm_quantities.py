@@ -169,24 +169,44 @@ def reason_counts(arm: ArmReach) -> list[tuple[str, int]]:
     return [(REASONS[index + 1], int(counts[index])) for index in order if counts[index]]
 
 
+def clearances(evaluation: ArmsEvaluation) -> FloatArray:
+    """The smaller of the distances from organ and wall of either arm at every point that it reaches [m], (n,)."""
+    parts = [
+        np.minimum(arm.organ_clearance, arm.wall_clearance)[arm.reachable & np.isfinite(arm.organ_clearance)]
+        for _, arm in sides(evaluation)
+    ]
+    return np.concatenate(parts)
+
+
+def surface_shares(evaluation: ArmsEvaluation) -> tuple[float, float, float]:
+    """Shares of the points of the surface that the left arm, the right arm and both at once reach, 0 to 1."""
+    outer = ~evaluation.inner
+    masks = (evaluation.left.reachable, evaluation.right.reachable, evaluation.both)
+    left, right, both = (float(mask[outer].mean()) if outer.any() else 0.0 for mask in masks)
+    return left, right, both
+
+
 def verdict(evaluation: ArmsEvaluation) -> str:
     """The first paragraph of a report: shares, worst clearance, smallest tip force, the commonest obstacles."""
-    inner, count = int(evaluation.inner.sum()), len(evaluation.points)
-    where = f"{count - inner} points on the surface of {evaluation.scene}" + (
-        f" and {inner} inside it" if inner else ""
-    )
-    left, right = (share_text(arm.reachable) for _, arm in sides(evaluation))
+    inner, outer = evaluation.inner, ~evaluation.inner
+    left, right = (share_text(arm.reachable[outer]) for _, arm in sides(evaluation))
     said = [
-        f"Of {where}, the left arm reaches {left}, the right arm {right}, "
-        f"and both at once {share_text(evaluation.both)}."
+        f"Of {int(outer.sum())} points on the surface of {evaluation.scene} that face the ports, the left arm reaches "
+        f"{left}, the right arm {right}, and both at once {share_text(evaluation.both[outer])}."
     ]
+    if inner.any():
+        said.append(f"Of {int(inner.sum())} targets inside it both reach {int(evaluation.both[inner].sum())}.")
     if not (evaluation.left.reachable.any() or evaluation.right.reachable.any()):
         said.append("There is nothing to tell of clearances and forces.")
     else:
         clearance, what = worst_clearance(evaluation)
         if clearance.side:
             distance = number_text(clearance.value, 1e3, 1, "mm")
-            said.append(f"The worst clearance is {distance}, between the {clearance.side} arm and {what}.")
+            usual = number_text(median(clearances(evaluation)), 1e3, 1, "mm")
+            said.append(
+                f"The worst clearance is {distance}, between the {clearance.side} arm and {what}; the median is "
+                f"{usual}."
+            )
         force = extreme(evaluation, "tip_force")
         if force.side:
             said.append(

@@ -49,7 +49,7 @@ thead th { border-bottom: 2px solid #20242c; vertical-align: bottom; }
 tbody th { font-weight: 500; }
 td.number, th.number { text-align: right; }
 td.number { white-space: nowrap; }
-td.wide { min-width: 22rem; }
+td.wide { min-width: 14rem; }
 .group { border-left: 1px solid #d9dce1; }
 code, pre { font: .9rem/1.45 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; }
 pre { background: #f3f4f6; padding: .75rem 1rem; white-space: pre-wrap; overflow-wrap: anywhere; }
@@ -139,8 +139,9 @@ def _legend(evaluation: ArmsEvaluation) -> str:
     )
     inner = " Diamonds are targets inside the organ." if evaluation.inner.any() else ""
     return (
-        "<p>Each map shows the organ as the endoscope sees it (above or left) and from behind. Dots are the points "
-        f"that were tried; between them the colours are interpolated. Grey was not reached.{inner}{escape(ports)}</p>\n"
+        "<p>Each map shows the organ as the endoscope sees it, and from behind if points were tried there. Dots are "
+        "the points that were tried; between them the colours are interpolated. Grey was not reached; on the palest "
+        f"parts no points were tried.{inner}{escape(ports)}</p>\n"
     )
 
 
@@ -225,16 +226,20 @@ def _ranking(ranking: Sequence[Ranked]) -> str:
     head = (
         '<tr><th scope="col">place</th><th scope="col">placement or robot</th><th scope="col" class="number">both</th>'
         '<th scope="col" class="number">left</th><th scope="col" class="number">right</th>'
+        '<th scope="col" class="number">either</th><th scope="col" class="number">median clearance [mm]</th>'
         '<th scope="col" class="number">worst clearance [mm]</th>'
         '<th scope="col" class="number">smallest tip force [N]</th><th scope="col">reasons</th></tr>'
     )
     rows = []
     for one in ranking:
-        shares = "".join(f'<td class="number">{100.0 * share:.0f} %</td>' for share in (one.both, one.left, one.right))
+        shares = "".join(
+            f'<td class="number">{100.0 * share:.0f} %</td>' for share in (one.both, one.left, one.right, one.either)
+        )
         rows.append(
             f'<tr><td>{one.place}</td><th scope="row">{escape(one.name)}<br><small>{escape(one.what)}</small></th>'
             f"{shares}"
             f'<td class="number">{number_text(one.clearance, 1e3, 1)}</td>'
+            f'<td class="number">{number_text(one.worst_clearance, 1e3, 1)}</td>'
             f'<td class="number">{number_text(one.force, 1.0, 2)}</td><td class="wide">{escape(one.reasons)}</td></tr>'
         )
     caption = "Placements and robots, the best first"

@@ -12,17 +12,20 @@ from surgsim_env.evaluation.arm_quantities import (
     DISTANCES,
     QUANTITIES,
     Quantity,
+    clearances,
     extreme,
+    median,
     number_text,
     sides,
+    surface_shares,
     worst_clearance,
 )
 from surgsim_env.evaluation.arm_results import REASONS, ArmReach, ArmsEvaluation
 
 RANKING_RULE = (
-    "Ranked by the share of points that both arms reach at once, in whole per cent, the largest first; equal shares by "
-    "the worst clearance from organ and body wall in whole millimetres, then by the smallest tip force in tenths of a "
-    "newton, both the largest first; then as given."
+    "Ranked by the share of the surface's points that both arms reach at once, in whole per cent, the largest first; "
+    "equal shares by the share that either reaches, then by the median clearance from organ and body wall in whole "
+    "millimetres, then by the smallest tip force in tenths of a newton, always the largest first; then as given."
 )
 
 
@@ -51,7 +54,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A row of the ranking; shares 0 to 1, clearance [m], force [N], NaN where nothing is reached."""
+    """A row of the ranking; shares 0 to 1, median clearance [m], smallest force [N], NaN where nothing is reached."""
 
     place: int
     name: str
@@ -59,7 +62,9 @@ class Ranked:
     left: float
     right: float
     both: float
+    either: float
     clearance: float
+    worst_clearance: float
     force: float
     reasons: str
 
@@ -117,15 +122,15 @@ def rank(candidates: Sequence[Candidate]) -> list[Ranked]:
 
 def _row(candidate: Candidate) -> Ranked:
     evaluation = candidate.evaluation
-    left, right = (float(arm.reachable.mean()) for _, arm in sides(evaluation))
-    clearance, _ = worst_clearance(evaluation)
+    left, right, both = surface_shares(evaluation)
+    either = float((evaluation.left.reachable | evaluation.right.reachable)[~evaluation.inner].mean())
+    usual, (worst, _) = median(clearances(evaluation)), worst_clearance(evaluation)
     force = extreme(evaluation, "tip_force").value
-    both = float(evaluation.both.mean())
-    return Ranked(0, candidate.name, candidate.what, left, right, both, clearance.value, force, "")
+    return Ranked(0, candidate.name, candidate.what, left, right, both, either, usual, worst.value, force, "")
 
 
-def _rank_key(row: Ranked) -> tuple[float, float, float]:
-    return -_per_cent(row.both), -_whole(row.clearance, 1e3), -_whole(row.force, 10.0)
+def _rank_key(row: Ranked) -> tuple[float, ...]:
+    return -_per_cent(row.both), -_per_cent(row.either), -_whole(row.clearance, 1e3), -_whole(row.force, 10.0)
 
 
 def _per_cent(share: float) -> int:
@@ -137,26 +142,31 @@ def _whole(value: float, scale: float) -> float:
 
 
 def _reasons(row: Ranked, other: Ranked) -> str:
-    """`reaches 12 % more of the points with both arms; 4 mm more clearance`; what is alike is left out."""
-    parts = []
-    for share, title in (("both", "with both arms"), ("left", "with the left arm"), ("right", "with the right arm")):
+    """`reaches 12 % more of the points with both arms; 4 mm more median clearance`; what is alike is left out."""
+    shares = []
+    for share, title in (
+        ("both", "both arms"),
+        ("either", "either arm"),
+        ("left", "the left arm"),
+        ("right", "the right arm"),
+    ):
         difference = _per_cent(getattr(row, share)) - _per_cent(getattr(other, share))
-        if difference:
-            parts.append(f"reaches {abs(difference)} % {'more' if difference > 0 else 'fewer'} of the points {title}")
+        # What either reaches ranks only where what both reach is alike.
+        if difference and not (share == "either" and shares):
+            more = "more" if difference > 0 else "fewer"
+            shares.append(f"{abs(difference)} % {more}{'' if shares else ' of the points'} with {title}")
+    parts = [f"reaches {', '.join(shares)}"] if shares else []
     for field, scale, digits, unit, title in (
-        ("clearance", 1e3, 0, "mm", "clearance"),
+        ("clearance", 1e3, 0, "mm", "median clearance"),
         ("force", 1.0, 1, "N", "smallest tip force"),
     ):
         mine, theirs = getattr(row, field), getattr(other, field)
         if math.isfinite(mine) and math.isfinite(theirs):
             difference = round(mine * scale, digits) - round(theirs * scale, digits)
             if abs(difference) > 1e-9:
-                parts.append(
-                    f"{number_text(abs(difference), 1.0, digits, unit)} {'more' if difference > 0 else 'less'} {title}"
-                )
-    if not parts:
-        return f"no different from {other.name} in any of these figures"
-    return f"against {other.name}: {'; '.join(parts)}"
+                more = "more" if difference > 0 else "less"
+                parts.append(f"{number_text(abs(difference), 1.0, digits, unit)} {more} {title}")
+    return f"against {other.name}: {'; '.join(parts)}" if parts else f"no different from {other.name} in these figures"
 
 
 def _meaning(quantity: Quantity) -> str:

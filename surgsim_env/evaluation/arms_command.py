@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.arms.arm import Arm, load_arm
@@ -18,10 +19,11 @@ from surgsim_env.arms.description import ArmDescription, read_description
 from surgsim_env.arms.port import Port
 from surgsim_env.evaluation.arm_maps import ArmMaps
 from surgsim_env.evaluation.arm_picture import write_pictures
-from surgsim_env.evaluation.arm_quantities import extreme, number_text, sides, verdict, worst_clearance
+from surgsim_env.evaluation.arm_quantities import extreme, number_text, verdict, worst_clearance
 from surgsim_env.evaluation.arm_report import write_report
 from surgsim_env.evaluation.arm_results import ArmsEvaluation
 from surgsim_env.evaluation.arm_table import Candidate, Ranked, rank, write_points
+from surgsim_env.evaluation.arms import evaluate_arms
 from surgsim_env.evaluation.ports import Ports, read_ports
 from surgsim_env.out_folder import writable_folder
 from surgsim_env.palpation.report import package_version, plain_json
@@ -104,12 +106,15 @@ def report_arms(request: Request, console: Console) -> ArmsEvaluation:
 
 
 def evaluate(setup: Setup, anatomy: Anatomy, request: Request, console: Console) -> ArmsEvaluation:
-    """One setup on the organ."""
-    from surgsim_env.evaluation.arms import evaluate_arms  # pyright: ignore[reportMissingImports]
+    """One setup on the organ, with a progress bar."""
+    left, right = setup.left.description, setup.right.description
+    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console) as bar:
+        task = bar.add_task(setup.name, total=1.0)
 
-    return evaluate_arms(
-        anatomy, setup.left, setup.right, setup.ports, points=request.points, seed=request.seed, console=console
-    )
+        def tell(what: str, share: float) -> None:
+            bar.update(task, description=f"{setup.name}: {what}", completed=share)
+
+        return evaluate_arms(anatomy, left, right, setup.ports, seed=request.seed, count=request.points, progress=tell)
 
 
 def command_text(request: Request) -> str:
@@ -128,7 +133,7 @@ def _scene(name: str) -> Scene:
 def _setup(request: Request, anatomy: Anatomy) -> Setup:
     ports = _checked_ports(request.ports, anatomy)
     left, right = _read("--left", request.left), _read("--right", request.right)
-    return _placed(request.ports.name, f"{left.name} left, {right.name} right, as given", left, right, ports)
+    return _placed(request.ports.name, f"{left.name} left, {right.name} right, as given", left, right, ports, anatomy)
 
 
 def _compared(source: str, request: Request, anatomy: Anatomy) -> Setup:
@@ -137,14 +142,16 @@ def _compared(source: str, request: Request, anatomy: Anatomy) -> Setup:
     if path.suffix == ".toml" and PORT_TABLES & read_toml(path, "--compare").keys():
         left, right = _read("--left", request.left), _read("--right", request.right)
         ports = _checked_ports(path, anatomy)
-        return _placed(path.name, f"ports, with {left.name} left, {right.name} right", left, right, ports)
+        return _placed(path.name, f"ports, with {left.name} left, {right.name} right", left, right, ports, anatomy)
     arm = _read("--compare", source)
     ports = _checked_ports(request.ports, anatomy)
-    return _placed(path.name, f"arm on both sides, at the ports of {request.ports.name}", arm, arm, ports)
+    return _placed(path.name, f"arm on both sides, at the ports of {request.ports.name}", arm, arm, ports, anatomy)
 
 
-def _placed(name: str, what: str, left: ArmDescription, right: ArmDescription, ports: Ports) -> Setup:
-    return Setup(name, what, load_arm(left, ports.left.port), load_arm(right, ports.right.port), ports)
+def _placed(name: str, what: str, left: ArmDescription, right: ArmDescription, ports: Ports, anatomy: Anatomy) -> Setup:
+    radius = anatomy.scene.instrument.tip_radius
+    left_arm = load_arm(left, ports.left.port, tip_radius=radius)
+    return Setup(name, what, left_arm, load_arm(right, ports.right.port, tip_radius=radius), ports)
 
 
 def _read(option: str, source: str) -> ArmDescription:
@@ -197,14 +204,10 @@ def _summary(evaluation: ArmsEvaluation, request: Request, ranking: Sequence[Ran
             **{name: version(name) for name in ("numpy", "scipy", "mujoco", "matplotlib")},
         },
         "seed": request.seed,
-        "shares": {
-            **{side: float(arm.reachable.mean()) for side, arm in sides(evaluation)},
-            "both": float(evaluation.both.mean()),
-        },
         "worst_clearance": {"value_m": clearance.value, "arm": clearance.side, "from": what, "point": clearance.point},
         "smallest_tip_force": {"value_N": force.value, "arm": force.side, "point": force.point},
         "verdict": verdict(evaluation),
-        "ranking": [vars(one) for one in ranking],
+        "compared": [vars(one) for one in ranking],
     }
     given = dict(evaluation.summary)
     merged = {**given, **own, "inputs": {**_table(given, "inputs"), **inputs}}
@@ -228,7 +231,7 @@ def _arm_input(source: str) -> dict[str, str]:
 def _print_ranking(ranking: Sequence[Ranked], console: Console) -> None:
     for one in ranking:
         figures = (
-            f"both {100.0 * one.both:.0f} %, worst clearance {number_text(one.clearance, 1e3, 1, 'mm')}, "
+            f"both {100.0 * one.both:.0f} %, median clearance {number_text(one.clearance, 1e3, 1, 'mm')}, "
             f"smallest tip force {number_text(one.force, 1.0, 2, 'N')}"
         )
         console.print(f"{one.place}. {one.name}: {figures}; {one.reasons}", highlight=False)

@@ -9,7 +9,7 @@ from tests.evaluation.made import made_evaluation
 
 
 def case(name, *, both, clearance=0.010, force=3.0, left=0.8, right=0.8):
-    """A made case: shares of 100 points, the worst clearance [m] and the smallest force [N]."""
+    """A made case: shares of 100 points, the clearance [m] and the force [N] at each of them."""
     evaluation = made_evaluation(count=100, inner_count=0, pictures=False)
     arms = {}
     for side, share in (("left", left), ("right", right)):
@@ -28,8 +28,8 @@ def test_the_share_of_both_comes_first_and_the_reasons_are_in_words():
     few, many = case("few", both=0.40, clearance=0.02), case("many", both=0.52, clearance=0.024)
     first, second = rank([few, many])
     assert (first.name, first.place, second.name, second.place) == ("many", 1, "few", 2)
-    assert first.reasons == "against few: reaches 12 % more of the points with both arms; 4 mm more clearance"
-    assert second.reasons == "against many: reaches 12 % fewer of the points with both arms; 4 mm less clearance"
+    assert first.reasons == "against few: reaches 12 % more of the points with both arms; 4 mm more median clearance"
+    assert second.reasons == "against many: reaches 12 % fewer of the points with both arms; 4 mm less median clearance"
 
 
 def test_equal_shares_go_by_clearance_then_force_then_order():
@@ -40,9 +40,9 @@ def test_equal_shares_go_by_clearance_then_force_then_order():
     ranked = rank([near, weak, twin, strong])
     assert [one.name for one in ranked] == ["strong", "weak", "twin", "near"]
     assert ranked[0].reasons == "against weak: 2.5 N more smallest tip force"
-    assert ranked[3].reasons == "against strong: 6 mm less clearance; 4.0 N more smallest tip force"
-    assert rank([weak, twin])[0].reasons == "no different from twin in any of these figures"
-    for word in ("both arms reach", "worst clearance", "smallest tip force", "as given"):
+    assert ranked[3].reasons == "against strong: 6 mm less median clearance; 4.0 N more smallest tip force"
+    assert rank([weak, twin])[0].reasons == "no different from twin in these figures"
+    for word in ("both arms reach", "either reaches", "median clearance", "smallest tip force", "as given"):
         assert word in RANKING_RULE
 
 
@@ -58,10 +58,34 @@ def test_one_that_reaches_nothing_is_last():
     ranked = rank([nothing, case("little", both=0.0, left=0.02, right=0.0)])
     assert [one.name for one in ranked] == ["little", "nothing"]
     assert np.isnan(ranked[1].clearance)
-    assert ranked[1].reasons == "against little: reaches 2 % fewer of the points with the left arm"
+    assert (
+        ranked[1].reasons
+        == "against little: reaches 2 % fewer of the points with either arm, 2 % fewer with the left arm"
+    )
 
 
 def test_figures_of_the_rows_are_the_arrays():
     (row,) = rank([case("one", both=0.31, clearance=0.0123, force=4.5, left=0.62, right=0.47)])
-    assert (row.both, row.left, row.right) == (0.31, 0.62, 0.47)
-    assert (row.clearance, row.force, row.reasons) == (0.0123, 4.5, "")
+    assert (row.both, row.left, row.right, row.either) == (0.31, 0.62, 0.47, 0.62)
+    assert (row.clearance, row.worst_clearance, row.force, row.reasons) == (0.0123, 0.0123, 4.5, "")
+
+
+def test_the_median_is_over_both_arms_and_the_nearer_of_organ_and_wall():
+    one = made_evaluation(inner_count=5)
+    wanted = [
+        min(arm.organ_clearance[index], arm.wall_clearance[index])
+        for arm in (one.left, one.right)
+        for index in np.flatnonzero(arm.reachable)
+    ]
+    (row,) = rank([Candidate("one", "made", one)])
+    assert row.clearance == np.median(wanted) and row.worst_clearance == min(wanted)
+    assert row.both == one.both[:-5].mean()
+
+
+def test_either_arm_decides_where_both_are_alike():
+    more, fewer = case("more", both=0.3, left=0.9), case("fewer", both=0.3)
+    first, second = rank([fewer, more])
+    assert (first.name, first.either, second.either) == ("more", 0.9, 0.8)
+    assert first.reasons == (
+        "against fewer: reaches 10 % more of the points with either arm, 10 % more with the left arm"
+    )

@@ -83,20 +83,23 @@ def page(folder):
 
 def test_the_verdict_says_what_the_arrays_say(evaluation):
     said = verdict(evaluation)
-    left, right = evaluation.left, evaluation.right
-    shares = [f"{100 * mask.mean():.0f} %" for mask in (left.reachable, right.reachable, evaluation.both)]
+    left, right, outer = evaluation.left, evaluation.right, ~evaluation.inner
+    shares = [f"{100 * mask[outer].mean():.0f} %" for mask in (left.reachable, right.reachable, evaluation.both)]
     assert f"the left arm reaches {shares[0]}, the right arm {shares[1]}, and both at once {shares[2]}." in said
     least = min(np.nanmin(getattr(arm, f"{what}_clearance")) for arm in (left, right) for what in ("organ", "wall"))
     assert f"The worst clearance is {least * 1e3:.1f} mm" in said
     forces = {"left": np.nanmin(left.tip_force), "right": np.nanmin(right.tip_force)}
     weaker = min(forces, key=forces.get)
     assert f"The smallest tip force is {forces[weaker]:.2f} N ({weaker} arm)" in said
-    assert "110 points on the surface of ellipsoid and 10 inside it" in said
+    assert "Of 110 points on the surface of ellipsoid that face the ports" in said
+    assert f"Of 10 targets inside it both reach {evaluation.both[evaluation.inner].sum()}." in said
+    nearest = [np.minimum(arm.organ_clearance, arm.wall_clearance)[arm.reachable] for arm in (left, right)]
+    assert f"the median is {np.median(np.concatenate(nearest)) * 1e3:.1f} mm." in said
 
 
 def test_the_verdict_names_the_worse_of_organ_and_wall_and_its_arm(evaluation):
     wall = np.where(evaluation.right.reachable, 0.0031, np.nan)
-    assert "The worst clearance is 3.1 mm, between the right arm and the body wall." in verdict(
+    assert "The worst clearance is 3.1 mm, between the right arm and the body wall; the median" in verdict(
         replace(evaluation, right=replace(evaluation.right, wall_clearance=wall))
     )
 
@@ -265,6 +268,27 @@ def test_the_map_is_grey_just_where_neither_arm_reaches(evaluation):
         far = np.linalg.norm(evaluation.points[surface] - centres[index], axis=1) ** 2
         turned = np.linalg.norm(evaluation.normals[surface] - maps._patches.normals[index], axis=1) ** 2
         assert nearest == surface[np.argmin(far + weight**2 * turned)]
+
+
+def test_nothing_is_painted_where_no_point_was_tried(evaluation):
+    """Points on one half only: the other half is claimed by no colour, and the view of it is left out."""
+    kept = evaluation.inner | (evaluation.points @ np.array([0.0, -0.74, 0.67]) > 0.0)
+    names = ("points", "normals", "inner", "both", "arm_distance_inside", "arm_distance_outside")
+    arms = {
+        side: replace(
+            getattr(evaluation, side),
+            **{name: value[kept] for name, value in vars(getattr(evaluation, side)).items() if name != "name"},
+        )
+        for side in ("left", "right")
+    }
+    half = replace(evaluation, **{name: getattr(evaluation, name)[kept] for name in names}, **arms)
+    maps = ArmMaps(half)
+    assert [title for title, _ in maps._views] == ["from the camera"]
+    assert [title for title, _ in ArmMaps(evaluation)._views] == ["from the camera", "from behind"]
+    centres = maps._patches.corners.mean(axis=1)
+    height = centres @ np.array([0.0, -0.74, 0.67])
+    assert not maps._tried[height < -0.03].any()
+    assert maps._tried[height > 0.01].mean() > 0.9
 
 
 def test_the_first_view_is_the_cameras(evaluation):

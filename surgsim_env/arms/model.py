@@ -191,10 +191,17 @@ def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> Non
             raise ValueError(
                 f"{where}: home of joint {name!r} is {home:g}, outside its limits {lower:g} to {upper:g} (rad or m)"
             )
-        if position_actuator(model, name) < 0:
+        actuator = position_actuator(model, name)
+        if actuator < 0:
             raise ValueError(
-                f"{where}: joint {name!r} has no position actuator; give the model one"
+                f"{where}: joint {name!r} has no position actuator of gear 1; give the model one"
                 + (', or use control.mode = "servo"' if name in arm.joints else "")
+            )
+        least, most = model.actuator_ctrlrange[actuator]
+        if model.actuator_ctrllimited[actuator] and (least > lower + 1e-9 or most < upper - 1e-9):
+            raise ValueError(
+                f"{where}: the position actuator of joint {name!r} takes {least:g} to {most:g}, less than the joint's "
+                f"limits {lower:g} to {upper:g}: widen its ctrlrange, or leave it out"
             )
 
 
@@ -217,5 +224,6 @@ def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
 def _is_servo(model: mujoco.MjModel, actuator: int, bias: int) -> bool:
     """Whether an actuator's force is gain (ctrl - x), x being position (bias 1) or speed (bias 2), and nothing else."""
     gain, biases = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
-    simple = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE and gain > 0.0
+    plain = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE and model.actuator_gear[actuator, 0] == 1.0
+    simple = plain and gain > 0.0
     return bool(simple and math.isclose(biases[bias], -gain) and (bias == 1 or biases[1] == 0.0))

@@ -43,6 +43,6 @@ def _across(vectors: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def approach_share(pointing: FloatArray, usable: np.ndarray, directions: FloatArray) -> FloatArray:
-    """Share of the directions (n, 32, 3) that usable tips (n, k) pointing along (n, k, 3) have within 10 degrees, (n,)."""
+    """Share of directions (n, 32, 3) that usable tips (n, k), pointing along (n, k, 3), have within 10 degrees."""
     cosine = -np.einsum("nki,ndi->nkd", pointing, directions)
     return ((cosine >= math.cos(APPROACH_ANGLE)) & usable[:, :, None]).any(axis=1).mean(axis=1)

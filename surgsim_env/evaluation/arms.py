@@ -40,7 +40,8 @@ def evaluate_arms(
 
     Args:
         scene: a scene's name, its TOML file, or what these give.
-        left, right: a shipped arm's name or the TOML file of one's own.
+        left: a shipped arm's name or the TOML file of one's own.
+        right: likewise.
         ports: a ports file, or what `read_ports` gave; `default_ports` where none is given.
         targets: inner targets; those of the ports file where none are given.
         seed: draws where the points of the surface begin.

@@ -18,7 +18,7 @@ WAYS = 6
 
 @dataclass(frozen=True)
 class BothArms:
-    """Fields: reachable by both at once (n,), and the pair's smallest distances inside and outside the body [m] (n,)."""
+    """Which points both reach at once (n,), and the pair's smallest distances inside and outside the body [m] (n,)."""
 
     reachable: NDArray[np.bool_]
     inside: FloatArray
@@ -53,7 +53,7 @@ def _improve(
 
 
 def _ways(arm: Reach, rows: NDArray) -> FloatArray:
-    """Joint values of usable candidates, from the furthest from its limits to the nearest, (len(rows), WAYS, n_joint)."""
+    """Joint values of usable candidates, the furthest from limits to the nearest, (len(rows), WAYS, n_joint)."""
     usable = arm.usable[rows]
     margin = np.where(usable, limit_margin(arm.kinematics, arm.candidates.joints[rows]), -np.inf)
     order = np.argsort(-margin, axis=1, kind="stable")
@@ -66,5 +66,7 @@ def _ways(arm: Reach, rows: NDArray) -> FloatArray:
 def _distances(
     left: Reach, right: Reach, left_joints: FloatArray, right_joints: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    sides = [(arm.kinematics, arm.kinematics.at(joints)) for arm, joints in ((left, left_joints), (right, right_joints))]
+    sides = [
+        (arm.kinematics, arm.kinematics.at(joints)) for arm, joints in ((left, left_joints), (right, right_joints))
+    ]
     return arm_distances(sides[0], sides[1], points)

@@ -1,10 +1,10 @@
-"""Joint values with which an arm comes to each point: from several starts, from many directions, from its neighbours."""
+"""Joint values with which an arm comes to each point: from several starts, many directions, and its neighbours."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.evaluation.approach import APPROACH_ANGLE, DIRECTION_COUNT
@@ -43,7 +43,7 @@ class Candidates:
 
 
 def spread_starts(kinematics: BatchKinematics) -> FloatArray:
-    """Home, the middle of all limits, and from there each joint alone half way to either limit, (2 n_joint + 2, n_joint).
+    """Home, the middle of all limits, and each joint alone half way from there to either limit, (k, n_joint).
 
     No random numbers: the starts of a mirrored arm are the mirrored starts.
     """
@@ -70,7 +70,7 @@ def from_neighbours(kinematics: BatchKinematics, tips: FloatArray, found: Candid
     if need.size == 0 or not has.any():
         return found
     first = np.where(has, met.argmax(axis=1), 0)
-    tree, owners = cKDTree(tips[has]), np.flatnonzero(has)
+    tree, owners = KDTree(tips[has]), np.flatnonzero(has)
     near = owners[tree.query(tips[need], k=min(NEIGHBOURS, len(owners)))[1].reshape(len(need), -1)]
     more = from_starts(kinematics, tips[need], found.joints[near, first[near]])
     rows = np.arange(near.shape[1])

@@ -1,4 +1,4 @@
-"""What an arm touches at given joint values: the organ but for the tip's own contact, the body wall but for its hole."""
+"""What an arm touches at given joint values: the organ but for the tip's own contact, the wall but for its hole."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ MEETING_ZONE = 0.020
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What arms may run into: the organ's surface at rest, the wall, and the tip's ball [m] that may touch the organ."""
+    """What an arm may run into: the organ's surface at rest, the wall; and its tip's ball [m], which may touch."""
 
     organ: SurfaceDistance
     ports: Ports
@@ -81,7 +81,7 @@ def arm_distances(
 
 
 def _without_zone(segments: FloatArray, points: FloatArray) -> FloatArray:
-    """Both parts of segments (n, k, 2, 3) outside the zone about points (n, 3), NaN where nothing is left: (n, 2k, 2, 3)."""
+    """Both parts of segments (n, k, 2, 3) outside the zone about points (n, 3), NaN where none is left."""
     parts, left = outside_ball(segments, points[:, None], MEETING_ZONE)
     parts[~left] = np.nan
     return parts.reshape(len(segments), -1, 2, 3)

@@ -23,7 +23,8 @@ def scaled_singular_values(kinematics: BatchKinematics, chain: Chain) -> FloatAr
         across = shaft - chain.along[:, :, None] * np.einsum("ni,nij->nj", chain.along, shaft)[:, None]
         idle = np.linalg.svd(across)[2][:, 2:]
         jacobian, freedoms = jacobian @ np.swapaxes(idle, 1, 2), freedoms - 2
-    return np.linalg.svd(jacobian, compute_uv=False)[:, : min(6, freedoms)]
+    values: FloatArray = np.asarray(np.linalg.svd(jacobian, compute_uv=False), dtype=np.float64)
+    return values[:, : min(6, freedoms)]
 
 
 def manipulability(singular_values: FloatArray) -> FloatArray:
@@ -37,7 +38,7 @@ def isotropy(singular_values: FloatArray) -> FloatArray:
 
 
 def limit_margin(kinematics: BatchKinematics, joints: FloatArray) -> FloatArray:
-    """prod 4 (q - low)(high - q) / (high - low)^2 over joints: 1 in the middle of all limits, 0 at any, (n,)."""
+    """Prod 4 (q - low)(high - q) / (high - low)^2 over joints: 1 in the middle of all limits, 0 at any, (n,)."""
     low, high = kinematics.lower, kinematics.upper
     return (4.0 * (joints - low) * (high - joints) / (high - low) ** 2).prod(axis=-1)
 

@@ -60,7 +60,7 @@ class BatchKinematics:
         self._shaft = model.body(trocar.shaft_body).id
         self._shaft_point = np.array(trocar.shaft_point)
         self._shaft_axis = np.array(trocar.shaft_axis) / np.linalg.norm(trocar.shaft_axis)
-        self.trocar = np.array(arm.port.point)
+        self.trocar, self._into = np.array(arm.port.point), -arm.port.rotation[:, 2]
         self._hinge = np.array([model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE for j in self._joint_of])
         bodies = [int(model.jnt_bodyid[joint]) for joint in self._joint_of]
         self._moves_tip = np.array([body in _ancestors(model, self._tip_body) for body in bodies])
@@ -141,8 +141,14 @@ class BatchKinematics:
         return np.swapaxes(linear, 1, 2), np.swapaxes(turning, 1, 2)
 
     def trocar_error(self, chain: Chain) -> FloatArray:
-        """Distance of the shaft's axis from the trocar [m], (n,)."""
-        return np.linalg.norm(self.trocar - chain.near, axis=1)
+        """Distance of the shaft from the trocar [m], (n,).
+
+        The shaft is the half line that ends at the tip: a tip that has not passed the trocar misses it. inf where the
+        shaft runs out of the body.
+        """
+        short = np.minimum(dot(chain.tip - chain.near, chain.along), 0.0)
+        missed = np.hypot(np.linalg.norm(self.trocar - chain.near, axis=1), short)
+        return np.where(chain.along @ self._into > 0.0, missed, np.inf)
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:

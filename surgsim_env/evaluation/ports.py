@@ -11,7 +11,7 @@ from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.arms.port import Port
 from surgsim_env.arms.port_placement import inside_surface
-from surgsim_env.evaluation.clearance import outside_ball
+from surgsim_env.evaluation.clearance import outside_ball, point_segment_distance
 from surgsim_env.evaluation.kinematics import dot
 from surgsim_env.palpable_face import tangent_axes
 from surgsim_env.toml_tables import fill, read_toml
@@ -74,32 +74,32 @@ class InnerTarget:
 
 @dataclass(frozen=True)
 class Wall:
-    """The insufflated body wall as a plate or a dome of even thickness, its middle through the trocars.
+    """The insufflated body wall: a dome of even thickness (of a sphere) or a plate, its middle through the trocars.
 
     Args:
         thickness: [m].
         hole: what is this near to a trocar may pass [m].
-        centre: of a dome's sphere [m]; the trocars lie at its radius. A plate where none is given.
-        normal: out of the body, of a plate; found from the ports where none is given.
+        radius: of the dome [m]; 20 cm is the girth of an insufflated abdomen, chosen.
+        plate: a plate without end in place of the dome.
+        normal: out of the body; found from the ports where none is given.
     """
 
     thickness: float = 0.02
     hole: float = 0.03
-    centre: Vector | None = None
+    radius: float = 0.20
+    plate: bool = False
     normal: Vector | None = None
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.thickness < math.inf and 0.5 * self.thickness < self.hole < math.inf):
             raise ValueError(
-                f"wall: thickness {self.thickness:g} m, hole {self.hole:g} m; the rule is 0 <= thickness < 2 hole, finite"
+                f"wall: thickness {self.thickness:g} m, hole {self.hole:g} m; the rule is "
+                "0 <= thickness < 2 hole, finite"
             )
-        if self.centre is not None and self.normal is not None:
-            raise ValueError("wall: give centre (a dome) or normal (a plate), not both")
-        for name, value in (("centre", self.centre), ("normal", self.normal)):
-            if value is not None and not np.isfinite(value).all():
-                raise ValueError(f"wall.{name} is {value}; every number must be finite")
-        if self.normal is not None and not any(self.normal):
-            raise ValueError("wall.normal is (0, 0, 0); it must be a direction such as [0, 0, 1]")
+        if not self.thickness < self.radius < math.inf:
+            raise ValueError(f"wall.radius is {self.radius:g} m; it must be finite and above the thickness")
+        if self.normal is not None and not (np.isfinite(self.normal).all() and any(self.normal)):
+            raise ValueError(f"wall.normal is {self.normal}; it must be a direction such as [0, 0, 1]")
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,12 @@ class Ports:
     def __post_init__(self) -> None:
         if math.dist(self.left.point, self.right.point) < 1e-3:
             raise ValueError(f"the left and the right port both lie at {self.left.point}: move them apart")
+        apart = math.dist(self.left.point, self.right.point)
+        if not self.wall.plate and not 0.5 * apart < self.wall.radius:
+            raise ValueError(
+                f"the ports lie {apart * 1e3:.0f} mm apart, more than the dome is wide: raise wall.radius above "
+                f"{0.5 * apart:.3f} m, or use wall.plate = true"
+            )
 
     def wall_clearance(self, segments: FloatArray, trocar: FloatArray) -> FloatArray:
         """Distances of segments (..., 2, 3) from the wall [m]; negative within it, inf where all lies in the hole.
@@ -131,30 +137,29 @@ class Ports:
     def _heights(self, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Least and greatest height of segments (..., 2, 3) above the middle of the wall [m]."""
         left, right = np.array(self.left.point), np.array(self.right.point)
-        if self.wall.centre is None:
-            heights = (segments - 0.5 * (left + right)) @ self.wall_normal
+        middle = 0.5 * (left + right)
+        if self.wall.plate:
+            heights = (segments - middle) @ self.wall_normal
             return heights.min(axis=-1), heights.max(axis=-1)
-        centre = np.array(self.wall.centre)
-        radius = 0.5 * (np.linalg.norm(left - centre) + np.linalg.norm(right - centre))
-        start, span = segments[..., 0, :] - centre, segments[..., 1, :] - segments[..., 0, :]
-        length = dot(span, span)
-        along = np.clip(-dot(start, span) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
-        nearest = start + along[..., None] * span
-        ends = np.sqrt(dot(segments - centre, segments - centre)).max(axis=-1)
-        return np.sqrt(dot(nearest, nearest)) - radius, ends - radius
+        radius = self.wall.radius
+        centre = middle - math.sqrt(radius**2 - 0.25 * float((right - left) @ (right - left))) * self.wall_normal
+        nearest = point_segment_distance(centre, segments)
+        furthest = np.sqrt(dot(segments - centre, segments - centre)).max(axis=-1)
+        return nearest - radius, furthest - radius
 
     @property
     def wall_normal(self) -> FloatArray:
-        """Out of a plate (3,): as given, or across the line of both ports, against their mean direction inwards."""
-        if self.wall.normal is not None:
-            return np.array(self.wall.normal) / np.linalg.norm(self.wall.normal)
+        """Out of the body (3,): across the line of both ports, as given or against their mean direction inwards."""
         line = np.array(self.right.point) - np.array(self.left.point)
         line /= np.linalg.norm(line)
-        out = self.left.port.rotation[:, 2] + self.right.port.rotation[:, 2]
+        given = self.wall.normal
+        out = self.left.port.rotation[:, 2] + self.right.port.rotation[:, 2] if given is None else np.array(given)
         out = out - (out @ line) * line
-        length = np.linalg.norm(out)
+        length = float(np.linalg.norm(out))
         if length < 1e-6:
-            raise ValueError("the ports point along the line between them, which tells no wall: give wall.normal")
+            raise ValueError(
+                "the wall's normal lies along the line of the ports, which tells no wall: give wall.normal"
+            )
         return out / length
 
     def check_outside(self, anatomy: Anatomy) -> None:
@@ -164,7 +169,11 @@ class Ports:
             ValueError: names the port, its place and the organ.
         """
         mesh = anatomy.mesh
-        for name, point in (("left", self.left.point), ("right", self.right.point), ("endoscope", self.endoscope.point)):
+        for name, point in (
+            ("left", self.left.point),
+            ("right", self.right.point),
+            ("endoscope", self.endoscope.point),
+        ):
             if inside_surface(point, mesh.points, mesh.boundary_triangles):
                 place = ", ".join(f"{value * 1e3:.1f}" for value in point)
                 raise ValueError(

@@ -66,49 +66,71 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Surroundin
     A point is reached if among the candidates from all starts, directions and neighbours one puts the tip within 1 mm
     of it, keeps limits and trocar and clears organ and wall. The arm stands as the one furthest from its limits does.
     """
-    tips = sites.tips(around.ball)
     ports = around.ports
     directions = approach_directions(
         sites.normals,
         np.array(ports.endoscope.point) - sites.points,
         np.array(ports.right.point) - np.array(ports.left.point),
     )
-    found = from_neighbours(kinematics, tips, from_starts(kinematics, tips, spread_starts(kinematics)))
-    clear = _clear(kinematics, found, sites, around)
-    some = found.met.any(axis=1)
-    if some.any():
-        more, more_clear = _all_around(kinematics, tips, directions, found, clear, some, sites, around)
-        found, clear = more, more_clear
-    usable = clear.all(axis=0)
-    reason = _reasons(kinematics, tips, found, clear)
-    report = _report(kinematics, sites, around, found, usable, reason, directions)
+    search = _Search(kinematics, sites, around, sites.tips(around.ball), directions)
+    found, clear = search.all_around(*search.from_starts())
+    usable = _every(clear)
+    report = _report(search, found, usable, _reasons(search, found, clear))
     return Reach(report, kinematics, found, usable)
 
 
-def _all_around(
-    kinematics: BatchKinematics,
-    tips: FloatArray,
-    directions: FloatArray,
-    found: Candidates,
-    clear: NDArray[np.bool_],
-    some: NDArray[np.bool_],
-    sites: Sites,
-    around: Surroundings,
-) -> tuple[Candidates, NDArray[np.bool_]]:
-    """Candidates from every direction, twice: from any that meets the point, then from those that keep every rule."""
-    for usable in (found.met, None):
-        begin = clear.all(axis=0) if usable is None else usable
-        # Where none keeps every rule, the second round too begins at what meets the point.
-        begin = np.where(begin.any(axis=1)[:, None], begin, found.met)
-        more = _empty_like(found, directions.shape[1])
-        rows = np.flatnonzero(some & still_open(directions, found, clear.all(axis=0)).any(axis=1))
-        if rows.size:
-            part = from_directions(kinematics, tips[rows], directions[rows], _rows(found, rows), begin[rows])
-            for name in vars(more):
-                getattr(more, name)[rows] = getattr(part, name)
-        clear = np.concatenate([clear, _clear(kinematics, more, sites, around)], axis=2)
-        found = found.add(more)
-    return found, clear
+@dataclass(frozen=True)
+class _Search:
+    """An arm, where it shall come, what is in its way; places of its tip (n, 3) [m] and ways to come (n, 32, 3)."""
+
+    kinematics: BatchKinematics
+    sites: Sites
+    around: Surroundings
+    tips: FloatArray
+    directions: FloatArray
+
+    def from_starts(self) -> tuple[Candidates, NDArray[np.bool_]]:
+        """Candidates from spread starts and from neighbours, and what they clear (3, n, k)."""
+        starts = spread_starts(self.kinematics)
+        found = from_neighbours(self.kinematics, self.tips, from_starts(self.kinematics, self.tips, starts))
+        return found, self.clear(found)
+
+    def all_around(self, found: Candidates, clear: NDArray[np.bool_]) -> tuple[Candidates, NDArray[np.bool_]]:
+        """More candidates, from every direction, twice: begun at any that meets the point, then at the usable ones."""
+        for begin in (found.met, None):
+            if begin is None:
+                # Where none is usable, the second round too begins at what meets the point.
+                usable = _every(clear)
+                begin = np.where(np.any(usable, axis=1, keepdims=True), usable, found.met)
+            wanted = still_open(self.directions, found, _every(clear)) & np.any(found.met, axis=1, keepdims=True)
+            rows = np.flatnonzero(np.any(wanted, axis=1))
+            more = _empty_like(found, self.directions.shape[1])
+            if rows.size:
+                directions, tips = self.directions[rows], self.tips[rows]
+                part = from_directions(self.kinematics, tips, directions, _rows(found, rows), begin[rows])
+                for name in vars(more):
+                    getattr(more, name)[rows] = getattr(part, name)
+            clear = np.concatenate([clear, self.clear(more)], axis=2)
+            found = found.add(more)
+        return found, clear
+
+    def clear(self, found: Candidates) -> NDArray[np.bool_]:
+        """Which candidates meet their point, and of these which clear the organ, and the wall: (3, n, k)."""
+        result = np.zeros((3, *found.met.shape), dtype=bool)
+        result[0] = found.met
+        points, places = np.nonzero(found.met)
+        for low in range(0, len(points), CANDIDATES_AT_ONCE):
+            point, place = points[low : low + CANDIDATES_AT_ONCE], places[low : low + CANDIDATES_AT_ONCE]
+            chain = self.kinematics.at(found.joints[point, place])
+            off_organ = self.around.organ_clearance(self.kinematics, chain, exact=False) >= 0.0
+            result[1, point, place] = off_organ | self.sites.inner[point]
+            result[2, point, place] = self.around.wall_clearance(self.kinematics, chain) >= 0.0
+        return result
+
+
+def _every(clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which candidates pass every test, (n, k)."""
+    return np.logical_and.reduce(clear, axis=0)
 
 
 def _rows(found: Candidates, rows: NDArray) -> Candidates:
@@ -122,29 +144,12 @@ def _empty_like(found: Candidates, count: int) -> Candidates:
     return Candidates(np.zeros((points, count, joints)), errors, errors.copy(), np.zeros((points, count, 3)))
 
 
-def _clear(
-    kinematics: BatchKinematics, found: Candidates, sites: Sites, around: Surroundings
-) -> NDArray[np.bool_]:
-    """Which candidates meet their point, and besides clear the organ, and the wall: (3, n, k)."""
-    result = np.zeros((3, *found.met.shape), dtype=bool)
-    result[0] = found.met
-    points, places = np.nonzero(found.met)
-    for low in range(0, len(points), CANDIDATES_AT_ONCE):
-        part = slice(low, low + CANDIDATES_AT_ONCE)
-        chain = kinematics.at(found.joints[points[part], places[part]])
-        off_organ = around.organ_clearance(kinematics, chain, exact=False) >= 0.0
-        result[1, points[part], places[part]] = off_organ | sites.inner[points[part]]
-        result[2, points[part], places[part]] = around.wall_clearance(kinematics, chain) >= 0.0
-    return result
-
-
-def _reasons(
-    kinematics: BatchKinematics, tips: FloatArray, found: Candidates, clear: NDArray[np.bool_]
-) -> IntArray:
+def _reasons(search: _Search, found: Candidates, clear: NDArray[np.bool_]) -> IntArray:
     """Index into REASONS of each point: the first test that no candidate passes, (n,)."""
-    reason = np.where(clear[:2].all(axis=0).any(axis=1), 5, 4)
-    reason[clear.all(axis=0).any(axis=1)] = 0
-    lost = np.flatnonzero(~clear[0].any(axis=1))
+    kinematics, tips = search.kinematics, search.tips
+    reason = np.where(np.any(_every(clear[:2]), axis=1), 5, 4)
+    reason[np.any(_every(clear), axis=1)] = 0
+    lost = np.flatnonzero(~np.any(clear[0], axis=1))
     if lost.size:
         starts = spread_starts(kinematics)
         best = np.argmin(found.position_error[lost] + found.trocar_error[lost], axis=1)
@@ -153,21 +158,14 @@ def _reasons(
         )
         reason[lost] = 1
         free = from_starts(kinematics, tips[lost], own, limits=False, trocar=False)
-        reason[lost[(free.position_error <= REACHED).any(axis=1)]] = 2
+        reason[lost[np.any(free.position_error <= REACHED, axis=1)]] = 2
         held = from_starts(kinematics, tips[lost], own, trocar=False)
-        reason[lost[(held.position_error <= REACHED).any(axis=1)]] = 3
+        reason[lost[np.any(held.position_error <= REACHED, axis=1)]] = 3
     return reason.astype(np.int32)
 
 
-def _report(
-    kinematics: BatchKinematics,
-    sites: Sites,
-    around: Surroundings,
-    found: Candidates,
-    usable: NDArray[np.bool_],
-    reason: IntArray,
-    directions: FloatArray,
-) -> ArmReach:
+def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
+    kinematics, sites, around = search.kinematics, search.sites, search.around
     rows, good = np.arange(len(reason)), reason == 0
     worth = np.where(usable, dexterity.limit_margin(kinematics, found.joints), -np.inf)
     nearest = np.argmin(found.position_error + found.trocar_error, axis=1)
@@ -188,7 +186,7 @@ def _report(
         reason=reason,
         joints=joints,
         position_error=found.position_error[rows, best],
-        approach_share=where_reached(approach_share(found.pointing, usable, directions)),
+        approach_share=where_reached(approach_share(found.pointing, usable, search.directions)),
         manipulability=where_reached(dexterity.manipulability(values)),
         isotropy=where_reached(dexterity.isotropy(values)),
         limit_margin=where_reached(dexterity.limit_margin(kinematics, joints)),

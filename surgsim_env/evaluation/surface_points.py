@@ -34,7 +34,9 @@ def facing_points(anatomy: Anatomy, ports: ArrayLike, count: int, seed: int) -> 
     while len(corners) < PLACES_PER_POINT * count:
         corners, normals = _quartered(corners), np.repeat(normals, 4, axis=0)
     centres = corners.mean(axis=1)
-    chosen = _spread(centres, count, int(np.random.default_rng(seed).integers(len(centres))))
+    # Ranked by distance from the ports: a mirrored organ has mirrored points, in the same order.
+    ranked = np.argsort(np.linalg.norm(centres - middle, axis=1), kind="stable")
+    chosen = _spread(centres, count, int(ranked[np.random.default_rng(seed).integers(len(centres))]))
     return centres[chosen], normals[chosen]
 
 

@@ -147,6 +147,16 @@ MODELS = [
     ('range="0 0.24"', "", r"joint 'insertion' has no limits; give it a range"),
     ('<position name="hold_roll"', '<motor name="hold_roll"', r"unrecognized attribute: 'kp'"),
     ('<position name="hold_roll" joint="roll" kp="6"/>', "", r"joint 'roll' has no position actuator"),
+    (
+        'name="hold_roll" joint="roll"',
+        'name="hold_roll" joint="roll" gear="2"',
+        r"'roll' has no position actuator of gear 1",
+    ),
+    (
+        'name="hold_roll" joint="roll"',
+        'name="hold_roll" joint="roll" ctrlrange="-1 1"',
+        r"joint 'roll' takes -1 to 1, less than the joint's limits -4\.53786 to 4\.53786: widen its ctrlrange",
+    ),
     ('<joint name="roll" type="hinge"', '<joint name="roll" type="ball"', r"."),
     ('name="neck" type="capsule"', 'name="neck" type="cylinder"', r"contact geom 'neck' is a cylinder; only spheres"),
     ("<mujoco", "<mujocco", r"not valid XML|begins with <mujocco>"),

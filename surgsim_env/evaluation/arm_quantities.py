@@ -49,14 +49,15 @@ class Quantity:
 
 QUANTITIES = (
     Quantity("tip_force", "tip force", "N", 1.0, 2, "_N", True,
-             "Largest static force that the tip can press with along the inward normal of the surface while no joint "
-             "exceeds its torque or force limit, at the joints found."),
+             "Largest static force of the tip along the inward normal of the surface within the joints' torque and "
+             "force limits, at the joints found, gravity compensated and the trocar bearing nothing."),
     Quantity("organ_clearance", "clearance from the organ", "mm", 1e3, 1, "_m", True,
-             "Smallest distance between the surface of the arm's shaft and links and the organ's surface; the tip, "
-             "which is to touch, is not counted."),
+             "Smallest distance between the arm's surface and the organ at rest; the tip's ball and 5 mm about it, "
+             "which are to touch, are left out."),
     Quantity("wall_clearance", "clearance from the body wall", "mm", 1e3, 1, "_m", True,
-             "Smallest distance between shaft and links and the body wall, a plate or dome through the ports; what "
-             "passes it through the hole of the arm's own port is left out."),
+             "Smallest distance between the arm's surface and the body wall, a dome or plate through the ports; "
+             "what lies in the hole about the arm's own port is left out. Sizes of wall and hole stand in the "
+             "inputs."),
     Quantity("approach_share", "approach directions", "%", 100.0, 0, "", True,
              "Share of 32 directions, spread evenly over the half space above the surface, from which the tip can "
              "come to the point within 10 degrees."),
@@ -64,17 +65,18 @@ QUANTITIES = (
              "Product over the joints of 4 (q - low)(high - q) / (high - low)²: 1 in the middle of every joint's "
              "range, 0 at any limit."),
     Quantity("manipulability", "manipulability", "", 1.0, None, "", True,
-             "Yoshikawa's sqrt(det J Jᵀ) of the tip's Jacobian in SI units, rotations multiplied by the length that "
-             "the summary states; 0 where a direction is lost. It compares points and ports of one arm."),
+             "Yoshikawa's sqrt(det J Jᵀ), the product of the singular values of the tip's Jacobian in SI units, "
+             "one radian of turning counted as 0.1 m; 0 where a direction is lost. It compares points and ports of "
+             "one arm."),
     Quantity("isotropy", "isotropy", "", 1.0, 3, "", True,
-             "Smallest over largest singular value of that Jacobian: 1 moves alike in every direction, 0 not at all in "
-             "one."),
+             "Smallest over largest singular value of that Jacobian: 1 moves alike in every direction, 0 not at "
+             "all in one."),
     Quantity("trocar_load", "sideways load on the trocar", "N", 1.0, 2, "_N", False,
-             "Force of the shaft on the trocar, across the shaft, while the tip presses with 1 N along the inward "
-             "normal."),
+             "Sideways force on the trocar while the tip presses with 1 N along the inward normal, the shaft taken "
+             "as a lever whose outer end is held without a moment."),
     Quantity("camera_angle", "angle to the camera", "degrees", 180.0 / math.pi, 0, "_rad", True,
-             "Angle between the instrument's shaft and the endoscope's line of sight to the point: at a small angle "
-             "the shaft hides what the tip does."),
+             "Angle between the instrument's shaft and the line of sight from the endoscope's port to the point: "
+             "at a small angle the shaft hides what the tip does."),
     Quantity("position_error", "tip error", "mm", 1e3, 3, "_m", False,
              "Distance between the point and the tip at the joints found."),
     Quantity("trocar_error", "trocar error", "mm", 1e3, 3, "_m", False,
@@ -82,15 +84,16 @@ QUANTITIES = (
 )  # fmt: skip
 DISTANCES = (
     ("arm_distance_inside", "distance between the arms inside the body",
-     "Smallest distance between the two arms' surfaces inside the body while both tips are at the point and beside it; "
-     "only where both reach it."),
+     "Smallest distance between the two arms' surfaces inside the body with both tips at the point, what lies within "
+     "20 mm of it left out; only where each reaches it."),
     ("arm_distance_outside", "distance between the arms outside the body",
      "The same outside the body."),
 )  # fmt: skip
 SHARE_DEFINITIONS = (
     ("reachable", "A point is reachable by an arm when joints within their limits put the tip there, the shaft passes "
      "through the trocar, and neither shaft nor links touch the organ or the body wall."),
-    ("both", "A point is reachable by both at once when each arm reaches it and the arms stay at least 5 mm apart."),
+    ("both", "A point is reachable by both at once when each arm reaches it and the arms are at least 5 mm apart, inside the "
+     "body and outside, but for the 20 mm about the point where the tips meet."),
 )  # fmt: skip
 
 

@@ -170,7 +170,6 @@ def _row(head: str, *cells: str, text: bool = False) -> str:
 
 def _shares(evaluation: ArmsEvaluation) -> str:
     groups = [("on the surface", ~evaluation.inner), ("inside the organ", evaluation.inner)]
-    groups.append(("all", np.ones(len(evaluation.points), dtype=bool)))
     masks = [evaluation.left.reachable, evaluation.right.reachable, evaluation.both]
     rows = [
         _row(f"{name} ({int(group.sum())} points)", *(share_text(mask[group]) for mask in masks))

@@ -324,7 +324,7 @@ def test_everything_reached_without_inner_targets(tmp_path):
     arms = {side: replace(getattr(evaluation, side), reason=everywhere) for side in ("left", "right")}
     evaluation = replace(evaluation, both=np.ones(60, dtype=bool), ports={}, **arms)
     page = Page((written(evaluation, tmp_path) / "report.html").read_text(encoding="utf-8"))
-    assert page.row("all (60 points)")[1:] == ["100 %"] * 3
+    assert page.row("on the surface (60 points)")[1:] == ["100 %"] * 3
     assert "missed" not in verdict(evaluation)
 
 

@@ -149,9 +149,9 @@ class Bench:
 
 Command = (
     Annotated[Palpate, tyro.conf.subcommand("palpate")]
-    | Annotated[Arms, tyro.conf.subcommand("arms")]
     | Annotated[Organ, tyro.conf.subcommand("organ")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Arms, tyro.conf.subcommand("arms")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )

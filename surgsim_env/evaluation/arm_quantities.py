@@ -92,8 +92,8 @@ DISTANCES = (
 SHARE_DEFINITIONS = (
     ("reachable", "A point is reachable by an arm when joints within their limits put the tip there, the shaft passes "
      "through the trocar, and neither shaft nor links touch the organ or the body wall."),
-    ("both", "A point is reachable by both at once when each arm reaches it and the arms are at least 5 mm apart, inside "
-     "the body and outside, but for the 20 mm about the point where the tips meet."),
+    ("both", "A point is reachable by both at once when each arm reaches it and the arms are at least 5 mm apart, "
+     "inside the body and outside, but for the 20 mm about the point where the tips meet."),
 )  # fmt: skip
 
 

@@ -98,7 +98,7 @@ SHARE_DEFINITIONS = (
 
 
 class Extreme(NamedTuple):
-    """A least or greatest value [SI] with the arm and the point it belongs to; NaN, "" and -1 where there is none."""
+    """A least value [SI] with the arm and the point it belongs to; NaN, "" and -1 where there is none."""
 
     value: float
     side: str
@@ -139,16 +139,16 @@ def worse_of_both(evaluation: ArmsEvaluation, quantity: Quantity) -> FloatArray:
     return np.where(evaluation.both, pair.min(axis=0) if quantity.more_is_better else pair.max(axis=0), np.nan)
 
 
-def extreme(evaluation: ArmsEvaluation, field: str, greatest: bool = False) -> Extreme:
-    """The least (or greatest) value of a field of ArmReach over both arms and all points that they reach."""
+def extreme(evaluation: ArmsEvaluation, field: str) -> Extreme:
+    """The least finite value of a field of ArmReach over both arms and all points that they reach."""
     found = Extreme(math.nan, "", -1)
     for side, arm in sides(evaluation):
         values = np.where(arm.reachable & np.isfinite(getattr(arm, field)), getattr(arm, field), np.nan)
         if np.isnan(values).all():
             continue
-        index = int(np.nanargmax(values) if greatest else np.nanargmin(values))
+        index = int(np.nanargmin(values))
         value = float(values[index])
-        if not found.side or (value > found.value if greatest else value < found.value):
+        if not found.side or value < found.value:
             found = Extreme(value, side, index)
     return found
 

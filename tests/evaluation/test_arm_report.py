@@ -117,6 +117,17 @@ def test_clearances_that_nothing_limits_are_left_aside(evaluation):
     assert f"The worst clearance is {least * 1e3:.1f} mm" in said and "organ" in said
 
 
+def test_forces_that_nothing_limits_are_not_told(evaluation):
+    """Joints without a stated torque hold any force: infinity, which is no smallest force."""
+    free = {
+        side: replace(
+            getattr(evaluation, side), tip_force=np.where(getattr(evaluation, side).reachable, np.inf, np.nan)
+        )
+        for side in ("left", "right")
+    }
+    assert "tip force" not in verdict(replace(evaluation, **free))
+
+
 def test_tables_show_least_median_and_greatest(evaluation, page):
     for quantity in QUANTITIES:
         cells = page.row(quantity.label)[1:]

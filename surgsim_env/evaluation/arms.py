@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.arms.arm import load_arm
 from surgsim_env.arms.description import ArmDescription
@@ -35,6 +36,7 @@ def evaluate_arms(
     seed: int = 0,
     count: int = 500,
     progress: Progress | None = None,
+    pictures: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
 
@@ -47,6 +49,7 @@ def evaluate_arms(
         seed: draws where the points of the surface begin.
         count: how many points of the surface.
         progress: told what is being done and the share of it that is done.
+        pictures: whether to draw the arms in the patient; without OpenGL there are none, and `progress` is told why.
 
     Raises:
         ValueError: one line with what is wrong in scene, arm or ports, and the way out.
@@ -75,9 +78,9 @@ def evaluate_arms(
         "count": count,
     }
     reports = found[0].report, found[1].report
+    points = sites.points[~sites.inner]
     summary = summarise(sites, *reports, both, inner, inputs, seed)
-    tell("done", 1.0)
-    return ArmsEvaluation(
+    evaluation = ArmsEvaluation(
         points=sites.points,
         normals=sites.normals,
         inner=sites.inner,
@@ -90,8 +93,10 @@ def evaluate_arms(
         scene=anatomy.scene.name,
         surface_points=mesh.points,
         surface_triangles=mesh.boundary_triangles,
-        pictures={},
+        pictures=_pictures(mesh.points, mesh.boundary_triangles, where, found, points, tell) if pictures else {},
     )
+    tell("done", 1.0)
+    return evaluation
 
 
 def _scene(scene: str | Path | Scene) -> Scene:
@@ -121,3 +126,18 @@ def _sites(anatomy: Anatomy, ports: Ports, targets: Sequence[InnerTarget], count
         np.concatenate([normals, out]),
         np.arange(len(points) + len(inner)) >= len(points),
     )
+
+
+def _pictures(
+    points: FloatArray, triangles: IntArray, ports: Ports, found: list[Reach], sites: FloatArray, tell: Progress
+) -> dict[str, NDArray[np.uint8]]:
+    """Pictures by caption, none where there is no OpenGL."""
+    # Drawing loads OpenGL: only where pictures are asked for.
+    from surgsim_env.evaluation.arm_pictures import NoPicturesError, draw_arms
+
+    tell("pictures", 0.95)
+    try:
+        return draw_arms(points, triangles, ports, found[0], found[1], sites)
+    except NoPicturesError as error:
+        tell(f"no pictures: {error}", 0.95)
+        return {}

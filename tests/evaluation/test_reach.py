@@ -9,6 +9,7 @@ from surgsim_env.arms.arm import load_arm
 from surgsim_env.arms.port import Port
 from surgsim_env.arms.psm import PSM_LINKS, shaft_depth
 from surgsim_env.evaluation.arm_results import REASONS
+from surgsim_env.evaluation.both_arms import ARM_DISTANCE, evaluate_both
 from surgsim_env.evaluation.candidates import REACHED
 from surgsim_env.evaluation.clearance import SurfaceDistance
 from surgsim_env.evaluation.collisions import Surroundings, arm_distances, split_at_trocar
@@ -202,3 +203,31 @@ def test_distance_of_two_arms_that_meet(tmp_path):
     inside, outside = arm_distances(sides[0], sides[1], point[None])
     assert inside[0] == pytest.approx(2.0 * 0.020 * half / math.hypot(half, depth) - 2 * RADIUS, abs=1e-9)
     assert outside[0] == pytest.approx(2.0 * half - 2 * RADIUS, abs=1e-9)
+
+
+def test_links_lie_outside_whatever_their_height():
+    """The PSM's rail and arc are outside, even where they stand beyond the trocar's plane; its wrist inside."""
+    kinematics = BatchKinematics(load_arm("psm_grasper", Port()))
+    chain = kinematics.at(kinematics.arm.home[None])
+    inside, outside = split_at_trocar(kinematics, chain)
+    assert np.isnan(inside[0, ~kinematics.distal]).all()
+    assert np.array_equal(outside[0, ~kinematics.distal], chain.shape_ends[0, ~kinematics.distal])
+    wrist = kinematics.arm.shape_names.index("wrist")
+    assert np.isnan(outside[0, wrist]).all() and not np.isnan(inside[0, wrist]).any()
+
+
+def test_arms_step_aside_for_each_other():
+    """Ports 4 cm apart: where the arms' best stands are too close others are tried, and none that is closer chosen."""
+    sites = surface_sites([[0.02 + x, y, -0.12] for x in (-0.03, 0.0, 0.03) for y in (-0.03, 0.0, 0.03)])
+    reaches = [
+        evaluate_reach(BatchKinematics(load_arm("psm_grasper", Port((x, 0.0, 0.0)))), sites, around())
+        for x in (0.0, 0.04)
+    ]
+    assert all(reach.report.reachable.all() for reach in reaches)
+    stands = [(reach.kinematics, reach.kinematics.at(reach.report.joints)) for reach in reaches]
+    first = np.minimum(*arm_distances(stands[0], stands[1], sites.points))
+    both = evaluate_both(reaches[0], reaches[1], sites.points)
+    chosen = np.minimum(both.inside, both.outside)
+    assert (first < ARM_DISTANCE).any()
+    assert (chosen >= first).all() and (chosen > first)[first < ARM_DISTANCE].any()
+    assert both.reachable.tolist() == (chosen >= ARM_DISTANCE).tolist()

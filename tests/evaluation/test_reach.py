@@ -16,6 +16,7 @@ from surgsim_env.evaluation.collisions import Surroundings, arm_distances, split
 from surgsim_env.evaluation.kinematics import BatchKinematics
 from surgsim_env.evaluation.ports import Endoscope, PortPlace, Ports, Wall
 from surgsim_env.evaluation.reach import Sites, evaluate_reach, tip_ball
+from tests.arms.joints import random_joints
 from tests.evaluation.pivot_arm import RADIUS, pivot, pivot_excess
 
 DOWN = (0.0, 0.0, -1.0)
@@ -93,6 +94,19 @@ def test_psm_reaches_its_cone_and_depths():
     reach = evaluate_reach(kinematics, surface_sites(points[sure]), around())
     assert reach.report.reachable.tolist() == inside[sure].tolist()
     assert {REASONS[index] for index in reach.report.reason[outside[sure]]} == {"a joint limit"}
+
+
+def test_search_misses_no_pose_of_the_psm():
+    """Places and directions that joint values have: each is found as a point approached along that direction."""
+    kinematics = BatchKinematics(load_arm("psm_grasper", Port()))
+    joints = random_joints(kinematics.arm, 60, seed=9, margin=0.03)
+    there = kinematics.at(joints, shapes=False)
+    past = kinematics.trocar_error(there) < 1e-6
+    directions = there.direction[past]
+    reach = evaluate_reach(kinematics, Sites(there.tip[past], -directions, np.ones(past.sum(), dtype=bool)), around())
+    assert reach.report.reachable.all()
+    cosine = np.einsum("nki,ni->nk", reach.candidates.pointing, directions)
+    assert ((cosine >= math.cos(math.radians(10.0))) & reach.usable).any(axis=1).all()
 
 
 def test_no_joints_reach_what_is_too_far():

@@ -79,7 +79,7 @@ class Palpate:
 class Arms:
     """Evaluate two arms on a patient's organ: what each reaches and both at once, clearances, forces, dexterity.
 
-    Writes report.html (self-contained), points.csv, heat maps (PNG) and summary.json. docs/evaluation.md tells more.
+    Writes report.html (self-contained), points.csv, heat maps (PNG) and summary.json. docs/arms_report.md tells more.
     """
 
     left: str

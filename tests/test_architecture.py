@@ -166,8 +166,8 @@ def tasks_do_not_advance(source: Source) -> Iterator[str]:
 
 
 def arms_know_no_task(source: Source) -> Iterator[str]:
-    """An arm is an instrument: it knows neither tasks nor environments nor the simulation that holds it."""
-    if source.path.startswith("surgsim_env/arms/"):
+    """An arm is an instrument: it, and what evaluates it, know neither tasks nor environments nor a simulation."""
+    if source.path.startswith(("surgsim_env/arms/", "surgsim_env/evaluation/")):
         for name, line in imported(source.tree):
             if name.split(".")[0] == "gymnasium" or re.match(r"surgsim_env\.(tasks|env|vector_env|simulation)\b", name):
                 yield f"line {line} imports {name}"
@@ -254,6 +254,7 @@ PLANTED = [
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "mujoco.mj_step1(model, data)"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.tasks.palpate import PalpateTask"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "def late():\n    import gymnasium"),
+    (arms_know_no_task, "surgsim_env/evaluation/reach.py", "from surgsim_env.simulation import Simulation"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
     (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),

@@ -37,12 +37,11 @@ PIECE = 0.02
 def write_pictures(
     evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], folder: Path, *, name: str = "arms"
 ) -> list[Picture]:
-    """Write the pictures that the evaluation brought, or else one of the arms as capsules; what was written."""
-    if evaluation.pictures:
-        return write_given_pictures(evaluation.pictures, folder, name=name)
+    """Write a picture of the arms as capsules, which needs no OpenGL, and those that the evaluation brought."""
+    given = write_given_pictures(evaluation.pictures, folder, name=name)
     places = poses(evaluation)
     if not places:
-        return []
+        return given
     parts = [_organ(evaluation)]
     for (side, arm), shape, colour in zip(sides(evaluation), arms, (LEFT, RIGHT), strict=True):
         if side in places:
@@ -57,7 +56,8 @@ def write_pictures(
             "The arms and the endoscope over the organ",
             f"Close to the organ, whole from the front and above, and whole from the side: {told}. Left arm blue, "
             "right arm orange, endoscope grey, dark balls the ports; the body wall is left out.",
-        )
+        ),
+        *given,
     ]
 
 

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.arms.arm import load_arm
 from surgsim_env.arms.description import ArmDescription
-from surgsim_env.evaluation.arm_results import ArmsEvaluation
+from surgsim_env.evaluation.arm_results import ArmReach, ArmsEvaluation
 from surgsim_env.evaluation.arm_summary import plain_ports, summarise
 from surgsim_env.evaluation.both_arms import evaluate_both
 from surgsim_env.evaluation.clearance import SurfaceDistance
@@ -35,6 +36,7 @@ def evaluate_arms(
     seed: int = 0,
     count: int = 500,
     progress: Progress | None = None,
+    pictures: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
 
@@ -47,6 +49,7 @@ def evaluate_arms(
         seed: draws where the points of the surface begin.
         count: how many points of the surface.
         progress: told what is being done and the share of it that is done.
+        pictures: whether to draw the arms in the patient; without OpenGL there are none, and `progress` is told why.
 
     Raises:
         ValueError: one line with what is wrong in scene, arm or ports, and the way out.
@@ -59,23 +62,12 @@ def evaluate_arms(
     inner = where.targets if targets is None else tuple(targets)
     arms = [_arm(side, place, anatomy) for side, place in ((left, where.left), (right, where.right))]
     sites = _sites(anatomy, where, inner, count, seed)
-    mesh = anatomy.mesh
-    organ = SurfaceDistance(mesh.points, mesh.boundary_triangles)
-    found: list[Reach] = []
-    for index, kinematics in enumerate(arms):
-        tell(f"the {('left', 'right')[index]} arm at {len(sites.points)} points", 0.05 + 0.4 * index)
-        found.append(evaluate_reach(kinematics, sites, Surroundings(organ, where, tip_ball(kinematics))))
+    reaches = _reaches(anatomy, arms, sites, where, tell)
     tell("both arms at once", 0.85)
-    both = evaluate_both(found[0], found[1], sites.points)
-    inputs: dict[str, Any] = {
-        "scene": anatomy.scene.name,
-        "left": found[0].report.name,
-        "right": found[1].report.name,
-        "ports": plain_ports(where),
-        "count": count,
-    }
-    reports = found[0].report, found[1].report
-    summary = summarise(sites, *reports, both, inner, inputs, seed)
+    both = evaluate_both(reaches[0], reaches[1], sites.points)
+    reports = reaches[0].report, reaches[1].report
+    inputs = _inputs(anatomy, reports, where, count)
+    drawn = _pictures(anatomy, where, reaches, sites, tell) if pictures else {}
     tell("done", 1.0)
     return ArmsEvaluation(
         points=sites.points,
@@ -86,12 +78,34 @@ def evaluate_arms(
         both=both.reachable,
         arm_distance_inside=both.inside,
         arm_distance_outside=both.outside,
-        summary=summary,
+        summary=summarise(sites, *reports, both, inner, inputs, seed),
         scene=anatomy.scene.name,
-        surface_points=mesh.points,
-        surface_triangles=mesh.boundary_triangles,
-        pictures={},
+        surface_points=anatomy.mesh.points,
+        surface_triangles=anatomy.mesh.boundary_triangles,
+        pictures=drawn,
     )
+
+
+def _reaches(
+    anatomy: Anatomy, arms: list[BatchKinematics], sites: Sites, ports: Ports, tell: Progress
+) -> tuple[Reach, Reach]:
+    """What the left and the right arm reach."""
+    organ = SurfaceDistance(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+    found = []
+    for index, kinematics in enumerate(arms):
+        tell(f"the {('left', 'right')[index]} arm at {len(sites.points)} points", 0.05 + 0.4 * index)
+        found.append(evaluate_reach(kinematics, sites, Surroundings(organ, ports, tip_ball(kinematics))))
+    return found[0], found[1]
+
+
+def _inputs(anatomy: Anatomy, reports: tuple[ArmReach, ArmReach], ports: Ports, count: int) -> dict[str, Any]:
+    return {
+        "scene": anatomy.scene.name,
+        "left": reports[0].name,
+        "right": reports[1].name,
+        "ports": plain_ports(ports),
+        "count": count,
+    }
 
 
 def _scene(scene: str | Path | Scene) -> Scene:
@@ -121,3 +135,19 @@ def _sites(anatomy: Anatomy, ports: Ports, targets: Sequence[InnerTarget], count
         np.concatenate([normals, out]),
         np.arange(len(points) + len(inner)) >= len(points),
     )
+
+
+def _pictures(
+    anatomy: Anatomy, ports: Ports, reaches: tuple[Reach, Reach], sites: Sites, tell: Progress
+) -> dict[str, NDArray[np.uint8]]:
+    """Pictures by caption, none where there is no OpenGL."""
+    # Drawing loads OpenGL: only where pictures are asked for.
+    from surgsim_env.evaluation.arm_pictures import NoPicturesError, draw_arms
+
+    tell("pictures", 0.95)
+    mesh, points = anatomy.mesh, sites.points[~sites.inner]
+    try:
+        return draw_arms(mesh.points, mesh.boundary_triangles, ports, *reaches, points)
+    except NoPicturesError as error:
+        tell(f"no pictures: {error}", 0.95)
+        return {}

@@ -81,8 +81,8 @@ def report_arms(request: Request, console: Console) -> ArmsEvaluation:
     # Before the work: a place that cannot be written is better known now than after it.
     folder = writable_folder(request.out, (REPORT_NAME, POINTS_NAME, SUMMARY_NAME))
     found = []
-    for setup in setups:
-        one = evaluate(setup, anatomy, request, console)
+    for number, setup in enumerate(setups):
+        one = evaluate(setup, anatomy, request, console, pictures=number == 0)
         found.append(replace(one, ports=_by_name(setup.ports)))
     first = found[0]
     ranking = rank([Candidate(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
@@ -105,7 +105,7 @@ def report_arms(request: Request, console: Console) -> ArmsEvaluation:
     return first
 
 
-def evaluate(setup: Setup, anatomy: Anatomy, request: Request, console: Console) -> ArmsEvaluation:
+def evaluate(setup: Setup, anatomy: Anatomy, request: Request, console: Console, *, pictures: bool) -> ArmsEvaluation:
     """One setup on the organ, with a progress bar."""
     left, right = setup.left.description, setup.right.description
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console) as bar:
@@ -114,7 +114,9 @@ def evaluate(setup: Setup, anatomy: Anatomy, request: Request, console: Console)
         def tell(what: str, share: float) -> None:
             bar.update(task, description=f"{setup.name}: {what}", completed=share)
 
-        return evaluate_arms(anatomy, left, right, setup.ports, seed=request.seed, count=request.points, progress=tell)
+        return evaluate_arms(
+            anatomy, left, right, setup.ports, seed=request.seed, count=request.points, progress=tell, pictures=pictures
+        )
 
 
 def command_text(request: Request) -> str:

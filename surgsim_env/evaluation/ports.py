@@ -136,16 +136,21 @@ class Ports:
 
     def _heights(self, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Least and greatest height of segments (..., 2, 3) above the middle of the wall [m]."""
-        left, right = np.array(self.left.point), np.array(self.right.point)
-        middle = 0.5 * (left + right)
         if self.wall.plate:
+            middle = 0.5 * (np.array(self.left.point) + np.array(self.right.point))
             heights = (segments - middle) @ self.wall_normal
             return heights.min(axis=-1), heights.max(axis=-1)
-        radius = self.wall.radius
-        centre = middle - math.sqrt(radius**2 - 0.25 * float((right - left) @ (right - left))) * self.wall_normal
+        centre, radius = self.dome_centre, self.wall.radius
         nearest = point_segment_distance(centre, segments)
         furthest = np.sqrt(dot(segments - centre, segments - centre)).max(axis=-1)
         return nearest - radius, furthest - radius
+
+    @property
+    def dome_centre(self) -> FloatArray:
+        """Middle of the dome's sphere [m] (3,): both ports lie on it, below them along the wall's normal."""
+        left, right = np.array(self.left.point), np.array(self.right.point)
+        depth = math.sqrt(self.wall.radius**2 - 0.25 * float((right - left) @ (right - left)))
+        return 0.5 * (left + right) - depth * self.wall_normal
 
     @property
     def wall_normal(self) -> FloatArray:

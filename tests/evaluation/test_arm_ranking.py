@@ -70,6 +70,11 @@ def test_figures_of_the_rows_are_the_arrays():
     assert (row.clearance, row.worst_clearance, row.force, row.reasons) == (0.0123, 0.0123, 4.5, "")
 
 
+def test_both_arms_count_before_either():
+    pair, single = case("pair", both=0.4, left=0.5, right=0.5), case("single", both=0.3, left=0.9)
+    assert [one.name for one in rank([single, pair])] == ["pair", "single"]
+
+
 def test_the_median_is_over_both_arms_and_the_nearer_of_organ_and_wall():
     one = made_evaluation(inner_count=5)
     wanted = [

@@ -72,7 +72,7 @@ def written(evaluation, folder):
     pictures = write_pictures(evaluation, arms, folder)
     maps = ArmMaps(evaluation).write_all(folder)
     write_points(evaluation, folder / "points.csv")
-    write_report(evaluation, folder / "report.html", pictures=pictures, maps=maps, command="surgsim arms <&>")
+    write_report(evaluation, folder / "report.html", pictures=pictures, maps=maps, command="surgsim arms <b>&amp;")
     return folder
 
 
@@ -230,12 +230,12 @@ def test_the_page_is_whole_and_stands_alone(folder, page):
     assert len(identifiers) == len(set(identifiers))
     for link in page.of("a"):
         assert link["href"][1:] in identifiers
-    assert "surgsim arms <&>" in "".join(page.text)
+    assert "surgsim arms <b>&amp;" in "".join(page.text)
 
 
 def test_the_page_can_be_read_aloud(page):
     assert page.of("html")[0]["lang"] == "en"
-    assert len(page.of("img")) == 1 + len(list(QUANTITIES)) - 2 + 2
+    assert len(page.of("img")) == 2 + (len(QUANTITIES) - 2) + 2
     for image in page.of("img"):
         assert len(image["alt"]) > 20
     assert len(page.of("caption")) == len(page.of("table")) >= 7
@@ -273,7 +273,7 @@ def test_the_map_is_grey_just_where_neither_arm_reaches(evaluation):
     maps = ArmMaps(evaluation)
     centres = maps._patches.corners.mean(axis=1)
     surface = np.flatnonzero(~evaluation.inner)
-    for index in range(0, len(centres), 997):
+    for index in range(0, len(centres), 7):
         nearest = maps._nearest[index, 0]
         weight = 0.15 * np.ptp(evaluation.surface_points, axis=0).max()
         far = np.linalg.norm(evaluation.points[surface] - centres[index], axis=1) ** 2

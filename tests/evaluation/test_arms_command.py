@@ -42,7 +42,7 @@ def made(monkeypatch):
     """In place of the evaluation, made-up ones: wider ports reach more, another arm less. Lists what was asked for."""
     asked = []
 
-    def evaluate(setup, anatomy, request, console):
+    def evaluate(setup, anatomy, request, console, *, pictures):
         asked.append((setup, request))
         reach = {"wide.toml": 0.6, "six_axis": 0.1}.get(setup.name, 0.3)
         return made_evaluation(count=request.points, seed=request.seed, left_to=reach, right_to=reach)
@@ -81,7 +81,9 @@ def test_the_files_and_the_summary(folder, made, capsys):
 
 def test_a_run_repeats_to_the_byte_wherever_it_is_written(folder, made, tmp_path_factory):
     other = tmp_path_factory.mktemp("other") / "deep" / "er"
-    compared = ("--compare", "wide.toml")
+    outside = tmp_path_factory.mktemp("outside") / "wide.toml"
+    shutil.copy(folder / "wide.toml", outside)
+    compared = ("--compare", str(outside))
     assert main(arguments(*compared, ports=str(folder / "ports.toml"), out="a")) == 0
     assert main(arguments(*compared, ports=str(folder / "ports.toml"), out=other)) == 0
     assert main(arguments(*compared, "--seed", "1", out="c")) == 0
@@ -91,6 +93,7 @@ def test_a_run_repeats_to_the_byte_wherever_it_is_written(folder, made, tmp_path
         first = (folder / "a" / name).read_bytes()
         assert first == (other / name).read_bytes(), name
         assert str(folder).encode() not in first and str(other).encode() not in first
+        assert str(outside.parent).encode() not in first
     assert (folder / "a" / "points.csv").read_bytes() != (folder / "c" / "points.csv").read_bytes()
 
 

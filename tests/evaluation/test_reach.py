@@ -9,12 +9,14 @@ from surgsim_env.arms.arm import load_arm
 from surgsim_env.arms.port import Port
 from surgsim_env.arms.psm import PSM_LINKS, shaft_depth
 from surgsim_env.evaluation.arm_results import REASONS
+from surgsim_env.evaluation.both_arms import ARM_DISTANCE, evaluate_both
 from surgsim_env.evaluation.candidates import REACHED
 from surgsim_env.evaluation.clearance import SurfaceDistance
 from surgsim_env.evaluation.collisions import Surroundings, arm_distances, split_at_trocar
 from surgsim_env.evaluation.kinematics import BatchKinematics
 from surgsim_env.evaluation.ports import Endoscope, PortPlace, Ports, Wall
 from surgsim_env.evaluation.reach import Sites, evaluate_reach, tip_ball
+from tests.arms.joints import random_joints
 from tests.evaluation.pivot_arm import RADIUS, pivot, pivot_excess
 
 DOWN = (0.0, 0.0, -1.0)
@@ -92,6 +94,19 @@ def test_psm_reaches_its_cone_and_depths():
     reach = evaluate_reach(kinematics, surface_sites(points[sure]), around())
     assert reach.report.reachable.tolist() == inside[sure].tolist()
     assert {REASONS[index] for index in reach.report.reason[outside[sure]]} == {"a joint limit"}
+
+
+def test_search_misses_no_pose_of_the_psm():
+    """Places and directions that joint values have: each is found as a point approached along that direction."""
+    kinematics = BatchKinematics(load_arm("psm_grasper", Port()))
+    joints = random_joints(kinematics.arm, 60, seed=9, margin=0.03)
+    there = kinematics.at(joints, shapes=False)
+    past = kinematics.trocar_error(there) < 1e-6
+    directions = there.direction[past]
+    reach = evaluate_reach(kinematics, Sites(there.tip[past], -directions, np.ones(past.sum(), dtype=bool)), around())
+    assert reach.report.reachable.all()
+    cosine = np.einsum("nki,ni->nk", reach.candidates.pointing, directions)
+    assert ((cosine >= math.cos(math.radians(10.0))) & reach.usable).any(axis=1).all()
 
 
 def test_no_joints_reach_what_is_too_far():
@@ -202,3 +217,31 @@ def test_distance_of_two_arms_that_meet(tmp_path):
     inside, outside = arm_distances(sides[0], sides[1], point[None])
     assert inside[0] == pytest.approx(2.0 * 0.020 * half / math.hypot(half, depth) - 2 * RADIUS, abs=1e-9)
     assert outside[0] == pytest.approx(2.0 * half - 2 * RADIUS, abs=1e-9)
+
+
+def test_links_lie_outside_whatever_their_height():
+    """The PSM's rail and arc are outside, even where they stand beyond the trocar's plane; its wrist inside."""
+    kinematics = BatchKinematics(load_arm("psm_grasper", Port()))
+    chain = kinematics.at(kinematics.arm.home[None])
+    inside, outside = split_at_trocar(kinematics, chain)
+    assert np.isnan(inside[0, ~kinematics.distal]).all()
+    assert np.array_equal(outside[0, ~kinematics.distal], chain.shape_ends[0, ~kinematics.distal])
+    wrist = kinematics.arm.shape_names.index("wrist")
+    assert np.isnan(outside[0, wrist]).all() and not np.isnan(inside[0, wrist]).any()
+
+
+def test_arms_step_aside_for_each_other():
+    """Ports 4 cm apart: where the arms' best stands are too close others are tried, and none that is closer chosen."""
+    sites = surface_sites([[0.02 + x, y, -0.12] for x in (-0.03, 0.0, 0.03) for y in (-0.03, 0.0, 0.03)])
+    reaches = [
+        evaluate_reach(BatchKinematics(load_arm("psm_grasper", Port((x, 0.0, 0.0)))), sites, around())
+        for x in (0.0, 0.04)
+    ]
+    assert all(reach.report.reachable.all() for reach in reaches)
+    stands = [(reach.kinematics, reach.kinematics.at(reach.report.joints)) for reach in reaches]
+    first = np.minimum(*arm_distances(stands[0], stands[1], sites.points))
+    both = evaluate_both(reaches[0], reaches[1], sites.points)
+    chosen = np.minimum(both.inside, both.outside)
+    assert (first < ARM_DISTANCE).any()
+    assert (chosen >= first).all() and (chosen > first)[first < ARM_DISTANCE].any()
+    assert both.reachable.tolist() == (chosen >= ARM_DISTANCE).tolist()

@@ -69,7 +69,8 @@ def write_given_pictures(pictures: Mapping[str, NDArray[np.uint8]], folder: Path
     for number, (caption, image) in enumerate(pictures.items(), start=1):
         file = f"{name}_{number}.png"
         imsave(folder / file, np.ascontiguousarray(image), format="png")
-        written.append(Picture(file, caption[0].upper() + caption[1:], ""))
+        title = caption[0].upper() + caption[1:]
+        written.append(Picture(file, title, "Drawn with OpenGL: each tip is at a point that its arm reaches."))
     return written
 
 

@@ -198,7 +198,11 @@ def verdict(evaluation: ArmsEvaluation) -> str:
         f"{left}, the right arm {right}, and both at once {share_text(evaluation.both[outer])}."
     ]
     if inner.any():
-        said.append(f"Of {int(inner.sum())} targets inside it both reach {int(evaluation.both[inner].sum())}.")
+        reached = int(evaluation.both[inner].sum())
+        if inner.sum() == 1:
+            said.append(f"{'Both' if reached else 'Not both'} reach the target inside it at once.")
+        else:
+            said.append(f"Of {int(inner.sum())} targets inside it both at once reach {reached}.")
     if not (evaluation.left.reachable.any() or evaluation.right.reachable.any()):
         said.append("There is nothing to tell of clearances and forces.")
     else:

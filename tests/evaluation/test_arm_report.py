@@ -92,7 +92,7 @@ def test_the_verdict_says_what_the_arrays_say(evaluation):
     weaker = min(forces, key=forces.get)
     assert f"The smallest tip force is {forces[weaker]:.2f} N ({weaker} arm)" in said
     assert "Of 110 points on the surface of ellipsoid that face the ports" in said
-    assert f"Of 10 targets inside it both reach {evaluation.both[evaluation.inner].sum()}." in said
+    assert f"Of 10 targets inside it both at once reach {evaluation.both[evaluation.inner].sum()}." in said
     nearest = [np.minimum(arm.organ_clearance, arm.wall_clearance)[arm.reachable] for arm in (left, right)]
     assert f"the median is {np.median(np.concatenate(nearest)) * 1e3:.1f} mm." in said
 
@@ -102,6 +102,12 @@ def test_the_verdict_names_the_worse_of_organ_and_wall_and_its_arm(evaluation):
     assert "The worst clearance is 3.1 mm, between the right arm and the body wall; the median" in verdict(
         replace(evaluation, right=replace(evaluation.right, wall_clearance=wall))
     )
+
+
+def test_the_verdict_speaks_of_a_single_target_as_one():
+    one = made_evaluation(inner_count=1)
+    for reached, said in ((True, " Both reach the target"), (False, " Not both reach the target")):
+        assert said in verdict(replace(one, both=np.where(one.inner, reached, one.both)))
 
 
 def test_clearances_that_nothing_limits_are_left_aside(evaluation):

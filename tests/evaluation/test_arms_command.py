@@ -97,6 +97,21 @@ def test_a_run_repeats_to_the_byte_wherever_it_is_written(folder, made, tmp_path
     assert (folder / "a" / "points.csv").read_bytes() != (folder / "c" / "points.csv").read_bytes()
 
 
+@pytest.mark.slow
+def test_a_real_run_repeats_to_the_byte_and_says_what_was_found(folder):
+    for out in ("a", "b"):
+        assert main(arguments("--compare", "wide.toml", out=out)) == 0
+    names = {path.name for path in (folder / "a").iterdir()}
+    for name in names:
+        assert (folder / "a" / name).read_bytes() == (folder / "b" / name).read_bytes(), name
+    summary = json.loads((folder / "a" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["points"] == 40 and summary["reachable"]["both"] > 0.5
+    assert f"both at once {100 * summary['reachable']['both']:.0f} %" in summary["verdict"]
+    assert [one["place"] for one in summary["compared"]] == [1, 2]
+    (row,) = [one for one in summary["compared"] if one["name"] == "ports.toml"]
+    assert row["both"] == pytest.approx(summary["reachable"]["both"])
+
+
 def test_the_command_in_the_report_makes_it_again(folder, made):
     assert (
         main(arguments("--compare", "wide.toml", "six_axis", left="mine.toml", ports=str(folder / "ports.toml"))) == 0

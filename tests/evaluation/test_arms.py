@@ -8,10 +8,12 @@ import pytest
 
 from msdm_core.mesh import TetMesh
 from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.arms.arm import load_arm
 from surgsim_env.arms.description import read_description
 from surgsim_env.evaluation.arm_results import ArmReach
 from surgsim_env.evaluation.arm_summary import ranking_key
 from surgsim_env.evaluation.arms import evaluate_arms
+from surgsim_env.evaluation.collisions import TIP_ZONE
 from surgsim_env.evaluation.ports import (
     CAMERA_DISTANCE,
     PORT_SPACING,
@@ -89,6 +91,29 @@ def test_what_is_reported_is_so(found):
         assert ((arm.limit_margin[good] > 0.0) & (arm.limit_margin[good] <= 1.0)).all()
     both = found.both
     assert both.any() and (np.minimum(found.arm_distance_inside, found.arm_distance_outside)[both] >= 0.005).all()
+
+
+def test_mujoco_agrees_with_what_is_reported(found, phantom):
+    """MuJoCo's own kinematics at the reported joints: the tip at its place, limits and trocar kept.
+
+    Points p of the axes outside the tip's zone are |max(|p - c| - h, 0)| from the block of half sizes h, less radii.
+    """
+    ports, radius = default_ports(phantom), phantom.scene.instrument.tip_radius
+    for report, place, ball in ((found.left, ports.left, radius), (found.right, ports.right, 0.0)):
+        arm = load_arm(report.name, place.port, tip_radius=radius)
+        for row in range(25):
+            joints = report.joints[row]
+            tip = arm.tip_pose(joints).position
+            assert np.linalg.norm(tip - found.points[row] - ball * found.normals[row]) < 1e-3
+            assert (joints >= arm.lower).all() and (joints <= arm.upper).all()
+            assert arm.trocar_residual(joints) < 1e-9
+            ends = arm.shape_ends(joints)
+            along = np.linspace(0.0, 1.0, 2001)[:, None]
+            axes = ends[:, None, 0] + along * (ends[:, None, 1] - ends[:, None, 0])
+            outside = np.linalg.norm(axes - tip, axis=2) > ball + TIP_ZONE
+            beyond = np.maximum(np.abs(axes - [0.03, 0.03, 0.015]) - [0.03, 0.03, 0.015], 0.0)
+            gaps = np.where(outside, np.linalg.norm(beyond, axis=2), np.inf) - arm.shape_radius[:, None]
+            assert report.organ_clearance[row] == pytest.approx(gaps.min(), abs=5e-5)
 
 
 def test_run_repeats_to_the_byte(found, phantom):

@@ -1,10 +1,9 @@
-"""The command line: `surgsim palpate`, `surgsim organ`, `surgsim scenes`, `surgsim validate`, `surgsim bench`."""
+"""The command line: `surgsim palpate`, `arms`, `organ`, `scenes`, `validate`, `bench`."""
 
 import contextlib
 import io
 import re
 import sys
-import tempfile
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from rich.table import Table
 from msdm_core.length_unit import LengthUnit
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.out_folder import writable_folder
 from surgsim_env.scenes import Ball, Scene, list_scenes, load_scene, make_scene
 
 # Options whose value is a list of numbers, which may begin with a minus.
@@ -76,6 +76,31 @@ class Palpate:
 
 
 @dataclass(frozen=True)
+class Arms:
+    """Evaluate two arms on a patient's organ: what each reaches and both at once, clearances, forces, dexterity.
+
+    Writes report.html (self-contained), points.csv, heat maps (PNG) and summary.json. docs/arms_report.md tells more.
+    """
+
+    left: str
+    """The left arm: a shipped arm's name (psm_grasper, psm_palpator, six_axis) or a TOML file (docs/arms.md)."""
+    right: str
+    """The right arm, likewise."""
+    ports: Path
+    """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into`."""
+    scene: str = "liver"
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
+    compare: tuple[str, ...] = ()
+    """Other ports files, or arms to use on both sides: ranked in one table with the reasons."""
+    points: int = 500
+    """How many points of the organ are tried."""
+    seed: int = 0
+    """Of the points and of where the search for joints starts."""
+    out: Path = Path("runs/arms")
+    """Folder for the results."""
+
+
+@dataclass(frozen=True)
 class Organ:
     """Build an organ from a closed surface or a tetrahedral mesh, report on it, and write it."""
 
@@ -126,6 +151,7 @@ Command = (
     Annotated[Palpate, tyro.conf.subcommand("palpate")]
     | Annotated[Organ, tyro.conf.subcommand("organ")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Arms, tyro.conf.subcommand("arms")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
@@ -157,10 +183,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run(command: Palpate | Organ | Scenes | Validate | Bench) -> int:
+def _run(command: Palpate | Arms | Organ | Scenes | Validate | Bench) -> int:
     console = Console()
     if isinstance(command, Palpate):
         _palpate(command, console)
+    elif isinstance(command, Arms):
+        from surgsim_env.evaluation.arms_command import Request, report_arms
+
+        report_arms(Request(**vars(command)), console)
     elif isinstance(command, Validate):
         from surgsim_env.validation.command import validate
 
@@ -210,7 +240,7 @@ def _palpate(command: Palpate, console: Console) -> None:
             raise ValueError(f"--around {command.around}: the radius is {radius:g} m; it must be finite and above 0")
         around = Ball((x, y, z), radius)
     # Before the work: a place that cannot be written is better known now than after it.
-    folder = _writable_folder(command.out or _free_folder(scene.name), (CSV_NAME, SUMMARY_NAME, PICTURE_NAME))
+    folder = writable_folder(command.out or _free_folder(scene.name), (CSV_NAME, SUMMARY_NAME, PICTURE_NAME))
     found = run_palpation(
         anatomy, lesions=lesions, around=around, seed=command.seed, workers=command.workers, console=console
     )
@@ -291,19 +321,6 @@ def _unit(text: str) -> LengthUnit:
         return float(text)
     except ValueError:
         return text
-
-
-def _writable_folder(folder: Path, names: Sequence[str]) -> Path:
-    """The folder, made if need be, in which files of these names can be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise ValueError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
-    for name in names:
-        if (folder / name).is_dir():
-            raise ValueError(f"--out {folder}: {name} is a folder there; choose another place or remove it")
-    return folder
 
 
 def _free_folder(scene: str) -> Path:

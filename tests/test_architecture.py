@@ -166,16 +166,19 @@ def tasks_do_not_advance(source: Source) -> Iterator[str]:
 
 
 def arms_know_no_task(source: Source) -> Iterator[str]:
-    """An arm is an instrument: it knows neither tasks nor environments nor the simulation that holds it."""
-    if source.path.startswith("surgsim_env/arms/"):
+    """An arm is an instrument: it, and what evaluates it, know neither tasks nor environments nor a simulation."""
+    if source.path.startswith(("surgsim_env/arms/", "surgsim_env/evaluation/")):
         for name, line in imported(source.tree):
             if name.split(".")[0] == "gymnasium" or re.match(r"surgsim_env\.(tasks|env|vector_env|simulation)\b", name):
                 yield f"line {line} imports {name}"
 
 
 def pictures_are_asked_for(source: Source) -> Iterator[str]:
-    """Only environments and the command line draw: the simulation and its tasks do not know how they look."""
-    may = ("surgsim_env/rendering/", "surgsim_env/__init__.py", "surgsim_env/env.py", "surgsim_env/cli.py")
+    """Only environments, the command line and reports draw: the simulation and its tasks do not know how they look."""
+    may = (
+        *("surgsim_env/rendering/", "surgsim_env/__init__.py", "surgsim_env/env.py", "surgsim_env/cli.py"),
+        *("surgsim_env/evaluation/arms.py", "surgsim_env/evaluation/arm_pictures.py"),
+    )
     if not source.path.startswith(may):
         for name, line in imported(source.tree):
             if name.startswith("surgsim_env.rendering"):
@@ -266,6 +269,7 @@ PLANTED = [
     (arms_know_no_task, "surgsim_env/arms/arm.py", "def late():\n    import gymnasium"),
     (tasks_do_not_advance, "surgsim_env/rendering/stage.py", "mujoco.mj_step(model, data)"),
     (pictures_are_asked_for, "surgsim_env/simulation.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
+    (arms_know_no_task, "surgsim_env/evaluation/reach.py", "from surgsim_env.simulation import Simulation"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
     (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),

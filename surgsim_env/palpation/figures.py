@@ -13,12 +13,15 @@ from surgsim_env.palpation.felt import ContrastMap, Truth
 from surgsim_env.palpation.job import MODEL, Palpation
 from surgsim_env.palpation.surface_drawing import (
     FADE_TO,
+    INK,
+    PAPER,
     Patches,
     View,
     curved_patches,
+    draw_patches,
     interpolated,
     nearness,
-    shaded,
+    save_png,
     tube,
 )
 
@@ -29,7 +32,6 @@ if TYPE_CHECKING:
 TISSUE = np.array([0.80, 0.73, 0.68])
 LIVER = np.array([0.56, 0.20, 0.16])
 STEEL = np.array([0.80, 0.83, 0.88])
-INK, PAPER = "#20242c", "white"
 NIGHT = "#0e1117"
 COLOUR_MAP = "magma"
 # Where a glow may run out beyond the last sites, it ends this many site spacings from them.
@@ -57,7 +59,7 @@ def write_stiffness_map(palpation: Palpation, path: Path) -> None:
     for axes, one in zip((left, middle), palpation.maps, strict=True):
         _draw_map(figure, axes, palpation, one, patches, view)
     _draw_curves(right, palpation)
-    _save(figure, path)
+    save_png(figure, path)
 
 
 def write_organ_picture(palpation: Palpation, path: Path) -> None:
@@ -83,16 +85,16 @@ def write_organ_picture(palpation: Palpation, path: Path) -> None:
     radius = scene.instrument.tip_radius
     ball = site + normal * (radius - scene.palpation.press_depth)
     handle = -palpation.anatomy.face.approach
-    _draw_patches(axes, [(organ, colours, 0.30)], view)
+    draw_patches(axes, [(organ, colours, 0.30)], view)
     _mark_sites(axes, palpation, view, colour="white", alpha=0.35)
     parts = []
     for start, end, thickness in ((ball, ball, radius), (ball, ball + handle * 0.11, 0.004)):
         shape = curved_patches(*tube(start, end, thickness))
         parts.append((shape, np.broadcast_to(STEEL, (len(shape.corners), 3)), 0.55))
-    _draw_patches(axes, parts, view, zorder=3)
+    draw_patches(axes, parts, view, zorder=3)
     axes.set_aspect("equal")
     axes.margins(0.04)
-    _save(figure, path, facecolor=NIGHT)
+    save_png(figure, path, facecolor=NIGHT)
 
 
 def _draw_map(figure: Figure, axes: Axes, palpation: Palpation, one: ContrastMap, patches: Patches, view: View) -> None:
@@ -103,7 +105,7 @@ def _draw_map(figure: Figure, axes: Axes, palpation: Palpation, one: ContrastMap
     field, weight = _map_over(palpation, one, patches)
     tint = _colours(COLOUR_MAP, norm(field))
     colours = (1.0 - weight[:, None]) * TISSUE + weight[:, None] * tint
-    _draw_patches(axes, [(patches, colours, 0.10)], view)
+    draw_patches(axes, [(patches, colours, 0.10)], view)
     _mark_sites(axes, palpation, view, colour="white", alpha=0.55)
     for score in one.scores:
         _outline(axes, score.truth, view)
@@ -140,22 +142,6 @@ def _map_over(
 def _rows_in(rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     wanted = {tuple(sorted(row)) for row in chosen.tolist()}
     return np.array([tuple(sorted(row)) in wanted for row in rows.tolist()])
-
-
-def _draw_patches(axes: Axes, parts: list[tuple[Patches, FloatArray, float]], view: View, zorder: int = 1) -> None:
-    """Draw patches from the farthest to the nearest, those that face away left out."""
-    from matplotlib.collections import PolyCollection
-
-    corners = np.concatenate([patches.corners for patches, _, _ in parts])
-    colours = np.concatenate([shaded(colour, patches.normals, view, gloss) for patches, colour, gloss in parts])
-    normals = np.concatenate([patches.normals for patches, _, _ in parts])
-    order = np.argsort(corners.mean(axis=1) @ view.towards)
-    order = order[normals[order] @ view.towards > -0.15]
-    face = colours[order]
-    axes.add_collection(
-        PolyCollection(list(view.flat(corners[order])), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder)
-    )
-    axes.autoscale_view()
 
 
 def _mark_sites(axes: Axes, palpation: Palpation, view: View, *, colour: str, alpha: float) -> None:
@@ -235,10 +221,3 @@ def _colours(name: str, values: FloatArray) -> FloatArray:
     from matplotlib import colormaps
 
     return colormaps[name](np.asarray(values))[:, :3]
-
-
-def _save(figure: Figure, path: Path, facecolor: str = PAPER) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
-    figure.savefig(path, format="png", facecolor=facecolor)

@@ -54,7 +54,7 @@ def write_summary(palpation: Palpation, path: Path, inputs: Mapping[str, Any]) -
     forces = [press.force_peak for press in palpation.presses]
     summary = {
         "inputs": dict(inputs),
-        "versions": {"surgsim": _version(), "python": platform.python_version(), "numpy": np.__version__},
+        "versions": {"surgsim": package_version(), "python": platform.python_version(), "numpy": np.__version__},
         "seed": palpation.seed,
         "organ": {"nodes": mesh.node_count, "tets": mesh.tet_count, "anchored_nodes": len(palpation.anatomy.anchors)},
         "press": {
@@ -91,7 +91,7 @@ def write_summary(palpation: Palpation, path: Path, inputs: Mapping[str, Any]) -
         "wall_time_s": palpation.wall_time,
         "real_time_factor": palpation.simulated_time / palpation.wall_time,
     }
-    plain = _plain(summary)
+    plain = plain_json(summary)
     path.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return plain
 
@@ -181,23 +181,24 @@ def _felt_cells(one: ContrastMap, score: LesionScore) -> tuple[str, str, str]:
     return f"{x:.1f}, {y:.1f}, {z:.1f}", f"{score.error * 1e3:.1f}{mark}", contrast
 
 
-def _version() -> str:
+def package_version() -> str:
+    """Of this package, or "checkout" where it is not installed."""
     try:
         return version("surgsim")
     except PackageNotFoundError:
         return "checkout"
 
 
-def _plain(value: Any) -> Any:
-    """JSON's own types: arrays as lists, numbers that are not finite as None."""
+def plain_json(value: Any, digits: int = 7) -> Any:
+    """JSON's own types: arrays as lists, numbers rounded to digits after the point, None where they are not finite."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain_json(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [_plain(item) for item in value]
+        return [plain_json(item, digits) for item in value]
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, float | np.floating):
-        return round(float(value), 7) if math.isfinite(value) else None
+        return round(float(value), digits) if math.isfinite(value) else None
     if isinstance(value, np.integer):
         return int(value)
     return str(value) if isinstance(value, Path) else value

@@ -1,6 +1,10 @@
 """An organ's surface drawn without GL: curved, shaded triangles in orthographic projection, painted with a map."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -9,6 +13,11 @@ from scipy.spatial import KDTree
 from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.palpable_face import tangent_axes
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, PAPER = "#20242c", "white"
 # Each triangle is drawn as SPLITS^2, bent towards its corners' tangent planes by this share (Boubekeur & Alexa 2008).
 SPLITS = 4
 BEND = 0.6
@@ -28,7 +37,7 @@ class View:
     towards: FloatArray
 
     @classmethod
-    def along(cls, direction: FloatArray, up: FloatArray | None = None) -> "View":
+    def along(cls, direction: FloatArray, up: FloatArray | None = None) -> View:
         """The view along a direction; without `up`, as the raster of a palpable face lies."""
         towards = -np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
         if up is None:
@@ -52,8 +61,8 @@ class Patches:
     origin: IntArray
 
 
-def curved_patches(points: FloatArray, triangles: IntArray) -> Patches:
-    """A triangle surface as smaller, bent triangles, so that it looks as smooth as the organ it stands for."""
+def curved_patches(points: FloatArray, triangles: IntArray, splits: int = SPLITS) -> Patches:
+    """A triangle surface as splits^2 smaller, bent triangles each: as smooth as the organ it stands for."""
     corners = points[triangles]
     area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face_normal = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
@@ -64,7 +73,7 @@ def curved_patches(points: FloatArray, triangles: IntArray) -> Patches:
     normals = mean[triangles]
     sharp = np.einsum("fij,fj->fi", normals, face_normal) < CREASE_COSINE
     normals = np.where(sharp[:, :, None], face_normal[:, None], normals)
-    weights, small = _split_triangle(SPLITS)
+    weights, small = _split_triangle(splits)
     flat = np.einsum("wi,fij->fwj", weights, corners)
     offset = np.einsum("fwij,fij->fwi", flat[:, :, None] - corners[:, None], normals)
     bent = flat - np.einsum("wi,fwi,fij->fwj", weights, offset, normals)
@@ -148,3 +157,39 @@ def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray,
     outward = corners.mean(axis=1) - (start + np.clip((corners.mean(axis=1) - start) @ axis, 0, length)[:, None] * axis)
     triangles[(normal * outward).sum(axis=1) < 0.0] = triangles[(normal * outward).sum(axis=1) < 0.0][:, [0, 2, 1]]
     return vertices, triangles[keep].astype(np.int32)
+
+
+def draw_patches(
+    axes: Axes, parts: list[tuple[Patches, FloatArray, float]], view: View, zorder: int = 1, flatness: float = 0.0
+) -> None:
+    """Draw patches from the farthest to the nearest, those that face away left out.
+
+    Args:
+        axes: to draw in.
+        parts: patches, their colours (n, 3) and gloss.
+        view: of them.
+        zorder: matplotlib's.
+        flatness: 0 with the light's full shading, 1 in the colours as given.
+    """
+    from matplotlib.collections import PolyCollection
+
+    corners = np.concatenate([patches.corners for patches, _, _ in parts])
+    colours = np.concatenate([shaded(colour, patches.normals, view, gloss) for patches, colour, gloss in parts])
+    if flatness:
+        colours = flatness * np.concatenate([colour for _, colour, _ in parts]) + (1.0 - flatness) * colours
+    normals = np.concatenate([patches.normals for patches, _, _ in parts])
+    order = np.argsort(corners.mean(axis=1) @ view.towards)
+    order = order[normals[order] @ view.towards > -0.15]
+    face = colours[order]
+    axes.add_collection(
+        PolyCollection(list(view.flat(corners[order])), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder)
+    )
+    axes.autoscale_view()
+
+
+def save_png(figure: Figure, path: Path, facecolor: str = PAPER) -> None:
+    """Write a figure without GL or display; the same bytes for the same figure."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png", facecolor=facecolor)

@@ -1,0 +1,1 @@
+"""Evaluation: of robot arms on a patient's anatomy."""

@@ -1,0 +1,289 @@
+"""report.html: what an evaluation of two arms found, in one file that any browser shows, prints and reads aloud."""
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surgsim_env.evaluation.arm_maps import Picture
+from surgsim_env.evaluation.arm_quantities import (
+    DISTANCES,
+    QUANTITIES,
+    SHARE_DEFINITIONS,
+    Quantity,
+    median,
+    number_text,
+    share_text,
+    sides,
+    values_of,
+    verdict,
+    worse_of_both,
+)
+from surgsim_env.evaluation.arm_results import REASONS, ArmsEvaluation
+from surgsim_env.evaluation.arm_table import RANKING_RULE, Ranked, columns
+
+# Nothing is loaded from anywhere: the browser itself refuses it.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+STYLE = """
+:root { color-scheme: light; }
+body { margin: 0 auto; max-width: 72rem; padding: 1.5rem; color: #20242c; background: #fff;
+       font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-serif; }
+h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .75rem; }
+h2 { font-size: 1.25rem; margin: 2.25rem 0 .5rem; border-bottom: 1px solid #c9cdd4; padding-bottom: .2rem; }
+p, li { max-width: 60rem; }
+.verdict { font-size: 1.15rem; border-left: .3rem solid #0072b2; padding-left: 1rem; margin: 1rem 0; }
+nav ul { list-style: none; padding: 0; margin: 0; display: flex; flex-wrap: wrap; gap: .25rem 1.25rem; }
+a { color: #005a8f; }
+figure { margin: 1.25rem 0 1.75rem; }
+figcaption { max-width: 60rem; margin-top: .4rem; }
+figcaption b { display: block; }
+img { max-width: 100%; height: auto; display: block; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; margin: .75rem 0 1rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; font-weight: 600; padding-bottom: .35rem; }
+th, td { padding: .3rem .7rem; border-bottom: 1px solid #d9dce1; text-align: left; vertical-align: top; }
+thead th { border-bottom: 2px solid #20242c; vertical-align: bottom; }
+tbody th { font-weight: 500; }
+td.number, th.number { text-align: right; }
+td.number { white-space: nowrap; }
+td.wide { min-width: 14rem; }
+.group { border-left: 1px solid #d9dce1; }
+code, pre { font: .9rem/1.45 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; }
+pre { background: #f3f4f6; padding: .75rem 1rem; white-space: pre-wrap; overflow-wrap: anywhere; }
+td code { overflow-wrap: anywhere; }
+dt { font-weight: 600; margin-top: .6rem; }
+dd { margin: 0 0 0 1.25rem; max-width: 60rem; }
+@media print {
+  body { max-width: none; padding: 0; font-size: 10pt; }
+  nav { display: none; }
+  h2 { break-after: avoid; }
+  figure, tr, dt { break-inside: avoid; }
+  .scroll { overflow: visible; }
+  table { font-size: 8.5pt; }
+  th, td { padding: .15rem .35rem; }
+  a { color: inherit; text-decoration: none; }
+}
+"""
+
+
+def write_report(
+    evaluation: ArmsEvaluation,
+    path: Path,
+    *,
+    pictures: Sequence[Picture],
+    maps: Sequence[Picture],
+    command: str,
+    ranking: Sequence[Ranked] = (),
+) -> None:
+    """Write the report.
+
+    Args:
+        evaluation: what was found.
+        path: of the file; pictures and maps lie beside it, and are copied into it.
+        pictures: of the arms in the patient.
+        maps: heat maps.
+        command: that makes this report.
+        ranking: of several placements or robots; left out if there is none.
+    """
+    title = f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)"
+    sections = [
+        ("ranking", "Ranking", _ranking(ranking)) if ranking else None,
+        ("patient", "The arms in the patient", _figures(path.parent, pictures)),
+        ("maps", "Maps on the organ", _legend(evaluation) + _figures(path.parent, maps)),
+        ("numbers", "Numbers", _shares(evaluation) + _values(evaluation) + _pair(evaluation) + _reasons(evaluation)),
+        ("definitions", "What each figure means", _definitions()),
+        ("columns", "Columns of points.csv", _columns(evaluation)),
+        ("inputs", "Inputs, versions, seed", _inputs(evaluation.summary)),
+        ("command", "The command that made this report", f"<pre><code>{escape(command)}</code></pre>"),
+    ]
+    shown = [section for section in sections if section is not None and section[2]]
+    links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, heading, _ in shown)
+    body = "\n".join(
+        f'<section id="{name}" aria-labelledby="{name}-heading">\n<h2 id="{name}-heading">{escape(heading)}</h2>\n'
+        f"{content}\n</section>"
+        for name, heading, content in shown
+    )
+    path.write_text(
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n<style>{STYLE}</style>\n</head>\n<body>\n'
+        f'<header>\n<h1>{escape(title)}</h1>\n<p class="verdict">{escape(verdict(evaluation))}</p>\n'
+        f'<nav aria-label="Contents"><ul>{links}</ul></nav>\n</header>\n<main>\n{body}\n</main>\n</body>\n</html>\n',
+        encoding="utf-8",
+        newline="\n",
+    )
+
+
+def _figures(folder: Path, files: Sequence[Picture]) -> str:
+    figures = []
+    for one in files:
+        data = base64.b64encode((folder / one.name).read_bytes()).decode("ascii")
+        figures.append(
+            f'<figure>\n<img src="data:image/png;base64,{data}" alt="{escape(f"{one.title}. {one.description}")}">\n'
+            f"<figcaption><b>{escape(one.title)}</b> {escape(one.description)} "
+            f"<code>{escape(one.name)}</code></figcaption>\n</figure>"
+        )
+    return "\n".join(figures)
+
+
+def _legend(evaluation: ArmsEvaluation) -> str:
+    ports = (
+        " L, R and E in discs are the ports of the left arm, the right arm and the endoscope; dashed lines are the "
+        "ways into the body."
+        if evaluation.ports
+        else ""
+    )
+    inner = " Diamonds are targets inside the organ." if evaluation.inner.any() else ""
+    return (
+        "<p>Each map shows the organ as the endoscope sees it, and from behind if points were tried there. Dots are "
+        "the points that were tried; between them the colours are interpolated. Grey was not reached; on the palest "
+        f"parts no points were tried.{inner}{escape(ports)}</p>\n"
+    )
+
+
+def _table(caption: str, head: str, rows: Iterable[str]) -> str:
+    return (
+        f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(caption)}"><table>\n'
+        f"<caption>{escape(caption)}</caption>\n<thead>{head}</thead>\n<tbody>\n" + "\n".join(rows) + "\n</tbody>\n"
+        "</table></div>\n"
+    )
+
+
+def _heads(*names: str, numbers_from: int = 1) -> str:
+    cells = (
+        f'<th scope="col"{" class=number" if index >= numbers_from else ""}>{escape(name)}</th>'
+        for index, name in enumerate(names)
+    )
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _row(head: str, *cells: str, text: bool = False) -> str:
+    kind = "<td>" if text else '<td class="number">'
+    return (
+        f'<tr><th scope="row">{escape(head)}</th>' + "".join(f"{kind}{escape(cell)}</td>" for cell in cells) + "</tr>"
+    )
+
+
+def _shares(evaluation: ArmsEvaluation) -> str:
+    groups = [("on the surface", ~evaluation.inner), ("inside the organ", evaluation.inner)]
+    masks = [evaluation.left.reachable, evaluation.right.reachable, evaluation.both]
+    rows = [
+        _row(f"{name} ({int(group.sum())} points)", *(share_text(mask[group]) for mask in masks))
+        for name, group in groups
+        if group.any()
+    ]
+    return _table("Share of points reachable", _heads("points", "left arm", "right arm", "both at once"), rows)
+
+
+def _values(evaluation: ArmsEvaluation) -> str:
+    """Least, median and greatest of each quantity for each arm, and for the worse arm where both reach at once."""
+    groups = ("left arm", "right arm", "both at once, the worse arm")
+    top = "".join(f'<th scope="colgroup" colspan="3" class="group">{name}</th>' for name in groups)
+    names = '<th scope="col" class="number group">least</th><th scope="col" class="number">median</th>'
+    names += '<th scope="col" class="number">greatest</th>'
+    head = f'<tr><th scope="col" rowspan="2">figure</th>{top}</tr><tr>{names * 3}</tr>'
+    rows = []
+    for quantity in QUANTITIES:
+        kinds = [values_of(arm, quantity) for _, arm in sides(evaluation)]
+        kinds.append(worse_of_both(evaluation, quantity))
+        cells = "".join(_spread_cells(values, quantity) for values in kinds)
+        rows.append(f'<tr><th scope="row">{escape(quantity.label)}</th>{cells}</tr>')
+    return _table("Figures over the points that are reached", head, rows)
+
+
+def _spread_cells(values: np.ndarray, quantity: Quantity) -> str:
+    known = values[np.isfinite(values)]
+    least, most = (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+    shown = (quantity.text(value, with_unit=False) for value in (least, median(values), most))
+    kinds = ("number group", "number", "number")
+    return "".join(f'<td class="{kind}">{text}</td>' for kind, text in zip(kinds, shown, strict=True))
+
+
+def _pair(evaluation: ArmsEvaluation) -> str:
+    rows = []
+    for field, title, _ in DISTANCES:
+        values = getattr(evaluation, field)
+        known = values[np.isfinite(values)]
+        least, most = (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+        rows.append(_row(title, *(number_text(value, 1e3, 1) for value in (least, median(values), most))))
+    return _table("Between the two arms, in mm", _heads("figure", "least", "median", "greatest"), rows)
+
+
+def _reasons(evaluation: ArmsEvaluation) -> str:
+    rows = []
+    for index, reason in enumerate(REASONS):
+        masks = [arm.reason == index for _, arm in sides(evaluation)]
+        rows.append(_row(reason, *(f"{int(mask.sum())} ({share_text(mask)})" for mask in masks)))
+    return _table("Why points are not reached", _heads("first obstacle", "left arm, points", "right arm, points"), rows)
+
+
+def _ranking(ranking: Sequence[Ranked]) -> str:
+    head = (
+        '<tr><th scope="col">place</th><th scope="col">placement or robot</th><th scope="col" class="number">both</th>'
+        '<th scope="col" class="number">left</th><th scope="col" class="number">right</th>'
+        '<th scope="col" class="number">either</th><th scope="col" class="number">median clearance [mm]</th>'
+        '<th scope="col" class="number">worst clearance [mm]</th>'
+        '<th scope="col" class="number">smallest tip force [N]</th><th scope="col">reasons</th></tr>'
+    )
+    rows = []
+    for one in ranking:
+        shares = "".join(
+            f'<td class="number">{100.0 * share:.0f} %</td>' for share in (one.both, one.left, one.right, one.either)
+        )
+        rows.append(
+            f'<tr><td>{one.place}</td><th scope="row">{escape(one.name)}<br><small>{escape(one.what)}</small></th>'
+            f"{shares}"
+            f'<td class="number">{number_text(one.clearance, 1e3, 1)}</td>'
+            f'<td class="number">{number_text(one.worst_clearance, 1e3, 1)}</td>'
+            f'<td class="number">{number_text(one.force, 1.0, 2)}</td><td class="wide">{escape(one.reasons)}</td></tr>'
+        )
+    caption = "Placements and robots, the best first"
+    return (
+        f"<p>{escape(RANKING_RULE)} All else in this report is about the arms and ports of the command itself.</p>\n"
+        + (_table(caption, head, rows))
+    )
+
+
+def _definitions() -> str:
+    items = [("reachable", SHARE_DEFINITIONS[0][1]), ("both at once", SHARE_DEFINITIONS[1][1])]
+    items += [(quantity.label, quantity.definition) for quantity in QUANTITIES]
+    items += [(f"{title} [mm]", definition) for _, title, definition in DISTANCES]
+    items.append(
+        ("the worse arm", "At a point, the smaller of both arms' values where more is better, else the larger.")
+    )
+    return "<dl>\n" + "\n".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in items) + "\n</dl>"
+
+
+def _columns(evaluation: ArmsEvaluation) -> str:
+    rows = [
+        f'<tr><th scope="row"><code>{escape(one.name)}</code></th><td>{escape(one.meaning)}</td></tr>'
+        for one in columns(evaluation)
+    ]
+    text = "<p>One line for each point, in SI units (m, N, rad); a cell is empty where there is no value.</p>\n"
+    return text + _table("Columns", _heads("column", "meaning", numbers_from=2), rows)
+
+
+def _inputs(summary: Mapping[str, Any]) -> str:
+    tables = []
+    for key, caption in (("inputs", "Inputs"), ("versions", "Versions")):
+        rows = [
+            f'<tr><th scope="row">{escape(name)}</th><td><code>{escape(value)}</code></td></tr>'
+            for name, value in _flat(summary.get(key, {}))
+        ]
+        if rows:
+            tables.append(_table(caption, _heads("what", "value", numbers_from=2), rows))
+    return f"<p>Seed: <code>{escape(str(summary.get('seed')))}</code></p>\n" + "".join(tables)
+
+
+def _flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        for key in sorted(value, key=str):
+            yield from _flat(value[key], f"{name}, {key}" if name else str(key))
+    elif isinstance(value, list | tuple):
+        yield name, ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in value)
+    else:
+        yield name, f"{value:g}" if isinstance(value, float) else str(value)

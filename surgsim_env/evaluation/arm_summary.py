@@ -1,0 +1,146 @@
+"""The figures of an evaluation in plain numbers: what summary.json holds, and what ports are ranked by."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.evaluation.approach import APPROACH_ANGLE, DIRECTION_COUNT
+from surgsim_env.evaluation.arm_results import REASONS, ArmReach
+from surgsim_env.evaluation.both_arms import ARM_DISTANCE, BothArms
+from surgsim_env.evaluation.candidates import REACHED
+from surgsim_env.evaluation.collisions import MEETING_ZONE, TIP_ZONE
+from surgsim_env.evaluation.dexterity import CHARACTERISTIC_LENGTH
+from surgsim_env.evaluation.ports import InnerTarget, Ports
+from surgsim_env.evaluation.reach import Sites
+
+# Quantities of an arm whose least, median and greatest values are told.
+QUANTITIES = (
+    *("approach_share", "manipulability", "isotropy", "limit_margin", "tip_force", "trocar_load", "camera_angle"),
+    *("organ_clearance", "wall_clearance", "trocar_error"),
+)
+
+
+def summarise(
+    sites: Sites,
+    left: ArmReach,
+    right: ArmReach,
+    both: BothArms,
+    targets: Sequence[InnerTarget],
+    inputs: Mapping[str, Any],
+    seed: int,
+) -> dict[str, Any]:
+    """Shares, extremes, targets, versions, seed and inputs; SI units; the same run gives the same text."""
+    outer = ~sites.inner
+    summary = {
+        "points": int(outer.sum()),
+        "reachable": {
+            "left": _share(left.reachable[outer]),
+            "right": _share(right.reachable[outer]),
+            "either": _share((left.reachable | right.reachable)[outer]),
+            "both": _share(both.reachable[outer]),
+        },
+        "left": _arm(left, outer),
+        "right": _arm(right, outer),
+        "arm_distance_inside": _extremes(both.inside[outer]),
+        "arm_distance_outside": _extremes(both.outside[outer]),
+        "targets": _targets(sites, left, right, both, targets),
+        "rules": {
+            "reached_within": REACHED,
+            "approach_directions": DIRECTION_COUNT,
+            "approach_angle": APPROACH_ANGLE,
+            "characteristic_length": CHARACTERISTIC_LENGTH,
+            "tip_zone": TIP_ZONE,
+            "meeting_zone": MEETING_ZONE,
+            "arm_distance": ARM_DISTANCE,
+        },
+        "versions": _versions(),
+        "seed": seed,
+        "inputs": dict(inputs),
+    }
+    return {**summary, "ranking": _ranking(left, right, both, outer)}
+
+
+def ranking_key(summary: Mapping[str, Any]) -> tuple[float, ...]:
+    """What ports are sorted by, the best first: share reached by both, by either, approaches, isotropy, arms apart."""
+    return tuple(-(value if value is not None else -1.0) for value in summary["ranking"].values())
+
+
+def plain_ports(ports: Ports) -> dict[str, Any]:
+    """Ports as plain JSON types."""
+    return _plain(asdict(ports))
+
+
+def _ranking(left: ArmReach, right: ArmReach, both: BothArms, outer: np.ndarray) -> dict[str, float | None]:
+    """Key figures, the most important first, more is better in all of them."""
+    approaches = np.nan_to_num(np.stack([left.approach_share[outer], right.approach_share[outer]]))
+    gaps = np.fmin(both.inside, both.outside)[outer & both.reachable]
+    return {
+        "both_share": _share(both.reachable[outer]),
+        "either_share": _share((left.reachable | right.reachable)[outer]),
+        "approach_share": float(approaches.mean()) if approaches.size else None,
+        "isotropy_median": _median(np.concatenate([left.isotropy[outer], right.isotropy[outer]])),
+        "arm_distance_median": _median(gaps),
+    }
+
+
+def _arm(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
+    counts = {reason: int((arm.reason[outer] == index).sum()) for index, reason in enumerate(REASONS)}
+    return {
+        "arm": arm.name,
+        "reasons": counts,
+        **{name: _extremes(getattr(arm, name)[outer]) for name in QUANTITIES},
+    }
+
+
+def _targets(
+    sites: Sites, left: ArmReach, right: ArmReach, both: BothArms, targets: Sequence[InnerTarget]
+) -> list[dict[str, Any]]:
+    rows = np.flatnonzero(sites.inner)
+    return [
+        {
+            "name": target.name,
+            "point": list(target.point),
+            "left": REASONS[left.reason[row]],
+            "right": REASONS[right.reason[row]],
+            "both": bool(both.reachable[row]),
+        }
+        for row, target in zip(rows, targets, strict=True)
+    ]
+
+
+def _extremes(values: FloatArray) -> dict[str, float | None]:
+    known = values[np.isfinite(values)]
+    if known.size == 0:
+        return {"least": None, "median": None, "greatest": None}
+    return {"least": float(known.min()), "median": float(np.median(known)), "greatest": float(known.max())}
+
+
+def _median(values: FloatArray) -> float | None:
+    return _extremes(values)["median"]
+
+
+def _share(flags: np.ndarray) -> float | None:
+    return float(flags.mean()) if flags.size else None
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in ("surgsim", "numpy", "scipy", "mujoco"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return value

@@ -141,13 +141,17 @@ def _setup(request: Request, anatomy: Anatomy) -> Setup:
 def _compared(source: str, request: Request, anatomy: Anatomy) -> Setup:
     """What a file of --compare stands for: other ports for the same arms, or an arm on both sides at the same ports."""
     path = Path(source)
-    if path.suffix == ".toml" and PORT_TABLES & read_toml(path, "--compare").keys():
+    if _is_ports_file(source):
         left, right = _read("--left", request.left), _read("--right", request.right)
         ports = _checked_ports(path, anatomy)
         return _placed(path.name, f"ports, with {left.name} left, {right.name} right", left, right, ports, anatomy)
     arm = _read("--compare", source)
     ports = _checked_ports(request.ports, anatomy)
     return _placed(path.name, f"arm on both sides, at the ports of {request.ports.name}", arm, arm, ports, anatomy)
+
+
+def _is_ports_file(source: str) -> bool:
+    return source.endswith(".toml") and bool(PORT_TABLES & read_toml(Path(source), "--compare").keys())
 
 
 def _placed(name: str, what: str, left: ArmDescription, right: ArmDescription, ports: Ports, anatomy: Anatomy) -> Setup:
@@ -192,12 +196,12 @@ def _summary(evaluation: ArmsEvaluation, request: Request, ranking: Sequence[Ran
     clearance, what = worst_clearance(evaluation)
     force = extreme(evaluation, "tip_force")
     inputs: dict[str, Any] = {
-        "scene": _shown(request.scene),
+        "scene": _shown(request.scene) if not request.scene.endswith(".toml") else _file_input(Path(request.scene)),
         "points": request.points,
         "left": _arm_input(request.left),
         "right": _arm_input(request.right),
         "ports": {"file": _shown(request.ports), **read_toml(request.ports, "ports")},
-        "compare": [_shown(one) for one in request.compare],
+        "compare": [_compared_input(one) for one in request.compare],
     }
     own = {
         "versions": {
@@ -222,11 +226,23 @@ def _table(summary: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
+def _compared_input(source: str) -> dict[str, str]:
+    return _file_input(Path(source)) if _is_ports_file(source) else _arm_input(source)
+
+
+def _file_input(path: Path) -> dict[str, str]:
+    return {"file": _shown(path), path.name: _checksum(path)}
+
+
+def _checksum(path: Path) -> str:
+    return f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+
+
 def _arm_input(source: str) -> dict[str, str]:
     """An arm's name with the checksums of its files: they say what ran, wherever the files were."""
     description = read_description(source)
     files = (description.folder / f"{description.name}.toml", description.folder / description.model)
-    sums = {file.name: f"sha256 {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files}
+    sums = {file.name: _checksum(file) for file in files}
     return {"arm": _shown(source), **sums}
 
 

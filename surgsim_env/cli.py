@@ -86,8 +86,9 @@ class Arms:
     """The left arm: a shipped arm's name (psm_grasper, psm_palpator, six_axis) or a TOML file (docs/arms.md)."""
     right: str
     """The right arm, likewise."""
-    ports: Path
-    """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into`."""
+    ports: Path | None = None
+    """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into` or `target`; without one
+    the ports stand as laparoscopy places them (docs/evaluation.md)."""
     scene: str = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     compare: tuple[str, ...] = ()

@@ -276,14 +276,18 @@ def _inputs(summary: Mapping[str, Any]) -> str:
         ]
         if rows:
             tables.append(_table(caption, _heads("what", "value", numbers_from=2), rows))
-    return f"<p>Seed: <code>{escape(str(summary.get('seed')))}</code></p>\n" + "".join(tables)
+    seed = escape(str(summary.get("seed")))
+    return f"<p>Seed: <code>{seed}</code>. Lengths of the inputs are metres, angles radians.</p>\n" + "".join(tables)
 
 
 def _flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
     if isinstance(value, Mapping):
         for key in sorted(value, key=str):
             yield from _flat(value[key], f"{name}, {key}" if name else str(key))
+    elif isinstance(value, list | tuple) and any(isinstance(item, Mapping) for item in value):
+        for number, item in enumerate(value, start=1):
+            yield from _flat(item, f"{name} {number}")
     elif isinstance(value, list | tuple):
-        yield name, ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in value)
+        yield name, ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in value) or "none"
     else:
         yield name, f"{value:g}" if isinstance(value, float) else str(value)

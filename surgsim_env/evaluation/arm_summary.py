@@ -36,7 +36,7 @@ def summarise(
 ) -> dict[str, Any]:
     """Shares, extremes, targets, versions, seed and inputs; SI units; the same run gives the same text."""
     outer = ~sites.inner
-    summary = {
+    return {
         "points": int(outer.sum()),
         "reachable": {
             "left": _share(left.reachable[outer]),
@@ -62,30 +62,11 @@ def summarise(
         "seed": seed,
         "inputs": dict(inputs),
     }
-    return {**summary, "ranking": _ranking(left, right, both, outer)}
-
-
-def ranking_key(summary: Mapping[str, Any]) -> tuple[float, ...]:
-    """What ports are sorted by, the best first: share reached by both, by either, approaches, isotropy, arms apart."""
-    return tuple(-(value if value is not None else -1.0) for value in summary["ranking"].values())
 
 
 def plain_ports(ports: Ports) -> dict[str, Any]:
     """Ports as plain JSON types."""
     return _plain(asdict(ports))
-
-
-def _ranking(left: ArmReach, right: ArmReach, both: BothArms, outer: np.ndarray) -> dict[str, float | None]:
-    """Key figures, the most important first, more is better in all of them."""
-    approaches = np.nan_to_num(np.stack([left.approach_share[outer], right.approach_share[outer]]))
-    gaps = np.fmin(both.inside, both.outside)[outer & both.reachable]
-    return {
-        "both_share": _share(both.reachable[outer]),
-        "either_share": _share((left.reachable | right.reachable)[outer]),
-        "approach_share": float(approaches.mean()) if approaches.size else None,
-        "isotropy_median": _median(np.concatenate([left.isotropy[outer], right.isotropy[outer]])),
-        "arm_distance_median": _median(gaps),
-    }
 
 
 def _arm(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
@@ -118,10 +99,6 @@ def _extremes(values: FloatArray) -> dict[str, float | None]:
     if known.size == 0:
         return {"least": None, "median": None, "greatest": None}
     return {"least": float(known.min()), "median": float(np.median(known)), "greatest": float(known.max())}
-
-
-def _median(values: FloatArray) -> float | None:
-    return _extremes(values)["median"]
 
 
 def _share(flags: np.ndarray) -> float | None:

@@ -24,7 +24,7 @@ from surgsim_env.evaluation.arm_report import write_report
 from surgsim_env.evaluation.arm_results import ArmsEvaluation
 from surgsim_env.evaluation.arm_table import Candidate, Ranked, rank, write_points
 from surgsim_env.evaluation.arms import evaluate_arms
-from surgsim_env.evaluation.ports import Ports, read_ports
+from surgsim_env.evaluation.ports import Ports, default_ports, read_ports
 from surgsim_env.out_folder import writable_folder
 from surgsim_env.palpation.report import package_version, plain_json
 from surgsim_env.scenes import Scene, load_scene, make_scene
@@ -43,7 +43,7 @@ class Request:
     scene: str
     left: str
     right: str
-    ports: Path
+    ports: Path | None
     compare: tuple[str, ...]
     points: int
     seed: int
@@ -122,7 +122,9 @@ def evaluate(setup: Setup, anatomy: Anatomy, request: Request, console: Console,
 def command_text(request: Request) -> str:
     """The command that makes the same report, but for --out; files outside the working folder by their names alone."""
     words = ["surgsim", "arms", "--scene", _shown(request.scene), "--left", _shown(request.left)]
-    words += ["--right", _shown(request.right), "--ports", _shown(request.ports)]
+    words += ["--right", _shown(request.right)]
+    if request.ports is not None:
+        words += ["--ports", _shown(request.ports)]
     if request.compare:
         words += ["--compare", *map(_shown, request.compare)]
     return shlex.join([*words, "--points", str(request.points), "--seed", str(request.seed)])
@@ -135,19 +137,23 @@ def _scene(name: str) -> Scene:
 def _setup(request: Request, anatomy: Anatomy) -> Setup:
     ports = _checked_ports(request.ports, anatomy)
     left, right = _read("--left", request.left), _read("--right", request.right)
-    return _placed(request.ports.name, f"{left.name} left, {right.name} right, as given", left, right, ports, anatomy)
+    return _placed(_ports_name(request), f"{left.name} left, {right.name} right, as given", left, right, ports, anatomy)
 
 
 def _compared(source: str, request: Request, anatomy: Anatomy) -> Setup:
     """What a file of --compare stands for: other ports for the same arms, or an arm on both sides at the same ports."""
     path = Path(source)
-    if path.suffix == ".toml" and PORT_TABLES & read_toml(path, "--compare").keys():
+    if _is_ports_file(source):
         left, right = _read("--left", request.left), _read("--right", request.right)
         ports = _checked_ports(path, anatomy)
         return _placed(path.name, f"ports, with {left.name} left, {right.name} right", left, right, ports, anatomy)
     arm = _read("--compare", source)
     ports = _checked_ports(request.ports, anatomy)
-    return _placed(path.name, f"arm on both sides, at the ports of {request.ports.name}", arm, arm, ports, anatomy)
+    return _placed(path.name, f"arm on both sides, at the ports of {_ports_name(request)}", arm, arm, ports, anatomy)
+
+
+def _is_ports_file(source: str) -> bool:
+    return source.endswith(".toml") and bool(PORT_TABLES & read_toml(Path(source), "--compare").keys())
 
 
 def _placed(name: str, what: str, left: ArmDescription, right: ArmDescription, ports: Ports, anatomy: Anatomy) -> Setup:
@@ -163,13 +169,25 @@ def _read(option: str, source: str) -> ArmDescription:
         raise ValueError(f"{option}: {error}") from None
 
 
-def _checked_ports(path: Path, anatomy: Anatomy) -> Ports:
+def _ports_name(request: Request) -> str:
+    return "default ports" if request.ports is None else request.ports.name
+
+
+def _checked_ports(path: Path | None, anatomy: Anatomy) -> Ports:
+    if path is None:
+        return default_ports(anatomy)
     ports = read_ports(path)
     try:
         ports.check_outside(anatomy)
     except ValueError as error:
         raise ValueError(f"ports file {path.name}: {error}") from None
     return ports
+
+
+def _ports_input(path: Path | None, evaluation: ArmsEvaluation) -> dict[str, Any]:
+    if path is None:
+        return dict(_table(_table(dict(evaluation.summary), "inputs"), "ports"))
+    return {"file": _shown(path), **read_toml(path, "ports")}
 
 
 def _by_name(ports: Ports) -> dict[str, Port]:
@@ -192,12 +210,12 @@ def _summary(evaluation: ArmsEvaluation, request: Request, ranking: Sequence[Ran
     clearance, what = worst_clearance(evaluation)
     force = extreme(evaluation, "tip_force")
     inputs: dict[str, Any] = {
-        "scene": _shown(request.scene),
+        "scene": _shown(request.scene) if not request.scene.endswith(".toml") else _file_input(Path(request.scene)),
         "points": request.points,
         "left": _arm_input(request.left),
         "right": _arm_input(request.right),
-        "ports": {"file": _shown(request.ports), **read_toml(request.ports, "ports")},
-        "compare": [_shown(one) for one in request.compare],
+        "ports": _ports_input(request.ports, evaluation),
+        "compare": [_compared_input(one) for one in request.compare],
     }
     own = {
         "versions": {
@@ -222,11 +240,23 @@ def _table(summary: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
+def _compared_input(source: str) -> dict[str, str]:
+    return _file_input(Path(source)) if _is_ports_file(source) else _arm_input(source)
+
+
+def _file_input(path: Path) -> dict[str, str]:
+    return {"file": _shown(path), path.name: _checksum(path)}
+
+
+def _checksum(path: Path) -> str:
+    return f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+
+
 def _arm_input(source: str) -> dict[str, str]:
     """An arm's name with the checksums of its files: they say what ran, wherever the files were."""
     description = read_description(source)
     files = (description.folder / f"{description.name}.toml", description.folder / description.model)
-    sums = {file.name: f"sha256 {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files}
+    sums = {file.name: _checksum(file) for file in files}
     return {"arm": _shown(source), **sums}
 
 

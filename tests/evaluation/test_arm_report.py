@@ -261,6 +261,16 @@ def test_the_page_says_the_verdict_first_and_what_it_was_made_from(evaluation, p
     assert "Seed: 0" in text and page.row("numpy")[1] == np.__version__ and page.row("points", -1)[1] == "120"
 
 
+def test_inputs_are_told_whatever_their_shape(evaluation, tmp_path):
+    inputs = {"targets": [{"name": "a", "point": [0.1, 0.2]}, {"name": "b"}], "compare": [], "ports": {"hole": 0.03}}
+    write_report(
+        replace(evaluation, summary={"inputs": inputs}), tmp_path / "r.html", pictures=[], maps=[], command="surgsim"
+    )
+    page = Page((tmp_path / "r.html").read_text(encoding="utf-8"))
+    assert page.row("targets 1, point")[1] == "0.1, 0.2" and page.row("targets 2, name")[1] == "b"
+    assert page.row("compare")[1] == "none" and page.row("ports, hole")[1] == "0.03"
+
+
 def test_every_map_is_a_picture_with_something_in_it(folder):
     from matplotlib.image import imread
 

@@ -11,7 +11,6 @@ from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.arms.arm import load_arm
 from surgsim_env.arms.description import read_description
 from surgsim_env.evaluation.arm_results import ArmReach
-from surgsim_env.evaluation.arm_summary import ranking_key
 from surgsim_env.evaluation.arms import evaluate_arms
 from surgsim_env.evaluation.collisions import TIP_ZONE
 from surgsim_env.evaluation.ports import (
@@ -298,15 +297,15 @@ def test_no_point_faces_ports_below_the_tray(phantom):
         facing_points(phantom, np.array([[0.03, 0.03, -0.2]]), 10, 0)
 
 
-def test_ports_further_off_rank_lower(phantom, found):
-    """From 24 cm above nothing is reached: it ranks below the default ports."""
+def test_ports_too_far_off_reach_nothing(phantom, found):
+    """From 30 cm above nothing is reached."""
     up = table(
         left={"point": [-0.05, 0.03, 0.33], "target": [0.03, 0.03, 0.03]},
         right={"point": [0.11, 0.03, 0.33], "target": [0.03, 0.03, 0.03]},
     )
     far = evaluate_arms(phantom, "psm_palpator", "psm_grasper", ports_from_table(up, name="far"), count=5)
     assert far.summary["reachable"]["either"] == 0.0
-    assert ranking_key(found.summary) < ranking_key(far.summary)
+    assert found.summary["reachable"]["either"] > 0.5
 
 
 def test_progress_is_told(phantom):

@@ -131,6 +131,9 @@ def test_compare_ranks_ports_and_robots(folder, made, capsys):
     ranking = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))["compared"]
     assert [one["name"] for one in ranking] == ["wide.toml", "ports.toml", "six_axis"]
     assert [one["place"] for one in ranking] == [1, 2, 3]
+    inputs = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))["inputs"]["compare"]
+    assert inputs[0]["file"] == "wide.toml" and inputs[0]["wide.toml"].startswith("sha256 ")
+    assert inputs[1]["arm"] == "six_axis" and inputs[1]["six_axis.xml"].startswith("sha256 ")
     setups = [setup for setup, _ in made]
     assert [(one.left.description.name, one.right.description.name) for one in setups] == [
         *[("psm_grasper", "psm_palpator")] * 2,

@@ -235,7 +235,18 @@ def test_a_bad_option_is_refused_in_one_line(folder, made, capsys, more, message
 
 
 def test_a_missing_option_is_refused_in_one_line(capsys):
-    refused(["arms", "--left", "psm_grasper", "--right", "psm_grasper"], "--ports", capsys)
+    refused(["arms", "--left", "psm_grasper"], "--right", capsys)
+
+
+def test_without_a_ports_file_they_stand_as_laparoscopy_places_them(folder, made):
+    given = arguments()
+    del given[given.index("--ports") : given.index("--ports") + 2]
+    assert main(given) == 0
+    setup, _ = made[0]
+    ports = default_ports(load_anatomy(make_scene("phantom")))
+    assert setup.name == "default ports" and setup.ports == ports
+    report = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert "default ports" in report and "--ports" not in report
 
 
 def test_help_says_what_it_does(capsys):

@@ -186,6 +186,11 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         """
         return self._view.renderer(self._lesions())
 
+    @property
+    def observation(self) -> Observation:
+        """The last observation that reset or step gave."""
+        return self._observation.copy()
+
     def close(self) -> None:
         """Close the window and give back the graphics; more than once is no harm."""
         self._view.close()

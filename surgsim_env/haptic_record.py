@@ -1,5 +1,7 @@
 """What a simulation felt and where its tip was, haptic step by haptic step."""
 
+from bisect import bisect_left
+
 import mujoco
 import numpy as np
 
@@ -22,6 +24,7 @@ class HapticRecord:
         self._wrench: list[FloatArray] = []
         self._position: list[FloatArray] = []
         self._orientation: list[FloatArray] = []
+        self._touching: list[int] = []
 
     def __len__(self) -> int:
         return len(self._time)
@@ -31,6 +34,8 @@ class HapticRecord:
         self._data.qpos[:] = self.instrument.data.qpos
         mujoco.mj_kinematics(self.instrument.model, self._data)
         position, orientation = self.instrument.tip_pose_in(self._data)
+        if wrench.any():
+            self._touching.append(len(self))
         self._time.append(time)
         self._wrench.append(wrench.copy())
         self._position.append(position)
@@ -38,7 +43,8 @@ class HapticRecord:
 
     def first_contact(self, start: int = 0) -> int | None:
         """Index of the first step from `start` on in which a tool felt the tissue; None where none did."""
-        return next((index for index in range(start, len(self)) if self._wrench[index].any()), None)
+        later = bisect_left(self._touching, start)
+        return self._touching[later] if later < len(self._touching) else None
 
     @property
     def time(self) -> FloatArray:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from surgsim_env.env import PalpateEnv
 from surgsim_env.haptic_record import HapticRecord
 from surgsim_env.scripting.steps import Control, Script, Step, StepFailed
-from surgsim_env.scripting.trace import StepInterval, Trace
+from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
 from surgsim_env.scripting.view import Action, View, look
 
 
@@ -116,7 +116,7 @@ class _Run:
             wrench=record.wrench,
             tip_position=record.tip_position,
             tip_orientation=record.tip_orientation,
-            depth=self._depth(),
+            depth=contact_depth(record.wrench, record.tip_position, simulation.anatomy.face.approach),
             control_time=np.array(self.times),
             observation=np.array(self.observations) if self.times else np.zeros((0, *shapes[0])),
             action=np.array(self.actions) if self.times else np.zeros((0, *shapes[1])),
@@ -128,12 +128,6 @@ class _Run:
             truncated=self.truncated,
             failure=failure,
         )
-
-    def _depth(self) -> NDArray[np.float64]:
-        along, places = self.inner.simulation.anatomy.face.approach, self.record.tip_position
-        if not len(places):
-            return np.zeros(0)
-        return (places - places[self.record.first_contact() or 0]) @ along
 
     def _look(self, began: float, first: int) -> View:
         simulation, touched = self.inner.simulation, self.record.first_contact(first)
@@ -178,6 +172,10 @@ def _names(script: Sequence[Step]) -> list[str]:
     names: list[str] = []
     for step in script:
         base = step.name or type(step).__name__
+        if not base.isprintable():
+            raise ValueError(
+                f"a step is called {base!r}; tables hold a name in one line: leave out what does not print"
+            )
         count = sum((other.name or type(other).__name__) == base for other in script[: len(names)])
         if step.name and step.name in names:
             raise ValueError(f"two steps are called {step.name!r}; the trace is cut by names: give each its own")

@@ -21,6 +21,8 @@ Predicate = Callable[[View], bool]
 APPROACH_GAIN = 0.6
 # A press counts as having used up its depth this close to it [m].
 DEPTH_SLACK = 2e-5
+# Stiffness is read off motions longer than this [m]: over shorter ones the sensor's noise would pass for it.
+TRAVEL_READ = 1e-4
 
 
 class StepFailed(Exception):
@@ -121,7 +123,7 @@ class PressUntil:
             before, place = felt, view.tip_position
             view = yield view.action(along * speed)
             travel = float((view.tip_position - place) @ along)
-            if travel > 0.0:
+            if travel > TRAVEL_READ:
                 stiffness = max(stiffness, (view.pressing_force(along, sensed=self.sensed) - before) / travel)
 
 
@@ -173,7 +175,7 @@ class Lift:
 class WaitUntil:
     """Keep the tip still until `predicate(view)` is true; fails after `timeout` [s]."""
 
-    predicate: Predicate
+    predicate: Predicate = field(repr=False)
     timeout: float
     name: str = ""
     ends_episode: bool = field(default=False, init=False, repr=False)
@@ -215,9 +217,9 @@ class Control:
     Without `until` it acts for `timeout`, which is then no failure.
     """
 
-    controller: Callable[[np.ndarray], Action]
+    controller: Callable[[np.ndarray], Action] = field(repr=False)
     timeout: float
-    until: Predicate | None = None
+    until: Predicate | None = field(default=None, repr=False)
     name: str = ""
     ends_episode: bool = field(default=True, init=False, repr=False)
     speed: float = field(default=0.0, init=False, repr=False)

@@ -32,7 +32,7 @@ class Trace:
         wrench: tissue's mean force [N], torque about the centre of mass [N m] on each tool               (n, n_tool, 6)
         tip_position: centre of the tip ball [m]                                                          (n, 3)
         tip_orientation: unit quaternion (w, x, y, z), the tip's axes in the world                        (n, 4)
-        depth: of the tip past its first contact in the run, along the approach [m]; above it negative    (n,)
+        depth: how far the tip is past where the present contact began, along the approach [m]; 0 without contact  (n,)
         control_time: end of each control step [s]                                                        (m,)
         observation, action, reward: after, in and for each control step                    (m, n_obs), (m, n_act), (m,)
         infos: of each control step
@@ -138,6 +138,21 @@ class Trace:
         if name not in names:
             raise ValueError(f"no step {name!r} was run; the steps are {', '.join(map(repr, names)) or 'none'}")
         return names.index(name)
+
+
+def contact_depth(wrench: FloatArray, tip_position: FloatArray, approach: FloatArray) -> FloatArray:
+    """How far the tip is past where the present contact began, along the approach [m]; 0 without contact, (n,).
+
+    Args:
+        wrench: on each tool at each haptic step [N, N m], shape (n, n_tool, 6).
+        tip_position: [m], shape (n, 3).
+        approach: unit vector, shape (3,).
+    """
+    touching = np.asarray(wrench.any(axis=(1, 2)))
+    along = tip_position @ approach
+    began = touching & ~np.concatenate([[False], touching[:-1]])
+    origin = np.maximum.accumulate(np.where(began, np.arange(len(along)), 0))
+    return np.where(touching, along - along[origin], 0.0)
 
 
 def _within(times: FloatArray, start: float, stop: float) -> slice:

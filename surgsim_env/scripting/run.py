@@ -136,9 +136,12 @@ class _Run:
 
     def _take(self, action: Action, name: str, *, checked: bool) -> None:
         values = np.asarray(action, dtype=np.float32)
-        if checked:
-            _check_unchanged(self.env, values, name)
         observation, reward, terminated, truncated, info = self.env.step(values)
+        if checked and not np.array_equal(self.inner.last_action, values):
+            raise ValueError(
+                f"a wrapper in {self.env} changes the actions of step {name!r}: run the script on the environment "
+                "inside it, or put what the wrapper takes into a Control step"
+            )
         self.observation = np.array(observation)
         self.terminated, self.truncated = bool(terminated), bool(truncated)
         self.times.append(self.inner.simulation.time)
@@ -190,15 +193,3 @@ def _check_speeds(script: Sequence[Step], names: Sequence[str], inner: PalpateEn
                 f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
                 f"{inner.task.speed_limit:g} m/s: ask for that or less"
             )
-
-
-def _check_unchanged(env: gym.Env, action: Action, name: str) -> None:
-    """A wrapper that changes actions would make a step do something else than it says."""
-    layer = env
-    while isinstance(layer, gym.Wrapper):
-        if isinstance(layer, gym.ActionWrapper) and not np.array_equal(layer.action(action), action):
-            raise ValueError(
-                f"the wrapper {type(layer).__name__} changes the action of step {name!r}: run the script on the "
-                "environment inside it, or put the wrapper's mapping into a Control step"
-            )
-        layer = layer.env

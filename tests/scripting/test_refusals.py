@@ -136,10 +136,18 @@ def test_a_speed_that_no_action_asks_for(env):
     assert env.unwrapped.simulation.time == 0.0
 
 
+class Halved(gym.Wrapper):
+    def step(self, action):
+        return self.env.step(0.5 * action)
+
+
 def test_a_wrapper_that_changes_actions(env):
     changed = gym.wrappers.RescaleAction(env, np.float32(-2.0), np.float32(2.0))
-    with pytest.raises(ValueError, match="RescaleAction changes the action of step 'Lift'"):
+    with pytest.raises(ValueError, match=r"a wrapper in <RescaleAction.* changes the actions of step 'Lift'"):
         run_script(changed, [Lift(0.01)], seed=0)
+    # Whatever kind of wrapper it is.
+    with pytest.raises(ValueError, match="a wrapper in <Halved"):
+        run_script(Halved(env), [Lift(0.01)], seed=0)
     # One that leaves them as they are is none, and a controller speaks the wrapper's language.
     run_script(gym.wrappers.ClipAction(env), [Lift(0.001)], seed=0)
     trace = run_script(changed, [Control(lambda seen: np.array([0.0, 0.0, 1.0, 0.0]), timeout=0.5)], seed=0)

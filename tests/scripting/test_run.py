@@ -82,6 +82,15 @@ def test_what_a_wrapper_makes_of_observations_is_what_a_controller_sees():
     assert (seen[-1] == mine).all()
 
 
+def test_every_environment_has_an_oracle():
+    ids = [env_id for env_id in gym.registry if env_id.startswith("SurgSim/")]
+    assert ids
+    for env_id in ids:
+        env = gym.make(env_id)
+        env.reset(seed=0)
+        assert oracle_script(env)
+
+
 CASES = [("phantom", "probe"), ("phantom", "psm_palpator"), ("liver", "probe"), ("liver", "psm_palpator")]
 
 

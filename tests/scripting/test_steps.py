@@ -97,8 +97,8 @@ def test_move_to_goes_straight_and_no_faster_than_told(instrument):
     env = above(instrument, gap=0.01)
     start = env.unwrapped.simulation.instrument.tip_position
     goal = start + np.array([0.008, -0.006, 0.004])
-    trace = run_script(env, [MoveTo(tuple(goal), speed=0.015, tolerance=0.0003)])
-    assert np.linalg.norm(trace.tip_position[-1] - goal) <= 0.0003
+    trace = run_script(env, [MoveTo(tuple(goal), speed=0.015, tolerance=0.0001)])
+    assert np.linalg.norm(trace.tip_position[-1] - goal) <= 0.0001
     line = (goal - start) / np.linalg.norm(goal - start)
     away = trace.tip_position - start
     assert np.linalg.norm(away - np.outer(away @ line, line), axis=1).max() < 1e-4

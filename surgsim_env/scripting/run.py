@@ -28,8 +28,8 @@ def run_script(
 ) -> Trace:
     """Run the steps of a script one after the other and record all of it; recording changes no bit of the episode.
 
-    The episode may end in a step that is made for that (Declare, Control) if it is the last one; anything else that
-    keeps the script from its end is an error.
+    The episode may end in a step that is made for that (Declare, Control) if it is the last one. Anything else that
+    keeps the script from its end is an error; so are the hard force limit and a fault in any step.
 
     Args:
         env: one environment of this project, wrapped or not.
@@ -96,7 +96,8 @@ class _Run:
                 self._take(action, name, checked=not isinstance(step, Control))
                 view = self._look(began, first)
                 if self.terminated or self.truncated:
-                    return "" if last and step.ends_episode else f"{self._end()}; {view.reached()}"
+                    meant = last and step.ends_episode and not self._harm()
+                    return "" if meant else f"{self._harm() or self._cut_short()}; {view.reached()}"
                 action = plan.send(view)
         except StopIteration:
             return ""
@@ -150,12 +151,14 @@ class _Run:
         self.rewards.append(float(reward))
         self.infos.append(dict(info))
 
-    def _end(self) -> str:
+    def _harm(self) -> str:
+        """The fault or the force limit that ended the episode; "" for none."""
         info = self.infos[-1]
         if info.get("sim_fault"):
             return f"came to a fault of the simulation ({info['sim_fault']})"
-        if info.get("hard_limit"):
-            return f"passed the hard force limit ({info['force_peak']:.3f} N)"
+        return f"passed the hard force limit ({info['force_peak']:.3f} N)" if info.get("hard_limit") else ""
+
+    def _cut_short(self) -> str:
         return "was cut short: the episode is over" + (", its time is up" if self.truncated else "")
 
 

@@ -142,6 +142,31 @@ def test_an_episode_that_ends_too_soon_is_an_error():
         run_script(above(), [PressUntil(0.1, 0.01), Declare(), Hold(0.1)])
 
 
+def test_a_controller_that_passes_the_hard_limit_fails_even_in_the_last_step():
+    with pytest.raises(
+        ScriptError, match=r"step 1 of 1, 'Control', passed the hard force limit \(0\.80\d N\)"
+    ) as caught:
+        run_script(above(), [Control(lambda observation: np.array([0.0, 0.0, -1.0, 0.0]), timeout=5.0)])
+    assert caught.value.trace.info["hard_limit"]
+
+
+def test_a_fault_is_named():
+    env = above()
+
+    def break_it(observation):
+        env.unwrapped.simulation.organ_state.node_velocity[700, 1] = np.nan
+        return np.zeros(4)
+
+    with pytest.raises(ScriptError, match=r"'Control', came to a fault of the simulation \(.*no longer finite"):
+        run_script(env, [Control(break_it, timeout=1.0)])
+
+
+def test_an_episode_whose_time_is_up_says_so():
+    env = gym.wrappers.TimeLimit(above().unwrapped, 3)
+    with pytest.raises(ScriptError, match="'Hold', was cut short: the episode is over, its time is up"):
+        run_script(env, [Hold(1.0)], seed=0)
+
+
 def test_an_episode_may_end_in_the_last_step_that_is_made_for_it():
     trace = run_script(above(), [PressUntil(0.1, 0.01), Declare()])
     assert trace.terminated and trace.info["declared"]

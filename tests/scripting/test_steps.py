@@ -229,7 +229,10 @@ def test_a_controller_of_ones_own_sees_each_observation_and_acts():
     for seen, gave in zip(pusher.observations[1:], mine.observation[:-1], strict=True):
         assert seen.tobytes() == gave.tobytes()
     assert mine.force_size[-1] > 0.05
-    until = run_script(above(), [Control(pusher, timeout=2.0, until=lambda view: view.true_force[2] > 0.05)])
+    env = above()
+    first = env.unwrapped.observation
+    until = run_script(env, [Control(pusher, timeout=2.0, until=lambda view: view.true_force[2] > 0.05)])
+    assert pusher.observations[0].tobytes() == first.tobytes()
     assert until.duration < 1.0 and until.force[-1, 2] > 0.05
 
 

@@ -1,7 +1,8 @@
-"""Make the README's pictures: python docs/make_pictures.py (about a minute)."""
+"""Make the pictures of the README and docs/scripting.md: python docs/make_pictures.py (about a minute)."""
 
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 from PIL import Image
 from rich.console import Console
@@ -12,6 +13,7 @@ from surgsim_env.palpation.job import run_palpation
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scenes import make_scene
+from surgsim_env.scripting import Hold, Lift, MoveTo, PressUntil, run_script
 from surgsim_env.simulation import Simulation
 
 IMAGES = Path(__file__).parent / "images"
@@ -46,8 +48,15 @@ def write_views(path: Path) -> None:
     Image.fromarray(np.concatenate(rows)).save(path, optimize=True)
 
 
+def write_trace(path: Path) -> None:
+    """The first script of docs/scripting.md, as its trace draws itself."""
+    script = [MoveTo((0.030, 0.030, 0.042)), PressUntil(0.30, max_depth=0.006), Hold(0.5), Lift(0.010)]
+    run_script(gym.make("SurgSim/Palpate-v0", scene="phantom"), script, seed=0).plot(path)
+
+
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
+    write_trace(IMAGES / "trace.png")
     write_views(IMAGES / "views.png")
     palpation = run_palpation(load_anatomy(make_scene("liver")), console=Console())
     write_organ_picture(palpation, IMAGES / "palpation.png")

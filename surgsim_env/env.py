@@ -108,6 +108,8 @@ class PalpateEnv(gym.Env[Observation, Observation]):
         self.observation_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.task.action_size,), dtype=np.float32)
         self._observation = np.zeros(self.observation_space.shape, dtype=np.float32)
+        # What the last step was told, after what wrappers made of it.
+        self.last_action = np.zeros(self.task.action_size)
         self._running = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
@@ -141,7 +143,8 @@ class PalpateEnv(gym.Env[Observation, Observation]):
     def step(self, action: Observation) -> tuple[Observation, float, bool, bool, Info]:
         """One control step: haptic steps until it is over, the hard limit is passed or the simulation faults."""
         self.command(action)
-        self.task.begin(self._checked(action))
+        self.last_action = self._checked(action)
+        self.task.begin(self.last_action)
         count = self.scene.timing.haptic_steps_per_control
         force_peak = self.simulation.control_step(count, self.task.force_limit)
         fault = self.simulation.fault
@@ -184,6 +187,11 @@ class PalpateEnv(gym.Env[Observation, Observation]):
             ResetNeeded: before the first reset there is nothing to show.
         """
         return self._view.renderer(self._lesions())
+
+    @property
+    def observation(self) -> Observation:
+        """The last observation that reset or step gave."""
+        return self._observation.copy()
 
     def close(self) -> None:
         """Close the window and give back the graphics; more than once is no harm."""

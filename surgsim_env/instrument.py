@@ -52,6 +52,12 @@ class Instrument(ToolBodies):
         mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_SITE, self._tip, self._velocity, 0)
         return self._velocity[3:].copy()
 
+    def tip_pose_in(self, data: mujoco.MjData) -> tuple[FloatArray, FloatArray]:
+        """Position [m] (3,) and orientation (w, x, y, z) of the tip in up-to-date data of this model."""
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, data.site_xmat[self._tip])
+        return data.site_xpos[self._tip].copy(), quaternion
+
     def place(self, position: FloatArray) -> None:
         """Put the tip at rest at a position [m], everything else as when loaded."""
         raise NotImplementedError

@@ -3,6 +3,8 @@
 import math
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
@@ -17,6 +19,7 @@ from surgsim_env import mujoco_library
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.arms.arm_instrument import ArmInstrument, is_arm
 from surgsim_env.exchange import StepsTaken, compiled_steps, haptic_step
+from surgsim_env.haptic_record import HapticRecord
 from surgsim_env.instrument import Instrument, Probe
 from surgsim_env.timing import substeps_needed
 from surgsim_env.tool_mass import check_tool_masses
@@ -60,6 +63,7 @@ class Simulation:
         self.fault = ""
         self.compiled = _runs_compiled(os.environ.get(LOOP_VARIABLE, "compiled"))
         self._taken: StepsTaken | None = None
+        self._record: HapticRecord | None = None
         self.organ_model: OrganModel
         self.organ_state: OrganState
         self.reset(healthy, self.instrument.parked)
@@ -143,6 +147,8 @@ class Simulation:
         # After a fault the last good wrench stays: nobody reads a NaN.
         self._wrench = wrench
         self._step += 1
+        if self._record is not None:
+            self._record.note(self.time, wrench)
         return True
 
     def control_step(self, count: int, force_limit: float = math.inf) -> float:
@@ -154,7 +160,7 @@ class Simulation:
         if self._taken is not None:
             taken, self._taken = self._taken, None
             return taken.force_peak
-        if self.compiled:
+        if self.compiled and self._record is None:
             taken = compiled_steps(
                 self.organ_model,
                 self.organ_state,
@@ -179,6 +185,21 @@ class Simulation:
                 break
         return force_peak
 
+    @contextmanager
+    def recording(self) -> Iterator[HapticRecord]:
+        """Record each haptic step made inside: control steps then run in the plain loop, with the same bits.
+
+        Raises:
+            RuntimeError: the simulation is being recorded already.
+        """
+        if self._record is not None:
+            raise RuntimeError("this simulation is being recorded already: end that recording first")
+        self._record = HapticRecord(self.instrument)
+        try:
+            yield self._record
+        finally:
+            self._record = None
+
     def take_over(self, organ_state: OrganState, wrench: FloatArray, taken: StepsTaken) -> None:
         """Accept a control step that was made elsewhere, among others; the next `control_step` only reports it.
 
@@ -186,7 +207,12 @@ class Simulation:
             organ_state: where it left the organ; the instrument's own data has moved along.
             wrench: of the last good haptic step [N, N m], shape (n_tool, 6).
             taken: what came of it.
+
+        Raises:
+            RuntimeError: the simulation is being recorded, and steps that were made elsewhere would be missing.
         """
+        if self._record is not None:
+            raise RuntimeError("a simulation that advances among others is not recorded: step its environment alone")
         self.organ_state = organ_state
         self._wrench[:] = wrench
         self._step += taken.count

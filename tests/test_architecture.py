@@ -185,6 +185,14 @@ def pictures_are_asked_for(source: Source) -> Iterator[str]:
                 yield f"line {line} imports {name}"
 
 
+def scripts_stand_on_top(source: Source) -> Iterator[str]:
+    """Scripts run environments; nothing else of the package knows of them."""
+    if not source.path.startswith("surgsim_env/scripting/"):
+        for name, line in imported(source.tree):
+            if name.startswith("surgsim_env.scripting"):
+                yield f"line {line} imports {name}"
+
+
 def short_enough(source: Source) -> Iterator[str]:
     """A file is read at one sitting, a function at one glance."""
     lines, limit = len(source.text.splitlines()), LONGER_FILES.get(source.path, LINES_PER_FILE)
@@ -214,6 +222,7 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     tasks_do_not_advance,
     arms_know_no_task,
     pictures_are_asked_for,
+    scripts_stand_on_top,
     short_enough,
     named_for_what_it_does,
 )
@@ -270,6 +279,7 @@ PLANTED = [
     (tasks_do_not_advance, "surgsim_env/rendering/stage.py", "mujoco.mj_step(model, data)"),
     (pictures_are_asked_for, "surgsim_env/simulation.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (arms_know_no_task, "surgsim_env/evaluation/reach.py", "from surgsim_env.simulation import Simulation"),
+    (scripts_stand_on_top, "surgsim_env/env.py", "from surgsim_env.scripting.run import run_script"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
     (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),
@@ -286,6 +296,7 @@ ALLOWED = [
     (tasks_do_not_advance, "surgsim_env/env.py", "simulation.haptic_step()"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.environment_words import WORDS"),
     (pictures_are_asked_for, "surgsim_env/env.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
+    (scripts_stand_on_top, "surgsim_env/scripting/run.py", "from surgsim_env.scripting.trace import Trace"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * LINES_PER_FILE),
     (named_for_what_it_does, "msdm_core/mesh_io.py", ""),
 ]

@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
@@ -78,6 +79,19 @@ class PalpateTask:
     def velocity(self, action: FloatArray) -> FloatArray:
         """The tip velocity that an action asks for [m/s], shape (3,)."""
         return np.asarray(action[:3], dtype=np.float64) * SPEED_FULL_SCALE
+
+    def action(self, velocity: FloatArray, *, declare: bool = False) -> FloatArray:
+        """The action that asks for a tip velocity [m/s] (3,): `velocity` the other way round; shape (4,)."""
+        return np.append(np.asarray(velocity, dtype=np.float64) / SPEED_FULL_SCALE, float(declare))
+
+    @property
+    def speed_limit(self) -> float:
+        """The fastest that an action can ask the tip to move along an axis [m/s]."""
+        return SPEED_FULL_SCALE
+
+    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
+        """The force sensor's reading in an observation [N], shape (3,)."""
+        return np.asarray(observation[6:9], dtype=np.float64)
 
     def begin(self, action: FloatArray) -> None:
         """Begin a control step: count it and note what the action declares."""

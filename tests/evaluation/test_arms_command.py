@@ -6,9 +6,12 @@ import shutil
 import numpy as np
 import pytest
 
+from surgsim_env.anatomy import load_anatomy
 from surgsim_env.cli import main
 from surgsim_env.evaluation import arms_command
+from surgsim_env.evaluation.ports import default_ports
 from surgsim_env.scene_files import scenes_folder
+from surgsim_env.scenes import make_scene
 from tests.evaluation.made import made_evaluation
 
 INSTRUMENTS = scenes_folder() / "instruments"

@@ -1,0 +1,198 @@
+"""Run a script in an environment and keep what came of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from surgsim_env.env import PalpateEnv
+from surgsim_env.haptic_record import HapticRecord
+from surgsim_env.scripting.steps import Control, Script, Step, StepFailed
+from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
+from surgsim_env.scripting.view import Action, View, look
+
+
+class ScriptError(Exception):
+    """A script did not come to its end: the message names the step; `trace` is what happened up to there."""
+
+    def __init__(self, message: str, trace: Trace) -> None:
+        super().__init__(message)
+        self.trace = trace
+
+
+def run_script(
+    env: gym.Env, script: Script, *, seed: int | None = None, observation: NDArray[np.floating] | None = None
+) -> Trace:
+    """Run the steps of a script one after the other and record all of it; recording changes no bit of the episode.
+
+    The episode may end in a step that is made for that (Declare, Control) if it is the last one. Anything else that
+    keeps the script from its end is an error; so are the hard force limit and a fault in any step.
+
+    Args:
+        env: one environment of this project, wrapped or not.
+        script: steps; those without a name of their own are called after their class, from the second on "Hold 2".
+        seed: resets the environment first; without it the run goes on from where the environment is.
+        observation: what a controller sees first where nothing is reset and a wrapper changes observations.
+
+    Raises:
+        ScriptError: a step ran out of time or depth, or the episode ended too soon; its `trace` is what was reached.
+        TypeError: not an environment of this project, or several in one.
+        ValueError: an empty script, two steps of one name, a speed or an action beyond what the environment takes.
+    """
+    inner = _inner(env)
+    names = _names(script)
+    _check_speeds(script, names, inner)
+    if seed is not None:
+        observation, _ = env.reset(seed=seed)
+    elif observation is None:
+        observation = inner.observation
+    with inner.simulation.recording() as record:
+        run = _Run(env, inner, record, np.asarray(observation), inner.simulation.time)
+        failure = ""
+        for index, (step, name) in enumerate(zip(script, names, strict=True)):
+            began = inner.simulation.time
+            failure = run.make(step, name, last=index == len(script) - 1)
+            run.steps.append(StepInterval(name, began, inner.simulation.time))
+            if failure:
+                failure = f"step {index + 1} of {len(script)}, {name!r}, {failure}"
+                break
+        trace = run.trace(failure)
+    if failure:
+        raise ScriptError(failure, trace)
+    return trace
+
+
+@dataclass
+class _Run:
+    """What a run gathers, control step by control step."""
+
+    env: gym.Env
+    inner: PalpateEnv
+    record: HapticRecord
+    observation: NDArray[np.floating]
+    start: float
+    times: list[float] = field(default_factory=list)
+    observations: list[NDArray[np.floating]] = field(default_factory=list)
+    actions: list[Action] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    infos: list[dict[str, Any]] = field(default_factory=list)
+    steps: list[StepInterval] = field(default_factory=list)
+    terminated: bool = False
+    truncated: bool = False
+
+    def make(self, step: Step, name: str, *, last: bool) -> str:
+        """Make one step of the script; "" or why it failed."""
+        began, first = self.inner.simulation.time, len(self.record)
+        view = self._look(began, first)
+        plan = step.actions(view)
+        try:
+            action = next(plan)
+            while True:
+                if view.step_time >= step.timeout - 1e-9:
+                    return f"ran out of its {step.timeout:g} s: {step}; {view.reached()}"
+                self._take(action, name, checked=not isinstance(step, Control))
+                view = self._look(began, first)
+                if self.terminated or self.truncated:
+                    meant = last and step.ends_episode and not self._harm()
+                    return "" if meant else f"{self._harm() or self._cut_short()}; {view.reached()}"
+                action = plan.send(view)
+        except StopIteration:
+            return ""
+        except StepFailed as reason:
+            return f"{reason}: {step}; {view.reached()}"
+        finally:
+            plan.close()
+
+    def trace(self, failure: str) -> Trace:
+        """Everything gathered."""
+        record, simulation = self.record, self.inner.simulation
+        shapes = self.inner.observation_space.shape, self.inner.action_space.shape
+        assert shapes[0] is not None and shapes[1] is not None
+        return Trace(
+            start=self.start,
+            haptic_time=record.time,
+            wrench=record.wrench,
+            tip_position=record.tip_position,
+            tip_orientation=record.tip_orientation,
+            depth=contact_depth(record.wrench, record.tip_position, simulation.anatomy.face.approach),
+            control_time=np.array(self.times),
+            observation=np.array(self.observations) if self.times else np.zeros((0, *shapes[0])),
+            action=np.array(self.actions) if self.times else np.zeros((0, *shapes[1])),
+            reward=np.array(self.rewards),
+            infos=tuple(self.infos),
+            steps=tuple(self.steps),
+            tool_names=tuple(simulation.instrument.tool_names),
+            terminated=self.terminated,
+            truncated=self.truncated,
+            failure=failure,
+        )
+
+    def _look(self, began: float, first: int) -> View:
+        simulation, touched = self.inner.simulation, self.record.first_contact(first)
+        place = None if touched is None else self.record.tip_position_at(touched)
+        return look(simulation, self.inner.task, self.observation, self.inner.observation, began, place)
+
+    def _take(self, action: Action, name: str, *, checked: bool) -> None:
+        values = np.asarray(action, dtype=np.float32)
+        observation, reward, terminated, truncated, info = self.env.step(values)
+        if checked and not np.array_equal(self.inner.last_action, values):
+            raise ValueError(
+                f"a wrapper in {self.env} changes the actions of step {name!r}: run the script on the environment "
+                "inside it, or put what the wrapper takes into a Control step"
+            )
+        self.observation = np.array(observation)
+        self.terminated, self.truncated = bool(terminated), bool(truncated)
+        self.times.append(self.inner.simulation.time)
+        self.observations.append(self.observation)
+        self.actions.append(values.copy())
+        self.rewards.append(float(reward))
+        self.infos.append(dict(info))
+
+    def _harm(self) -> str:
+        """The fault or the force limit that ended the episode; "" for none."""
+        info = self.infos[-1]
+        if info.get("sim_fault"):
+            return f"came to a fault of the simulation ({info['sim_fault']})"
+        return f"passed the hard force limit ({info['force_peak']:.3f} N)" if info.get("hard_limit") else ""
+
+    def _cut_short(self) -> str:
+        return "was cut short: the episode is over" + (", its time is up" if self.truncated else "")
+
+
+def _inner(env: gym.Env) -> PalpateEnv:
+    if isinstance(env, gym.vector.VectorEnv):
+        raise TypeError("a script runs in one environment, not in several abreast: make one with gym.make")
+    inner = env.unwrapped
+    if not isinstance(inner, PalpateEnv):
+        raise TypeError(f'{type(inner).__name__} is no environment of this project: use gym.make("SurgSim/Palpate-v0")')
+    return inner
+
+
+def _names(script: Sequence[Step]) -> list[str]:
+    """A name for each step: its own, or its class's, from the second on with a number."""
+    if not script:
+        raise ValueError("the script is empty; give it at least one step, such as Hold(0.1)")
+    names: list[str] = []
+    for step in script:
+        base = step.name or type(step).__name__
+        if not base.isprintable():
+            raise ValueError(
+                f"a step is called {base!r}; tables hold a name in one line: leave out what does not print"
+            )
+        count = sum((other.name or type(other).__name__) == base for other in script[: len(names)])
+        if step.name and step.name in names:
+            raise ValueError(f"two steps are called {step.name!r}; the trace is cut by names: give each its own")
+        names.append(f"{base} {count + 1}" if count else base)
+    return names
+
+
+def _check_speeds(script: Sequence[Step], names: Sequence[str], inner: PalpateEnv) -> None:
+    for step, name in zip(script, names, strict=True):
+        if step.speed > inner.task.speed_limit * (1.0 + 1e-9):
+            raise ValueError(
+                f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
+                f"{inner.task.speed_limit:g} m/s: ask for that or less"
+            )

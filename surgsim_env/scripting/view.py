@@ -1,0 +1,121 @@
+"""What a step of a script sees between two control steps; nothing in it can be written to."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.simulation import Simulation
+
+Action = NDArray[np.floating]
+
+
+class ScriptedTask(Protocol):
+    """What a script asks of a task: how its actions and observations are laid out."""
+
+    @property
+    def speed_limit(self) -> float:
+        """The fastest that an action can ask the tip to move along an axis [m/s]."""
+        ...
+
+    def action(self, velocity: FloatArray) -> Action:
+        """The action that asks for a tip velocity [m/s] (3,); tasks take more commands by keyword."""
+        ...
+
+    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
+        """The force sensor's reading in an observation [N], shape (3,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A moment of a run, as the steps of its script and their predicates see it.
+
+    Fields:
+        time: since the episode's reset [s]
+        step_time: since the present step of the script began [s]
+        control_step: duration of a control step [s]
+        observation: as the environment, with its wrappers, gave it
+        tip_position, tip_velocity: centre of the tip ball [m], [m/s]                       (3,)
+        true_force: of the tissue on the tools, mean of the last haptic step [N]            (3,)
+        sensed_force: the same through the sensor model, as observed [N]                    (3,)
+        contact_position: the tip at the first contact since the step began [m]; None before it  (3,)
+        approach: unit vector along which the instrument comes                              (3,)
+        task: how actions are laid out
+    """
+
+    time: float
+    step_time: float
+    control_step: float
+    observation: NDArray[np.floating]
+    tip_position: FloatArray
+    tip_velocity: FloatArray
+    true_force: FloatArray
+    sensed_force: FloatArray
+    contact_position: FloatArray | None
+    approach: FloatArray
+    task: ScriptedTask
+
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+    def action(self, velocity: FloatArray, **commands: Any) -> Action:
+        """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`)."""
+        return self.task.action(velocity, **commands)
+
+    def still(self, **commands: Any) -> Action:
+        """The action that keeps the tip where it is."""
+        return self.action(np.zeros(3), **commands)
+
+    def pressing_force(self, direction: FloatArray, *, sensed: bool = False) -> float:
+        """The force with which the tissue pushes back against a unit direction [N], true or sensed."""
+        return -float((self.sensed_force if sensed else self.true_force) @ direction)
+
+    def depth(self, direction: FloatArray) -> float:
+        """How far the tip went along a unit direction since the step's first contact [m]; 0 before it."""
+        if self.contact_position is None:
+            return 0.0
+        return float((self.tip_position - self.contact_position) @ direction)
+
+    def reached(self) -> str:
+        """Where the tip is and what it feels, in words."""
+        place = ", ".join(f"{value * 1e3:.2f}" for value in self.tip_position)
+        force = float(np.linalg.norm(self.true_force))
+        return f"tip at ({place}) mm, contact force {force:.3f} N, {self.step_time:.2f} s after the step began"
+
+
+def look(
+    simulation: Simulation,
+    task: ScriptedTask,
+    observation: NDArray[np.floating],
+    raw_observation: NDArray[np.floating],
+    began: float,
+    contact_position: FloatArray | None,
+) -> View:
+    """The view of a simulation now.
+
+    Args:
+        simulation: between two control steps.
+        task: how its actions and observations are laid out.
+        observation: as wrappers gave it.
+        raw_observation: as the environment itself gave it.
+        began: when the step of the script began [s].
+        contact_position: the tip at the first contact since then [m] (3,), or None.
+    """
+    return View(
+        time=simulation.time,
+        step_time=simulation.time - began,
+        control_step=simulation.anatomy.scene.timing.control_step,
+        observation=np.array(observation),
+        tip_position=simulation.instrument.tip_position,
+        tip_velocity=simulation.instrument.tip_velocity,
+        true_force=simulation.contact_force,
+        sensed_force=task.sensed_force(raw_observation),
+        contact_position=contact_position,
+        approach=simulation.anatomy.face.approach.copy(),
+        task=task,
+    )

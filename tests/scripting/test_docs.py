@@ -1,0 +1,53 @@
+"""The Python of docs/scripting.md runs as printed: its pytest file under pytest, the rest one block after the other."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import surgsim_env.scripting
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = (ROOT / "docs" / "scripting.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", DOCS, flags=re.S)
+(TEST_FILE,) = (block for block in BLOCKS if "import pytest" in block)
+
+
+def run_pytest(folder, text):
+    (folder / "test_mine.py").write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py"]
+    settings = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, env=settings)
+
+
+def test_the_guides_test_file_passes(tmp_path):
+    done = run_pytest(tmp_path, TEST_FILE)
+    assert done.returncode == 0, done.stdout
+    assert "4 passed" in done.stdout
+
+
+def test_the_guides_test_file_fails_with_a_controller_that_swings(tmp_path):
+    worse = TEST_FILE.replace("gain = 0.05 ", "gain = 0.5 ").replace("[0, 1, 2]", "[0]")
+    assert worse.count("gain = 0.5 ") == 1
+    done = run_pytest(tmp_path, worse)
+    assert done.returncode == 1 and "test_it_keeps_its_force[0]" in done.stdout, done.stdout
+
+
+def test_the_other_examples_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for block in BLOCKS:
+        if block is not TEST_FILE:
+            exec(compile(block, "docs/scripting.md", "exec"), names)
+    first, second = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"peak 0\.3\d N, [2-5]\.\d mm deep", first), first
+    assert second == "True 0.20 N"
+    assert {path.name for path in tmp_path.iterdir()} == {"run.csv", "run_control.csv", "run.png"}
+
+
+def test_every_step_and_every_name_of_the_view_is_there():
+    steps = re.findall(r"^\| `(\w+)\(", DOCS, flags=re.M)
+    assert len(steps) == 7 and all(hasattr(surgsim_env.scripting, name) for name in steps)
+    (sentence,) = re.findall(r"read-only `View`: (.*?)\. A step", DOCS, flags=re.S)
+    assert set(re.findall(r"`(\w+)`", sentence)) <= set(surgsim_env.scripting.View.__dataclass_fields__)

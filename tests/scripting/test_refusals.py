@@ -1,0 +1,171 @@
+"""What a script is refused for, before anything runs: the value, the rule, the way out."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import surgsim_env  # noqa: F401
+from surgsim_env.scripting import (
+    Control,
+    Declare,
+    Hold,
+    Lift,
+    MoveTo,
+    PressUntil,
+    WaitUntil,
+    oracle_script,
+    run_script,
+)
+
+MADE = {
+    "MoveTo": lambda **more: MoveTo(**{"point": (0.0, 0.0, 0.0), **more}),
+    "PressUntil": lambda **more: PressUntil(**{"force": 0.2, "max_depth": 0.004, **more}),
+    "Hold": lambda **more: Hold(**{"duration": 0.1, **more}),
+    "Lift": lambda **more: Lift(**{"height": 0.01, **more}),
+    "WaitUntil": lambda **more: WaitUntil(**{"predicate": bool, "timeout": 1.0, **more}),
+    "Declare": lambda **more: Declare(**more),
+    "Control": lambda **more: Control(**{"controller": np.zeros, "timeout": 1.0, **more}),
+}
+NUMBERS = [
+    *(("MoveTo", field) for field in ("speed", "tolerance", "timeout")),
+    *(("PressUntil", field) for field in ("force", "max_depth", "speed", "tolerance", "timeout")),
+    ("Hold", "duration"),
+    *(("Lift", field) for field in ("height", "speed", "timeout")),
+    ("WaitUntil", "timeout"),
+    ("Declare", "timeout"),
+    ("Control", "timeout"),
+]
+NOT_ABOVE_ZERO = st.one_of(
+    st.floats(max_value=0.0), st.sampled_from([math.nan, math.inf, None, "fast", True, (0.1,), 1j]), st.integers(-9, 0)
+)
+
+
+@given(st.sampled_from(NUMBERS), NOT_ABOVE_ZERO)
+def test_numbers_that_are_not_above_zero(place, value):
+    step, field = place
+    with pytest.raises(ValueError) as caught:
+        MADE[step](**{field: value})
+    assert str(caught.value).startswith(f"{step}: {field} is {value!r}; it must be a finite number above 0")
+
+
+@given(st.sampled_from(NUMBERS), st.floats(min_value=1e-6, max_value=1e6))
+def test_any_number_above_zero_is_taken(place, value):
+    step, field = place
+    more = {}
+    if step == "PressUntil" and field in ("force", "tolerance"):
+        more = {"tolerance": value / 2.0} if field == "force" else {"force": 2.0 * value}
+    assert getattr(MADE[step](**{field: value, **more}), field) == value
+
+
+POINTS = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3)
+
+
+@given(POINTS, st.sampled_from([tuple, list, np.array]))
+def test_any_three_numbers_are_a_point(values, kind):
+    assert MoveTo(kind(values)).point == tuple(values)
+
+
+@given(st.one_of(st.lists(st.floats(-1.0, 1.0)).filter(lambda values: len(values) != 3), st.text(), st.none()))
+def test_other_than_three_numbers_are_no_point(value):
+    with pytest.raises(ValueError, match=r"MoveTo: point is .* it must be three finite numbers, x, y and z"):
+        MoveTo(value)
+
+
+@pytest.mark.parametrize("value", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), ("x", 0.0, 0.0)])
+def test_points_are_finite(value):
+    with pytest.raises(ValueError, match="three finite numbers"):
+        MoveTo(value)
+
+
+@given(POINTS.filter(lambda values: np.linalg.norm(values) > 1e-3))
+def test_directions_are_brought_to_length_one(values):
+    for step in (PressUntil(0.2, 0.004, direction=values), Lift(0.01, direction=values)):
+        assert np.linalg.norm(step.direction) == pytest.approx(1.0, abs=1e-12)
+        np.testing.assert_allclose(np.cross(step.direction, values), 0.0, atol=1e-12)
+        assert np.dot(step.direction, values) > 0.0
+
+
+@pytest.mark.parametrize("step", ["PressUntil", "Lift"])
+def test_a_direction_points_somewhere(step):
+    with pytest.raises(ValueError, match=f"{step}: direction is .* must point somewhere"):
+        MADE[step](direction=(0.0, 0.0, 0.0))
+
+
+def test_a_tolerance_as_large_as_the_force():
+    with pytest.raises(ValueError, match=r"tolerance is 0\.2 N with a force of 0\.2 N; it must be smaller"):
+        PressUntil(0.2, 0.004, tolerance=0.2)
+
+
+@pytest.mark.parametrize(
+    ("step", "field"), [("WaitUntil", "predicate"), ("Control", "controller"), ("Control", "until")]
+)
+def test_what_is_called_must_be_callable(step, field):
+    with pytest.raises(TypeError, match=rf"{step}: {field} is 3\.0; it must be callable"):
+        MADE[step](**{field: 3.0})
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = gym.make("SurgSim/Palpate-v0")
+    env.reset(seed=0)
+    return env
+
+
+def test_an_empty_script(env):
+    with pytest.raises(ValueError, match="the script is empty"):
+        run_script(env, [])
+
+
+def test_two_steps_of_one_name(env):
+    with pytest.raises(ValueError, match="two steps are called 'wait'"):
+        run_script(env, [Hold(0.1, name="wait"), Hold(0.2), Hold(0.1, name="wait")])
+
+
+def test_a_name_that_does_not_print(env):
+    with pytest.raises(ValueError, match=r"a step is called 'up\\ndown'"):
+        run_script(env, [Hold(0.1, name="up\ndown")])
+
+
+def test_a_speed_that_no_action_asks_for(env):
+    with pytest.raises(ValueError, match=r"'Lift 2': speed is 0\.021 m/s; .* than 0\.02 m/s"):
+        run_script(env, [Lift(0.01), Lift(0.01, speed=0.021)])
+    assert env.unwrapped.simulation.time == 0.0
+
+
+class Halved(gym.Wrapper):
+    def step(self, action):
+        return self.env.step(0.5 * action)
+
+
+def test_a_wrapper_that_changes_actions(env):
+    changed = gym.wrappers.RescaleAction(env, np.float32(-2.0), np.float32(2.0))
+    with pytest.raises(ValueError, match=r"a wrapper in <RescaleAction.* changes the actions of step 'Lift'"):
+        run_script(changed, [Lift(0.01)], seed=0)
+    # Whatever kind of wrapper it is.
+    with pytest.raises(ValueError, match="a wrapper in <Halved"):
+        run_script(Halved(env), [Lift(0.01)], seed=0)
+    # One that leaves them as they are is none, and a controller speaks the wrapper's language.
+    run_script(gym.wrappers.ClipAction(env), [Lift(0.001)], seed=0)
+    trace = run_script(changed, [Control(lambda seen: np.array([0.0, 0.0, 1.0, 0.0]), timeout=0.5)], seed=0)
+    assert trace.tip_position[-1, 2] - trace.tip_position[0, 2] == pytest.approx(0.5 * 0.5 * 0.02, abs=2e-4)
+
+
+def test_other_environments_and_several_at_once():
+    with pytest.raises(TypeError, match="CartPoleEnv is no environment of this project"):
+        run_script(gym.make("CartPole-v1"), [Hold(0.1)])
+    with pytest.raises(TypeError, match="not in several abreast"):
+        run_script(gym.make_vec("CartPole-v1", num_envs=2), [Hold(0.1)])
+    with pytest.raises(ValueError, match="no oracle is known for CartPoleEnv; there is one for PalpateEnv"):
+        oracle_script(gym.make("CartPole-v1"))
+
+
+def test_before_the_first_reset():
+    env = gym.make("SurgSim/Palpate-v0")
+    with pytest.raises(gym.error.ResetNeeded):
+        run_script(env, [Hold(0.1)])
+    with pytest.raises(ValueError, match="none has begun"):
+        oracle_script(env)

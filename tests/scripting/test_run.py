@@ -1,0 +1,121 @@
+"""A run begins from a seed, from where the environment is, or from a saved state: the same trace to the bit."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+from surgsim_env.scripting import Control, Hold, Lift, PressUntil, oracle_script, run_script
+
+ARRAYS = (
+    *("haptic_time", "wrench", "tip_position", "tip_orientation"),
+    *("control_time", "observation", "action", "reward"),
+)
+
+
+def assert_same(one, other, names=(*ARRAYS, "depth")):
+    for name in names:
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
+    assert one.infos == other.infos
+
+
+def press():
+    return [PressUntil(0.2, 0.015, sensed=True), Hold(0.1), Lift(0.008)]
+
+
+def test_a_seed_resets_and_repeats_to_the_bit():
+    env, other = gym.make("SurgSim/Palpate-v0"), gym.make("SurgSim/Palpate-v0").unwrapped
+    first = run_script(env, press(), seed=5)
+    again = run_script(env, press(), seed=5)
+    assert_same(first, again)
+    assert first.steps == again.steps and first.peak_force > 0.15
+    # Wrapped or not, and seeded by hand.
+    other.reset(seed=5)
+    assert_same(first, run_script(other, press()))
+    assert run_script(env, press(), seed=6).observation.tobytes() != first.observation.tobytes()
+
+
+def test_actions_of_a_trace_replayed_without_recording_give_its_observations():
+    env = gym.make("SurgSim/Palpate-v0")
+    trace = run_script(env, press(), seed=5)
+    assert env.unwrapped.simulation.compiled
+    env.reset(seed=5)
+    for action, observation, reward, info in zip(trace.action, trace.observation, trace.reward, trace.infos):
+        seen, paid, _, _, told = env.step(action)
+        assert seen.tobytes() == observation.tobytes()
+        assert (paid, told) == (reward, info)
+
+
+@pytest.mark.parametrize("instrument", ["probe", "psm_palpator"])
+def test_a_run_goes_on_from_a_saved_state_to_the_bit(instrument):
+    env, other = (gym.make("SurgSim/Palpate-v0", instrument=instrument) for _ in range(2))
+    whole = run_script(env, press(), seed=7)
+    run_script(env, press()[:1], seed=7)
+    saved = env.unwrapped.save_state()
+    for one in (env, other):
+        one.reset(seed=1)
+        one.unwrapped.load_state(saved)
+        rest = run_script(one, press()[1:])
+        part = whole.between("Hold", "Lift")
+        assert rest.start == part.start and rest.steps == part.steps
+        # Depth counts from where the contact began in the run: all else is the same.
+        assert_same(rest, part, ARRAYS)
+
+
+def test_what_a_wrapper_makes_of_observations_is_what_a_controller_sees():
+    seen = []
+
+    def controller(observation):
+        seen.append(observation)
+        return np.zeros(4)
+
+    env = gym.wrappers.TransformObservation(
+        gym.make("SurgSim/Palpate-v0"), lambda observation: observation[6:9], gym.spaces.Box(-2.0, 2.0, (3,))
+    )
+    trace = run_script(env, [Control(controller, timeout=0.1)], seed=3)
+    assert trace.observation.shape == (2, 3) and [one.shape for one in seen] == [(3,), (3,)]
+    # Steps of ours go on reading the environment's own.
+    trace = run_script(env, [PressUntil(0.1, 0.008, sensed=True), Control(controller, timeout=0.05)])
+    assert trace.peak_force > 0.05
+    mine = np.array([9.0, 9.0, 9.0])
+    run_script(env, [Control(controller, timeout=0.05)], observation=mine)
+    assert (seen[-1] == mine).all()
+
+
+def test_every_environment_has_an_oracle():
+    ids = [env_id for env_id in gym.registry if env_id.startswith("SurgSim/")]
+    assert ids
+    for env_id in ids:
+        env = gym.make(env_id)
+        env.reset(seed=0)
+        assert oracle_script(env)
+
+
+CASES = [("phantom", "probe"), ("phantom", "psm_palpator"), ("liver", "probe"), ("liver", "psm_palpator")]
+
+
+def oracle_run(scene, instrument, seeds):
+    env = gym.make("SurgSim/Palpate-v0", scene=scene, instrument=instrument)
+    for seed in seeds:
+        env.reset(seed=seed)
+        yield env.unwrapped, run_script(env, oracle_script(env))
+
+
+@pytest.mark.parametrize(("scene", "instrument"), CASES)
+def test_the_oracle_finds_the_lesion_gently(scene, instrument):
+    ((env, trace),) = oracle_run(scene, instrument, [1])
+    limits = env.scene.limits
+    assert trace.info["success"] and trace.info["error_mm"] < 5.0 and not trace.info["sim_fault"]
+    assert trace.reward[-1] > 9.9
+    # Nothing is touched on the way, and the press stays gentle.
+    assert trace.between("rise", "come down").peak_force == 0.0
+    assert 0.38 * limits.soft_force < trace.peak_force < 0.45 * limits.soft_force
+    assert trace.duration < 15.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "instrument"), CASES)
+def test_the_oracle_finds_nearly_every_lesion(scene, instrument):
+    infos = [trace.info for _, trace in oracle_run(scene, instrument, range(20))]
+    assert sum(info["success"] for info in infos) >= 19
+    assert not any(info["sim_fault"] for info in infos)

@@ -249,7 +249,7 @@ def test_without_a_ports_file_they_stand_as_laparoscopy_places_them(folder, made
     ports = default_ports(load_anatomy(make_scene("phantom")))
     assert setup.name == "default ports" and setup.ports == ports
     report = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    assert "default ports" in report and "--ports" not in report
+    assert "surgsim arms --scene phantom" in report and "--ports" not in report
 
 
 def test_help_says_what_it_does(capsys):

@@ -1,6 +1,6 @@
 """Springs and volume term of several organs of one mesh side by side: the organ's number is the last index of an array.
 
-One register holds the same number of every organ (8 of float64, 16 of float32), so that nothing is gathered or
+One register holds the same number of every organ (8 of float64, 16 or 8 of float32), so that nothing is gathered or
 scattered. The equations are those of `element_kernels`, the sums in the order of `tissue_kernels`: an organ moves to
 the bit as it would alone.
 """

@@ -30,7 +30,7 @@ class PalpateVectorEnv(SyncVectorEnv):
         scene: a scene's name or the path of a scene file.
         instrument: "probe", an arm's name or the path of its TOML file; the scene's own by default.
         autoreset_mode: "NextStep", "SameStep" or "Disabled" (reset with `options={"reset_mask": ...}`).
-        dtype: "float64", or "float32" for twice the speed and forces within 0.5 %.
+        dtype: "float64", or "float32" for up to half the speed more, with forces within 0.5 %.
         threads: groups of organs that advance at the same time; as many as there are cores by default.
         max_episode_steps: truncate after so many control steps, at most the environment's own number.
         render_mode: None, or "rgb_array": `render()` gives a tuple of pictures, drawn with shared graphics.

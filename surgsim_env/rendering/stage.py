@@ -164,6 +164,8 @@ class Stage:
         kind = mujoco.mjtGeom.mjGEOM_ELLIPSOID
         mujoco.mjv_initGeom(geom, kind, half_axes, centre, np.eye(3).ravel(), colour)
         geom.specular, geom.shininess = 0.35, 0.5
+        # mjv_initGeom leaves these as it found them, in memory that nobody has written.
+        geom.objtype, geom.objid, geom.category = mujoco.mjtObj.mjOBJ_UNKNOWN, -1, mujoco.mjtCatBit.mjCAT_DECOR
         geom.segid = drawn.ngeom
         drawn.ngeom += 1
 

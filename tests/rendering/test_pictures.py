@@ -2,6 +2,7 @@
 
 import copy
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -76,6 +77,17 @@ def test_labels_count_up_to_the_picture_and_to_the_shapes(phantom, draw):
     inner, outer = np.split(np.floor(pixels).astype(int), 2)
     assert (labels[inner[:, 1], inner[:, 0]] == INSTRUMENT).all()
     assert (labels[outer[:, 1], outer[:, 0]] == INSTRUMENT).mean() < 0.6
+
+
+@pytest.mark.parametrize("left_there", [mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY])
+def test_lesions_are_labelled_whatever_the_memory_of_their_geoms_held(phantom, draw, left_there):
+    """MuJoCo hands out geoms that nobody has written, and mjv_initGeom writes only a part of them."""
+    renderer = draw(phantom, camera="above", show_lesion=True)
+    renderer.rgb()
+    drawn = renderer._stage._drawn
+    for geom in drawn.geoms[drawn.ngeom - 1 :]:
+        geom.objtype, geom.objid, geom.category = left_there, 1000, mujoco.mjtCatBit.mjCAT_STATIC
+    assert (renderer.segmentation() == LESION).sum() > 100
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

@@ -82,7 +82,7 @@ def test_labels_count_up_to_the_picture_and_to_the_shapes(phantom, draw):
 @pytest.mark.parametrize("left_there", [mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY])
 def test_lesions_are_labelled_whatever_the_memory_of_their_geoms_held(phantom, draw, left_there):
     """MuJoCo hands out geoms that nobody has written, and mjv_initGeom writes only a part of them."""
-    renderer = draw(phantom, camera="above", show_lesion=True)
+    renderer = draw(phantom, camera="side", show_lesion=True)
     renderer.rgb()
     drawn = renderer._stage._drawn
     for geom in drawn.geoms[drawn.ngeom - 1 :]:

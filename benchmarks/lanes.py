@@ -17,6 +17,7 @@ import numpy as np
 from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel
 from msdm_core.lanes import advance_lanes, rest_lanes, stack_organs, stack_shapes
 from msdm_core.organ import rest_state
+from msdm_core.shapes import round_shapes
 from msdm_core.stepping import advance_organ
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.scenes import make_scene
@@ -40,13 +41,7 @@ def press_sites(anatomy: Anatomy, model: OrganModel) -> np.ndarray:
 def ball(site: np.ndarray, radius: float) -> ContactShapes:
     """A ball that touches a site from above and moves down."""
     centre = site + np.array([0.0, 0.0, radius])
-    return ContactShapes(
-        shape_ends=np.array([[centre, centre]]),
-        shape_radius=np.array([radius]),
-        shape_tool=np.zeros(1, dtype=np.int32),
-        tool_centre=centre[None].copy(),
-        tool_twist=np.array([[0.0, 0.0, -PRESS_SPEED, 0.0, 0.0, 0.0]]),
-    )
+    return round_shapes([[centre, centre]], radius, twist=[0.0, 0.0, -PRESS_SPEED, 0.0, 0.0, 0.0])
 
 
 class Group:

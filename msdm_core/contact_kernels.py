@@ -8,6 +8,9 @@ from numba import njit
 # Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
 CANDIDATE_MARGIN = 1e-3
 
+# A place this near to the border of a shape's core, as a share of its size, is on it but for rounding.
+BORDER = 1e-12
+
 # Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
 QUADRATURE_COUNT = 4
 QUADRATURE_WEIGHT = 0.25
@@ -29,7 +32,7 @@ def find_candidates(model, state, shapes, duration):
     Returns how many candidates the busiest shape has; the list of a shape ends with -1.
     """
     # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
-    position, ends, surface = state.node_position, shapes.shape_ends, model.surface_triangles
+    position, ends, spans, surface = state.node_position, shapes.shape_ends, shapes.shape_span, model.surface_triangles
     engaged, candidates, twist = state.contact_engaged, state.contact_candidates, shapes.tool_twist
     most = 0
     for shape in range(shapes.shape_radius.shape[0]):
@@ -40,9 +43,9 @@ def find_candidates(model, state, shapes, duration):
             # An angular part moves a point by at most its lever, taken as one metre: generous for a hand-held tool.
             speed += abs(twist[tool, part])
         margin = CANDIDATE_MARGIN + 2.0 * speed * duration
-        low_x, high_x = _extent(ends, shape, 0, radius + margin)
-        low_y, high_y = _extent(ends, shape, 1, radius + margin)
-        low_z, high_z = _extent(ends, shape, 2, radius + margin)
+        low_x, high_x = _extent(ends, spans, shape, 0, radius + margin)
+        low_y, high_y = _extent(ends, spans, shape, 1, radius + margin)
+        low_z, high_z = _extent(ends, spans, shape, 2, radius + margin)
         count = 0
         for triangle in range(surface.shape[0]):
             a = surface[triangle, 0]
@@ -56,7 +59,7 @@ def find_candidates(model, state, shapes, duration):
             )
             if near:
                 x, y, z, size_squared = _middle(position, a, b, c)
-                px, py, pz = closest_on_axis(ends, shape, x, y, z)
+                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
                 limit = math.sqrt(size_squared) + radius + margin
                 near = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 <= limit * limit
             if near or _is_held(engaged, shape, triangle):
@@ -72,7 +75,7 @@ def find_candidates(model, state, shapes, duration):
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
     """Contact of every shape with its candidate triangles; adds the reaction to the tools' wrench.
 
-    Each quadrature point is held off by a penetration that keeps rising with depth. With d from the shape's axis to the
+    Each quadrature point is held off by a penetration that keeps rising with depth. With d from the shape's core to the
     point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2) the half chord, the line through the
     point along n leaves the ball t + s below the point. The energy per area is (k_p / 2) g^2 with g = s (s + t) / r: to
     first order the radial penetration r - |d|, yet growing without bound as the ball sinks below the surface, where a
@@ -86,10 +89,11 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
     surface, rest_area = model.surface_triangles, model.surface_rest_area
-    ends, centre, twist = shapes.shape_ends, shapes.tool_centre, shapes.tool_twist
+    ends, spans, centre, twist = shapes.shape_ends, shapes.shape_span, shapes.tool_centre, shapes.tool_twist
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
         radius = shapes.shape_radius[shape]
+        friction = law.friction * shapes.shape_friction[shape]
         for entry in range(candidate_count):
             triangle = candidates[shape, entry]
             if triangle < 0:
@@ -100,7 +104,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
             if not _is_held(engaged, shape, triangle):
                 # Only points inside the shape can be met, and they lie within half of that radius around the middle.
                 x, y, z, size_squared = _middle(position, a, b, c)
-                px, py, pz = closest_on_axis(ends, shape, x, y, z)
+                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
                 limit = 0.5 * math.sqrt(size_squared) + radius
                 if (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 > limit * limit:
                     continue
@@ -120,7 +124,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 wb = QUADRATURE_BARYCENTRIC[point, 1]
                 wc = QUADRATURE_BARYCENTRIC[point, 2]
                 x, y, z = _mean(position, a, b, c, wa, wb, wc)
-                px, py, pz = closest_on_axis(ends, shape, x, y, z)
+                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
                 t = (x - px) * nx + (y - py) * ny + (z - pz) * nz
                 rx = x - px - t * nx
                 ry = y - py - t * ny
@@ -149,23 +153,30 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                     load = 0.0
                 scale = -weighted_area * load / (radius * radius)
 
-                # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the axis' direction inside
-                # a capsule.
+                # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the directions in which
+                # the nearest point of the core follows.
                 gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
                 gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
                 gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
-                gx, gy, gz = _without_axis(ends, shape, px, py, pz, gx, gy, gz)
+                gx, gy, gz = _without_core(ends, spans, shape, px, py, pz, gx, gy, gz)
 
-                # Friction: a tangential spring that sticks until mu times the pressure, then slips.
-                ux = stretch_memory[shape, item, 0] + dt * vx
-                uy = stretch_memory[shape, item, 1] + dt * vy
-                uz = stretch_memory[shape, item, 2] + dt * vz
+                # Friction: a tangential spring that turns with the tool and sticks until mu times the pressure, then
+                # slips.
+                ux = stretch_memory[shape, item, 0]
+                uy = stretch_memory[shape, item, 1]
+                uz = stretch_memory[shape, item, 2]
+                vx += twist[tool, 4] * uz - twist[tool, 5] * uy
+                vy += twist[tool, 5] * ux - twist[tool, 3] * uz
+                vz += twist[tool, 3] * uy - twist[tool, 4] * ux
+                ux += dt * vx
+                uy += dt * vy
+                uz += dt * vz
                 out_of_plane = ux * ex + uy * ey + uz * ez
                 ux -= out_of_plane * ex
                 uy -= out_of_plane * ey
                 uz -= out_of_plane * ez
                 stretch = math.sqrt(ux * ux + uy * uy + uz * uz)
-                longest = law.friction * load * s / radius / law.tangential_stiffness
+                longest = friction * load * s / radius / law.tangential_stiffness
                 if stretch > longest:
                     ux *= longest / stretch
                     uy *= longest / stretch
@@ -191,9 +202,10 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
 
 
 @njit(forceinline=True, error_model="numpy")
-def _extent(ends, shape, axis, around):
-    """Lowest and highest coordinate of a shape's axis, and so much around it [m]."""
+def _extent(ends, spans, shape, axis, around):
+    """Lowest and highest coordinate of a shape's core, and so much around it [m]."""
     first, second = ends[shape, 0, axis], ends[shape, 1, axis]
+    around += abs(spans[shape, axis])
     return min(first, second) - around, max(first, second) + around
 
 
@@ -270,6 +282,22 @@ def closest_on_axis(ends, shape, x, y, z):
 
 
 @njit(forceinline=True, error_model="numpy")
+def closest_on_core(ends, spans, shape, x, y, z):
+    """The point of a shape's core nearest to (x, y, z) [m]: on its axis, and as far across as a rounded box spans."""
+    px, py, pz = closest_on_axis(ends, shape, x, y, z)
+    sx = spans[shape, 0]
+    sy = spans[shape, 1]
+    sz = spans[shape, 2]
+    squared = sx * sx + sy * sy + sz * sz
+    if squared > 0.0:
+        across = min(1.0, max(-1.0, ((x - px) * sx + (y - py) * sy + (z - pz) * sz) / squared))
+        px += across * sx
+        py += across * sy
+        pz += across * sz
+    return px, py, pz
+
+
+@njit(forceinline=True, error_model="numpy")
 def _release(engaged, stretch_memory, shape, item):
     """Forget the contact of one quadrature point with one shape."""
     engaged[shape, item] = 0
@@ -299,19 +327,31 @@ def _push_corner(position, force, reference, wrench, tool, node, weight, along_n
 
 
 @njit(forceinline=True, error_model="numpy")
-def _without_axis(ends, shape, px, py, pz, gx, gy, gz):
-    """Drop the part along a capsule's axis where the nearest axis point lies strictly between the ends."""
+def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
+    """Drop the part along a shape's core in which the nearest point (px, py, pz) lies strictly between its borders."""
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
     uy = ends[shape, 1, 1] - ends[shape, 0, 1]
     uz = ends[shape, 1, 2] - ends[shape, 0, 2]
+    px -= ends[shape, 0, 0]
+    py -= ends[shape, 0, 1]
+    pz -= ends[shape, 0, 2]
     length_squared = ux * ux + uy * uy + uz * uz
     if length_squared > 0.0:
-        along = (px - ends[shape, 0, 0]) * ux + (py - ends[shape, 0, 1]) * uy + (pz - ends[shape, 0, 2]) * uz
-        if 0.0 < along < length_squared:
+        along = px * ux + py * uy + pz * uz
+        if BORDER * length_squared < along < (1.0 - BORDER) * length_squared:
             share = (gx * ux + gy * uy + gz * uz) / length_squared
             gx -= share * ux
             gy -= share * uy
             gz -= share * uz
+    ux = spans[shape, 0]
+    uy = spans[shape, 1]
+    uz = spans[shape, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    if length_squared > 0.0 and abs(px * ux + py * uy + pz * uz) < (1.0 - BORDER) * length_squared:
+        share = (gx * ux + gy * uy + gz * uz) / length_squared
+        gx -= share * ux
+        gy -= share * uy
+        gz -= share * uz
     return gx, gy, gz
 
 

@@ -127,7 +127,10 @@ SCRATCH_FIELDS = ("node_tension", "row_position", "row_velocity", "row_force", "
 
 
 class ContactShapes(NamedTuple):
-    """Capsules (spheres when both ends coincide) rigidly carried by tools, SI units, world frame.
+    """Rounded bodies rigidly carried by tools, SI units, world frame: all within a radius of a core.
+
+    The core is a point (a ball), an axis (a capsule) or a rectangle (a rounded box), given by its long centre line and
+    the half way across; `shapes.round_shapes` makes balls and capsules.
 
     Fields:
         shape_ends: the two end points of the axis [m]                           (n_shape, 2, 3)
@@ -135,6 +138,8 @@ class ContactShapes(NamedTuple):
         shape_tool: the tool that carries the shape                              (n_shape,)
         tool_centre: centre of mass, moved along the twist by each substep [m]   (n_tool, 3)
         tool_twist: linear [m/s] at the centre of mass, angular [rad/s]          (n_tool, 6)
+        shape_span: from the axis to the rectangle's border, square to it [m]    (n_shape, 3)
+        shape_friction: Coulomb coefficient over the contact law's               (n_shape,)
     """
 
     shape_ends: FloatArray
@@ -142,6 +147,8 @@ class ContactShapes(NamedTuple):
     shape_tool: NDArray[np.int32]
     tool_centre: FloatArray
     tool_twist: FloatArray
+    shape_span: FloatArray
+    shape_friction: FloatArray
 
 
 class ToolResponse(NamedTuple):
@@ -189,6 +196,12 @@ def move_shapes(shapes, dt):
             shapes.shape_ends[shape, end, 0] += dt * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
             shapes.shape_ends[shape, end, 1] += dt * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
             shapes.shape_ends[shape, end, 2] += dt * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
+        sx = shapes.shape_span[shape, 0]
+        sy = shapes.shape_span[shape, 1]
+        sz = shapes.shape_span[shape, 2]
+        shapes.shape_span[shape, 0] += dt * (twist[tool, 4] * sz - twist[tool, 5] * sy)
+        shapes.shape_span[shape, 1] += dt * (twist[tool, 5] * sx - twist[tool, 3] * sz)
+        shapes.shape_span[shape, 2] += dt * (twist[tool, 3] * sy - twist[tool, 4] * sx)
     for tool in range(shapes.tool_centre.shape[0]):
         for axis in range(3):
             shapes.tool_centre[tool, axis] += dt * twist[tool, axis]

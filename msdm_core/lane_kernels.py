@@ -172,7 +172,7 @@ def shapes_of(shapes, lane):
     """One lane's contact shapes."""
     return ContactShapes(
         shapes.shape_ends[lane], shapes.shape_radius[lane], shapes.shape_tool[lane], shapes.tool_centre[lane],
-        shapes.tool_twist[lane],
+        shapes.tool_twist[lane], shapes.shape_span[lane], shapes.shape_friction[lane],
     )  # fmt: skip
 
 

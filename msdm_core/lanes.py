@@ -256,6 +256,8 @@ def _check_fit(
         "node_position": (state.node_position, (nodes, 3, len(model.lanes))),
         "contact_engaged": (state.contact_engaged, (lanes, count, surface * QUADRATURE_COUNT)),
         "shape_ends": (shapes.shape_ends, (len(state.lane_fault), count, 2, 3)),
+        "shape_span": (shapes.shape_span, (lanes, count, 3)),
+        "shape_friction": (shapes.shape_friction, (lanes, count)),
         "tool_twist": (shapes.tool_twist, (lanes, tools, 6)),
         "tool_mobility": (response.tool_mobility, (lanes, tools, 6, 6)),
         "wrench": (wrench, (lanes, tools, 6)),

@@ -51,7 +51,7 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
 def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> float:
     """Energy stored between tissue and shapes where they stand now, without friction's [J].
 
-    E = sum over shapes and quadrature points of (k_p / 2) A g^2, g = s (s + t) / r: with d from the shape's axis to the
+    E = sum over shapes and quadrature points of (k_p / 2) A g^2, g = s (s + t) / r: with d from the shape's core to the
     point and n the triangle's normal, t = d . n and s^2 = r^2 - (|d|^2 - t^2). Counted are points inside the shape that
     it meets from outside (t <= 0) or holds already (`state.contact_engaged`). To this comes the guard's energy.
     """
@@ -65,6 +65,9 @@ def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, 
         squared = float(axis @ axis)
         along = np.clip((points - start) @ axis / squared, 0.0, 1.0) if squared > 0.0 else np.zeros(points.shape[:2])
         offset = points - start - along[:, :, None] * axis
+        span = shapes.shape_span[shape]
+        if span.any():
+            offset -= np.clip(offset @ span / (span @ span), -1.0, 1.0)[:, :, None] * span
         height = np.einsum("tqx,tx->tq", offset, normal)
         chord_squared = radius**2 - (np.einsum("tqx,tqx->tq", offset, offset) - height**2)
         chord = np.sqrt(np.maximum(chord_squared, 0.0))

@@ -19,11 +19,10 @@ from msdm_core.kernels import (
 )
 from msdm_core.measure import volume_ratios
 from msdm_core.mesh import FloatArray
+from msdm_core.shapes import round_shapes
 from msdm_core.stability import stable_dt
 
-NO_SHAPES = ContactShapes(
-    np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0, dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 6))
-)
+NO_SHAPES = round_shapes(np.zeros((0, 2, 3)), np.zeros(0), centre=np.zeros((0, 3)))
 NO_CONTACT = ContactLaw(stiffness=1.0, damping=0.0, friction=0.0, tangential_stiffness=1.0)
 
 
@@ -84,13 +83,16 @@ def _check_state(model: OrganModel, state: OrganState, shapes: ContactShapes) ->
 
 def _check_shapes(shapes: ContactShapes) -> None:
     count, tools = len(shapes.shape_radius), len(shapes.tool_centre)
-    wanted = {"shape_ends": (count, 2, 3), "shape_tool": (count,), "tool_centre": (tools, 3), "tool_twist": (tools, 6)}
+    wanted = {
+        **{"shape_ends": (count, 2, 3), "shape_tool": (count,), "shape_span": (count, 3), "shape_friction": (count,)},
+        **{"tool_centre": (tools, 3), "tool_twist": (tools, 6)},
+    }
     for name, shape in wanted.items():
         if getattr(shapes, name).shape != shape:
             raise OrganError(
                 f"{name} has shape {getattr(shapes, name).shape}; with these shapes and tools it is {shape}"
             )
-    for name in ("shape_ends", "shape_radius", "tool_centre", "tool_twist"):
+    for name in ("shape_ends", "shape_radius", "shape_span", "shape_friction", "tool_centre", "tool_twist"):
         if not np.isfinite(getattr(shapes, name)).all():
             raise OrganError(f"{name} has a number that is not finite: check the tool's pose and twist")
     if count and not (0 <= shapes.shape_tool.min() and shapes.shape_tool.max() < tools):

@@ -67,7 +67,9 @@ class ToolViews(NamedTuple):
     Fields:
         model, data: addresses of mjModel and mjData
         timestep: [s]                                                            scalar
-        geoms, half_length: contact shapes and half their axes [m]               (n_shape,)
+        geoms: contact shapes                                                    (n_shape,)
+        axis, half_length: which axis of the geom the core lies along, its half length [m]  (n_shape,), (n_shape,)
+        across, half_width: which axis of the geom a rounded box spans, its half width [m]  (n_shape,), (n_shape,)
         bodies: the tools                                                        (n_tool,)
         joint_damping: [N s/m, N m s]                                            (nv,)
         geom_position, geom_rotation: of all geoms, world frame [m]              (n_geom, 3), (n_geom, 9)
@@ -84,7 +86,10 @@ class ToolViews(NamedTuple):
     data: int
     timestep: float
     geoms: NDArray[np.int64]
+    axis: NDArray[np.int64]
     half_length: FloatArray
+    across: NDArray[np.int64]
+    half_width: FloatArray
     bodies: NDArray[np.int32]
     joint_damping: FloatArray
     geom_position: FloatArray
@@ -171,10 +176,12 @@ def _read_shapes(tools, shapes):
     """`ToolBodies.read_shapes`: pose and twist of every contact shape; MuJoCo gives angular before linear."""
     for shape in range(tools.geoms.shape[0]):
         geom = tools.geoms[shape]
+        along, across = tools.axis[shape], tools.across[shape]
         for axis in range(3):
-            offset = tools.geom_rotation[geom, 3 * axis + 2] * tools.half_length[shape]
+            offset = tools.geom_rotation[geom, 3 * axis + along] * tools.half_length[shape]
             shapes.shape_ends[shape, 0, axis] = tools.geom_position[geom, axis] - offset
             shapes.shape_ends[shape, 1, axis] = tools.geom_position[geom, axis] + offset
+            shapes.shape_span[shape, axis] = tools.geom_rotation[geom, 3 * axis + across] * tools.half_width[shape]
     for tool in range(tools.bodies.shape[0]):
         body = tools.bodies[tool]
         _mj_velocity(

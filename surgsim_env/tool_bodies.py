@@ -1,23 +1,65 @@
 """Bodies of a MuJoCo model that tissue feels: their contact shapes, poses and twists, and how they yield."""
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.kernels import ContactShapes
 from msdm_core.mesh import FloatArray
+from msdm_core.shapes import round_shapes
 from msdm_core.stepping import unyielding
 from surgsim_env.haptic_kernels import Servo, ToolViews, factorise, yield_tool
 
 IndexArray = NDArray[np.int64]
 
-# Geoms of this group are what tissue feels: spheres and capsules.
+# Geoms of this group are what tissue feels: spheres, capsules and boxes, whose edges are rounded.
 CONTACT_GROUP = 3
+# A custom number (<numeric>) of a model that says how rough a geom is: this, and the geom's name.
+ROUGHNESS = "roughness_"
 
 
 def make_servo(lower: FloatArray, upper: FloatArray, position: IndexArray, speed: IndexArray) -> Servo:
     """A servo at rest: limits of its joints [m or rad] and which of MuJoCo's controls hold and pace them, each (n,)."""
     return Servo(np.zeros(len(lower)), lower, upper, position, speed, np.zeros(1, dtype=bool))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cores:
+    """Of each contact geom (n_shape,): its rounding [m], along which of its axes its core lies and spans [m], friction.
+
+    A box is rounded by its smallest half size; its core lies along the longest and spans the other.
+    """
+
+    radius: FloatArray
+    axis: IndexArray
+    half_length: FloatArray
+    across: IndexArray
+    half_width: FloatArray
+    friction: FloatArray
+
+
+def _cores(model: mujoco.MjModel, geoms: IndexArray) -> _Cores:
+    size, kind = model.geom_size[geoms], model.geom_type[geoms]
+    box = kind == mujoco.mjtGeom.mjGEOM_BOX
+    capsule = kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+    # Of a box: the axes by size, thin, middle, long; all others lie along z and are as thick as their first size.
+    order = np.where(box[:, None], np.argsort(size, axis=1, kind="stable"), np.array([[0, 1, 2]]))
+    thin, middle, long = np.take_along_axis(size, order, axis=1).T
+    return _Cores(
+        radius=thin.copy(),
+        axis=order[:, 2].copy(),
+        half_length=np.where(box, long - thin, np.where(capsule, size[:, 1], 0.0)),
+        across=order[:, 1].copy(),
+        half_width=np.where(box, middle - thin, 0.0),
+        friction=np.array([_roughness(model, int(geom)) for geom in geoms]),
+    )
+
+
+def _roughness(model: mujoco.MjModel, geom: int) -> float:
+    """Coulomb coefficient of a geom over the contact law's: the model's custom number of that name, or 1."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, ROUGHNESS + model.geom(geom).name)
+    return 1.0 if number < 0 else float(model.numeric_data[model.numeric_adr[number]])
 
 
 class ToolBodies:
@@ -34,15 +76,14 @@ class ToolBodies:
         self._geoms = np.flatnonzero(model.geom_group == CONTACT_GROUP)
         bodies = model.geom_bodyid[self._geoms]
         self._tools = np.unique(bodies)
-        capsule = model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_CAPSULE
-        self._half_length = np.where(capsule, model.geom_size[self._geoms, 1], 0.0)
+        self._core = _cores(model, self._geoms)
         count = len(self._tools)
-        self.shapes = ContactShapes(
-            shape_ends=np.zeros((len(self._geoms), 2, 3)),
-            shape_radius=model.geom_size[self._geoms, 0].copy(),
-            shape_tool=np.searchsorted(self._tools, bodies).astype(np.int32),
-            tool_centre=np.zeros((count, 3)),
-            tool_twist=np.zeros((count, 6)),
+        self.shapes = round_shapes(
+            np.zeros((len(self._geoms), 2, 3)),
+            self._core.radius,
+            friction=self._core.friction,
+            tool=np.searchsorted(self._tools, bodies),
+            centre=np.zeros((count, 3)),
         )
         self.response = unyielding(count)
         self.servo = make_servo(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
@@ -75,10 +116,13 @@ class ToolBodies:
     def read_shapes(self) -> None:
         """Copy the current pose and twist of every contact shape into `shapes`; call after mj_step1."""
         shapes, data = self.shapes, self.data
+        core = self._core
         for index, geom in enumerate(self._geoms):
-            axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * self._half_length[index]
-            shapes.shape_ends[index, 0] = data.geom_xpos[geom] - axis
-            shapes.shape_ends[index, 1] = data.geom_xpos[geom] + axis
+            axes = data.geom_xmat[geom].reshape(3, 3).T
+            half = axes[core.axis[index]] * core.half_length[index]
+            shapes.shape_ends[index, 0] = data.geom_xpos[geom] - half
+            shapes.shape_ends[index, 1] = data.geom_xpos[geom] + half
+            shapes.shape_span[index] = axes[core.across[index]] * core.half_width[index]
         for index, body in enumerate(self._tools):
             mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_BODY, body, self._velocity, 0)
             shapes.tool_centre[index] = data.xipos[body]
@@ -134,7 +178,10 @@ class ToolBodies:
             data=data._address,
             timestep=model.opt.timestep,
             geoms=self._geoms,
-            half_length=self._half_length,
+            axis=self._core.axis,
+            half_length=self._core.half_length,
+            across=self._core.across,
+            half_width=self._core.half_width,
             bodies=self._tools,
             joint_damping=model.dof_damping,
             geom_position=data.geom_xpos,

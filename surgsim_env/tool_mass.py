@@ -35,7 +35,9 @@ class ToolMass:
 
 
 def contact_area(tools: ToolBodies, tool: int) -> float:
-    """Largest surface area that can push a tool [m^2]: the cross-sections of its shapes, pi r^2 + 2 r l each.
+    """Largest surface area that can push a tool [m^2]: the cross-sections of its shapes, pi r^2 + 2 r l + w (2 r + l).
+
+    l and w are length and width of the core, 0 for a ball, w = 0 for a capsule.
 
     A surface pressed by k_p per area and penetration holds a shape with k_p int (e . u)^2 dA along u, e being the
     direction of the pressure. For a ball in a flat surface up to its centre that is half of pi r^2, for one with
@@ -45,7 +47,8 @@ def contact_area(tools: ToolBodies, tool: int) -> float:
     mine = tools.shapes.shape_tool == tool
     radius = tools.shapes.shape_radius[mine]
     length = np.linalg.norm(np.diff(tools.shapes.shape_ends[mine], axis=1)[:, 0], axis=1)
-    return float((np.pi * radius**2 + 2.0 * radius * length).sum())
+    width = 2.0 * np.linalg.norm(tools.shapes.shape_span[mine], axis=1)
+    return float((np.pi * radius**2 + 2.0 * radius * (length + width) + width * length).sum())
 
 
 def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float) -> list[ToolMass]:
@@ -88,7 +91,9 @@ def effective_mass(tools: ToolBodies, tool: int, inertia: FloatArray) -> float:
     """Least mass of a tool at the ends of its shapes' axes, 1 / max eig(J M^-1 J^T) [kg], M (nv, nv) as given."""
     jacobian = tools.jacobian(tool)
     mobility = 0.0
-    for end in tools.shapes.shape_ends[tools.shapes.shape_tool == tool].reshape(-1, 3):
+    mine = tools.shapes.shape_tool == tool
+    ends, span = tools.shapes.shape_ends[mine], tools.shapes.shape_span[mine][:, None]
+    for end in np.concatenate([ends - span, ends + span]).reshape(-1, 3):
         x, y, z = end - tools.shapes.tool_centre[tool]
         # Velocity of that end: v + omega x (x, y, z).
         there = jacobian[:3] + np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ jacobian[3:]

@@ -4,9 +4,10 @@ import numpy as np
 
 from msdm_core.damping import Damping
 from msdm_core.errors import OrganDivergedError
-from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel
+from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
+from msdm_core.shapes import round_shapes
 from msdm_core.stability import stable_dt
 from msdm_core.stepping import advance_organ, describe_fault
 from surgsim_env.timing import substeps_needed
@@ -85,9 +86,7 @@ def press_work(model: OrganModel, substeps: int, random: np.random.Generator) ->
     site = random.uniform(0.3, 0.7, 2) * BLOCK[:2]
     start = np.array([*site, BLOCK[2] + radius])
     state = rest_state(model, shape_count=1)
-    shapes = ContactShapes(
-        np.tile(start, (1, 2, 1)), np.array([radius]), np.zeros(1, np.int32), start[None].copy(), np.zeros((1, 6))
-    )
+    shapes = round_shapes([[start, start]], radius)
     way = max(1, round(depth / speed / HAPTIC_STEP))
     work: list[float] = []
     for down, steps in ((-1.0, way), (0.0, way // 2), (1.0, way + 5)):

@@ -11,6 +11,7 @@ from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel,
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state
 from msdm_core.regions import Lesion
+from msdm_core.shapes import round_shapes
 from msdm_core.stability import stable_dt
 from msdm_core.stepping import advance_organ
 from surgsim_env.anatomy import load_anatomy
@@ -81,13 +82,7 @@ def ball(site: ArrayLike, radius: float) -> ContactShapes:
     """A ball that just touches the block's top at (x, y) [m]."""
     x, y = np.asarray(site, dtype=np.float64)
     centre = np.array([x, y, SIZE[2] + radius])
-    return ContactShapes(
-        shape_ends=np.array([[centre, centre]]),
-        shape_radius=np.array([radius]),
-        shape_tool=np.zeros(1, dtype=np.int32),
-        tool_centre=centre[None].copy(),
-        tool_twist=np.zeros((1, 6)),
-    )
+    return round_shapes([[centre, centre]], radius)
 
 
 def block(

@@ -15,6 +15,7 @@ from msdm_core.meshing import box_mesh
 from msdm_core.ordering import spring_order
 from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material
+from msdm_core.shapes import round_shapes
 from msdm_core.stability import largest_frequency, step_limit
 from msdm_core.stepping import advance_organ
 
@@ -147,7 +148,7 @@ def contact_energy(
             normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
             normal = normal / np.linalg.norm(normal)
             points = QUADRATURE @ corners
-            offset = points - nearest_on_axis(shapes.shape_ends[shape], points)
+            offset = points - nearest_on_core(shapes.shape_ends[shape], shapes.shape_span[shape], points)
             height = offset @ normal
             chord_squared = radius**2 - ((offset * offset).sum(axis=1) - height**2)
             chord = np.sqrt(np.maximum(chord_squared, 0.0))
@@ -191,6 +192,13 @@ def nearest_pair(ends: FloatArray, corners: FloatArray, normal: FloatArray) -> t
             if 0.0 <= share <= 1.0 and 0.0 <= edge_share <= 1.0:
                 pairs.append((ends[0] + share * along, corners[i] + edge_share * edge))
     return min(pairs, key=lambda pair: float(np.linalg.norm(pair[0] - pair[1])))
+
+
+def nearest_on_core(ends: FloatArray, span: FloatArray, points: FloatArray) -> FloatArray:
+    """The point of a shape's core, the axis swept to either side by the span, nearest to each point [m], (n, 3)."""
+    middle = nearest_on_axis(ends, points)
+    sides = [np.array([place - span, place + span]) for place in middle]
+    return np.array([nearest_on_axis(side, point[None])[0] for side, point in zip(sides, points, strict=True)])
 
 
 def nearest_on_axis(ends: FloatArray, points: FloatArray) -> FloatArray:
@@ -261,18 +269,17 @@ def without_stiffness(model: OrganModel) -> OrganModel:
 
 
 def single_tool(
-    ends: ArrayLike, radius: ArrayLike, *, centre: ArrayLike | None = None, twist: ArrayLike = (0.0,) * 6
+    ends: ArrayLike,
+    radius: ArrayLike,
+    *,
+    centre: ArrayLike | None = None,
+    twist: ArrayLike = (0.0,) * 6,
+    span: ArrayLike | None = None,
 ) -> ContactShapes:
     """Shapes carried by one tool: axis ends (n_shape, 2, 3) [m], radii (n_shape,) [m], centre of mass, twist (6,)."""
     axes = np.array(ends, dtype=np.float64).reshape(-1, 2, 3)
     middle = axes[0].mean(axis=0) if centre is None else np.asarray(centre, dtype=np.float64)
-    return ContactShapes(
-        shape_ends=axes,
-        shape_radius=np.array(radius, dtype=np.float64).reshape(-1),
-        shape_tool=np.zeros(len(axes), dtype=np.int32),
-        tool_centre=middle.reshape(1, 3).copy(),
-        tool_twist=np.array(twist, dtype=np.float64).reshape(1, 6),
-    )
+    return round_shapes(axes, radius, span=span, centre=middle, twist=twist)
 
 
 def ball(centre: ArrayLike, radius: float, *, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> ContactShapes:

@@ -168,6 +168,13 @@ SHAPES = {
         [0.007, 0.004],
         centre=(0.0, 0.0, 0.05),
     ),
+    # Tilted about its length: points below the core, beside it and off its end.
+    "rounded box": oracle.single_tool(
+        [[[0.012, 0.013, TOP + 0.0035], [0.024, 0.012, TOP + 0.0038]]],
+        0.005,
+        span=(0.0004, 0.0051, 0.001),
+        centre=(0.0, 0.0, 0.05),
+    ),
 }
 
 
@@ -228,7 +235,7 @@ def moved_shapes(shapes: ContactShapes, shift: NDArray, turn: NDArray) -> Contac
     centre = shapes.tool_centre[0]
     axes = shapes.shape_ends.reshape(-1, 3)
     turned = (axes - centre) @ rotation_matrix(turn).T + centre + shift
-    return shapes._replace(shape_ends=turned.reshape(-1, 2, 3))
+    return shapes._replace(shape_ends=turned.reshape(-1, 2, 3), shape_span=shapes.shape_span @ rotation_matrix(turn).T)
 
 
 @pytest.mark.parametrize("law", [ELASTIC, FULL], ids=["elastic", "with damping and friction"])
@@ -255,11 +262,12 @@ def test_a_frictionless_ball_feels_no_torque_about_its_centre(name: str):
     assert largest(wrench[3:]) <= 1e-12 * largest(wrench[:3]) * 0.007
 
 
+@pytest.mark.parametrize("name", ["ball and shaft", "rounded box"])
 @settings(max_examples=15, deadline=None)
-@given(st.tuples(ANGLES, ANGLES, ANGLES), st.tuples(SHIFTS, SHIFTS, SHIFTS))
-def test_contact_turns_with_the_frame(turn: tuple[float, float, float], shift: tuple[float, float, float]):
+@given(turn=st.tuples(ANGLES, ANGLES, ANGLES), shift=st.tuples(SHIFTS, SHIFTS, SHIFTS))
+def test_contact_turns_with_the_frame(name: str, turn: tuple[float, float, float], shift: tuple[float, float, float]):
     """The whole scene turned and shifted, friction's memory included: forces turn, nothing else changes."""
-    model, name = oracle.irregular_organ(4), "ball and shaft"
+    model = oracle.irregular_organ(4)
     shapes = SHAPES[name]._replace(tool_twist=np.array([[0.03, -0.02, 0.05, 0.4, -0.3, 0.2]]))
     rotation = rotation_matrix(turn)
     state = touched_state(model, name)
@@ -271,6 +279,7 @@ def test_contact_turns_with_the_frame(turn: tuple[float, float, float], shift: t
     turned.contact_stretch[:] = state.contact_stretch @ rotation.T
     turned_shapes = shapes._replace(
         shape_ends=shapes.shape_ends @ rotation.T + shift,
+        shape_span=shapes.shape_span @ rotation.T,
         tool_centre=shapes.tool_centre @ rotation.T + shift,
         tool_twist=(shapes.tool_twist.reshape(2, 3) @ rotation.T).reshape(1, 6),
     )

@@ -7,7 +7,7 @@ from msdm_core import numba_cache
 
 with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
     # First of all: what is compiled is cached where it was decorated.
-    from surgsim_env import haptic_kernels, lane_haptic_kernels  # noqa: F401
+    from surgsim_env import haptic_kernels, lane_haptic_kernels, visibility_kernels  # noqa: F401
 from surgsim_env.rendering.gl import import_mujoco
 
 import_mujoco()

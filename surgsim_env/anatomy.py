@@ -77,9 +77,11 @@ class Anatomy:
         size cannot have it (a thin or sharply bent one) is drawn again.
 
         Raises:
-            ValueError: the organ has no room for such a lesion in 200 draws.
+            ValueError: the scene says nothing of lesions, or the organ has no room for such a one in 200 draws.
         """
         draw = self.scene.lesion
+        if draw is None:
+            raise ValueError(f"scene {self.scene.name!r} has no [lesion] table to draw a lesion from: add one")
         radius = float(rng.uniform(*draw.radius))
         cover = float(rng.uniform(*draw.cover))
         ratio = float(rng.uniform(*draw.modulus_ratio))

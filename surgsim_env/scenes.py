@@ -12,6 +12,7 @@ from msdm_core.regions import Capsule, Material
 from msdm_core.stiffness import check_stiffness_rule
 from surgsim_env.arms.description import list_arms
 from surgsim_env.arms.port import Port
+from surgsim_env.retraction import Retraction, RetractionCamera
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.toml_tables import fill, nearest, read_toml
 
@@ -151,16 +152,22 @@ class Timing:
 
 @dataclass(frozen=True)
 class Limits:
-    """Forces on the tissue [N]: above soft_force costs reward, above hard_force ends an episode."""
+    """Forces on the tissue [N]: above soft_force costs reward, above hard_force ends an episode; so does tearing.
+
+    tear_force is what a jaw may pull; without one nothing tears.
+    """
 
     soft_force: float
     hard_force: float
+    tear_force: float = math.inf
 
     def __post_init__(self) -> None:
         if not 0.0 < self.soft_force < self.hard_force:
             raise ValueError(
                 f"limits: 0 < soft_force < hard_force must hold; got {self.soft_force}, {self.hard_force} N"
             )
+        if not self.tear_force > 0.0:
+            raise ValueError(f"limits.tear_force is {self.tear_force:g} N; it must be above 0")
 
 
 @dataclass(frozen=True)
@@ -308,7 +315,8 @@ class Scene:
     limits: Limits
     sensor: ForceSensor
     palpation: Palpation
-    lesion: LesionDraw
+    lesion: LesionDraw | None = None
+    retract: Retraction | None = None
     capsule: Capsule | None = None
     demonstration: tuple[FixedLesion, ...] = field(default=())
     stiffness_rule: str = "lloyd"
@@ -330,6 +338,7 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
 _TABLES = (
     *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
     *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Endoscope, Port),
+    *(Retraction, RetractionCamera),
 )
 
 

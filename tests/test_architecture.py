@@ -176,7 +176,7 @@ def arms_know_no_task(source: Source) -> Iterator[str]:
 def pictures_are_asked_for(source: Source) -> Iterator[str]:
     """Only environments, the command line and reports draw: the simulation and its tasks do not know how they look."""
     may = (
-        *("surgsim_env/rendering/", "surgsim_env/__init__.py", "surgsim_env/env.py", "surgsim_env/cli.py"),
+        *("surgsim_env/rendering/", "surgsim_env/__init__.py", "surgsim_env/surgical_env.py", "surgsim_env/cli.py"),
         *("surgsim_env/evaluation/arms.py", "surgsim_env/evaluation/arm_pictures.py"),
     )
     if not source.path.startswith(may):
@@ -295,7 +295,7 @@ ALLOWED = [
     (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(fastmath=False)\ndef f(x): return math.sqrt(x)"),
     (tasks_do_not_advance, "surgsim_env/env.py", "simulation.haptic_step()"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.environment_words import WORDS"),
-    (pictures_are_asked_for, "surgsim_env/env.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
+    (pictures_are_asked_for, "surgsim_env/surgical_env.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (scripts_stand_on_top, "surgsim_env/scripting/run.py", "from surgsim_env.scripting.trace import Trace"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * LINES_PER_FILE),
     (named_for_what_it_does, "msdm_core/mesh_io.py", ""),

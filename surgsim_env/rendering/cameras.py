@@ -8,6 +8,7 @@ import numpy as np
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.palpable_face import tangent_axes
+from surgsim_env.scenes import Endoscope
 
 # The organ takes this share of the overview's picture, which is aimed above its middle by a share of half its height.
 OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
@@ -67,10 +68,12 @@ def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Came
     points, face = anatomy.mesh.points, anatomy.face
     up = -face.approach
     across, along = tangent_axes(face.approach)
-    front = cut_direction(anatomy)
+    front, place = cut_direction(anatomy), anatomy.scene.endoscope
     return {
         "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, aspect, OVERVIEW_SHIFT),
-        "endoscope": _placed(anatomy, up) or _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up),
+        "endoscope": _endoscope(anatomy, _raised(-along, up, 90.0 - ENDOSCOPE_TILT), up)
+        if place is None
+        else placed_endoscope(anatomy, place),
         "side": _framing(points, _raised(across, up, SIDE_HEIGHT), up, aspect, SIDE_SHIFT),
         "above": _framing(points, up, along, aspect, 0.0),
     }
@@ -108,11 +111,9 @@ def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
     return level * math.cos(math.radians(angle)) + up * math.sin(math.radians(angle))
 
 
-def _placed(anatomy: Anatomy, up: FloatArray) -> Camera | None:
-    """The endoscope where the scene puts it, None where it does not."""
-    place = anatomy.scene.endoscope
-    if place is None:
-        return None
+def placed_endoscope(anatomy: Anatomy, place: Endoscope) -> Camera:
+    """The camera of an endoscope that stands somewhere, upright as seen by the instrument."""
+    up = -anatomy.face.approach
     return Camera.looking(np.asarray(place.position), np.asarray(place.target), up, place.fov_deg)
 
 

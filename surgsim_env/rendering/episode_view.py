@@ -3,7 +3,7 @@
 import ctypes.util
 import os
 import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -12,12 +12,30 @@ from numpy.typing import NDArray
 
 from msdm_core.regions import Lesion
 from surgsim_env.rendering import gl
+from surgsim_env.rendering.cameras import placed_endoscope
 from surgsim_env.rendering.options import render_options
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.rendering.window import Window, WindowContext, require_display
+from surgsim_env.scenes import Endoscope
 from surgsim_env.simulation import Simulation
+from surgsim_env.visibility import Disc
 
 RENDER_MODES = ("human", "rgb_array")
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What of an episode a picture cannot read off the simulation.
+
+    Fields:
+        lesions: hidden in the organ; shown where the options ask for them
+        target: a disc to be seen, None for none
+        endoscope: where the endoscope stands; None: where the scene puts it
+    """
+
+    lesions: tuple[Lesion, ...] = ()
+    target: Disc | None = None
+    endoscope: Endoscope | None = None
 
 
 class EpisodeView:
@@ -45,25 +63,28 @@ class EpisodeView:
         modes = [mode for mode in RENDER_MODES if mode == self.mode or mode in offered_modes()]
         return {"render_modes": modes, "render_fps": round(1.0 / self._simulation.anatomy.scene.timing.control_step)}
 
-    def renderer(self, lesions: Sequence[Lesion]) -> OrganRenderer:
-        """The renderer, showing these lesions where the options ask for them."""
+    def renderer(self, shown: Shown) -> OrganRenderer:
+        """The renderer, set to show what an episode has."""
         if self._renderer is None:
             self._renderer = OrganRenderer(self._simulation, self.options)
-        self._renderer.lesions = tuple(lesions)
+        self._renderer.lesions = shown.lesions
+        self._renderer.target = shown.target
+        if shown.endoscope is not None:
+            self._renderer.cameras["endoscope"] = placed_endoscope(self._simulation.anatomy, shown.endoscope)
         return self._renderer
 
-    def frame(self, lesions: Sequence[Lesion]) -> NDArray[np.uint8]:
+    def frame(self, shown: Shown) -> NDArray[np.uint8]:
         """The picture of this moment, shape (height, width, 3)."""
-        return self.renderer(lesions).rgb()
+        return self.renderer(shown).rgb()
 
-    def show(self, lesions: Sequence[Lesion]) -> None:
+    def show(self, shown: Shown) -> None:
         """Show this moment in the window, which opens with the first."""
         if self._window is None:
             context = WindowContext("surgsim", self.options.width, self.options.height)
             self._renderer = OrganRenderer(self._simulation, self.options, gl_context=context)
             period = self._simulation.anatomy.scene.timing.control_step
             self._window = Window(self._renderer, context, period)
-        self.renderer(lesions)
+        self.renderer(shown)
         self._window.show()
 
     def close(self) -> None:

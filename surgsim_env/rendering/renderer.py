@@ -16,6 +16,7 @@ from surgsim_env.rendering.options import RenderOptions, check_camera
 from surgsim_env.rendering.stage import LOCK, Picture, Stage, borrow_stage, give_back_stage
 from surgsim_env.rendering.tissue import Tissue
 from surgsim_env.simulation import Simulation
+from surgsim_env.visibility import Disc
 
 
 class OrganRenderer:
@@ -24,7 +25,8 @@ class OrganRenderer:
         renderer = OrganRenderer(simulation, RenderOptions(camera="endoscope"))
         frame = renderer.rgb()
 
-    `lesions` are those that are shown where the options ask for them: assign the ones of the episode. OpenGL is loaded
+    `lesions` are those that are shown where the options ask for them: assign the ones of the episode; `target` is a
+    disc to be shown. OpenGL is loaded
     with the first picture. Renderers of one anatomy and size share their meshes on the graphics side.
     """
 
@@ -41,6 +43,7 @@ class OrganRenderer:
         aspect = self.options.width / self.options.height
         self.cameras: dict[str, Camera] = scene_cameras(simulation.anatomy, aspect)
         self.lesions: tuple[Lesion, ...] = tuple(lesions)
+        self.target: Disc | None = None
         self._simulation = simulation
         self._gl_context = gl_context
         self._stage: Stage | None = None
@@ -138,4 +141,5 @@ class OrganRenderer:
             shapes=shapes,
             lesions=list(zip(tissue.lesion_centres(nodes), axes)) if options.show_lesion else [],
             instrument=simulation.instrument.data,
+            target=self.target,
         )

@@ -35,6 +35,7 @@ LOOKS = {
     "shadow": Look((0.055, 0.150, 0.170), 0.0, 0.0),
 }
 LESION_COLOUR = (0.98, 0.84, 0.42)
+TARGET_COLOUR = (0.20, 0.75, 0.35)
 # The drape's squares are this wide [m]: a scale to read sizes off.
 DRAPE_SQUARE = 0.02
 DRAPE_COLOURS = (0.115, 0.315, 0.355), (0.128, 0.345, 0.385)

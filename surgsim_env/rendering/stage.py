@@ -18,16 +18,19 @@ from surgsim_env.rendering.cameras import Camera
 from surgsim_env.rendering.drawn_mesh import Shape
 from surgsim_env.rendering.instrument_geoms import PREFIX
 from surgsim_env.rendering.options import RenderOptions
-from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, build_scene
+from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, TARGET_COLOUR, build_scene
 from surgsim_env.rendering.surface import DrawnSurface, drawn_surface
+from surgsim_env.visibility import Disc
 
 # What a pixel may show, and the number that stands for it.
-LABELS = {"background": 0, "organ": 1, "instrument": 2, "lesion": 3}
+LABELS = {"background": 0, "organ": 1, "instrument": 2, "lesion": 3, "target": 4}
 # Which of them the scene's meshes are.
 MESH_LABELS = dict.fromkeys(("organ", "held", "section"), LABELS["organ"]) | {"section_lesion": LABELS["lesion"]}
-# Geoms that a picture may have beyond those of the model: lesions.
+# Geoms that a picture may have beyond those of the model: lesions, and a target.
 LESIONS_MOST = 100
 SHADOW_MAP = 2048
+# A target is drawn this thick [m], half of it above the disc itself.
+TARGET_THICKNESS = 2e-4
 
 _stages: dict[tuple, "Stage"] = {}
 # One thread draws at a time.
@@ -42,11 +45,13 @@ class Picture:
         shapes: surface and cut faces by their names in the scene
         lesions: centre [m] (3,), half axes [m] (3,) of each solid lesion
         instrument: the instrument's data, which is read
+        target: a disc to be seen, None for none
     """
 
     shapes: dict[str, Shape]
     lesions: Sequence[tuple[FloatArray, FloatArray]]
     instrument: mujoco.MjData
+    target: Disc | None = None
 
 
 class Stage:
@@ -66,9 +71,11 @@ class Stage:
             except mujoco.FatalError as error:
                 raise gl.NoGLError(f"OpenGL is there, but MuJoCo cannot draw with it: {error}") from error
         self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-        self._drawn = mujoco.MjvScene(model, model.ngeom + LESIONS_MOST)
+        self._drawn = mujoco.MjvScene(model, model.ngeom + LESIONS_MOST + 1)
         self._drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = options.shadows
         self._drawn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        # What the scene shows beyond its model: labels by their places in it.
+        self._added: dict[int, int] = {}
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         self._visible = mujoco.MjvOption()
@@ -87,8 +94,11 @@ class Stage:
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._visible, None, self._camera, everything, self._drawn)
         self._drawn.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = camera.sees_above_level()
+        self._added.clear()
         for centre, half_axes in picture.lesions[:LESIONS_MOST]:
             self._add_lesion(centre, half_axes)
+        if picture.target is not None:
+            self._add_target(picture.target)
 
     def colour(self) -> NDArray[np.uint8]:
         """The picture, shape (height, width, 3), its first row on top."""
@@ -140,12 +150,12 @@ class Stage:
 
     def _label(self, geom: Any) -> int:
         if geom.objtype != mujoco.mjtObj.mjOBJ_GEOM:
-            return LABELS["lesion"]
+            return self._added[geom.segid]
         name = self.scene.model.geom(geom.objid).name
         return LABELS["instrument"] if name.startswith(PREFIX) else MESH_LABELS.get(name, LABELS["background"])
 
     def _lesions_solid(self) -> bool:
-        return any(geom.objtype != mujoco.mjtObj.mjOBJ_GEOM for geom in self._drawn.geoms[: self._drawn.ngeom])
+        return LABELS["lesion"] in self._added.values()
 
     @contextlib.contextmanager
     def _without_organ(self) -> Iterator[None]:
@@ -158,15 +168,25 @@ class Stage:
             mesh.show(True, self.context)
 
     def _add_lesion(self, centre: FloatArray, half_axes: FloatArray) -> None:
+        self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, half_axes, centre, np.eye(3), LESION_COLOUR, "lesion")
+
+    def _add_target(self, disc: Disc) -> None:
+        size = np.array([disc.radius, 0.5 * TARGET_THICKNESS, 0.0])
+        self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, disc.centre, disc.rotation, TARGET_COLOUR, "target")
+
+    def _add(
+        self, kind: mujoco.mjtGeom, size: FloatArray, centre: FloatArray, rotation: FloatArray,
+        colour: tuple[float, float, float], label: str,
+    ) -> None:  # fmt: skip
+        """Add a geom to the drawn scene that its model does not have."""
         drawn = self._drawn
         geom = drawn.geoms[drawn.ngeom]
-        colour = np.array([*LESION_COLOUR, 1.0], dtype=np.float32)
-        kind = mujoco.mjtGeom.mjGEOM_ELLIPSOID
-        mujoco.mjv_initGeom(geom, kind, half_axes, centre, np.eye(3).ravel(), colour)
+        mujoco.mjv_initGeom(geom, kind, size, centre, rotation.ravel(), np.array([*colour, 1.0], dtype=np.float32))
         geom.specular, geom.shininess = 0.35, 0.5
         # mjv_initGeom leaves these as it found them, in memory that nobody has written.
         geom.objtype, geom.objid, geom.category = mujoco.mjtObj.mjOBJ_UNKNOWN, -1, mujoco.mjtCatBit.mjCAT_DECOR
         geom.segid = drawn.ngeom
+        self._added[drawn.ngeom] = LABELS[label]
         drawn.ngeom += 1
 
 

@@ -1,17 +1,22 @@
 """Palpation: find one hidden lesion by touch and declare it while pressing on it."""
 
 import json
-from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.kernels import OrganModel
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
+from surgsim_env.instrument import Instrument
 from surgsim_env.rewards import PALPATE_WEIGHTS, weighted
+from surgsim_env.scenes import Endoscope
 from surgsim_env.sensors import ForceReading
 from surgsim_env.simulation import Simulation
+from surgsim_env.tasks.task import Bounds, InfoValue, Start, Verdict
+from surgsim_env.visibility import Disc
 
 EPISODE_STEPS = 600
 SPEED_FULL_SCALE = 0.02
@@ -26,30 +31,26 @@ POSITION_SLACK = 0.005
 SPEED_BOUND = 0.5
 
 
-@dataclass(frozen=True)
-class Start:
-    """What an episode begins with: the lesions hidden in the organ and where the tip is [m]."""
-
-    lesions: tuple[Lesion, ...]
-    tip_position: FloatArray
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The judgement of a control step."""
-
-    terminated: bool
-    truncated: bool
-    rewards: dict[str, float]
-    info: dict[str, bool | float | str]
-
-
 class PalpateTask:
     """SurgSim/Palpate-v0 on one anatomy."""
 
     action_size = 4
+    weights = PALPATE_WEIGHTS
+    pull_limit = math.inf
+    target: Disc | None = None
+    endoscope: Endoscope | None = None
 
     def __init__(self, anatomy: Anatomy) -> None:
+        """Palpate an anatomy.
+
+        Raises:
+            ValueError: the scene says of no lesion how it is drawn.
+        """
+        if anatomy.scene.lesion is None:
+            raise ValueError(
+                f"scene {anatomy.scene.name!r} has no [lesion] table, so that there is nothing to find in it: "
+                "add one, or take a scene that has it, such as 'phantom'"
+            )
         self.anatomy = anatomy
         self.limits = anatomy.scene.limits
         self.reading = ForceReading(anatomy.scene.sensor)
@@ -58,12 +59,17 @@ class PalpateTask:
         self.declare_count = 0
         self._declare_value = 0.0
 
-    def bounds(self, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bounds of the observation, from the tip's workspace [m]."""
+    @property
+    def lesions(self) -> tuple[Lesion, ...]:
+        """The lesion of the episode; none before the first."""
+        return () if self.lesion is None else (self.lesion,)
+
+    def bounds(self, instrument: Instrument) -> Bounds:
+        """Bounds of the observation, from the tip's workspace [m]."""
         speed, force = np.full(3, SPEED_BOUND), np.full(3, self.anatomy.scene.sensor.range)
-        low = np.concatenate([lower - POSITION_SLACK, -speed, -force, [0.0]])
-        high = np.concatenate([upper + POSITION_SLACK, speed, force, [1.0]])
-        return low, high
+        low = np.concatenate([instrument.lower - POSITION_SLACK, -speed, -force, [0.0]])
+        high = np.concatenate([instrument.upper + POSITION_SLACK, speed, force, [1.0]])
+        return Bounds(low, high)
 
     def reset(self, rng: np.random.Generator) -> Start:
         """Draw the lesion, the sensor's bias and the tip's start."""
@@ -74,7 +80,15 @@ class PalpateTask:
         self._declare_value = 0.0
         above, outward = self.anatomy.face.random_point(rng, self.anatomy.scene.palpation.face_margin)
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
-        return Start((self.lesion,), above + outward * gap)
+        return Start(self.anatomy.organ(self.lesions), above + outward * gap)
+
+    def accepts(self, simulation: Simulation) -> bool:
+        """Every drawn lesion can be found."""
+        return True
+
+    def command(self, action: FloatArray, instrument: Instrument) -> None:
+        """Set the tip velocity that an action asks for."""
+        instrument.command_velocity(self.velocity(action))
 
     def velocity(self, action: FloatArray) -> FloatArray:
         """The tip velocity that an action asks for [m/s], shape (3,)."""
@@ -146,13 +160,9 @@ class PalpateTask:
             },
         )
 
-    def blank_info(self) -> dict[str, bool | float | str]:
+    def blank_info(self) -> dict[str, InfoValue]:
         """The info of a reset: the same keys and types as a verdict's."""
         return {"force_peak": 0.0, "hard_limit": False, "declared": False, "success": False, "error_mm": -1.0}
-
-    def blank_rewards(self) -> dict[str, float]:
-        """The reward terms of a reset, all 0."""
-        return dict.fromkeys(PALPATE_WEIGHTS, 0.0)
 
     def _declares(self, simulation: Simulation) -> bool:
         pressing = self._declare_value > DECLARE_VALUE and simulation.contact_centre is not None
@@ -181,8 +191,8 @@ class PalpateTask:
             }
         )
 
-    def set_state(self, text: str) -> tuple[Lesion, ...]:
-        """Restore what `get_state` gave; returns the lesions that the organ must have."""
+    def set_state(self, text: str) -> OrganModel:
+        """Restore what `get_state` gave; returns the organ with the lesion of that episode."""
         table = json.loads(text)
         self.lesion = self.anatomy.lesion_of_modulus(
             table["centre"], table["radius"], table["youngs_modulus"], "lesion"
@@ -190,4 +200,4 @@ class PalpateTask:
         self.reading.bias = np.array(table["bias"])
         self.step_count, self.declare_count = table["counts"]
         self._declare_value = table["declare_value"]
-        return (self.lesion,)
+        return self.anatomy.organ(self.lesions)

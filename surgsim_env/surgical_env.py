@@ -1,0 +1,283 @@
+"""An environment in general: a simulation and a task put together; no physics and no reward is computed here."""
+
+import io
+import json
+import zipfile
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown
+from surgsim_env.rendering.renderer import OrganRenderer
+from surgsim_env.simulation import Simulation
+from surgsim_env.tasks.task import Task
+
+# Numbers as float32, or a picture as uint8.
+Observation = NDArray[Any]
+Action = NDArray[np.float32]
+Info = dict[str, Any]
+
+# How far an action may leave [-1, 1] by rounding.
+ACTION_SLACK = 1e-6
+# Episodes that a task does not accept are drawn again, so many times at most.
+DRAWS_MOST = 20
+# What an environment may observe, and the size of a picture that it observes [pixels].
+OBSERVATION_MODES = ("state", "rgb")
+PICTURE_SIZE = 84
+
+
+class SurgicalEnv(gym.Env[Observation, Action]):
+    """One organ, one instrument and one task as a Gymnasium environment; the ids' classes say which.
+
+    `obs_mode` "state" observes the task's vector, "rgb" the endoscope's picture, uint8 of shape (84, 84, 3).
+    """
+
+    metadata: ClassVar[Info] = {"render_modes": list(RENDER_MODES), "render_fps": 20}
+    task: Task
+
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        task: Task,
+        *,
+        render_mode: str | None,
+        pictures: dict[str, Any],
+        obs_mode: str = "state",
+    ) -> None:
+        """Set up a simulation of an anatomy; `pictures` are fields of `RenderOptions`.
+
+        Raises:
+            ValueError: an obs_mode, a render_mode or a picture's option that is unknown.
+        """
+        if obs_mode not in OBSERVATION_MODES:
+            raise ValueError(f"obs_mode {obs_mode!r} is unknown; the modes are {', '.join(OBSERVATION_MODES)}")
+        self.scene = anatomy.scene
+        self.simulation = Simulation(anatomy)
+        self._view = EpisodeView(self.simulation, render_mode, pictures)
+        self.render_mode = render_mode
+        # The modes that this machine offers; the class names all that there are.
+        self.metadata = self._view.metadata()  # type: ignore[misc]
+        self.task = task
+        bounds = task.bounds(self.simulation.instrument)
+        self._low, self._high = bounds.low.astype(np.float32), bounds.high.astype(np.float32)
+        self._eye: EpisodeView | None = None
+        if obs_mode == "rgb":
+            sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_force": False}
+            self._eye = EpisodeView(self.simulation, "rgb_array", sight)
+            self.observation_space = gym.spaces.Box(0, 255, (PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
+        else:
+            self.observation_space = gym.spaces.Box(self._low, self._high, dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (task.action_size,), dtype=np.float32)
+        self._observation = np.zeros(self._low.shape, dtype=np.float32)
+        # What the last step was told, after what wrappers made of it.
+        self.last_action = np.zeros(task.action_size)
+        self._begun = False
+        self._running = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+        """Draw an episode and put its organ and instrument at rest; no options are known."""
+        super().reset(seed=seed)
+        if options:
+            raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
+        self._draw()
+        values, saturated = self.task.observe(self.simulation, self.np_random)
+        self._observation = values.astype(np.float32)
+        self._begun = self._running = True
+        rewards = dict.fromkeys(self.task.weights, 0.0)
+        info = self._info("", saturated, self.task.blank_info(), rewards)
+        self._show()
+        return self._observed(), info
+
+    def command(self, action: Action) -> None:
+        """Check an action and give the commands that it holds; the first part of `step`, which repeats it.
+
+        Raises:
+            ResetNeeded: no episode is running.
+            ValueError: names the entry of the action that is out of bounds.
+        """
+        if not self._running:
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
+        values = self._checked(action)
+        if not self.simulation.taken_over:
+            self.task.command(values, self.simulation.instrument)
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
+        """One control step: haptic steps until it is over, a force limit is passed or the simulation faults."""
+        self.command(action)
+        self.last_action = self._checked(action)
+        self.task.begin(self.last_action)
+        count = self.scene.timing.haptic_steps_per_control
+        force_peak = self.simulation.control_step(count, self.task.force_limit)
+        fault = self.simulation.fault
+        saturated = False
+        if not fault:
+            self.simulation.end_control_step()
+            values, saturated = self.task.observe(self.simulation, self.np_random)
+            fault = self.simulation.fault or self._out_of_bounds(values)
+            if not fault:
+                self._observation = values.astype(np.float32)
+        verdict = self.task.judge(self.simulation, force_peak, fault)
+        self._running = not (verdict.terminated or verdict.truncated)
+        info = self._info(fault, saturated, verdict.info, verdict.rewards)
+        self._show()
+        return self._observed(), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The picture of this moment in mode "rgb_array", shape (height, width, 3); a window shows each step by itself.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to show.
+            NoGLError: there is no OpenGL to draw with; names the packages that are missing.
+        """
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() without a render_mode shows nothing: make the environment with "
+                f'gym.make("{self.spec.id if self.spec else "SurgSim/..."}", render_mode="rgb_array")'
+            )
+            return None
+        if self.render_mode == "human":
+            self._shown()
+            return None
+        return self._view.frame(self._shown())
+
+    @property
+    def renderer(self) -> OrganRenderer:
+        """Draws the episode in any render_mode: `rgb(camera)`, `depth(camera)` [m], `segmentation(camera)`.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to show.
+        """
+        return self._view.renderer(self._shown())
+
+    @property
+    def observation(self) -> Observation:
+        """The last observation that reset or step gave."""
+        return self._observed()
+
+    def close(self) -> None:
+        """Close the window and give back the graphics; more than once is no harm."""
+        self._view.close()
+        if self._eye is not None:
+            self._eye.close()
+
+    def save_state(self) -> bytes:
+        """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed.
+
+        Wrappers keep counts of their own (TimeLimit): load a state into an environment that was just reset.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to save.
+        """
+        if not self._begun:
+            raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
+        arrays = self.simulation.get_state()
+        arrays["made_by"] = np.array(self._fingerprint())
+        arrays["task"] = np.array(self.task.get_state())
+        arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
+        arrays["observation"] = self._observation.copy()
+        arrays["running"] = np.array(self._running)
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **arrays)
+        return buffer.getvalue()
+
+    def load_state(self, state: bytes) -> None:
+        """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene.
+
+        Raises:
+            ValueError: bytes that are no saved state, or one of another scene or mesh (names both).
+        """
+        try:
+            with np.load(io.BytesIO(state), allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            made_by = str(arrays["made_by"])
+        except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"not a saved state of this kind of environment: {error}") from None
+        if made_by != self._fingerprint():
+            raise ValueError(f"the state was saved by {made_by}, this is {self._fingerprint()}: use the same scene")
+        self._check_entries(arrays)
+        self.simulation.set_state(self.task.set_state(str(arrays["task"])), arrays)
+        self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
+        self._observation = arrays["observation"]
+        self._begun, self._running = True, bool(arrays["running"])
+
+    def _draw(self) -> None:
+        """Draw episodes until the task accepts one."""
+        for _ in range(DRAWS_MOST):
+            start = self.task.reset(self.np_random)
+            self.simulation.reset(start.organ, start.tip_position)
+            if self.task.accepts(self.simulation):
+                return
+        raise ValueError(
+            f"scene {self.scene.name!r}: none of {DRAWS_MOST} draws is an episode that the task accepts: "
+            "narrow the ranges of the scene's draw"
+        )
+
+    def _observed(self) -> Observation:
+        """The last observation, as obs_mode has it."""
+        if self._eye is not None:
+            return self._eye.frame(self._shown())
+        return self._observation.copy()
+
+    def _shown(self) -> Shown:
+        if not self._begun:
+            raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
+        return Shown(self.task.lesions, self.task.target, self.task.endoscope)
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._view.show(self._shown())
+
+    def _check_entries(self, arrays: dict[str, np.ndarray]) -> None:
+        """Refuse an archive that lacks an entry or has one of another shape, before anything is changed."""
+        wanted = {name: array.shape for name, array in self.simulation.get_state().items()}
+        wanted |= {"task": (), "random": (), "running": (), "observation": self._observation.shape}
+        for name, shape in wanted.items():
+            if name not in arrays or arrays[name].shape != shape:
+                found = arrays[name].shape if name in arrays else "nothing"
+                raise ValueError(f"not a saved state of this environment: {name} has shape {shape}, found {found}")
+
+    def _fingerprint(self) -> str:
+        """What a saved state must agree with: the environment, its scene and mesh, the rates."""
+        mesh, timing = self.simulation.anatomy.mesh, self.scene.timing
+        digest = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
+        digest = zlib.crc32(repr(replace(self.scene, folder=Path())).encode(), digest)
+        return (
+            f"{type(self).__name__} of scene {self.scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
+            f"{timing.substep_count} substeps in {timing.haptic_step:g} s, digest {digest:08x})"
+        )
+
+    def _checked(self, action: Action) -> FloatArray:
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape:
+            raise ValueError(f"action has shape {values.shape}; the rule is {self.action_space.shape}")
+        bad = np.flatnonzero(~(np.abs(values) <= 1.0 + ACTION_SLACK))
+        if bad.size:
+            raise ValueError(
+                f"action[{bad[0]}] is {values[bad[0]]}; every entry must be finite and in [-1, 1]: "
+                "wrap the environment in gymnasium.wrappers.ClipAction"
+            )
+        return values
+
+    def _out_of_bounds(self, values: FloatArray) -> str:
+        single = values.astype(np.float32)
+        bad = np.flatnonzero(~((single >= self._low) & (single <= self._high)))
+        return f"observation[{bad[0]}] = {values[bad[0]]:g} left its bounds" if bad.size else ""
+
+    def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
+        residual = self.simulation.instrument.trocar_residual
+        return {
+            "sim_fault": fault,
+            "sensor_saturated": saturated,
+            "workspace_limited": self.simulation.instrument.workspace_limited,
+            "added_mass": self.simulation.organ_model.added_mass,
+            "trocar_error_mm": -1.0 if residual is None else residual * 1000.0,
+            **task_info,
+            **{f"reward_{name}": value for name, value in rewards.items()},
+        }

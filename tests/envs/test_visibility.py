@@ -129,7 +129,7 @@ def test_a_plane_hides_what_lies_behind_it():
 
 
 def test_what_is_not_shown_and_not_felt_hides_nothing():
-    ball = '<geom type="sphere" size="0.02" pos="0 0 0.03" {{}}/>'
+    ball = '<geom type="sphere" size="0.02" pos="0 0 0.03" {}/>'
     assert seen(geoms=ball.format('rgba="1 1 1 0"')) == 1.0
     assert seen(geoms=ball.format('group="4"')) == 1.0
     assert seen(geoms=ball.format('group="3" rgba="1 1 1 0"')) == 0.0

@@ -50,25 +50,31 @@ class Anatomy:
 
         Where the scene says `mass_scaling`, with the mass that its number of substeps needs (`OrganModel.added_mass`).
         """
+        return self.compiled(self.specification(lesions, modulus_factor=modulus_factor))
+
+    def specification(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganSpec:
+        """What `organ` compiles, for changes that a scene's draw makes to it."""
         scene, capsule = self.scene, self.scene.capsule
         material = replace(scene.material, youngs_modulus=scene.material.youngs_modulus * modulus_factor)
         if capsule is not None:
             capsule = replace(capsule, youngs_modulus=capsule.youngs_modulus * modulus_factor)
-        organ = compile_organ(
-            OrganSpec(
-                mesh=self.mesh,
-                materials=material,
-                capsule=capsule,
-                lesions=tuple(lesions),
-                anchors=self.anchors,
-                damping=scene.damping,
-                stiffness_rule=scene.stiffness_rule,
-            )
+        return OrganSpec(
+            mesh=self.mesh,
+            materials=material,
+            capsule=capsule,
+            lesions=tuple(lesions),
+            anchors=self.anchors,
+            damping=scene.damping,
+            stiffness_rule=scene.stiffness_rule,
         )
-        timing = scene.timing
+
+    def compiled(self, specification: OrganSpec) -> OrganModel:
+        """The organ of a specification, with the mass that the scene's number of substeps needs if it says so."""
+        organ, timing = compile_organ(specification), self.scene.timing
         if not timing.mass_scaling:
             return organ
-        return scale_mass(organ, step_needed(timing.haptic_step, timing.substep_count), scene.contact.law)
+        needed = step_needed(timing.haptic_step, timing.substep_count)
+        return scale_mass(organ, needed, self.scene.contact.law)
 
     def random_lesion(self, rng: np.random.Generator) -> Lesion:
         """A lesion drawn from the scene's ranges, below a random point of the palpable face.

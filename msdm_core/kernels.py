@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from msdm_core.contact_kernels import add_contact_forces, find_candidates, stretch_by_lag
 from msdm_core.guard_kernels import guard_axes
 from msdm_core.squeeze_kernels import hold_squeezed
+from msdm_core.support_kernels import add_support_forces
 from msdm_core.tissue_kernels import (
     GROUP,
     add_spring_damping,
@@ -57,10 +58,20 @@ class OrganModel(NamedTuple):
         averages_volume: whether any node_bulk is above 0                        scalar
         surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
         surface_rest_area: [m^2]                                                 (n_surface,)
+        support_kind: what the organ rests on, a kind of `support_kernels`       (n_support,)
+        support_position: its middle or a plane's point [m]                      (n_support, 3)
+        support_rotation: its axes in the world, one a column                    (n_support, 3, 3)
+        support_size: radius, half length, half sizes [m]                        (n_support, 3)
+        support_friction: Coulomb coefficient                                    (n_support,)
+        support_nodes: nodes that supports may hold: free ones of the surface    (n_support_node,)
+        support_area: surface area that belongs to each of them [m^2]            (n_support_node,)
+        support_stiffness: pressure per penetration [N/m^3]                      scalar
+        support_damping: pressure per closing speed [N s/m^3]                    scalar
+        support_tangential_stiffness: traction per stretch while sticking [N/m^3] scalar
         gravity: [m/s^2]                                                         (3,)
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
-        stable_step: largest stable step without contact [s]                     scalar
+        stable_step: largest stable step without contact of instruments [s]      scalar
         added_mass: how much of node_mass `mass_scaling.scale_mass` added [kg]   scalar
     """
 
@@ -81,6 +92,16 @@ class OrganModel(NamedTuple):
     averages_volume: bool
     surface_triangles: NDArray[np.int32]
     surface_rest_area: FloatArray
+    support_kind: NDArray[np.int32]
+    support_position: FloatArray
+    support_rotation: FloatArray
+    support_size: FloatArray
+    support_friction: FloatArray
+    support_nodes: NDArray[np.int32]
+    support_area: FloatArray
+    support_stiffness: float
+    support_damping: float
+    support_tangential_stiffness: float
     gravity: FloatArray
     alpha: float
     beta: float
@@ -104,6 +125,7 @@ class OrganState(NamedTuple):
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
         contact_passed: the shape and the triangle it passed through, after such a fault  (2,)
+        support_stretch: tangential stretch of nodes that stick to supports [m]  (n_support_node, n_support, 3)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
     """
 
@@ -119,6 +141,7 @@ class OrganState(NamedTuple):
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
     contact_passed: NDArray[np.int32]
+    support_stretch: FloatArray
     volume_ratio_smallest: FloatArray
 
 
@@ -230,7 +253,7 @@ def _in_rows(state):
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
         state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
         state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
-        state.volume_ratio_smallest,
+        state.support_stretch, state.volume_ratio_smallest,
     )  # fmt: skip
 
 
@@ -293,6 +316,7 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
             # Before anything moves: the state shows which tet it was.
             fault = FAULT_INVERTED_TET
             break
+        add_support_forces(model, position, velocity, force, state.support_stretch, dt)
         add_contact_forces(model, rows, shapes, law, dt, candidate_count, reference, wrench)
         kept = guard_axes(model, rows, shapes, law, response, dt, candidate_count, reference, wrench)
         hold_squeezed(
@@ -322,7 +346,7 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def evaluate_forces(model, state):
-    """Internal forces and gravity of a state into `state.node_force` [N], without contact."""
+    """Internal forces and gravity of a state into `state.node_force` [N], without contact and supports."""
     rows = _in_rows(state)
     _copy_rows(state.node_position, rows.node_position)
     _copy_rows(state.node_velocity, rows.node_velocity)

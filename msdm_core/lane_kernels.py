@@ -37,6 +37,7 @@ from msdm_core.lane_tissue_kernels import (
     set_gravity,
 )
 from msdm_core.squeeze_kernels import hold_squeezed
+from msdm_core.support_kernels import add_support_forces
 
 # In place of a fault: no organ is in this lane, or it is to stand still.
 LANE_EMPTY = -1
@@ -65,10 +66,11 @@ class LaneModel(NamedTuple):
         node_rest_position: undeformed position [m]                              (n_node, 3)
         surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
         surface_rest_area: [m^2]                                                 (n_surface,)
+        support_kind and the other support_ fields: as in OrganModel
         gravity: [m/s^2]                                                         (3,)
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
-        stable_step: largest stable step without contact [s]                     (n_lane,)
+        stable_step: largest stable step without contact of instruments [s]      (n_lane,)
     """
 
     lanes: tuple[int, ...]
@@ -87,6 +89,16 @@ class LaneModel(NamedTuple):
     node_rest_position: FloatArray
     surface_triangles: NDArray[np.int32]
     surface_rest_area: FloatArray
+    support_kind: NDArray[np.int32]
+    support_position: FloatArray
+    support_rotation: FloatArray
+    support_size: FloatArray
+    support_friction: FloatArray
+    support_nodes: NDArray[np.int32]
+    support_area: FloatArray
+    support_stiffness: float
+    support_damping: float
+    support_tangential_stiffness: float
     gravity: FloatArray
     alpha: float
     beta: float
@@ -106,6 +118,7 @@ class LaneState(NamedTuple):
         contact_stretch: tangential stretch of sticking friction [m]             (n_lane, n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_lane, n_shape, n_surface)
         contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
+        support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
         kept_force: scratch: node_force of the lanes that stand still [N]        (n_node, 3, n_lane)
@@ -124,6 +137,7 @@ class LaneState(NamedTuple):
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
     contact_passed: NDArray[np.int32]
+    support_stretch: FloatArray
     node_tension: LaneArray
     squeezed_tets: NDArray[np.int32]
     kept_force: LaneArray
@@ -252,7 +266,7 @@ def _evaluate(model, state):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _touch(model, state, shapes, law, response, dt, squeezed_count, reference, wrench):
-    """Contact, squeezed tets and guard, lane by lane; a lane with an inverted tet stops before anything of it moves."""
+    """Supports, contact, guard and squeezed tets, lane by lane; an inverted tet stops its lane before it moves."""
     for lane in range(state.lane_fault.shape[0]):
         if state.lane_fault[lane] != FAULT_NONE:
             continue
@@ -261,9 +275,12 @@ def _touch(model, state, shapes, law, response, dt, squeezed_count, reference, w
             continue
         state.contact_kept[lane] = 1
         count, about, push = state.candidate_count[lane], reference[lane], wrench[lane]
+        surface, touched, moved = _surface_of(model, lane), _touched_of(state, lane), shapes_of(shapes, lane)
+        add_support_forces(
+            model, touched.node_position, touched.node_velocity, touched.node_force, state.support_stretch[lane], dt
+        )
         if count == 0 and squeezed_count == 0:
             continue
-        surface, touched, moved = _surface_of(model, lane), _touched_of(state, lane), shapes_of(shapes, lane)
         add_contact_forces(surface, touched, moved, law, dt, count, about, push)
         if not guard_axes(surface, touched, moved, law, response_of(response, lane), dt, count, about, push):
             state.contact_kept[lane] = 0
@@ -334,5 +351,5 @@ def advance_lane_substeps(model, state, shapes, law, response, dt, decay, subste
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def evaluate_lane_forces(model, state):
-    """Internal forces and gravity of all lanes into `state.node_force` [N], without contact."""
+    """Internal forces and gravity of all lanes into `state.node_force` [N], without contact and supports."""
     _evaluate(model, state)

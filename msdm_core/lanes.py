@@ -1,7 +1,8 @@
 """Organs of one mesh side by side: eight float64 or sixteen float32 advance at once, each as it would alone.
 
-Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, damping and
-gravity are shared. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its neighbours.
+Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, supports,
+damping and gravity are shared. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its
+neighbours.
 """
 
 import math
@@ -16,7 +17,7 @@ from msdm_core.errors import OrganError
 from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState, ToolResponse
 from msdm_core.lane_kernels import LANE_EMPTY, LaneModel, LaneState, advance_lane_substeps
 from msdm_core.mesh import FloatArray
-from msdm_core.organ import rest_state
+from msdm_core.organ import rest_state, support_shape
 from msdm_core.vector import aligned_zeros, lane_counts
 
 # Of an organ's arrays, those that each lane has of its own; all others are shared.
@@ -24,7 +25,7 @@ OWN_FIELDS = ("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", 
 OWN_NUMBERS = ("averages_volume", "stable_step")
 SHARED_FIELDS = tuple(name for name in LaneModel._fields if name not in (*OWN_FIELDS, *OWN_NUMBERS, "lanes"))
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
-CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed")
+CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch")
 
 
 def stack_organs(organs: Sequence[OrganModel], *, dtype: Any = np.float64, lanes: int | None = None) -> LaneModel:
@@ -37,7 +38,7 @@ def stack_organs(organs: Sequence[OrganModel], *, dtype: Any = np.float64, lanes
 
     Raises:
         OrganError: no organ or too many, another dtype or number of lanes, or an organ that differs from the first in
-            what they share: its mesh, anchors, damping or gravity. Names the lane and the field.
+            what they share: its mesh, anchors, supports, damping or gravity. Names the lane and the field.
     """
     count = _lane_count(dtype, lanes)
     if not 1 <= len(organs) <= count:
@@ -83,7 +84,7 @@ def _check_shared(model: LaneModel, lane: int, organ: OrganModel, anchored: NDAr
     if differing:
         raise OrganError(
             f"the organ for lane {lane} has another {differing[0]} than its neighbours: organs side by side share "
-            "mesh, anchors, damping and gravity; put it into a group of its own"
+            "mesh, anchors, supports, damping and gravity; put it into a group of its own"
         )
 
 
@@ -118,6 +119,7 @@ def rest_lanes(
         contact_stretch=np.zeros((count, shape_count, surface * QUADRATURE_COUNT, 3)),
         contact_candidates=np.zeros((count, shape_count, surface), dtype=np.int32),
         contact_passed=np.zeros((count, 2), dtype=np.int32),
+        support_stretch=np.zeros((count, *support_shape(first))),
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
         moving=aligned_zeros((1, count), dtype),
@@ -139,13 +141,12 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
         OrganError: no such lane, or a state of another mesh or of another number of contact shapes.
     """
     _check_lane(lane, len(state.lane_fault))
-    if organ.node_position.shape != state.node_position.shape[:2] or (
-        organ.contact_engaged.shape != state.contact_engaged.shape[1:]
-    ):
+    memory = tuple(getattr(organ, name).shape for name in ("contact_engaged", "support_stretch"))
+    lane_memory = tuple(getattr(state, name).shape[1:] for name in ("contact_engaged", "support_stretch"))
+    if organ.node_position.shape != state.node_position.shape[:2] or memory != lane_memory:
         raise OrganError(
-            f"the state has {len(organ.node_position)} nodes and contact memory {organ.contact_engaged.shape}, lane "
-            f"{lane} {len(state.node_position)} and {state.contact_engaged.shape[1:]}: make it with rest_state(model, "
-            "shape_count=...)"
+            f"the state has {len(organ.node_position)} nodes and memory of contact and supports {memory}, lane {lane} "
+            f"{len(state.node_position)} and {lane_memory}: make it with rest_state(model, shape_count=...)"
         )
     for name in NODE_FIELDS:
         getattr(state, name)[:, :, lane] = getattr(organ, name)
@@ -255,6 +256,7 @@ def _check_fit(
     fits = {
         "node_position": (state.node_position, (nodes, 3, len(model.lanes))),
         "contact_engaged": (state.contact_engaged, (lanes, count, surface * QUADRATURE_COUNT)),
+        "support_stretch": (state.support_stretch, (lanes, len(model.support_nodes), len(model.support_kind), 3)),
         "shape_ends": (shapes.shape_ends, (len(state.lane_fault), count, 2, 3)),
         "shape_span": (shapes.shape_span, (lanes, count, 3)),
         "shape_friction": (shapes.shape_friction, (lanes, count)),

@@ -9,7 +9,7 @@ import numpy as np
 from msdm_core.errors import OrganError
 from msdm_core.kernels import ContactLaw, OrganModel
 from msdm_core.mesh import FloatArray
-from msdm_core.stability import contact_node_stiffness, largest_frequency, stable_dt, step_limit
+from msdm_core.stability import contact_node_stiffness, own_step, stable_dt, support_hold
 
 # More than this share of the organ's mass is no longer a detail.
 ADDED_SHARE_LIMIT = 0.1
@@ -62,11 +62,11 @@ def _with_mass(model: OrganModel, mass: FloatArray) -> OrganModel:
         array.setflags(write=False)
     added = float((mass - model.node_mass).sum()) + model.added_mass
     heavier = model._replace(node_mass=mass, node_inverse_mass=inverse, added_mass=added)
-    return heavier._replace(stable_step=step_limit(largest_frequency(heavier), model.alpha, model.beta))
+    return heavier._replace(stable_step=own_step(heavier))
 
 
 def _node_stiffness(model: OrganModel, contact: ContactLaw | None) -> FloatArray:
-    """Stiffness of each node while all others stand still, and contact's [N/m], shape (n_node,)."""
+    """Stiffness of each node while all others stand still, with contact and supports [N/m], shape (n_node,)."""
     block = np.zeros((len(model.node_mass), 3, 3))
     span = model.node_rest_position[model.spring_nodes]
     along = (span[:, 1] - span[:, 0]) / model.spring_rest_length[:, None]
@@ -82,4 +82,4 @@ def _node_stiffness(model: OrganModel, contact: ContactLaw | None) -> FloatArray
             block, model.tet_nodes[:, corner], modulus[:, None, None] * np.einsum("ti,tj->tij", gradient, gradient)
         )
     held = 0.0 if contact is None else contact_node_stiffness(model, contact)
-    return np.linalg.eigvalsh(block)[:, -1].astype(np.float64) + held
+    return np.linalg.eigvalsh(block)[:, -1].astype(np.float64) + held + support_hold(model)[0]

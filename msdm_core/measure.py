@@ -1,4 +1,4 @@
-"""What an organ's state amounts to: energy, momentum, volume ratios, inverted tets, internal forces."""
+"""What an organ's state amounts to: energy, momentum, volume ratios, inverted tets, internal and support forces."""
 
 import math
 
@@ -16,6 +16,7 @@ from msdm_core.kernels import (
     evaluate_forces,
 )
 from msdm_core.mesh import FloatArray, IntArray, tet_volumes
+from msdm_core.support_kernels import add_support_forces
 
 
 def kinetic_energy(model: OrganModel, state: OrganState) -> float:
@@ -140,3 +141,24 @@ def internal_forces(model: OrganModel, state: OrganState) -> FloatArray:
     )
     evaluate_forces(model._replace(gravity=no_gravity), scratch)
     return scratch.node_force
+
+
+def support_forces(model: OrganModel, state: OrganState) -> FloatArray:
+    """What each support pushes the organ with, friction included [N], shape (n_support, 3); the state is left as it is.
+
+    Minus that is the load on it.
+    """
+    total = np.zeros((len(model.support_kind), 3))
+    for support in range(len(total)):
+        one = slice(support, support + 1)
+        alone = model._replace(
+            support_kind=model.support_kind[one],
+            support_position=model.support_position[one],
+            support_rotation=model.support_rotation[one],
+            support_size=model.support_size[one],
+            support_friction=model.support_friction[one],
+        )
+        force, stretch = np.zeros_like(state.node_position), np.ascontiguousarray(state.support_stretch[:, one])
+        add_support_forces(alone, state.node_position, state.node_velocity, force, stretch.copy(), 0.0)
+        total[support] = force.sum(axis=0)
+    return total

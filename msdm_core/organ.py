@@ -10,16 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.contact_kernels import QUADRATURE_COUNT
 from msdm_core.damping import Damping
-from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import FAULT_NONE, OrganModel, OrganState, evaluate_forces
+from msdm_core.errors import OrganError
+from msdm_core.kernels import OrganModel, OrganState
+from msdm_core.lane_kernels import LaneModel
 from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.ordering import spring_order
 from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
-from msdm_core.stability import largest_frequency, step_limit
-from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
+from msdm_core.settling import settle
+from msdm_core.stability import own_step
 from msdm_core.stiffness import membrane_stiffness, spring_network
+from msdm_core.support import Support, SupportLaw, support_fields
 from msdm_core.vector import aligned_zeros
 from msdm_core.volume import averaged_volume_modulus, nodal_average
 
@@ -38,6 +40,8 @@ class OrganSpec:
         mass_scheme: "barycentric" (eq. 2) or "voronoi" (eq. 5).
         stiffness_rule: "lloyd" (eq. 6), "fitted" (eq. 6 times factors fitted to the mesh) or "van_gelder".
         gravity: [m/s^2]; off by default, because a scanned shape is the equilibrium.
+        supports: fixed solids that it rests on.
+        support_law: how they hold it off.
     """
 
     mesh: TetMesh
@@ -49,6 +53,8 @@ class OrganSpec:
     mass_scheme: MassScheme = "barycentric"
     stiffness_rule: str = "lloyd"
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    supports: tuple[Support, ...] = ()
+    support_law: SupportLaw = field(default_factory=SupportLaw)
 
 
 def compile_organ(spec: OrganSpec) -> OrganModel:
@@ -58,7 +64,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
 
     Raises:
         OrganError: an organ of impossible size, a region without material, a lesion outside the organ or smaller than
-            a cell, an anchor that is no node.
+            a cell, an anchor that is no node, a support smaller than a cell.
     """
     mesh = spec.mesh
     _check_extent(mesh)
@@ -93,17 +99,21 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         averages_volume=bool(node_bulk.any()),
         surface_triangles=_read_only(np.ascontiguousarray(surface)),
         surface_rest_area=_read_only(area),
+        **support_fields(spec.supports, spec.support_law, mesh, surface, anchored),
         gravity=_read_only(_checked_gravity(spec.gravity)),
         alpha=float(spec.damping.alpha),
         beta=float(spec.damping.beta),
         stable_step=0.0,
         added_mass=0.0,
     )
-    return model._replace(stable_step=step_limit(largest_frequency(model), model.alpha, model.beta))
+    return model._replace(stable_step=own_step(model))
 
 
 def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     """A state at rest, with contact memory for `shape_count` shapes; under gravity the settled static equilibrium.
+
+    The organ settles from its undeformed shape onto its supports, their friction included; what settled last is
+    remembered (`settling.settle`).
 
     Raises:
         OrganDivergedError: gravity turns the organ inside out or it does not settle.
@@ -122,11 +132,17 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         contact_stretch=np.zeros((shape_count, point_count, 3)),
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
         contact_passed=np.zeros(2, dtype=np.int32),
+        support_stretch=np.zeros(support_shape(model)),
         volume_ratio_smallest=np.ones(1),
     )
     if np.any(model.gravity != 0.0):
-        _settle(model, state)
+        settle(model, state)
     return state
+
+
+def support_shape(model: OrganModel | LaneModel) -> tuple[int, int, int]:
+    """Shape of the memory of supports, `support_stretch`: nodes that may be held, supports, 3."""
+    return len(model.support_nodes), len(model.support_kind), 3
 
 
 def _check_extent(mesh: TetMesh) -> None:
@@ -196,33 +212,6 @@ def _anchor_mask(anchors: ArrayLike, node_count: int) -> NDArray[np.bool_]:
         )
     mask[nodes] = True
     return mask
-
-
-def _settle(model: OrganModel, state: OrganState, *, force_tolerance: float = 1e-6, rounds: int = 4000) -> None:
-    """Dynamic relaxation: run the organ with the mode that gravity excites damped critically, till forces balance.
-
-    alpha = 2 w, w^2 = -(u . f) / (u . M u) (Rayleigh's quotient of the displacement u, f the internal forces).
-    """
-    relaxed = model._replace(alpha=0.0, beta=0.0)
-    free = model.node_inverse_mass > 0.0
-    mass = model.node_mass[:, None]
-    weight = float(np.linalg.norm(model.gravity) * model.node_mass.sum())
-    wrench = np.zeros((0, 6))
-    dt = 0.8 * step_limit(largest_frequency(relaxed), 0.0, 0.0)
-    for _ in range(rounds):
-        fault = advance_organ(relaxed, state, NO_SHAPES, NO_CONTACT, dt, 10, wrench)
-        if fault != FAULT_NONE:
-            raise OrganDivergedError("under gravity, " + describe_fault(relaxed, state, fault))
-        evaluate_forces(relaxed, state)
-        if np.linalg.norm(state.node_force[free], axis=1).sum() <= force_tolerance * weight:
-            state.node_velocity[:] = 0.0
-            return
-        displacement = state.node_position - model.node_rest_position
-        held = float((displacement * (mass * model.gravity - state.node_force)).sum())
-        relaxed = relaxed._replace(alpha=2.0 * math.sqrt(max(held, 0.0) / float((mass * displacement**2).sum())))
-    raise OrganDivergedError(
-        f"the organ did not settle under gravity in {rounds * 10} steps: is it anchored? Give `anchors`, or no gravity"
-    )
 
 
 def _read_only(array: NDArray) -> NDArray:

@@ -85,3 +85,16 @@ def _face_area_vectors(points: FloatArray, tets: NDArray[np.integer]) -> FloatAr
     """Outward normal times area of the face opposite each corner [m^2], shape (n_tet, 4, 3)."""
     a, b, c = (points[tets[:, TET_FACES[:, corner]]] for corner in range(3))
     return np.cross(b - a, c - a) / 2
+
+
+def surface_cell(mesh: TetMesh, triangles: NDArray[np.int32]) -> float:
+    """Edge of the cubic lattice cell whose tets (a^3 / 12) are as large as the middle one at a surface's triangles [m].
+
+    Args:
+        mesh: the organ.
+        triangles: of its surface, such as the palpable face, shape (n, 3).
+    """
+    on_surface = np.zeros(mesh.node_count, dtype=bool)
+    on_surface[triangles] = True
+    touching = on_surface[mesh.tets].any(axis=1)
+    return float(np.cbrt(12.0 * np.median(mesh.volumes[touching])))

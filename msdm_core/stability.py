@@ -1,4 +1,4 @@
-"""The largest stable step of an organ, from its springs, volume term, damping and contact together."""
+"""The largest stable step of an organ, from its springs, volume term, damping, supports and contact together."""
 
 import math
 
@@ -101,20 +101,44 @@ def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) 
 
 
 def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
-    """Largest stable step [s]: springs, volume term, alpha, beta, and contact stiffness, damping and friction if given.
+    """Largest stable step [s]: springs, volume term, alpha, beta, supports, and contact of instruments if given.
 
-    Contact holds each node with `contact_node_stiffness` and drags it with c_p times its area A; the guard of the
-    shapes' axes asks for nothing, it is taken implicitly. Beta damps the organ alone. The step is stable where
+    Contact holds each node with `contact_node_stiffness` and drags it with c_p times its area A, supports hold and
+    drag it with `support_hold`, both at once where an instrument presses against a bed; the guard of the shapes' axes
+    asks for nothing, it is taken implicitly. Beta damps the organ alone. The step is stable where
     (K + k_contact) dt^2 + 2 (beta K + c_p A) dt <= 2 (1 + e^(-alpha dt)) M: damping counts as stiffness over dt / 2,
     taken at a step that is surely stable, as if the stiffest and the most damped mode were the same.
     """
     if contact is None:
         return model.stable_step
-    held = contact_node_stiffness(model, contact)
-    drag = contact.damping * contact_node_area(model)
+    held, drag = support_hold(model)
+    return _held_step(
+        model, held + contact_node_stiffness(model, contact), drag + contact.damping * contact_node_area(model)
+    )
+
+
+def own_step(model: OrganModel) -> float:
+    """Largest stable step without instruments [s]: springs, volume term, alpha, beta and supports."""
+    if not len(model.support_kind):
+        return step_limit(largest_frequency(model), model.alpha, model.beta)
+    return _held_step(model, *support_hold(model))
+
+
+def support_hold(model: OrganModel) -> tuple[FloatArray, FloatArray]:
+    """The most that supports can hold each node with in any direction [N/m] and drag it with [N s/m], (n_node,) each.
+
+    One support holds a node of area A with k_p A along its normal and less across it; all of them may meet in it.
+    """
+    area = np.zeros(len(model.node_mass))
+    area[model.support_nodes] = len(model.support_kind) * model.support_area
+    return max(model.support_stiffness, model.support_tangential_stiffness) * area, model.support_damping * area
+
+
+def _held_step(model: OrganModel, held: FloatArray, drag: FloatArray) -> float:
+    """Stable step [s] with what holds each node [N/m] and drags it [N s/m], shape (n_node,) each."""
     most_drag = float((drag * model.node_inverse_mass).max())
     dt = step_limit(largest_frequency(model, held), model.alpha, model.beta, most_drag)
-    if (contact.damping == 0.0 and model.beta == 0.0) or not math.isfinite(dt):
+    if (not drag.any() and model.beta == 0.0) or not math.isfinite(dt):
         return dt
     # From below: the shorter the step, the stiffer the damping counts. With beta the first guess is far off.
     for _ in range(1 if model.beta == 0.0 else 3):

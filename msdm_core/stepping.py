@@ -69,10 +69,13 @@ def _check_state(model: OrganModel, state: OrganState, shapes: ContactShapes) ->
     points = len(model.surface_triangles) * QUADRATURE_COUNT
     nodes = model.node_rest_position.shape
     arrays = (state.node_position, state.node_velocity, state.node_force)
-    if any(array.shape != nodes for array in arrays) or state.contact_engaged.shape[1] != points:
+    supports = (len(model.support_nodes), len(model.support_kind), 3)
+    fits = state.contact_engaged.shape[1] == points and state.support_stretch.shape == supports
+    if any(array.shape != nodes for array in arrays) or not fits:
         raise OrganError(
-            f"the state has {len(state.node_position)} nodes and {state.contact_engaged.shape[1]} contact points, the "
-            f"organ {len(model.node_mass)} and {points}: make the state with rest_state(model, ...)"
+            f"the state has {len(state.node_position)} nodes, {state.contact_engaged.shape[1]} contact points and "
+            f"memory of supports {state.support_stretch.shape}, the organ {len(model.node_mass)}, {points} and "
+            f"{supports}: make the state with rest_state(model, ...)"
         )
     if len(shapes.shape_radius) > len(state.contact_engaged):
         raise OrganError(

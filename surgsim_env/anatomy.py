@@ -14,10 +14,11 @@ from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing import box_mesh, mesh_surface
 from msdm_core.ordering import in_sweep_order
 from msdm_core.organ import OrganSpec, compile_organ
+from msdm_core.quality import surface_cell
 from msdm_core.regions import Lesion
 from msdm_core.surface import triangles_facing
 from msdm_core.triangles import nearest_triangle
-from surgsim_env.cell_share import surface_cell, warn_of_coarse_cells
+from surgsim_env.cell_share import warn_of_coarse_cells
 from surgsim_env.palpable_face import PalpableFace, find_palpable_face
 from surgsim_env.scenes import Anchor, FixedLesion, Scene, SurfaceMesh
 from surgsim_env.timing import step_needed

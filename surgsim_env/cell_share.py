@@ -3,26 +3,8 @@
 import math
 import warnings
 
-import numpy as np
-from numpy.typing import NDArray
-
-from msdm_core.mesh import TetMesh
-
 # Under a ball on coarser cells than this the force changes by more from site to site than over a deep lesion.
 SHARE_LARGEST = 1.0
-
-
-def surface_cell(mesh: TetMesh, triangles: NDArray[np.int32]) -> float:
-    """Edge of the cubic lattice cell whose tets (a^3 / 12) are as large as the middle one at a surface's triangles [m].
-
-    Args:
-        mesh: the organ.
-        triangles: of its surface, such as the palpable face, shape (n, 3).
-    """
-    on_surface = np.zeros(mesh.node_count, dtype=bool)
-    on_surface[triangles] = True
-    touching = on_surface[mesh.tets].any(axis=1)
-    return float(np.cbrt(12.0 * np.median(mesh.volumes[touching])))
 
 
 def contact_radius(tip_radius: float, press_depth: float) -> float:

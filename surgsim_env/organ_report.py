@@ -9,8 +9,8 @@ from rich.table import Table
 from msdm_core.length_unit import LengthUnit
 from msdm_core.mesh import TetMesh
 from msdm_core.organ import OrganSpec, compile_organ
-from msdm_core.quality import MeshQuality, mesh_quality
-from surgsim_env.cell_share import share_text, surface_cell, warn_of_coarse_cells
+from msdm_core.quality import MeshQuality, mesh_quality, surface_cell
+from surgsim_env.cell_share import share_text, warn_of_coarse_cells
 from surgsim_env.scenes import make_scene
 
 

@@ -10,8 +10,9 @@ import trimesh
 
 from msdm_core.mesh import TetMesh
 from msdm_core.meshing import box_mesh
+from msdm_core.quality import surface_cell
 from surgsim_env.anatomy import load_anatomy
-from surgsim_env.cell_share import contact_radius, surface_cell
+from surgsim_env.cell_share import contact_radius
 from surgsim_env.cli import main
 from surgsim_env.scenes import BlockMesh, MeshSource, make_scene
 

@@ -1,0 +1,146 @@
+"""The solids that organs rest on: depth and normal against a slow oracle, and what is refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels import OrganModel
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, compile_organ, rest_state
+from msdm_core.support import SIZES, Support, SupportLaw
+from msdm_core.support_kernels import add_support_forces
+from tests.core import oracle
+
+CELL = 0.005
+LAW = SupportLaw(1e7, 0.0)
+
+
+def organ(*supports: Support, law: SupportLaw = LAW) -> OrganModel:
+    return compile_organ(
+        OrganSpec(box_mesh((0.02, 0.01, 0.01), (4, 2, 2)), oracle.TISSUE, supports=supports, support_law=law)
+    )
+
+
+def outline(support: Support, random: np.random.Generator, count: int = 20000) -> np.ndarray:
+    """Random points all over a solid's surface in its own frame [m], shape (count, 3)."""
+    directions = random.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    if support.kind == "sphere":
+        return support.size[0] * directions
+    if support.kind == "capsule":
+        radius, half = support.size
+        # Round ends, and the wall between them.
+        points = radius * directions + half * np.sign(directions[:, 2:]) * np.array([0.0, 0.0, 1.0])
+        wall = random.random(count) < 0.5
+        round_ = directions[wall, :2] / np.linalg.norm(directions[wall, :2], axis=1)[:, None]
+        points[wall] = np.column_stack([radius * round_, random.uniform(-half, half, wall.sum())])
+        return points
+    half = np.array(support.size)
+    points = random.uniform(-half, half, (count, 3))
+    face = random.integers(0, 3, count)
+    points[np.arange(count), face] = random.choice([-1.0, 1.0], count) * half[face]
+    return points
+
+
+def inside(support: Support, point: np.ndarray) -> bool:
+    """Whether a point of a solid's own frame lies in it."""
+    if support.kind == "plane":
+        return bool(point[2] < 0.0)
+    if support.kind == "box":
+        return bool((np.abs(point) < support.size).all())
+    if support.kind == "sphere":
+        return bool(point @ point < support.size[0] ** 2)
+    radius, half = support.size
+    near = min(np.linalg.norm(point - [0.0, 0.0, end]) for end in np.linspace(-half, half, 4001))
+    return bool(near < radius)
+
+
+numbers = st.floats(-1.0, 1.0, allow_nan=False)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    kind=st.sampled_from(sorted(SIZES)),
+    sizes=st.tuples(*[st.floats(0.006, 0.02)] * 3),
+    place=st.tuples(numbers, numbers, numbers),
+    turn=st.tuples(numbers, numbers, numbers, numbers).filter(lambda q: np.linalg.norm(q) > 0.1),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_nodes_are_pushed_out_the_nearest_way(kind, sizes, place, turn, seed):
+    """The force on each node is k_p A d n, none outside; d n leads to the surface, of which no point is nearer."""
+    support = Support(
+        "solid", kind, position=tuple(0.01 * np.array(place)), rotation=turn, size=sizes[: len(SIZES[kind])]
+    )
+    model = organ(support)
+    force, stretch = np.zeros_like(model.node_rest_position), np.zeros((len(model.support_nodes), 1, 3))
+    add_support_forces(model, model.node_rest_position, np.zeros_like(force), force, stretch, 1e-4)
+    assert not stretch.any()
+    w, x, y, z = turn
+    back = Rotation.from_quat([x, y, z, w]).inv()
+    local = back.apply(model.node_rest_position[model.support_nodes] - support.position)
+    step = back.apply(force[model.support_nodes]) / (LAW.stiffness * model.support_area[:, None])
+    surface = None if kind == "plane" else outline(support, np.random.default_rng(seed))
+    for point, out in zip(local, step, strict=True):
+        depth = float(np.linalg.norm(out))
+        if not inside(support, point):
+            assert depth < 1e-7
+            continue
+        if surface is None:
+            np.testing.assert_allclose(out, [0.0, 0.0, -point[2]], atol=1e-12)
+            continue
+        assert np.linalg.norm(surface - point, axis=1).min() > depth - 1e-9
+        assert not inside(support, point + 1.001 * out + 1e-9 * out / max(depth, 1e-12))
+        assert depth < 1e-7 or inside(support, point + 0.999 * out)
+
+
+def test_only_free_surface_nodes_are_held():
+    mesh = box_mesh((0.02, 0.01, 0.01), (4, 2, 2))
+    anchors = np.flatnonzero(mesh.points[:, 0] < 1e-9)
+    model = compile_organ(OrganSpec(mesh, oracle.TISSUE, anchors=anchors, supports=(Support("floor", "plane"),)))
+    held = set(model.support_nodes.tolist())
+    assert held == set(mesh.boundary_nodes.tolist()) - set(anchors.tolist())
+    assert not len(compile_organ(OrganSpec(mesh, oracle.TISSUE)).support_nodes)
+    # All of the surface belongs to its nodes, of which the anchored ones are left out here.
+    everything = organ(Support("floor", "plane"))
+    assert everything.support_area.sum() == pytest.approx(2 * (2 * 0.02 * 0.01 + 0.01 * 0.01))
+    assert rest_state(everything).support_stretch.shape == (len(everything.support_nodes), 1, 3)
+
+
+REFUSED = [
+    ({"kind": "mesh"}, "kind is 'mesh'.*plane"),
+    ({"name": ""}, "give a name"),
+    ({"kind": "box", "size": (0.1, 0.1)}, r"size is .*3 finite numbers \(half size along x"),
+    ({"kind": "plane", "size": (1.0,)}, "size is .*0 finite numbers"),
+    ({"kind": "sphere", "size": (-0.1,)}, "above 0"),
+    ({"kind": "capsule", "size": (0.1, float("nan"))}, r"2 finite numbers \(radius, half length"),
+    ({"position": (0.0, 0.0)}, "position is .*3 finite"),
+    ({"axis": (0.0, 0.0, 0.0)}, "axis is .*must not be zero"),
+    ({"rotation": (0.0, 0.0, 0.0, 0.0)}, "rotation is .*must not be zero"),
+    ({"rotation": (1.0, 0.0, 0.0)}, "rotation is .*4 finite"),
+    ({"axis": (0.0, 0.0, 1.0), "rotation": (1.0, 0.0, 0.0, 0.0)}, "both given"),
+    ({"friction": -0.1}, "friction is -0.1"),
+]
+
+
+@pytest.mark.parametrize(("entries", "words"), REFUSED)
+def test_a_wrong_support_is_refused(entries, words):
+    with pytest.raises(OrganError, match=words):
+        Support(**{"name": "s", "kind": "plane", **entries})
+
+
+def test_what_an_organ_cannot_rest_on_is_refused():
+    ball = Support("ball", "sphere", size=(0.0049,))
+    with pytest.raises(OrganError, match=r"support 'ball': radius is 4.9 mm.*at least.*5 mm.*cells smaller"):
+        organ(ball)
+    with pytest.raises(OrganError, match=r"half size along y is 2 mm"):
+        organ(Support("plate", "box", size=(0.1, 0.002, 0.1)))
+    organ(Support("roll", "capsule", size=(0.0051, 0.001)))
+    with pytest.raises(OrganError, match="two supports are named 'floor'"):
+        organ(Support("floor", "plane"), Support("floor", "plane"))
+    with pytest.raises(OrganError, match="stiffness is 0 "):
+        SupportLaw(0.0)
+    with pytest.raises(OrganError, match="damping is -1 "):
+        SupportLaw(1.0, -1.0)

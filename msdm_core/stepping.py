@@ -73,7 +73,7 @@ def _check_state(model: OrganModel, state: OrganState, shapes: ContactShapes) ->
     fits = state.contact_engaged.shape[1] == points and state.support_stretch.shape == supports
     if any(array.shape != nodes for array in arrays) or not fits:
         raise OrganError(
-            f"the state has {len(state.node_position)} nodes, {state.contact_engaged.shape[1]} contact points and "
+            f"the state has {len(state.node_position)} nodes with {state.contact_engaged.shape[1]} contact points and "
             f"memory of supports {state.support_stretch.shape}, the organ {len(model.node_mass)}, {points} and "
             f"{supports}: make the state with rest_state(model, ...)"
         )

@@ -207,7 +207,7 @@ def test_supports_are_the_only_force_from_outside():
         "roll", "capsule", position=(0.01, 0.0, -0.021), axis=(0.3, 1.0, 0.0), size=(0.02, 0.1), friction=0.0
     )
     model = block(roll, damping=oracle.UNDAMPED)
-    state = OrganState(*(array.copy() for array in rest_state(model._replace(gravity=oracle.frozen([0.0, 0.0, 0.0])))))
+    state = rest_state(model._replace(gravity=oracle.frozen(np.zeros(3))))
     state.node_velocity[:, 2] = -0.3
     dt, worst, largest = 0.9 * model.stable_step, 0.0, 0.0
     for _ in range(200):

@@ -121,12 +121,15 @@ def test_forces_are_those_of_the_organ_alone(term: str, beta: float, gravity: fl
 
 
 def tool(lane: int, *, depth: float = 0.0) -> ContactShapes:
-    """Two capsules on one tool above the block, with a path of their lane's own: down, across and turning."""
+    """A capsule and a ball or a rough rounded box on one tool above the block, with a path of their lane's own."""
     centre = np.array([0.012 + 5e-4 * lane, 0.0095 + 2e-4 * lane, 0.02 + RADIUS - depth])
     tilt = np.array([0.004, 0.0, 0.0005 * (lane % 3)])
     ends = [[centre, centre + tilt], [centre - 0.006, centre - 0.006]]
     twist = [4e-3 * (lane % 4 - 1.5), 2e-3 * (lane % 3 - 1), -0.012 - 1e-3 * lane, 0.3 * (lane % 2), 0.2, -0.5]
-    return oracle.single_tool(ends, [RADIUS, 0.003], centre=centre, twist=twist)
+    span = [[0.0, 0.0, 0.0], [0.0, 0.003 * (lane % 2), 0.001 * (lane % 2)]]
+    shapes = oracle.single_tool(ends, [RADIUS, 0.003], centre=centre, twist=twist, span=span)
+    shapes.shape_friction[1] = 1.5
+    return shapes
 
 
 def yielding(lane: int = 0) -> ToolResponse:

@@ -61,11 +61,19 @@ def haptic_step(
 
 
 class StepsTaken(NamedTuple):
-    """What came of some haptic steps: how many were finished, their largest total force [N], a fault or ""."""
+    """What came of some haptic steps.
+
+    Fields:
+        count: how many were finished
+        force_peak: their largest total force [N]
+        fault: what ended them, or ""
+        pull_peak: the largest pull of a jaw, the size of the sum of its fingers' forces [N]
+    """
 
     count: int
     force_peak: float
     fault: str
+    pull_peak: float = 0.0
 
 
 def compiled_steps(
@@ -78,11 +86,12 @@ def compiled_steps(
     wrench: FloatArray,
     count: int,
     force_limit: float,
+    pull_limit: float = math.inf,
 ) -> StepsTaken:
     """`haptic_step` up to `count` times in one compiled call without the interpreter's lock, equal to the bit.
 
-    It ends with the step whose total force passes `force_limit` [N]; a fault is told, not raised, and leaves `wrench`
-    as the last good step had it.
+    It ends with the step whose total force passes `force_limit` [N], or a jaw's pull `pull_limit` [N]; a fault is told,
+    not raised, and leaves `wrench` as the last good step had it.
 
     Raises:
         RuntimeError: MuJoCo's functions are not known to the linker (says why).
@@ -94,11 +103,12 @@ def compiled_steps(
         raise RuntimeError(f"haptic steps cannot be compiled: {missing}; call haptic_step in a loop")
     tools = instrument.views()
     decay = math.exp(-model.alpha * dt)
-    taken, fault, peak = advance_haptic_steps(
+    taken, fault, peak, pull_peak = advance_haptic_steps(
         model, state, contact, instrument.shapes, instrument.response, tools, dt, decay, substep_count, wrench, count,
-        force_limit,
+        force_limit, pull_limit,
     )  # fmt: skip
-    return StepsTaken(taken, peak, describe(model, state, tools.wrench, fault) if fault != FAULT_NONE else "")
+    told = describe(model, state, tools.wrench, fault) if fault != FAULT_NONE else ""
+    return StepsTaken(taken, peak, told, pull_peak)
 
 
 def describe(model: OrganModel, state: OrganState, wrench: FloatArray, fault: int) -> str:

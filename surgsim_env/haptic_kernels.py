@@ -48,7 +48,7 @@ class Servo(NamedTuple):
         lower, upper: the workspace, or the joints' limits [m or rad]            (n_joint,)
         position: which of MuJoCo's controls are the positions                   (n_joint,)
         speed: which are the speeds; -1 where a joint has none                   (n_joint,)
-        limited: whether the last step was stopped by the limits                 (1,)
+        limited: which joints the last step stopped at their limits              (n_joint,)
     """
 
     command: FloatArray
@@ -78,6 +78,7 @@ class ToolViews(NamedTuple):
         applied_wrench: xfrc_applied [N, N m]                                    (n_body, 6)
         control: of all actuators                                                (nu,)
         servo: what moves the controls
+        jaws: the two fingers of each jaw, as tools                              (n_jaw, 2)
         velocity, jacobian, inertia, yielded: scratch                            (6,), (6, nv), (nv, nv), (nv, 6)
         reference, wrench: scratch: the step's first tool_centre [m], its mean wrench   (n_tool, 3), (n_tool, 6)
     """
@@ -99,6 +100,7 @@ class ToolViews(NamedTuple):
     applied_wrench: FloatArray
     control: FloatArray
     servo: Servo
+    jaws: NDArray[np.int32]
     velocity: FloatArray
     jacobian: FloatArray
     inertia: FloatArray
@@ -153,7 +155,6 @@ def yield_tool(factors, jacobian, smooth_force, yielded, mobility, acceleration)
 def _drive(tools):
     """`ToolBodies.drive`: the servo's targets move on by one step and stop at their limits."""
     servo, control = tools.servo, tools.control
-    servo.limited[0] = False
     for joint in range(servo.command.shape[0]):
         place, pace = servo.position[joint], servo.speed[joint]
         target = control[place] + servo.command[joint] * tools.timestep
@@ -163,12 +164,9 @@ def _drive(tools):
         if held > servo.upper[joint]:
             held = servo.upper[joint]
         control[place] = held
+        servo.limited[joint] = held != target
         if pace >= 0:
-            control[pace] = servo.command[joint]
-        if held != target:
-            servo.limited[0] = True
-            if pace >= 0:
-                control[pace] = 0.0
+            control[pace] = 0.0 if held != target else servo.command[joint]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -270,17 +268,33 @@ def total_force(wrench):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def pull_force(jaws, wrench):
+    """Largest size of the sum of the forces on the two fingers of a jaw, over all jaws (n_jaw, 2) [N]."""
+    largest = 0.0
+    for jaw in range(jaws.shape[0]):
+        one, other = jaws[jaw, 0], jaws[jaw, 1]
+        x, y, z = (
+            wrench[one, 0] + wrench[other, 0],
+            wrench[one, 1] + wrench[other, 1],
+            wrench[one, 2] + wrench[other, 2],
+        )
+        largest = max(largest, math.sqrt(x * x + y * y + z * z))
+    return largest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def advance_haptic_steps(
-    model, state, law, shapes, response, tools, dt, decay, substep_count, wrench, count, force_limit
+    model, state, law, shapes, response, tools, dt, decay, substep_count, wrench, count, force_limit, pull_limit
 ):
     """Advance an organ and its tools by `count` haptic steps, fewer where there is a fault or too much force.
 
     Model: model, law
-    In:    dt [s] of a substep, decay = exp(-alpha dt), substep_count, count; beyond force_limit [N] a step is the last
+    In:    dt [s] of a substep, decay = exp(-alpha dt), substep_count, count; beyond force_limit or pull_limit [N] a
+           step is the last
     Out:   state, shapes, response, tools, wrench: of the last good haptic step (n_tool, 6)
-    Returns how many steps were finished, a FAULT_ code and the largest `total_force` [N].
+    Returns how many steps were finished, a FAULT_ code and the largest `total_force` and `pull_force` [N].
     """
-    peak = 0.0
+    peak, pull_peak = 0.0, 0.0
     for step in range(count):
         begin_step(tools, shapes, response)
         fault = advance_substeps(
@@ -289,10 +303,11 @@ def advance_haptic_steps(
         if fault == FAULT_NONE:
             fault = end_step(tools, wrench)
         if fault != FAULT_NONE:
-            return step, fault, peak
+            return step, fault, peak, pull_peak
         force = total_force(wrench)
         if force > peak:
             peak = force
-        if peak > force_limit:
-            return step + 1, FAULT_NONE, peak
-    return count, FAULT_NONE, peak
+        pull_peak = max(pull_peak, pull_force(tools.jaws, wrench))
+        if peak > force_limit or pull_peak > pull_limit:
+            return step + 1, FAULT_NONE, peak, pull_peak
+    return count, FAULT_NONE, peak, pull_peak

@@ -1,11 +1,10 @@
-"""An instrument simulated in MuJoCo: what a simulation and a task ask of any, and the Cartesian probe of a scene."""
-
-from pathlib import Path
+"""An instrument simulated in MuJoCo: what a simulation and a task ask of any, and a scene's Cartesian probe."""
 
 import mujoco
 import numpy as np
 
 from msdm_core.mesh import FloatArray
+from surgsim_env.jaw import Jaw
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene
 from surgsim_env.tool_bodies import ToolBodies, make_servo
@@ -19,8 +18,11 @@ class Instrument(ToolBodies):
     Fields:
         lower, upper: the box that the tip may move in [m]                       (3,)
         parked: where the tip waits before the first reset [m]                   (3,)
+        jaw: None without one
+        turning_size: how many numbers say how the tip turns: 0 if it does not, 1 about a hinge, 3 in space
     """
 
+    turning_size = 0
     lower: FloatArray
     upper: FloatArray
     parked: FloatArray
@@ -29,12 +31,19 @@ class Instrument(ToolBodies):
         """Take a compiled model, the tip's box [m] and the index of the site at its tip."""
         super().__init__(model)
         self.lower, self.upper = lower, upper
+        self.jaw: Jaw | None = None
         self._tip = tip_site
 
     @property
     def workspace_limited(self) -> bool:
         """Whether the servo's targets were stopped at a limit in the last haptic step."""
-        return bool(self.servo.limited[0])
+        # The joints of a jaw, which stop at their target, stand behind those that move the tip.
+        return bool(self.servo.limited[: len(self.servo.limited) - 2 * len(self.jaws)].any())
+
+    @property
+    def opening(self) -> float | None:
+        """Gap between the pads of the jaw [m]; None without one."""
+        return None if self.jaw is None else self.jaw.opening
 
     @property
     def trocar_residual(self) -> float | None:
@@ -59,12 +68,33 @@ class Instrument(ToolBodies):
         return data.site_xpos[self._tip].copy(), quaternion
 
     def place(self, position: FloatArray) -> None:
-        """Put the tip at rest at a position [m], everything else as when loaded."""
+        """Put the tip at rest at a position [m], everything else as when loaded; a jaw with pads is open."""
         raise NotImplementedError
 
-    def command_velocity(self, velocity: FloatArray) -> None:
-        """Set the tip velocity that the servo follows from now on [m/s], shape (3,)."""
+    def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
+        """Set the tip's velocity [m/s] (3,) and how it turns [rad/s] (turning_size,) from now on."""
         raise NotImplementedError
+
+    def command_jaw(self, target: float) -> None:
+        """Let the jaw go to a target from -1 (closed) to 1 (open), at its limited speed, and stay there.
+
+        Raises:
+            ValueError: no jaw, or a target outside that range.
+        """
+        if self.jaw is None:
+            raise ValueError(f"{self._where()} has no jaw to command")
+        self.jaw.command(target)
+
+    def turning_of(self, turning: FloatArray | None) -> FloatArray:
+        """How the tip shall turn [rad/s], (turning_size,); zeros where nothing was said.
+
+        Raises:
+            ValueError: another number of values.
+        """
+        values = np.zeros(self.turning_size) if turning is None else np.asarray(turning, dtype=np.float64)
+        if values.shape != (self.turning_size,):
+            raise ValueError(f"turning has shape {values.shape}; {self._where()} takes ({self.turning_size},)")
+        return values
 
     def refresh(self) -> None:
         """Bring poses and velocities up to the current coordinates (after mj_step2 they are one step old)."""
@@ -84,23 +114,34 @@ class Instrument(ToolBodies):
         signature = mujoco.mjtState.mjSTATE_INTEGRATION
         state = np.empty(mujoco.mj_stateSize(self.model, signature))
         mujoco.mj_getState(self.model, self.data, state, signature)
-        return np.concatenate([state, self.servo.command, [float(self.servo.limited[0])]])
+        servo = self.servo
+        return np.concatenate([state, servo.command, servo.limited.astype(np.float64), servo.lower, servo.upper])
 
     def set_state(self, state: FloatArray) -> None:
         """Restore what `get_state` gave, to the bit."""
-        size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION)
-        joints = len(self.servo.command)
+        servo, size = self.servo, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, state[:size], mujoco.mjtState.mjSTATE_INTEGRATION)
-        self.servo.command[:] = state[size : size + joints]
-        self.servo.limited[0] = bool(state[size + joints])
+        servo.command[:], servo.limited[:], servo.lower[:], servo.upper[:] = state[size:].reshape(4, -1)
         self.refresh()
 
     def _rest(self) -> None:
         """Everything as when loaded, the servo still."""
         mujoco.mj_resetData(self.model, self.data)
         self.servo.command[:] = 0.0
-        self.servo.limited[0] = False
+        self.servo.limited[:] = False
+
+    def _set_jaw(self, jaw: Jaw) -> None:
+        self.jaw, self.jaws = jaw, jaw.tools[None]
+
+    def _open_jaw(self) -> None:
+        """Open a jaw that has pads to hold tissue with; others stay as they are."""
+        if self.jaw is not None and self.jaw.has_pads:
+            self.jaw.put(1.0)
+
+    def _where(self) -> str:
+        """What an error calls this instrument."""
+        return f"instrument {self.model.names.split(bytes(1))[0].decode()!r}"
 
 
 class Probe(Instrument):
@@ -120,17 +161,23 @@ class Probe(Instrument):
         self.data.ctrl[:3] = position
         mujoco.mj_forward(self.model, self.data)
 
-    def command_velocity(self, velocity: FloatArray) -> None:
-        """Set the tip velocity that the servo follows from now on [m/s], shape (3,)."""
+    def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
+        """Set the tip velocity that the servo follows from now on [m/s], shape (3,); a probe does not turn."""
+        self.turning_of(turning)
         self.servo.command[:] = velocity
 
 
-def _compile(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco.MjModel:
-    path = scenes_folder() / "instruments" / scene.instrument.model
+def read_model(name: str) -> mujoco.MjSpec:
+    """The model of a Cartesian instrument, an MJCF file in scenes/instruments."""
+    path = scenes_folder() / "instruments" / name
     if not path.is_file():
-        known = ", ".join(sorted(item.name for item in Path(path.parent).glob("*.xml")))
-        raise ValueError(f"instrument {scene.instrument.model!r} is unknown; the instruments are {known}")
-    spec = mujoco.MjSpec.from_file(str(path))
+        known = ", ".join(sorted(item.name for item in path.parent.glob("*.xml")))
+        raise ValueError(f"instrument {name!r} is unknown; the instruments are {known}")
+    return mujoco.MjSpec.from_file(str(path))
+
+
+def _compile(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco.MjModel:
+    spec = read_model(scene.instrument.model)
     spec.option.timestep = scene.timing.haptic_step
     ball, shaft, tip = spec.geom("tip_ball"), spec.geom("tip_shaft"), spec.body("tip")
     radius = scene.instrument.tip_radius

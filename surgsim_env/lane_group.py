@@ -36,9 +36,11 @@ class LaneGroup:
         self._wrench, self._mean = np.zeros((2, count, tools, 6))
         self._reference = np.zeros((count, tools, 3))
         self._taken, self._fault = np.zeros((2, count), dtype=np.int64)
-        self._peak = np.zeros(count)
+        self._peak, self._pull_peak = np.zeros((2, count))
 
-    def control_step(self, active: NDArray[np.bool_], count: int, force_limit: float) -> None:
+    def control_step(
+        self, active: NDArray[np.bool_], count: int, force_limit: float, pull_limit: float = math.inf
+    ) -> None:
         """Advance the active simulations (n,) by up to `count` haptic steps; each is told what came of it.
 
         Called from several threads for several groups: the compiled call does not hold the interpreter's lock.
@@ -53,7 +55,7 @@ class LaneGroup:
             self._model, self._state, first.contact, self._shapes, self._response,
             tuple(views), first.substep_dt,
             math.exp(-self._model.alpha * first.substep_dt), first.substep_count, self._wrench, count, force_limit,
-            self._reference, self._mean, self._taken, self._fault, self._peak,
+            pull_limit, self._reference, self._mean, self._taken, self._fault, self._peak, self._pull_peak,
         )  # fmt: skip
         for lane in np.flatnonzero(active):
             self._unload(int(lane))
@@ -74,5 +76,5 @@ class LaneGroup:
         message = ""
         if code != FAULT_NONE:
             message = describe(simulation.organ_model, organ_state, self._mean[lane], code)
-        taken = StepsTaken(int(self._taken[lane]), float(self._peak[lane]), message)
+        taken = StepsTaken(int(self._taken[lane]), float(self._peak[lane]), message, float(self._pull_peak[lane]))
         simulation.take_over(organ_state, self._wrench[lane], taken)

@@ -16,6 +16,9 @@ from surgsim_env.retraction import Retraction, RetractionCamera
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.toml_tables import fill, nearest, read_toml
 
+# Instruments carried by slides; their models are NAME.xml in scenes/instruments.
+CARTESIAN = ("probe", "grasper")
+
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
 
@@ -115,16 +118,20 @@ class Instrument:
         model: MJCF file of a probe in scenes/instruments, a shipped arm's name or the path of an arm's TOML file.
         tip_radius: of the ball tip [m].
         approach: direction in which it comes to the organ; the shaft lies along it.
+        tip_direction: where a grasper's jaw and an arm's tip point; along the approach if it is not given.
     """
 
     model: str = "probe.xml"
     tip_radius: float = 0.008
     approach: Vector = (0.0, 0.0, -1.0)
+    tip_direction: Vector | None = None
 
     def __post_init__(self) -> None:
         _require("instrument.tip_radius", self.tip_radius, 0.0, "m", above=True)
-        if not 0.0 < math.hypot(*self.approach) < math.inf:
-            raise ValueError(f"instrument.approach is {self.approach}; it must be a direction such as [0, 0, -1]")
+        for name in ("approach", "tip_direction"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < math.hypot(*value) < math.inf:
+                raise ValueError(f"instrument.{name} is {value}; it must be a direction such as [0, 0, -1]")
 
 
 @dataclass(frozen=True)
@@ -367,18 +374,18 @@ def make_scene(name: str | Path) -> Scene:
 
 
 def with_instrument(scene: Scene, instrument: str | None) -> Scene:
-    """The scene with another instrument: "probe", an arm's name or the path of its TOML file; None keeps its own."""
+    """The scene with another instrument: one of CARTESIAN, an arm's name or the path of its TOML file, or its own."""
     if instrument is None:
         return scene
     if not isinstance(instrument, str | Path):
         raise ValueError(f'instrument is {instrument!r}; it must be "probe", an arm\'s name or the path of a TOML file')
-    known = ["probe", *list_arms()]
+    known = [*CARTESIAN, *list_arms()]
     if Path(instrument).suffix != ".toml" and instrument not in known:
         raise ValueError(
             f"instrument {str(instrument)!r} is unknown{nearest(str(instrument), known)}; the instruments are "
             f"{', '.join(known)}, or the path of an arm's TOML file"
         )
-    model = "probe.xml" if instrument == "probe" else str(instrument)
+    model = f"{instrument}.xml" if instrument in CARTESIAN else str(instrument)
     return replace(scene, instrument=replace(scene.instrument, model=model))
 
 

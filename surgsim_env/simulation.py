@@ -17,10 +17,12 @@ from msdm_core.organ import rest_state
 from msdm_core.stability import stable_dt
 from surgsim_env import mujoco_library
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.arms.arm_instrument import ArmInstrument, is_arm
 from surgsim_env.exchange import StepsTaken, compiled_steps, haptic_step
+from surgsim_env.grasp import Grasp, read_grasp
+from surgsim_env.haptic_kernels import pull_force
 from surgsim_env.haptic_record import HapticRecord
-from surgsim_env.instrument import Instrument, Probe
+from surgsim_env.instrument import Instrument
+from surgsim_env.scene_instrument import make_instrument
 from surgsim_env.timing import substeps_needed
 from surgsim_env.tool_mass import check_tool_masses
 
@@ -36,6 +38,7 @@ class Simulation:
     """An organ and an instrument in contact; advanced by `control_step` or `haptic_step`, read by tasks.
 
     `compiled` says whether control steps run in one compiled call or in the plain loop: the bits are the same.
+    `pull_peak` is the largest pull of a jaw in the last control step [N].
     """
 
     def __init__(self, anatomy: Anatomy) -> None:
@@ -54,14 +57,14 @@ class Simulation:
         margin = WORKSPACE_MARGIN + scene.instrument.tip_radius
         points = anatomy.mesh.points
         lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
-        arm = is_arm(scene.instrument.model)
-        self.instrument: Instrument = ArmInstrument(anatomy, lower, upper) if arm else Probe(scene, lower, upper)
+        self.instrument: Instrument = make_instrument(anatomy, lower, upper)
         healthy = anatomy.organ()
         check_tool_masses(scene.name, self.instrument, self.contact, float(healthy.surface_rest_area.sum()))
         self._wrench = np.zeros((self.instrument.tool_count, 6))
         self._step = 0
         self.fault = ""
         self.compiled = _runs_compiled(os.environ.get(LOOP_VARIABLE, "compiled"))
+        self.pull_peak = 0.0
         self._taken: StepsTaken | None = None
         self._record: HapticRecord | None = None
         self.organ_model: OrganModel
@@ -87,6 +90,11 @@ class Simulation:
     def contact_force(self) -> FloatArray:
         """Sum of the tissue's force over all tools in the last haptic step [N], shape (3,)."""
         return self._wrench[:, :3].sum(axis=0)
+
+    @property
+    def grasp(self) -> Grasp | None:
+        """What the jaw has hold of as of the last haptic step; None for an instrument without a jaw."""
+        return read_grasp(self.instrument, self._wrench, self.contact.friction)
 
     @property
     def contact_centre(self) -> FloatArray | None:
@@ -126,6 +134,7 @@ class Simulation:
         self._wrench[:] = 0.0
         self._step = 0
         self.fault = ""
+        self.pull_peak = 0.0
         self._taken = None
 
     def haptic_step(self) -> bool:
@@ -151,14 +160,20 @@ class Simulation:
             self._record.note(self.time, wrench)
         return True
 
-    def control_step(self, count: int, force_limit: float = math.inf) -> float:
-        """Advance by `count` haptic steps, fewer where one comes to a `fault` or its force passes a limit [N].
+    def control_step(self, count: int, force_limit: float = math.inf, pull_limit: float = math.inf) -> float:
+        """Advance by `count` haptic steps, fewer where one comes to a `fault` or passes a limit.
+
+        Args:
+            count: of haptic steps.
+            force_limit: of the size of the tissue's total force [N].
+            pull_limit: of the pull of a jaw, the size of the sum of its fingers' forces [N].
 
         Returns:
-            The largest size of the tissue's total force in these steps [N].
+            The largest size of the tissue's total force in these steps [N]; `pull_peak` is the largest pull.
         """
         if self._taken is not None:
             taken, self._taken = self._taken, None
+            self.pull_peak = taken.pull_peak
             return taken.force_peak
         if self.compiled and self._record is None:
             taken = compiled_steps(
@@ -171,17 +186,20 @@ class Simulation:
                 self._wrench,
                 count,
                 force_limit,
+                pull_limit,
             )
             self._step += taken.count
             self.fault = taken.fault or self.fault
+            self.pull_peak = taken.pull_peak
             return taken.force_peak
-        force_peak = 0.0
+        force_peak, self.pull_peak = 0.0, 0.0
         for _ in range(count):
             if not self.haptic_step():
                 break
             x, y, z = self.contact_force.tolist()
             force_peak = max(force_peak, math.sqrt(x * x + y * y + z * z))
-            if force_peak > force_limit:
+            self.pull_peak = max(self.pull_peak, pull_force(self.instrument.jaws, self._wrench))
+            if force_peak > force_limit or self.pull_peak > pull_limit:
                 break
         return force_peak
 

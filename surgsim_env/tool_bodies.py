@@ -21,7 +21,7 @@ ROUGHNESS = "roughness_"
 
 def make_servo(lower: FloatArray, upper: FloatArray, position: IndexArray, speed: IndexArray) -> Servo:
     """A servo at rest: limits of its joints [m or rad] and which of MuJoCo's controls hold and pace them, each (n,)."""
-    return Servo(np.zeros(len(lower)), lower, upper, position, speed, np.zeros(1, dtype=bool))
+    return Servo(np.zeros(len(lower)), lower.copy(), upper.copy(), position, speed, np.zeros(len(lower), dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +87,7 @@ class ToolBodies:
         )
         self.response = unyielding(count)
         self.servo = make_servo(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+        self.jaws = np.zeros((0, 2), dtype=np.int32)
         self._velocity = np.zeros(6)
         self._jacobian = np.zeros((6, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
@@ -108,7 +109,7 @@ class ToolBodies:
         target = control[servo.position] + servo.command * self.model.opt.timestep
         held = np.clip(target, servo.lower, servo.upper)
         stopped = held != target
-        servo.limited[0] = stopped.any()
+        servo.limited[:] = stopped
         control[servo.position] = held
         paced = servo.speed >= 0
         control[servo.speed[paced]] = np.where(stopped, 0.0, servo.command)[paced]
@@ -191,6 +192,7 @@ class ToolBodies:
             applied_wrench=data.xfrc_applied,
             control=data.ctrl,
             servo=self.servo,
+            jaws=self.jaws,
             velocity=self._velocity,
             jacobian=self._jacobian,
             inertia=self._inertia,

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write `psm_palpator.xml` and `psm_grasper.xml`: a da Vinci-like arm with two tools, drawn from primitives of our own.
+"""Write `psm_palpator.xml`, `psm_grasper.xml`, `psm_retractor.xml`: a da Vinci-like arm with three tools of our own.
 
 Kinematics, limits and efforts come from the one table in `surgsim_env/arms/psm.py`; masses, servos and shapes are
 this project's own. The remote centre is held by an arc about it, on which a carriage with the insertion's rail runs: a
@@ -27,6 +27,7 @@ INERTIA = {
     "wrist_pitch": (0.006, (0.0, 0.0, 0.011), (1e-6, 1e-6, 1e-6)),
     "wrist_yaw": (0.012, (0.0, 0.0, -0.006), (1e-6, 1e-6, 1e-6)),
     "finger": (0.003, (0.0, 0.0, 0.0), (3e-7, 3e-7, 3e-7)),
+    "long_finger": (0.005, (0.0, 0.0, -0.024), (6e-7, 6e-7, 2e-7)),
 }
 # Reflected inertia of the motor [kg m^2 or kg], friction [N m s or N s/m], servo stiffness and damping. Chosen: natural
 # frequencies of 13 to 30 Hz, about critically damped; 5 N at the tip move it by 0.4 to 1 mm.
@@ -38,9 +39,17 @@ DRIVE = {
     "wrist_pitch": (1.5e-4, 2e-3, 6.0, 0.06),
     "wrist_yaw": (1.5e-4, 2e-3, 6.0, 0.06),
     "finger": (2e-5, 2e-4, 1.5, 0.01),
+    "long_finger": (2e-5, 2e-4, 1.5, 0.01),
 }
 SHAFT_RADIUS = 0.004  # an 8 mm instrument
-TIP_LENGTH = {"palpator": 0.020, "grasper": 0.0102}  # beyond the wrist's yaw axis [m]
+TIP_LENGTH = {"palpator": 0.020, "grasper": 0.0102, "retractor": 0.026}  # beyond the wrist's yaw axis [m]
+# The retractor's pads: half their width, thickness and length; half the gap at which they are parallel [m].
+PAD_HALF, PARALLEL_GAP = (0.004, 0.0015, 0.007), 0.0035
+# From where the pads' middles meet to 24 mm between them [rad]; how hard a pad closes, at its middle [N].
+PAD_RANGE = (-math.asin(PARALLEL_GAP / TIP_LENGTH["retractor"]), math.radians(19.0))
+PAD_FORCE = 0.4
+# Serrated: this times the contact law's coefficient of friction.
+PAD_ROUGHNESS = 3.0
 LIGHT, METAL, DARK = "0.86 0.87 0.89 1", "0.72 0.74 0.78 1", "0.13 0.14 0.16 1"
 BRIGHT, GREY, ACCENT = "0.90 0.91 0.94 1", "0.45 0.47 0.50 1", "0.10 0.42 0.60 1"
 ARC_RADIUS, ARC_SIDE, RAIL_SIDE = 0.285, 0.078, 0.048  # arc about the remote centre; beside the shaft [m]
@@ -202,8 +211,40 @@ def grasper_parts() -> tuple[list[str], list[str]]:
     return [clevis, *finger(1), *finger(-1)], ["finger_left", "finger_right"]
 
 
+def long_finger(side: int) -> list[str]:
+    """One finger of the retractor's jaw: a pad on an arm, parallel to the other one at a gap of 7 mm."""
+    name, yaw, length = ("left", "right")[side < 0], FRAMES["wrist_yaw"][2, 3], TIP_LENGTH["retractor"]
+    frame = FRAMES["wrist_yaw"][:3, :3]
+    across = np.cross(frame[:, 2], (0.0, 0.0, -1.0)) * side
+    middle = across * (PARALLEL_GAP + PAD_HALF[1]) + (0.0, 0.0, yaw - length)
+    back = across * (PARALLEL_GAP + 2.0 * PAD_HALF[1])
+    knee = back + np.array([0.0, 0.0, yaw - length + PAD_HALF[2] + 0.003])
+    end = back + np.array([0.0, 0.0, yaw - length - PAD_HALF[2] + 0.0015])
+    width, thickness, long = PAD_HALF
+    half = np.abs(frame.T @ (width * frame[:, 2] + thickness * across + long * np.array([0.0, 0.0, 1.0])))
+    effort = PAD_FORCE * length
+    return [
+        f'<body name="finger_{name}">',
+        joint(f"finger_{name}", "long_finger", *PAD_RANGE, effort, axis=f"0 0 {side}"),
+        inertial("long_finger", "wrist_yaw"),
+        f'<geom name="pad_{name}" type="box" pos="{local("wrist_yaw", middle)}" size="{numbers(np.round(half, 12))}" '
+        f'group="3" rgba="{BRIGHT}"/>',
+        capsule("wrist_yaw", "", (0.0, 0.0, yaw + 0.001), knee, 0.0017, METAL),
+        capsule("wrist_yaw", "", knee, end, 0.0012, METAL),
+        "</body>",
+    ]
+
+
+def retractor_parts() -> tuple[list[str], list[str]]:
+    clevis = ball("clevis", (0.0, 0.0, FRAMES["wrist_yaw"][2, 3]), 0.003, METAL)
+    return [clevis, *long_finger(1), *long_finger(-1)], ["finger_left", "finger_right"]
+
+
+PARTS = {"palpator": palpator_parts, "grasper": grasper_parts, "retractor": retractor_parts}
+
+
 def model(tool: str) -> str:
-    parts, fingers = palpator_parts() if tool == "palpator" else grasper_parts()
+    parts, fingers = PARTS[tool]()
     parts.append(
         f'<site name="tip" pos="{numbers(TIP_LENGTH[tool] * TIP_ROTATION[:, 2])}" quat="{quaternion(TIP_ROTATION)}" '
         'size="0.001" group="4"/>'
@@ -221,10 +262,16 @@ def model(tool: str) -> str:
         lines.extend(f"{pad}  {part}" for part in link_parts)
         depth += 1
     lines.extend("  " * level + "</body>" for level in range(depth - 1, 1, -1))
-    servos = [(link.joint, DRIVE[link.joint]) for link in PSM_LINKS] + [(name, DRIVE["finger"]) for name in fingers]
+    servos = [(link.joint, DRIVE[link.joint]) for link in PSM_LINKS] + [
+        (name, DRIVE["long_finger" if tool == "retractor" else "finger"]) for name in fingers
+    ]
     actuators = [f'    <position name="hold_{name}" joint="{name}" kp="{kp:g}"/>' for name, (_, _, kp, _) in servos]
     actuators += [f'    <velocity name="drive_{name}" joint="{name}" kv="{kv:g}"/>' for name, (_, _, _, kv) in servos]
-    return HEAD.format(tool=tool) + "\n".join(lines) + MIDDLE + "\n".join(actuators) + TAIL
+    middle = MIDDLE
+    if tool == "retractor":
+        pads = [f'    <numeric name="roughness_pad_{side}" data="{PAD_ROUGHNESS:g}"/>' for side in ("left", "right")]
+        middle = MIDDLE.replace("  <actuator>\n", "\n".join(["  <custom>", *pads, "  </custom>", "  <actuator>\n"]))
+    return HEAD.format(tool=tool) + "\n".join(lines) + middle + "\n".join(actuators) + TAIL
 
 
 HEAD = """<!-- A da Vinci-like arm (PSM) with a {tool}. Written by make_psm.py from surgsim_env/arms/psm.py: change it

@@ -33,7 +33,8 @@ class Arm:
         speed_limit: [rad/s or m/s]                                              (n,)
         home: [rad or m]                                                         (n,)
         jaw_range: least and largest opening of the jaw [rad], (0, 0) without one
-        shape_names, shape_radius: outer shapes (felt ones first) and radii [m]   (n_shape,)
+        shape_names, shape_radius: outer shapes (felt ones first) and radii [m]; of a box, those of the capsule that
+            is as long as it and holds its cross-section                          (n_shape,)
         felt: whether tissue feels a shape                                       (n_shape,)
     """
 
@@ -52,9 +53,12 @@ class Arm:
         self._shapes = np.concatenate(groups)
         self.felt = np.arange(len(self._shapes)) < len(groups[0])
         self.shape_names = [model.geom(geom).name for geom in self._shapes]
-        self.shape_radius = model.geom_size[self._shapes, 0].copy()
-        capsule = model.geom_type[self._shapes] == mujoco.mjtGeom.mjGEOM_CAPSULE
-        self._half_length = np.where(capsule, model.geom_size[self._shapes, 1], 0.0)
+        size, kind = model.geom_size[self._shapes], model.geom_type[self._shapes]
+        box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+        thin, middle, long = np.sort(size, axis=1).T
+        self.shape_radius = np.where(box, np.hypot(thin, middle), size[:, 0])
+        self._axis = np.where(box, size.argmax(axis=1), 2)
+        self._half_length = np.where(box, long, np.where(capsule, size[:, 1], 0.0))
         self.tip_site = model.site(description.tip.site or TIP_SITE).id
         self._tip_axis = _unit(description.tip.direction)
         trocar = description.trocar
@@ -111,7 +115,8 @@ class Arm:
     def shape_ends(self, joints: ArrayLike, jaw: float = 0.0) -> FloatArray:
         """Ends of the outer shapes' axes at joint values (n,) and a jaw angle [rad], shape (n_shape, 2, 3) [m]."""
         data = self._at(joints, jaw)
-        axis = data.geom_xmat[self._shapes].reshape(-1, 3, 3)[:, :, 2] * self._half_length[:, None]
+        rotations = data.geom_xmat[self._shapes].reshape(-1, 3, 3)
+        axis = rotations[np.arange(len(rotations)), :, self._axis] * self._half_length[:, None]
         centre = data.geom_xpos[self._shapes]
         return np.stack([centre - axis, centre + axis], axis=1)
 

@@ -7,16 +7,17 @@ import numpy as np
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.arms.arm import load_arm
-from surgsim_env.arms.inverse_kinematics import PoseSolution, follow, reach_pose, turn_towards
+from surgsim_env.arms.arm import Arm, load_arm
 from surgsim_env.arms.model import position_actuator, speed_actuator
+from surgsim_env.arms.port import Port
 from surgsim_env.arms.port_placement import check_port_outside, default_port
+from surgsim_env.arms.steering import SteeredArm, millimetres, missing, placed
 from surgsim_env.arms.wrist_sensor import WristSensor
 from surgsim_env.instrument import Instrument
+from surgsim_env.jaw import Jaw
+from surgsim_env.scenes import Scene
 from surgsim_env.tool_bodies import make_servo
 
-# A place counts as reached by the tip within this [m]; how it points is as the joints allow.
-PLACE_TOLERANCE = 1e-6
 # Where the tip waits before the first reset: this far above the middle of the palpable face [m].
 PARKED_GAP = 0.010
 # How many places of the palpable face are tried when an arm is set up.
@@ -26,15 +27,13 @@ PLACES_TRIED = 24
 class ArmInstrument(Instrument):
     """An arm at a scene's port whose tip is steered by its velocity and points along the scene's approach.
 
-    Once a control step `command_velocity` finds the joint values that put the tip where it shall be at the step's end
-    (`inverse_kinematics.follow`) and commands the steady joint speeds that lead there; the servo integrates them at
-    haptic rate, as the probe's does. Joint targets start from where the last ones ended, so that the path has no drift.
-
     Fields:
         arm: the arm as a mechanism
+        steered: the arm as it is steered
         wrist: its force sensor, None where the model has none
-        direction: where the tip shall point (3,)
     """
+
+    turning_size = 3
 
     def __init__(self, anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> None:
         """Set the scene's arm up at its port; the tip may move in the box from lower to upper [m].
@@ -43,117 +42,87 @@ class ArmInstrument(Instrument):
             ValueError: a wrong description or model, a port inside the organ, a palpable face out of reach.
         """
         scene = anatomy.scene
-        port = scene.port or default_port(anatomy.face)
-        check_port_outside(port, f"scene {scene.name!r}", anatomy.mesh.points, anatomy.mesh.boundary_triangles)
-        beside = scene.folder / scene.instrument.model
-        self.arm = load_arm(
-            beside if beside.is_file() else scene.instrument.model,
-            port,
-            tip_radius=scene.instrument.tip_radius,
-            timestep=scene.timing.haptic_step,
-        )
+        self.arm = load_scene_arm(anatomy, scene.instrument.model, scene.port or default_port(anatomy.face))
         arm, model = self.arm, self.arm.model
         super().__init__(model, lower, upper, arm.tip_site)
-        pairs = [(position_actuator(model, name), speed_actuator(model, name)) for name in arm.joints]
-        position, speed = np.array(pairs, dtype=np.int64).T.copy()
-        self.servo = make_servo(arm.lower, arm.upper, position, speed)
-        self._jaw = [position_actuator(model, name) for name in arm.description.jaw]
-        self._control_step = scene.timing.control_step
-        self._approach = anatomy.face.approach
-        self.direction = self._approach.copy()
-        self._short = False
+        count = arm.joint_count
+        self.servo = joint_servo(model, (*arm.joints, *arm.description.jaw))
+        self.servo.lower[:count], self.servo.upper[:count] = arm.lower, arm.upper
+        if arm.description.jaw:
+            self._set_jaw(Jaw(self, arm.description.jaw, count + np.arange(len(arm.description.jaw))))
+        self.steered = SteeredArm(
+            arm,
+            self,
+            np.arange(count),
+            direction=start_direction(scene),
+            control_step=scene.timing.control_step,
+            jaw=self.jaw,
+        )
         self.wrist = WristSensor.of(model)
-        self.parked = _middle(anatomy) - (scene.instrument.tip_radius + PARKED_GAP) * self._approach
+        self.parked = parked_place(anatomy)
         self._check_reach(anatomy)
         self.place(self.parked)
 
     @property
     def workspace_limited(self) -> bool:
         """Whether the box, a joint's limit or its speed limit kept the tip from going where it was told."""
-        return self._short or bool(self.servo.limited[0])
+        return self.steered.limited
+
+    @property
+    def direction(self) -> FloatArray:
+        """Where the tip shall point, (3,)."""
+        wanted = self.steered.wanted
+        return wanted.copy() if wanted.ndim == 1 else wanted @ np.asarray(self.arm.description.tip.direction)
 
     @property
     def joint_positions(self) -> FloatArray:
         """Values of the driven joints [rad or m], (n,)."""
-        return self.data.qpos[self.arm.qpos]
+        return self.steered.joint_positions
 
     @property
     def trocar_residual(self) -> float:
         """Distance of the shaft's axis from the trocar where the joints are now [m]."""
-        return self.arm.trocar_residual(self.joint_positions)
+        return self.steered.trocar_residual
 
     def place(self, position: FloatArray) -> None:
-        """Put the tip at rest at a position [m], pointing along the approach as far as the joints allow, jaw closed.
+        """Put the tip at rest at a position [m], pointing as at the start as far as the joints allow.
+
+        A jaw with pads is open, one without is as when loaded.
 
         Raises:
             ValueError: the tip does not reach there (says by how much, and the port).
         """
-        found = self._reach(position)
-        if not _placed(found):
-            raise ValueError(f"{self._where()} cannot put its tip at {_millimetres(position)}: {_missing(found)}")
         self._rest()
-        self.direction = self._approach.copy()
-        self._short = False
-        self.arm.write(self.data, found.joints)
-        self.data.ctrl[self.servo.position] = found.joints
+        self.steered.place(position)
         mujoco.mj_forward(self.model, self.data)
 
     def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
-        """Set the velocity of the tip [m/s] (3,), and how the direction it points in turns [rad/s] (3,).
+        """Set the velocity of the tip [m/s] (3,), and how the tip turns [rad/s] (3,).
 
         Good for one control step; held for longer, the joints go on at the same speeds.
         """
-        duration = self._control_step
-        if turning is not None and np.any(turning):
-            self.direction = _rotated(self.direction, np.asarray(turning, dtype=np.float64) * duration)
-        joints = self.data.ctrl[self.servo.position]
-        if not np.isfinite(joints).all():
-            # MuJoCo is about to say so itself.
-            self.servo.command[:] = 0.0
-            return
-        start = self.arm.tip_pose(joints).position
-        wanted = start + np.asarray(velocity, dtype=np.float64) * duration
-        held = np.clip(wanted, self.lower, self.upper)
-        still = (
-            not np.any(velocity) and np.linalg.norm(turn_towards(self.arm.tip_direction(joints), self.direction)) < 1e-6
-        )
-        if still:
-            self._short = False
-            self.servo.command[:] = 0.0
-            return
-        step = follow(self.arm, joints, held, self.direction, duration)
-        self._short = step.limited or bool((held != wanted).any())
-        self.servo.command[:] = (step.joints - joints) / duration
+        self.steered.command_velocity(velocity, self.turning_of(turning))
 
-    def command_jaw(self, angle: float) -> None:
-        """Set the jaw's opening angle [rad], shared by its fingers.
+    def command_jaw(self, target: float) -> None:
+        """Let the jaw go to a target from -1 (closed) to 1 (open), at its limited speed, and stay there.
 
         Raises:
-            ValueError: no jaw, or an angle outside its range.
+            ValueError: no jaw, or a target outside that range.
         """
-        lower, upper = self.arm.jaw_range
-        if not self._jaw:
-            raise ValueError(f"{self._where()} has no jaw: it carries a {self.arm.description.kind}")
-        if not lower <= angle <= upper:
-            raise ValueError(f"{self._where()}: jaw angle {angle:g} rad is outside its range {lower:g} to {upper:g}")
-        self.data.ctrl[self._jaw] = angle / len(self._jaw)
+        self.steered.command_jaw(target)
 
     def get_state(self) -> FloatArray:
         """All of the instrument's state, command and wanted direction included, as one vector."""
-        return np.concatenate([super().get_state(), [float(self._short)], self.direction])
+        return np.concatenate([super().get_state(), self.steered.get_state()])
 
     def set_state(self, state: FloatArray) -> None:
         """Restore what `get_state` gave, to the bit."""
-        super().set_state(state[:-4])
-        self._short = bool(state[-4])
-        self.direction = state[-3:].copy()
+        size = len(self.steered.get_state())
+        super().set_state(state[:-size])
+        self.steered.set_state(state[-size:])
 
-    def _reach(self, position: FloatArray) -> PoseSolution:
-        """Joint values for a place, pointing along the approach if they can, else as near to it as they come."""
-        found = reach_pose(self.arm, position, direction=self._approach, starts=2)
-        if _placed(found):
-            return found
-        return reach_pose(self.arm, position, starts=4)
+    def _where(self) -> str:
+        return self.steered.where
 
     def _check_reach(self, anatomy: Anatomy) -> None:
         """The tip comes to the parking place and to places all over the palpable face."""
@@ -162,43 +131,50 @@ class ArmInstrument(Instrument):
         thick = np.flatnonzero(face.thickness >= face.thickness_smallest)
         tried = thick[np.linspace(0, len(thick) - 1, min(PLACES_TRIED, len(thick))).astype(int)]
         radius = anatomy.scene.instrument.tip_radius
-        for place in [self.parked, *(corners[tried].mean(axis=1) - radius * self._approach)]:
-            found = self._reach(place)
-            if not _placed(found):
+        for place in [self.parked, *(corners[tried].mean(axis=1) - radius * face.approach)]:
+            found = self.steered.reach(place)
+            if not placed(found):
                 raise ValueError(
                     f"{self._where()} does not reach the palpable face of scene {anatomy.scene.name!r} at "
-                    f"{_millimetres(place)}: {_missing(found)}; move its [port]"
+                    f"{millimetres(place)}: {missing(found)}; move its [port]"
                 )
 
-    def _where(self) -> str:
-        return f"arm {self.arm.description.name!r} at its port {_millimetres(np.array(self.arm.port.point))}"
+
+def load_scene_arm(anatomy: Anatomy, name: str, port: Port) -> Arm:
+    """An arm by its name or its file beside the scene, at a port outside the organ.
+
+    Raises:
+        ValueError: a wrong description or model, or a port inside the organ.
+    """
+    scene = anatomy.scene
+    check_port_outside(port, f"scene {scene.name!r}", anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+    beside = scene.folder / name
+    return load_arm(
+        beside if beside.is_file() else name,
+        port,
+        tip_radius=scene.instrument.tip_radius,
+        timestep=scene.timing.haptic_step,
+    )
 
 
-def _placed(found: PoseSolution) -> bool:
-    return found.position_error <= PLACE_TOLERANCE and found.trocar_error <= PLACE_TOLERANCE
+def start_direction(scene: Scene) -> FloatArray:
+    """Where a scene's tip points at the start, (3,)."""
+    return np.asarray(scene.instrument.tip_direction or scene.instrument.approach, dtype=np.float64)
 
 
-def _missing(found: PoseSolution) -> str:
-    away, off = found.position_error * 1e3, found.trocar_error * 1e3
-    return f"its tip stays {away:.3f} mm away, its shaft {off:.3f} mm off the trocar"
+def joint_servo(model: mujoco.MjModel, joints: tuple[str, ...]):
+    """A servo at rest that drives joints of a model within their limits, in the order given."""
+    pairs = [(position_actuator(model, name), speed_actuator(model, name)) for name in joints]
+    position, speed = np.array(pairs, dtype=np.int64).T.copy()
+    lower, upper = np.array([model.joint(name).range for name in joints]).T
+    return make_servo(lower, upper, position, speed)
 
 
-def _millimetres(point: FloatArray) -> str:
-    return "(" + ", ".join(f"{value * 1e3:.1f}" for value in point) + ") mm"
-
-
-def _middle(anatomy: Anatomy) -> FloatArray:
-    """The place of the palpable face nearest to its middle [m], (3,)."""
+def parked_place(anatomy: Anatomy) -> FloatArray:
+    """Where a tip waits before the first reset: above the middle of the palpable face [m], (3,)."""
     corners = anatomy.face.points[anatomy.face.triangles]
-    return anatomy.face.project(corners.mean(axis=(0, 1)))[0]
-
-
-def _rotated(direction: FloatArray, turn: FloatArray) -> FloatArray:
-    quaternion, result = np.zeros(4), np.zeros(3)
-    angle = float(np.linalg.norm(turn))
-    mujoco.mju_axisAngle2Quat(quaternion, turn / angle, angle)
-    mujoco.mju_rotVecQuat(result, direction, quaternion)
-    return result / np.linalg.norm(result)
+    middle = anatomy.face.project(corners.mean(axis=(0, 1)))[0]
+    return middle - (anatomy.scene.instrument.tip_radius + PARKED_GAP) * anatomy.face.approach
 
 
 def is_arm(model: str) -> bool:

@@ -237,20 +237,30 @@ class FollowStep:
 
 
 def follow(
-    arm: Arm, joints: FloatArray, position: FloatArray, direction: FloatArray | None, duration: float
+    arm: Arm,
+    joints: FloatArray,
+    position: FloatArray,
+    direction: FloatArray | None,
+    duration: float,
+    *,
+    rotation: FloatArray | None = None,
 ) -> FollowStep:
-    """Joint values a time [s] from now that put the tip at a place nearby [m], and turn it to a direction as they can.
+    """Joint values a time [s] from now that put the tip at a place nearby [m], and turn it as they can.
 
-    Joint and speed limits hold. Where they leave no way to the place, the tip goes an eighth to half of the way, or
-    nowhere: it never leaves its line. A trocar kept by control comes before all.
+    It turns to a direction (3,) or to a whole frame, `rotation` (3, 3). Joint and speed limits hold. Where they leave
+    no way to the place, the tip goes an eighth to half of the way, or nowhere: it never leaves its line. A trocar kept
+    by control comes before all.
     """
-    now = arm.tip_pose(joints).position
+    pose = arm.tip_pose(joints)
+    now = pose.position
     reach = arm.speed_limit * duration
     lower, upper = np.maximum(arm.lower, joints - reach), np.minimum(arm.upper, joints + reach)
     if direction is not None:
         direction = _turned(arm.tip_direction(joints), direction, TURN_RATE * duration)
+    if rotation is not None:
+        rotation = frame_towards(pose.rotation, rotation, TURN_RATE * duration)
     for share in SHARES:
-        found = _newton(arm, joints, Target(now + share * (position - now), direction), lower, upper)
+        found = _newton(arm, joints, Target(now + share * (position - now), direction, rotation), lower, upper)
         if found is not None:
             return FollowStep(found, share < 1.0)
     return FollowStep(joints.copy(), True)
@@ -266,11 +276,28 @@ def _turned(now: FloatArray, wanted: FloatArray, most: float) -> FloatArray:
     return np.cos(most) * now + np.sin(most) * across
 
 
+def frame_towards(now: FloatArray, wanted: FloatArray, most: float) -> FloatArray:
+    """A frame turned towards another by an angle at most [rad], (3, 3)."""
+    turn = _turn_between(now, wanted)
+    angle = float(np.linalg.norm(turn))
+    return wanted if angle <= most else turn_matrix(turn * (most / angle)) @ now
+
+
+def turn_matrix(turn: FloatArray) -> FloatArray:
+    """The rotation by a rotation vector [rad] (3,), as a matrix (3, 3): Rodrigues."""
+    angle = float(np.linalg.norm(turn))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = turn / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+
+
 def _newton(arm: Arm, start: FloatArray, target: Target, lower: FloatArray, upper: FloatArray) -> FloatArray | None:
     """A few steps to a near target within limits; None where its place or the trocar is not met."""
     joints, placed = start, Target(target.position)
     for iteration in range(NEWTON_STEPS):
-        turning = iteration < TURNING_STEPS and target.direction is not None
+        turning = iteration < TURNING_STEPS and (target.direction is not None or target.rotation is not None)
         tasks = tip_tasks(arm, joints, target if turning else placed)
         if not turning and all(np.linalg.norm(task.error) <= POSITION_TOLERANCE for task in tasks):
             return joints

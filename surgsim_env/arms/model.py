@@ -101,9 +101,14 @@ def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
     for name in (*description.contact, *description.links, *([tip.ball] if tip.ball else [])):
         what = "contact geom" if name in description.contact else "geom"
         _require_part(what, name, geoms)
-        if geoms[name].type not in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+        round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        pad = name in description.contact and geoms[name].type == mujoco.mjtGeom.mjGEOM_BOX
+        if geoms[name].type not in round_ones and not pad:
             kind = geoms[name].type.name.removeprefix("mjGEOM_").lower()
-            raise ValueError(f"{what} {name!r} is a {kind}; only spheres and capsules can be felt: draw one around it")
+            raise ValueError(
+                f"{what} {name!r} is a {kind}; only spheres and capsules can be felt, and boxes as contact: draw one "
+                "around it"
+            )
     bodies = {body.name: body for body in spec.bodies}
     _require_part("trocar.shaft_body", trocar.shaft_body, bodies)
     if tip.site is not None:

@@ -255,15 +255,22 @@ def test_an_unreachable_place_is_refused_with_the_distance(instrument):
         instrument.place(np.array([5.0, 0.0, 0.0]))
 
 
-def test_the_jaw_takes_angles_of_its_range():
+def test_the_jaw_goes_to_its_target_and_stays_there():
+    """-1 to 1 is -20 to 40 degrees of each finger, in half a second; without pads it starts as when loaded."""
     grasper = made("psm_grasper")
     grasper.place(ABOVE)
-    grasper.command_jaw(0.6)
-    for _ in let_run(grasper, 500):
-        pass
+    assert grasper.opening < 0.002
+    grasper.command_jaw(0.5)
+    least, most = np.radians([-20.0, 40.0])
+    rate, reached = (most - least) / 0.5, least + 0.75 * (most - least)
+    for step, _ in enumerate(let_run(grasper, 500), start=1):
+        targets = grasper.data.ctrl[grasper.servo.position[6:]]
+        assert targets == pytest.approx(np.full(2, min(step * 0.001 * rate, reached)), abs=1e-12)
+        assert not grasper.workspace_limited
+    assert grasper.jaw.target == pytest.approx(0.5)
     angles = [grasper.data.joint(name).qpos[0] for name in ("finger_left", "finger_right")]
-    assert angles == pytest.approx([0.3, 0.3], abs=1e-3)
-    with pytest.raises(ValueError, match=r"jaw angle 2 rad is outside its range -0\.698132 to 1\.39626"):
+    assert angles == pytest.approx([reached, reached], abs=1e-3)
+    with pytest.raises(ValueError, match=r"jaw target 2 is out of range: it goes from -1 \(closed\) to 1 \(open\)"):
         grasper.command_jaw(2.0)
     with pytest.raises(ValueError, match="has no jaw: it carries a palpator"):
         made("psm_palpator").command_jaw(0.1)
@@ -277,7 +284,7 @@ def test_a_state_is_restored_to_the_bit(instrument):
     saved = instrument.get_state()
     tips = []
     for direction in (instrument.direction, np.array([0.6, 0.0, -0.8])):
-        instrument.direction = direction.copy()
+        instrument.steered.wanted = direction.copy()
         instrument.set_state(saved)
         assert instrument.get_state().tobytes() == saved.tobytes()
         for _ in range(3):

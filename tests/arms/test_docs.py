@@ -18,7 +18,7 @@ def test_the_examples_run(capsys):
     for block in blocks:
         exec(compile(block, "docs/arms.md", "exec"), names)
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0] == "['psm_grasper', 'psm_palpator', 'six_axis']"
+    assert printed[0] == "['psm_grasper', 'psm_palpator', 'psm_retractor', 'six_axis']"
     assert re.fullmatch(r"\S*e-1\d False", printed[1]), printed[1]
     assert printed[2].startswith("True [") and printed[2].endswith(" m")
     assert re.match(r"False \de-\d+ m 0\.\d+", printed[3])

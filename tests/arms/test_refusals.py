@@ -78,7 +78,7 @@ def swap(text, old, new):
 
 
 def test_the_shipped_arms_are_listed_and_load():
-    assert list_arms() == ["psm_grasper", "psm_palpator", "six_axis"]
+    assert list_arms() == ["psm_grasper", "psm_palpator", "psm_retractor", "six_axis"]
     for name in list_arms():
         assert load_arm(name).description.name == name
 

@@ -29,7 +29,7 @@ def steps_of(env, count):
     shapes, response, wrench = sim.instrument.shapes, sim.instrument.response, np.zeros((1, 6))
     return lambda: advance_haptic_steps(
         sim.organ_model, sim.organ_state, sim.contact, shapes, response, tools, sim.substep_dt, decay,
-        sim.substep_count, wrench, count, np.inf,
+        sim.substep_count, wrench, count, np.inf, np.inf,
     )  # fmt: skip
 
 

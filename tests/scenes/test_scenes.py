@@ -184,7 +184,7 @@ def test_a_scene_file_of_ones_own_is_read(tmp_path):
 def test_instrument_that_is_not_there_lists_those_that_are():
     scene = make_scene("phantom")
     anatomy = load_anatomy(replace(scene, instrument=replace(scene.instrument, model="scalpel.xml")))
-    with pytest.raises(ValueError, match=r"'scalpel.xml' is unknown; the instruments are probe.xml"):
+    with pytest.raises(ValueError, match=r"'scalpel.xml' is unknown; the instruments are grasper.xml, probe.xml"):
         Simulation(anatomy)
 
 

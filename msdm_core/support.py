@@ -89,6 +89,17 @@ class Support:
             ]
         )
 
+    def reach(self, direction: FloatArray) -> float:
+        """How far it goes along a unit direction, seen from the origin [m]; a plane has no end."""
+        along = direction @ self.frame
+        if self.kind == "plane":
+            return math.inf
+        if self.kind == "box":
+            out = float(np.abs(along) @ self.size)
+        else:
+            out = self.size[0] + (self.size[1] * abs(float(along[2])) if self.kind == "capsule" else 0.0)
+        return float(direction @ np.array(self.position)) + out
+
 
 @dataclass(frozen=True)
 class SupportLaw:

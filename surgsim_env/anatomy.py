@@ -16,6 +16,7 @@ from msdm_core.ordering import in_sweep_order
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.quality import surface_cell
 from msdm_core.regions import Lesion
+from msdm_core.support import SupportLaw
 from msdm_core.surface import triangles_facing
 from msdm_core.triangles import nearest_triangle
 from surgsim_env.cell_share import warn_of_coarse_cells
@@ -67,6 +68,9 @@ class Anatomy:
             anchors=self.anchors,
             damping=scene.damping,
             stiffness_rule=scene.stiffness_rule,
+            gravity=scene.gravity,
+            supports=scene.supports,
+            support_law=scene.support_law or SupportLaw(scene.contact.stiffness, scene.contact.damping),
         )
 
     def compiled(self, specification: OrganSpec) -> OrganModel:

@@ -7,6 +7,7 @@ from msdm_core.mesh import FloatArray
 from surgsim_env.jaw import Jaw
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene
+from surgsim_env.supports import add_supports
 from surgsim_env.tool_bodies import ToolBodies, make_servo
 
 SLIDES = ("x", "y", "z")
@@ -187,6 +188,7 @@ def _compile(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco.MjMod
     tip.quat = _rotation_from_down(np.asarray(scene.instrument.approach))
     for axis, name in enumerate(SLIDES):
         spec.joint(f"slide_{name}").range = [lower[axis], upper[axis]]
+    add_supports(spec, scene.supports)
     return spec.compile()
 
 

@@ -10,6 +10,7 @@ from msdm_core.damping import Damping
 from msdm_core.kernels import ContactLaw
 from msdm_core.regions import Capsule, Material
 from msdm_core.stiffness import check_stiffness_rule
+from msdm_core.support import Support, SupportLaw
 from surgsim_env.arms.description import list_arms
 from surgsim_env.arms.port import Port
 from surgsim_env.retraction import Retraction, RetractionCamera
@@ -306,7 +307,9 @@ class Endoscope:
 class Scene:
     """A whole scene; `name` is the file's stem, `stiffness_rule` one of msdm_core.stiffness.STIFFNESS_RULES.
 
-    `port` is where an arm enters the body; if it is not given, `arms.port_placement.default_port` finds one.
+    The organ is settled under `gravity` [m/s^2] onto its anchors and `supports`, which push as contact does where no
+    `support_law` is given. `port` is where an arm enters the body; if it is not given,
+    `arms.port_placement.default_port` finds one.
     """
 
     name: str
@@ -329,6 +332,9 @@ class Scene:
     stiffness_rule: str = "lloyd"
     port: Port | None = None
     endoscope: Endoscope | None = None
+    gravity: Vector = (0.0, 0.0, 0.0)
+    supports: tuple[Support, ...] = ()
+    support_law: SupportLaw | None = None
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
@@ -345,7 +351,7 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
 _TABLES = (
     *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
     *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Endoscope, Port),
-    *(Retraction, RetractionCamera),
+    *(Retraction, RetractionCamera, Support, SupportLaw),
 )
 
 

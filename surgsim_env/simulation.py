@@ -116,14 +116,16 @@ class Simulation:
         self.organ_model = organ_model
         self._check_step()
         self.organ_state = rest_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
-        # Where the organ rests: as scanned, or settled under gravity.
+        # Where the organ rests: as scanned, or settled under gravity, and how it sticks to what it rests on.
         self._rest_position = self.organ_state.node_position.copy()
+        self._rest_stretch = self.organ_state.support_stretch.copy()
         self.restart(tip_position)
 
     def restart(self, tip_position: FloatArray) -> None:
         """Back to the rest of the same organ with the tip somewhere else [m]; the clock starts again."""
         state = self.organ_state
         state.node_position[:] = self._rest_position
+        state.support_stretch[:] = self._rest_stretch
         state.node_velocity[:] = 0.0
         state.node_force[:] = 0.0
         state.contact_engaged[:] = 0
@@ -250,6 +252,7 @@ class Simulation:
             **arrays,
             "instrument": self.instrument.get_state(),
             "rest_position": self._rest_position.copy(),
+            "rest_stretch": self._rest_stretch.copy(),
             "wrench": self._wrench.copy(),
             "step": np.array(self._step),
             "fault": np.array(self.fault),
@@ -261,6 +264,7 @@ class Simulation:
         self.organ_state = self.organ_state._replace(**{name: arrays[f"organ_{name}"].copy() for name in KEPT_FIELDS})
         self.instrument.set_state(arrays["instrument"])
         self._rest_position = arrays["rest_position"].copy()
+        self._rest_stretch = arrays["rest_stretch"].copy()
         self._wrench[:] = arrays["wrench"]
         self._step = int(arrays["step"])
         self.fault = str(arrays["fault"])

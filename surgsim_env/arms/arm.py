@@ -1,5 +1,6 @@
 """An arm as a mechanism: where its tip, shaft and shapes are at given joint values, and how they move."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msdm_core.mesh import FloatArray
+from msdm_core.support import Support
 from surgsim_env.arms.description import ArmDescription, read_description
 from surgsim_env.arms.model import LINK_GROUP, TIP_SITE, compile_arm
 from surgsim_env.arms.port import Port
@@ -148,6 +150,7 @@ def load_arm(
     *,
     tip_radius: float | None = None,
     timestep: float = 0.001,
+    supports: Sequence[Support] = (),
 ) -> Arm:
     """An arm with its trocar at a port, the world's origin if none is given.
 
@@ -156,13 +159,14 @@ def load_arm(
         port: where it enters the body.
         tip_radius: of the tip's ball [m]; as in the model if none is given.
         timestep: of MuJoCo [s].
+        supports: what stands in the world and its tools meet.
 
     Raises:
         ValueError: one line with the arm, the entry that is wrong and the way out.
     """
     description = source if isinstance(source, ArmDescription) else read_description(source)
     port = port or Port()
-    arm = Arm(description, port, compile_arm(description, port, tip_radius, timestep))
+    arm = Arm(description, port, compile_arm(description, port, tip_radius, timestep, supports))
     _check_trocar(arm)
     return arm
 

@@ -154,6 +154,7 @@ def load_scene_arm(anatomy: Anatomy, name: str, port: Port) -> Arm:
         port,
         tip_radius=scene.instrument.tip_radius,
         timestep=scene.timing.haptic_step,
+        supports=scene.supports,
     )
 
 

@@ -1,7 +1,7 @@
 """An arm's MuJoCo model: read from MJCF or URDF, checked against its description, placed at a port, compiled."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -9,8 +9,10 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from msdm_core.support import Support
 from surgsim_env.arms.description import ArmDescription
 from surgsim_env.arms.port import Port, frame_into
+from surgsim_env.supports import add_supports
 from surgsim_env.toml_tables import nearest
 from surgsim_env.tool_bodies import CONTACT_GROUP
 
@@ -21,10 +23,17 @@ TIP_SITE = "surgsim_tip"
 URDF_COMPILER = {"discardvisual": "false", "fusestatic": "false", "strippath": "true", "balanceinertia": "true"}
 
 
-def compile_arm(description: ArmDescription, port: Port, tip_radius: float | None, timestep: float) -> mujoco.MjModel:
+def compile_arm(
+    description: ArmDescription,
+    port: Port,
+    tip_radius: float | None,
+    timestep: float,
+    supports: Sequence[Support] = (),
+) -> mujoco.MjModel:
     """The model of an arm alone, its trocar at a port; its tip ball gets a radius [m] if one is given.
 
-    Geoms touch nothing in MuJoCo itself; bodies are gravity-compensated; MuJoCo's own gravity is the model's.
+    Geoms touch nothing in MuJoCo itself but supports, if any are given; bodies are gravity-compensated; MuJoCo's own
+    gravity is the model's.
 
     Raises:
         ValueError: a file that is missing or broken, or a part that the description names and the model lacks.
@@ -34,6 +43,7 @@ def compile_arm(description: ArmDescription, port: Port, tip_radius: float | Non
         spec = _read_spec(description)
         _check_parts(spec, description)
         _set_up(spec, description, port, tip_radius, timestep)
+        add_supports(spec, supports)
         model = spec.compile()
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None

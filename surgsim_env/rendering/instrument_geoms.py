@@ -1,4 +1,4 @@
-"""The instrument's geoms in the drawn scene: whatever its model shows, posed as its data says."""
+"""The instrument's geoms in the drawn scene, and the supports that stand in its model: all that shows, as posed."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from msdm_core.mesh import FloatArray
+from surgsim_env.supports import SUPPORT_PREFIX
 from surgsim_env.tool_bodies import CONTACT_GROUP
 
 PREFIX = "instrument"
@@ -43,7 +44,7 @@ def shown_geoms(model: mujoco.MjModel) -> list[int]:
     for geom in range(model.ngeom):
         group, body = int(model.geom_group[geom]), int(model.geom_bodyid[geom])
         wanted = group < CONTACT_GROUP or (group == CONTACT_GROUP and body not in dressed)
-        if wanted and int(model.geom_type[geom]) in _DRAWN_TYPES and _colour(model, geom)[3] > 0.0:
+        if wanted and _is_drawn(model, geom) and _colour(model, geom)[3] > 0.0:
             shown.append(geom)
     return shown
 
@@ -53,10 +54,10 @@ def add_instrument(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     for geom in shown_geoms(model):
         kind = int(model.geom_type[geom])
         added = spec.worldbody.add_geom(
-            name=f"{PREFIX}_{geom}",
+            name=_name(model, geom),
             type=mujoco.mjtGeom(kind),
             rgba=_colour(model, geom),
-            material=_material(spec, model, int(model.geom_matid[geom])),
+            material=_cloth(spec) if _is_support(model, geom) else _material(spec, model, int(model.geom_matid[geom])),
             contype=0,
             conaffinity=0,
         )
@@ -75,8 +76,29 @@ def find_instrument(drawn: mujoco.MjModel, model: mujoco.MjModel) -> InstrumentG
         _slice(drawn, target, "normal")[:] = _slice(model, mesh, "normal")
     return InstrumentGeoms(
         source=np.array(source, dtype=np.int64),
-        target=np.array([drawn.geom(f"{PREFIX}_{geom}").id for geom in source], dtype=np.int64),
+        target=np.array([drawn.geom(_name(model, geom)).id for geom in source], dtype=np.int64),
     )
+
+
+def _is_drawn(model: mujoco.MjModel, geom: int) -> bool:
+    return int(model.geom_type[geom]) in _DRAWN_TYPES or _is_support(model, geom)
+
+
+def _is_support(model: mujoco.MjModel, geom: int) -> bool:
+    return int(model.geom_bodyid[geom]) == 0 and model.geom(geom).name.startswith(SUPPORT_PREFIX)
+
+
+def _name(model: mujoco.MjModel, geom: int) -> str:
+    """A geom's name in the drawn scene: what begins with PREFIX is labelled as the instrument, supports are not."""
+    return f"{SUPPORT_PREFIX if _is_support(model, geom) else f'{PREFIX}_'}{geom}"
+
+
+def _cloth(spec: mujoco.MjSpec) -> str:
+    """The material of supports, which do not shine."""
+    name = f"{SUPPORT_PREFIX}material"
+    if spec.material(name) is None:
+        spec.add_material(name=name, specular=0.0, shininess=0.0)
+    return name
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> FloatArray:

@@ -130,11 +130,16 @@ def _add_lights(spec: mujoco.MjSpec, anatomy: Anatomy, options: RenderOptions) -
 
 
 def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
-    """A cloth below the organ, as seen by the instrument that comes to it; a point of it [m]."""
+    """A cloth below the organ and what it rests on, as seen by the instrument that comes to it; a point of it [m].
+
+    A plane that the organ rests on stands in its place.
+    """
     points, approach = anatomy.mesh.points, anatomy.face.approach
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     radius = float(np.linalg.norm(points - centre, axis=1).max())
-    ground = centre + (float((points @ approach).max()) + DRAPE_GAP - centre @ approach) * approach
+    solids = [support for support in anatomy.scene.supports if support.kind != "plane"]
+    lowest = max([float((points @ approach).max()), *(solid.reach(approach) for solid in solids)])
+    ground = centre + (lowest + DRAPE_GAP - centre @ approach) * approach
     # Where a camera sees beyond the drape.
     sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96)
     sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
@@ -149,6 +154,8 @@ def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "drape"
     # A uniform texture repeats for each metre; one repeat holds two squares.
     material.texuniform, material.texrepeat = True, [0.5 / DRAPE_SQUARE, 0.5 / DRAPE_SQUARE]
+    if len(solids) < len(anatomy.scene.supports):
+        return ground
     spec.worldbody.add_geom(
         name="drape",
         type=mujoco.mjtGeom.mjGEOM_PLANE,

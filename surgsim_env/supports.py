@@ -1,0 +1,53 @@
+"""What an organ rests on, as fixed geoms of an instrument's MuJoCo model: tools meet it, pictures show it."""
+
+from collections.abc import Sequence
+
+import mujoco
+
+from msdm_core.support import Support
+from surgsim_env.tool_bodies import CONTACT_GROUP
+
+SUPPORT_PREFIX = "support_"
+# Supports meet the geoms that tissue feels by this bit of their contact masks, and nothing else does.
+SUPPORT_BIT = 2
+# Cloth over something soft: 1500 N/m under a tool of 0.1 kg, more under a heavier one, critically damped. MuJoCo's
+# negative solref [1/s^2, 1/s] makes a contact of impedance 1/2 as stiff as 2 x 7500 per kilogram of the tool.
+SOLREF = (-7500.0, -173.0)
+SOLIMP = (0.5, 0.5, 0.001, 0.5, 2.0)
+COLOUR = (0.125, 0.335, 0.375, 1.0)
+_GEOMS = {
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
+
+
+def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support]) -> None:
+    """Add supports to a model's world as geoms `support_NAME`, in the scene's frame; its tools then meet them.
+
+    Without supports nothing changes. Call it when every geom has its group, and the world its last place.
+    """
+    if not supports:
+        return
+    for geom in spec.geoms:
+        if geom.group == CONTACT_GROUP:
+            geom.conaffinity |= SUPPORT_BIT
+    for support in supports:
+        spec.worldbody.add_geom(
+            name=SUPPORT_PREFIX + support.name,
+            type=_GEOMS[support.kind],
+            pos=support.position,
+            quat=support.quaternion,
+            # A plane without end is drawn where its half sizes are 0.
+            size=(*support.size, 0.0, 0.0, 0.0)[:3] if support.kind != "plane" else (0.0, 0.0, 0.05),
+            friction=(support.friction, 0.005, 0.0001),
+            contype=SUPPORT_BIT,
+            conaffinity=0,
+            # What it says of the contact counts, not what the tool says.
+            priority=1,
+            condim=3,
+            solref=SOLREF,
+            solimp=SOLIMP,
+            rgba=COLOUR,
+        )

@@ -9,6 +9,7 @@ from msdm_core.mesh import FloatArray
 from surgsim_env.instrument import SLIDES, Instrument, read_model
 from surgsim_env.jaw import Jaw
 from surgsim_env.scenes import Scene
+from surgsim_env.supports import add_supports
 from surgsim_env.tool_bodies import make_servo
 
 FINGERS = ("finger_upper", "finger_lower")
@@ -126,4 +127,5 @@ def _compile(scene: Scene, rotation: FloatArray) -> mujoco.MjModel:
     for name in SLIDES:
         # The box is the tip's: where the slides are then depends on the hinge.
         spec.joint(f"slide_{name}").range = [-10.0, 10.0]
+    add_supports(spec, scene.supports)
     return spec.compile()

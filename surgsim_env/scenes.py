@@ -11,6 +11,7 @@ from msdm_core.kernels import ContactLaw
 from msdm_core.regions import Capsule, Material
 from msdm_core.stiffness import check_stiffness_rule
 from msdm_core.support import Support, SupportLaw
+from surgsim_env.anchors import Anchor, Ball, Bed, Box
 from surgsim_env.arms.description import list_arms
 from surgsim_env.arms.port import Port
 from surgsim_env.retraction import Retraction, RetractionCamera
@@ -22,48 +23,6 @@ CARTESIAN = ("probe", "grasper")
 
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Box:
-    """An axis-aligned box: lower and upper corner [m]."""
-
-    lower: Vector
-    upper: Vector
-
-
-@dataclass(frozen=True)
-class Ball:
-    """A ball: centre [m] and radius [m]."""
-
-    centre: Vector
-    radius: float
-
-
-@dataclass(frozen=True)
-class Bed:
-    """What an organ lies on: the deepest share of it along a direction, such as 0.15 along the approach."""
-
-    direction: Vector
-    share: float
-
-    def __post_init__(self) -> None:
-        if not any(self.direction) or not 0.0 < self.share < 1.0:
-            raise ValueError(f"bed: direction {self.direction}, share {self.share}; give a direction and 0 < share < 1")
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """Where something holds the organ: every node of its surface (or, for a box, every node) inside is fixed."""
-
-    name: str
-    box: Box | None = None
-    ball: Ball | None = None
-    bed: Bed | None = None
-
-    def __post_init__(self) -> None:
-        if sum(part is not None for part in (self.box, self.ball, self.bed)) != 1:
-            raise ValueError(f"anchor {self.name!r}: give one of a box, a ball and a bed")
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support]) -> None:
     """
     if not supports:
         return
+    # A pyramid of friction would make the contact 1 / mu^2 times as stiff.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     for geom in spec.geoms:
         if geom.group == CONTACT_GROUP:
             geom.conaffinity |= SUPPORT_BIT

@@ -107,7 +107,8 @@ def _room(anatomy: Anatomy, surface: DrawnSurface, options: RenderOptions) -> di
         # A cut tet is a quadrangle at most, whose triangles are split and may each be parted by a lesion's outline.
         small = 2 * SECTION_SPLITS**2 * most_tets_cut(anatomy.mesh, cut_direction(anatomy))
         room |= {"section": (6 * small, 2 * small), "section_lesion": (6 * small, 2 * small)}
-    elif not (options.shadows or options.show_lesion):
+    elif not (options.shadows or options.show_lesion or anatomy.scene.supports):
+        # Where it rests on something else, that is in the drape's way.
         room["shadow"] = (anatomy.mesh.node_count, len(surface.triangles))
     return room
 

@@ -8,6 +8,10 @@ import pytest
 
 from msdm_core.errors import OrganError
 from msdm_core.measure import support_forces
+from msdm_core.mesh import TetMesh
+from msdm_core.organ import compile_organ, rest_state
+from msdm_core.regions import Capsule
+from msdm_core.stability import stable_dt
 from msdm_core.support import Support, SupportLaw
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.rendering.options import render_options
@@ -17,6 +21,7 @@ from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene, load_scene, make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.supports import SUPPORT_BIT
+from surgsim_env.timing import substeps_needed
 from surgsim_env.tool_bodies import CONTACT_GROUP
 
 # Beside the lobe, over its bed, whose top is z = 0 [m].
@@ -148,6 +153,19 @@ def test_instruments_of_other_scenes_know_of_no_supports():
     model = Simulation(load_anatomy(make_scene("phantom"))).instrument.model
     assert not model.geom_contype.any() and not model.geom_conaffinity.any()
     assert model.opt.cone == 0
+
+
+@pytest.mark.parametrize("scale", [0.92, 1.08])
+def test_the_lobes_substeps_bear_its_hardest_draw(scale: float):
+    """10 kPa, cells of 0.92 x 4 mm, a capsule of 20 N/m; it settles too."""
+    anatomy = load_anatomy(scene())
+    mesh = TetMesh(anatomy.mesh.points * scale, anatomy.mesh.tets)
+    hardest = replace(scene().material, youngs_modulus=10000.0)
+    capsule = Capsule(1e6, 2e-5)
+    organ = compile_organ(replace(anatomy.specification(), mesh=mesh, materials=hardest, capsule=capsule))
+    timing = scene().timing
+    assert substeps_needed(timing.haptic_step, stable_dt(organ, scene().contact.law)) <= timing.substep_count
+    assert np.isfinite(rest_state(organ).node_position).all()
 
 
 def test_a_scene_whose_substeps_are_too_few_for_its_bed_is_refused():

@@ -43,6 +43,12 @@ class Anatomy:
         return surface_cell(self.mesh, self.face.triangles)
 
     @cached_property
+    def downward(self) -> FloatArray:
+        """Unit vector that points down in pictures: along gravity, or where there is none, as the instrument comes."""
+        gravity = np.asarray(self.scene.gravity, dtype=np.float64)
+        return gravity / np.linalg.norm(gravity) if gravity.any() else self.face.approach
+
+    @cached_property
     def along_surface(self) -> SurfaceDistance:
         """Distances along the resting surface."""
         return SurfaceDistance(self.mesh.points, self.mesh.boundary_triangles)

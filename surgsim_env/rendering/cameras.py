@@ -65,9 +65,9 @@ class Camera:
 
 def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Camera]:
     """The scene's cameras by name, those of `options.CAMERAS`, for pictures so many times as wide as high."""
-    points, face = anatomy.mesh.points, anatomy.face
-    up = -face.approach
-    across, along = tangent_axes(face.approach)
+    points = anatomy.mesh.points
+    up = -anatomy.downward
+    across, along = tangent_axes(anatomy.downward)
     front, place = cut_direction(anatomy), anatomy.scene.endoscope
     return {
         "overview": _framing(points, _raised(front, up, OVERVIEW_HEIGHT), up, aspect, OVERVIEW_SHIFT),
@@ -81,7 +81,7 @@ def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Came
 
 def cut_direction(anatomy: Anatomy) -> FloatArray:
     """The level unit direction towards the overview, the side from which an organ is cut open, shape (3,)."""
-    across, along = tangent_axes(anatomy.face.approach)
+    across, along = tangent_axes(anatomy.downward)
     side = math.radians(OVERVIEW_SIDE)
     return across * math.sin(side) - along * math.cos(side)
 
@@ -112,8 +112,8 @@ def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
 
 
 def placed_endoscope(anatomy: Anatomy, place: Endoscope) -> Camera:
-    """The camera of an endoscope that stands somewhere, upright as seen by the instrument."""
-    up = -anatomy.face.approach
+    """The camera of an endoscope that stands somewhere, upright."""
+    up = -anatomy.downward
     return Camera.looking(np.asarray(place.position), np.asarray(place.target), up, place.fov_deg)
 
 

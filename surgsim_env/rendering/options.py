@@ -17,7 +17,7 @@ class RenderOptions:
 
     Args:
         camera: "overview" (organ and instrument), "endoscope" (the palpable face, near and oblique), "side" (level) or
-            "above" (along the instrument's approach).
+            "above" (from straight above).
         width, height: of the picture [pixels].
         show_force: draw the tissue's force on each tool as an arrow with its size in newtons; none where it is 0.
         force_mm_per_newton: length of that arrow in the scene [mm/N].

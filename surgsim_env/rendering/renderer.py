@@ -135,7 +135,7 @@ class OrganRenderer:
         axes = [lesion.half_axes for lesion in tissue.lesions]
         shapes = tissue.shapes(nodes)
         if "shadow" in scene.meshes:
-            up = -simulation.anatomy.face.approach
+            up = -simulation.anatomy.downward
             shapes["shadow"] = ground_shadow(nodes, stage.surface.triangles, scene.light, scene.ground, up)
         return Picture(
             shapes=shapes,

@@ -115,8 +115,8 @@ def _room(anatomy: Anatomy, surface: DrawnSurface, options: RenderOptions) -> di
 
 def _add_lights(spec: mujoco.MjSpec, anatomy: Anatomy, options: RenderOptions) -> FloatArray:
     """A lamp above the surgeon's left shoulder, a faint one from behind, one at the camera; the lamp's direction."""
-    up = -anatomy.face.approach
-    across, along = tangent_axes(anatomy.face.approach)
+    up = -anatomy.downward
+    across, along = tangent_axes(anatomy.downward)
     directions = {"lamp": (0.30 * along + 0.38 * across - up, 0.60), "rim": (-along - 0.4 * across - 0.5 * up, 0.22)}
     for name, (towards, strength) in directions.items():
         light = spec.worldbody.add_light(name=name, dir=towards / np.linalg.norm(towards))
@@ -131,23 +131,23 @@ def _add_lights(spec: mujoco.MjSpec, anatomy: Anatomy, options: RenderOptions) -
 
 
 def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
-    """A cloth below the organ and what it rests on, as seen by the instrument that comes to it; a point of it [m].
+    """A cloth below the organ and what it rests on; a point of it [m].
 
     A plane that the organ rests on stands in its place.
     """
-    points, approach = anatomy.mesh.points, anatomy.face.approach
+    points, down = anatomy.mesh.points, anatomy.downward
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     radius = float(np.linalg.norm(points - centre, axis=1).max())
     solids = [support for support in anatomy.scene.supports if support.kind != "plane"]
-    lowest = max([float((points @ approach).max()), *(solid.reach(approach) for solid in solids)])
-    ground = centre + (lowest + DRAPE_GAP - centre @ approach) * approach
+    lowest = max([float((points @ down).max()), *(solid.reach(down) for solid in solids)])
+    ground = centre + (lowest + DRAPE_GAP - centre @ down) * down
     # Where a camera sees beyond the drape.
     sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96)
     sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
     sky.rgb1 = sky.rgb2 = BACKGROUND_COLOUR
-    across, _ = tangent_axes(approach)
+    across, _ = tangent_axes(down)
     quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.column_stack([across, np.cross(-approach, across), -approach]).ravel())
+    mujoco.mju_mat2Quat(quaternion, np.column_stack([across, np.cross(-down, across), -down]).ravel())
     cloth = spec.add_texture(name="drape", type=mujoco.mjtTexture.mjTEXTURE_2D, width=64, height=64)
     cloth.builtin = mujoco.mjtBuiltin.mjBUILTIN_CHECKER
     cloth.rgb1, cloth.rgb2 = DRAPE_COLOURS

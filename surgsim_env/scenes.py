@@ -268,7 +268,7 @@ class Scene:
 
     The organ is settled under `gravity` [m/s^2] onto its anchors and `supports`, which push as contact does where no
     `support_law` is given. `port` is where an arm enters the body; if it is not given,
-    `arms.port_placement.default_port` finds one.
+    `arms.port_placement.default_port` finds one. `ports` are those of two arms, the left one's first.
     """
 
     name: str
@@ -290,6 +290,7 @@ class Scene:
     demonstration: tuple[FixedLesion, ...] = field(default=())
     stiffness_rule: str = "lloyd"
     port: Port | None = None
+    ports: tuple[Port, ...] = ()
     endoscope: Endoscope | None = None
     gravity: Vector = (0.0, 0.0, 0.0)
     supports: tuple[Support, ...] = ()

@@ -40,15 +40,21 @@ def compile_arm(
     """
     where = f"arm {description.name!r}"
     try:
-        spec = _read_spec(description)
-        _check_parts(spec, description)
-        _set_up(spec, description, port, tip_radius, timestep)
+        spec = arm_spec(description, port, tip_radius, timestep)
         add_supports(spec, supports)
         model = spec.compile()
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
     _check_joints(model, description, where)
     return model
+
+
+def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, timestep: float) -> mujoco.MjSpec:
+    """What `compile_arm` compiles, to be put into a model with others."""
+    spec = _read_spec(description)
+    _check_parts(spec, description)
+    _set_up(spec, description, port, tip_radius, timestep)
+    return spec
 
 
 def _read_spec(description: ArmDescription) -> mujoco.MjSpec:

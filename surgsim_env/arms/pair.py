@@ -1,0 +1,207 @@
+"""Two arms in one model: the left grasps, the right touches; they meet the organ, its supports and each other."""
+
+import mujoco
+import numpy as np
+
+from msdm_core.mesh import FloatArray, IntArray
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.arms.arm import Arm
+from surgsim_env.arms.arm_instrument import joint_servo, load_scene_arm, parked_place, start_direction
+from surgsim_env.arms.model import LINK_GROUP, arm_spec
+from surgsim_env.arms.steering import SteeredArm, millimetres, missing, placed
+from surgsim_env.instrument import Instrument
+from surgsim_env.jaw import Jaw
+from surgsim_env.scenes import Scene
+from surgsim_env.supports import SUPPORT_PREFIX, add_supports
+from surgsim_env.tool_bodies import CONTACT_GROUP, ROUGHNESS
+
+# Instruments of two arms that a scene may name: what stands left and right.
+PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
+SIDES = ("left", "right")
+# Which geoms MuJoCo lets meet, beside supports: those of one arm meet the other's, never their own.
+ARM_BITS = {"left": 4, "right": 8}
+# Arms meet softly: critically damped, with a time constant of five haptic steps [s].
+CONTACT_SOFTNESS = (0.005, 1.0)
+# Half the distance of the tips from each other before the first reset [m].
+PARKED_ASIDE = 0.025
+# Beyond this the distance of the arms is not looked at [m].
+DISTANCE_MOST = 0.05
+
+
+class Pair(Instrument):
+    """Two arms, each at its own port, each steered as `ArmInstrument` steers one.
+
+    Where an instrument has one tip, that is the left arm's, and so is the jaw; `place` and `command_velocity` take a
+    row for each arm.
+
+    Fields:
+        arms: the arms as they are steered, "left" and "right"
+        parked: where the tips wait before the first reset [m]                   (2, 3)
+    """
+
+    turning_size = 3
+
+    def __init__(self, anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> None:
+        """Set the scene's arms up at its two ports; both tips may move in the box from lower to upper [m].
+
+        Raises:
+            ValueError: not two ports, a wrong description or model, a port inside the organ, an organ out of reach.
+        """
+        scene = anatomy.scene
+        names = PAIRS[scene.instrument.model]
+        if len(scene.ports) != 2:
+            raise ValueError(
+                f"scene {scene.name!r} has {len(scene.ports)} [[ports]]; {scene.instrument.model!r} needs two, the "
+                "left arm's first"
+            )
+        made = {side: load_scene_arm(anatomy, name, port) for side, name, port in zip(SIDES, names, scene.ports)}
+        model = _compile(made, scene)
+        super().__init__(model, lower, upper, model.site(f"left_{made['left'].description.tip.site}").id)
+        driven = [f"{side}_{name}" for side, arm in made.items() for name in arm.joints]
+        fingers = {side: [f"{side}_{name}" for name in arm.description.jaw] for side, arm in made.items()}
+        self.servo = joint_servo(model, (*driven, *fingers["left"], *fingers["right"]))
+        self.arms: dict[str, SteeredArm] = {}
+        for side, arm in made.items():
+            places = np.array([index for index, name in enumerate(driven) if name.startswith(side)])
+            jaw = None
+            if fingers[side]:
+                first = len(driven) + (len(fingers["left"]) if side == "right" else 0)
+                jaw = Jaw(self, tuple(fingers[side]), first + np.arange(len(fingers[side])))
+            self.arms[side] = SteeredArm(
+                arm,
+                self,
+                places,
+                direction=start_direction(scene),
+                control_step=scene.timing.control_step,
+                jaw=jaw,
+                prefix=f"{side}_",
+            )
+        jaws = [one.jaw for one in self.arms.values() if one.jaw is not None]
+        self.jaw = jaws[0] if jaws else None
+        self.jaws = np.array([jaw.tools for jaw in jaws], dtype=np.int32).reshape(-1, 2)
+        self._geoms_of = {side: _outside(model, side) for side in SIDES}
+        aside = np.array(scene.ports[1].point) - np.array(scene.ports[0].point)
+        aside *= PARKED_ASIDE / np.linalg.norm(aside)
+        middle = parked_place(anatomy)
+        self.parked = np.stack([middle - aside, middle + aside])
+        for side, place in zip(SIDES, self.parked, strict=True):
+            found = self.arms[side].reach(place)
+            if not placed(found):
+                raise ValueError(
+                    f"{self.arms[side].where} does not reach {millimetres(place)}, before the palpable face of scene "
+                    f"{scene.name!r}: {missing(found)}; move its port"
+                )
+        self.place(self.parked)
+
+    @property
+    def workspace_limited(self) -> bool:
+        """Whether limits kept a tip from going where it was told."""
+        return any(one.limited for one in self.arms.values())
+
+    @property
+    def trocar_residual(self) -> float:
+        """The larger distance of a shaft's axis from its trocar [m]."""
+        return max(one.trocar_residual for one in self.arms.values())
+
+    @property
+    def distance(self) -> float:
+        """Smallest distance between the arms' outer shapes, at most 50 mm [m]; below 0 they press each other."""
+        least, ends = DISTANCE_MOST, np.zeros(6)
+        for left in self._geoms_of["left"]:
+            for right in self._geoms_of["right"]:
+                least = min(least, mujoco.mj_geomDistance(self.model, self.data, left, right, least, ends))
+        return least
+
+    @property
+    def arms_collide(self) -> bool:
+        """Whether the arms touch each other now."""
+        return self.distance <= 0.0
+
+    @property
+    def collision_force(self) -> float:
+        """Size of the force between the arms in the last haptic step [N]."""
+        return self._contact_force(self._geoms_of["left"], self._geoms_of["right"])
+
+    def place(self, position: FloatArray) -> None:
+        """Put the tips at rest at two positions [m], (2, 3), pointing as at the start; a jaw with pads is open.
+
+        Raises:
+            ValueError: a tip does not reach there (says by how much, and the port).
+        """
+        self._rest()
+        for side, place in zip(SIDES, position, strict=True):
+            self.arms[side].place(place)
+        mujoco.mj_forward(self.model, self.data)
+
+    def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
+        """Set both tips' velocities [m/s] (2, 3), and how they turn [rad/s] (2, 3), for one control step."""
+        turns = np.zeros((2, 3)) if turning is None else turning
+        for side, speed, turn in zip(SIDES, velocity, turns, strict=True):
+            self.arms[side].command_velocity(speed, self.turning_of(turn))
+
+    def contact_force(self, side: str, wrench: FloatArray) -> FloatArray:
+        """Tissue's force on an arm [N], (3,), of the wrenches on all tools (n_tool, 6)."""
+        return wrench[self.tools_of(side), :3].sum(axis=0)
+
+    def tools_of(self, side: str) -> IntArray:
+        """Which tools are an arm's, (n,)."""
+        return np.flatnonzero([name.startswith(f"{side}_") for name in self.tool_names]).astype(np.int32)
+
+    def touch_force(self, side: str, support: str) -> float:
+        """Size of the force between an arm and one of the scene's supports in the last haptic step [N]."""
+        return self._contact_force(self._geoms_of[side], np.array([self.model.geom(SUPPORT_PREFIX + support).id]))
+
+    def get_state(self) -> FloatArray:
+        """All of both arms' state, commands and wanted directions included, as one vector."""
+        return np.concatenate([super().get_state(), *(one.get_state() for one in self.arms.values())])
+
+    def set_state(self, state: FloatArray) -> None:
+        """Restore what `get_state` gave, to the bit; forces of contact follow with the next haptic step."""
+        sizes = [len(one.get_state()) for one in self.arms.values()]
+        first = len(state) - sum(sizes)
+        super().set_state(state[:first])
+        for one, size in zip(self.arms.values(), sizes, strict=True):
+            one.set_state(state[first : first + size])
+            first += size
+
+    def _contact_force(self, some: IntArray, others: IntArray) -> float:
+        """Size of the sum of MuJoCo's contact forces between geoms of two sets [N]."""
+        total, force = np.zeros(3), np.zeros(6)
+        for index in range(self.data.ncon):
+            contact = self.data.contact[index]
+            first, second = contact.geom
+            sign = 1.0 if first in some and second in others else -1.0 if first in others and second in some else 0.0
+            if sign:
+                mujoco.mj_contactForce(self.model, self.data, index, force)
+                total += sign * (contact.frame.reshape(3, 3).T @ force[:3])
+        return float(np.linalg.norm(total))
+
+    def _where(self) -> str:
+        return f"the pair of {self.arms['left'].where} and {self.arms['right'].where}"
+
+
+def _compile(arms: dict[str, Arm], scene: Scene) -> mujoco.MjModel:
+    """Both arms and the supports in one model, the names of the arms' parts with a prefix."""
+    spec, timestep = mujoco.MjSpec(), scene.timing.haptic_step
+    for side, arm in arms.items():
+        child = arm_spec(arm.description, arm.port, scene.instrument.tip_radius, timestep)
+        spec.option.timestep = timestep
+        for name in ("integrator", "jacobian", "gravity", "disableflags"):
+            setattr(spec.option, name, getattr(child.option, name))
+        for geom in child.geoms:
+            if geom.group in (CONTACT_GROUP, LINK_GROUP):
+                other = next(bit for name, bit in ARM_BITS.items() if name != side)
+                geom.contype, geom.conaffinity = ARM_BITS[side], other
+                geom.solref, geom.condim = CONTACT_SOFTNESS, 1
+        rough = {number.name: list(number.data) for number in child.numerics if number.name.startswith(ROUGHNESS)}
+        spec.attach(child, prefix=f"{side}_", frame=spec.worldbody.add_frame())
+        for name, value in rough.items():
+            spec.add_numeric(name=f"{ROUGHNESS}{side}_{name.removeprefix(ROUGHNESS)}", data=value, size=1)
+    add_supports(spec, scene.supports)
+    return spec.compile()
+
+
+def _outside(model: mujoco.MjModel, side: str) -> IntArray:
+    """The geoms of an arm's outside, (n,)."""
+    named = [model.geom(index).name.startswith(f"{side}_") for index in range(model.ngeom)]
+    return np.flatnonzero(named & np.isin(model.geom_group, (CONTACT_GROUP, LINK_GROUP))).astype(np.int32)

@@ -7,7 +7,8 @@ from scipy.optimize import curve_fit
 
 from msdm_core.kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
-from msdm_core.organ import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault, rest_state
+from msdm_core.organ import rest_state
+from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 
 SAMPLES = 400
 

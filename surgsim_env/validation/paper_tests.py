@@ -8,7 +8,8 @@ import numpy as np
 
 from msdm_core.kernels import FAULT_NONE
 from msdm_core.mesh import FloatArray
-from msdm_core.organ import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault, rest_state
+from msdm_core.organ import rest_state
+from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.palpation.scan import press
 from surgsim_env.scenes import make_scene

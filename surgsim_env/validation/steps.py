@@ -11,9 +11,10 @@ from msdm_core.kernels import OrganModel
 from msdm_core.measure import kinetic_energy, potential_energy
 from msdm_core.mesh import FloatArray
 from msdm_core.meshing import box_mesh
-from msdm_core.organ import NO_CONTACT, NO_SHAPES, OrganSpec, advance_organ, compile_organ, rest_state
+from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Capsule, Lesion, Material
 from msdm_core.stability import stable_dt
+from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
 from surgsim_env.validation.motion import followed
 from surgsim_env.validation.row import Outcome, Row, compare
 from surgsim_env.validation.statics import DENSITY, assemble_stiffness

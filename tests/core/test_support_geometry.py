@@ -96,6 +96,25 @@ def test_nodes_are_pushed_out_the_nearest_way(kind, sizes, place, turn, seed):
         assert depth < 1e-7 or inside(support, point + 0.999 * out)
 
 
+def test_what_parts_from_a_support_forgets_where_it_stuck():
+    """A node's stretch grows with its path across, u = v t, is cut at mu N / (k_t A), and is 0 once it is outside."""
+    floor = Support("floor", "plane", position=(0.0, 0.0, 0.001), friction=0.5)
+    model = organ(floor)
+    position, force = model.node_rest_position.copy(), np.zeros_like(model.node_rest_position)
+    sideways, stretch = np.zeros_like(force), np.zeros((len(model.support_nodes), 1, 3))
+    sideways[:, 0] = 0.1
+    low = position[model.support_nodes, 2] < 0.001
+    for count in range(1, 4):
+        add_support_forces(model, position, sideways, force, stretch, 1e-3)
+        np.testing.assert_allclose(stretch[low, 0], [[1e-4 * count, 0.0, 0.0]] * int(low.sum()), atol=1e-15)
+    assert not stretch[~low].any()
+    # 1 mm deep: mu k_p d / k_t = 0.5 x 2 x 1 mm.
+    add_support_forces(model, position, 100.0 * sideways, force, stretch, 1e-3)
+    np.testing.assert_allclose(stretch[low, 0, 0], 1e-3, rtol=1e-12)
+    add_support_forces(model, position + np.array([0.0, 0.0, 0.002]), sideways, force, stretch, 1e-3)
+    assert not stretch.any()
+
+
 def test_only_free_surface_nodes_are_held():
     mesh = box_mesh((0.02, 0.01, 0.01), (4, 2, 2))
     anchors = np.flatnonzero(mesh.points[:, 0] < 1e-9)

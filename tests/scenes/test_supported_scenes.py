@@ -14,6 +14,7 @@ from msdm_core.regions import Capsule
 from msdm_core.stability import stable_dt
 from msdm_core.support import Support, SupportLaw
 from surgsim_env.anatomy import load_anatomy
+from surgsim_env.lane_group import LaneGroup
 from surgsim_env.rendering.options import render_options
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.rendering.stage import LABELS
@@ -191,3 +192,27 @@ def test_pictures_show_the_bed_as_background():
     # The drape of the bare scene lies at z = -0.5 mm, the bed's side face stands nearer, its drape is 30 mm lower.
     assert (depth[below] > drape[below] + 0.005).any(), "the drape is below the bed"
     assert np.isfinite(depth[below]).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_lobes_side_by_side_rest_as_they_do_alone(dtype):
+    """Two lobes pressed aside on their beds: in float64 to the bit, in float32 within 0.5 % of the force."""
+    alone, together = [simulation() for _ in range(2)], [simulation() for _ in range(2)]
+    group = LaneGroup(together, dtype)
+    for _ in range(8):
+        for one in (alone, together):
+            for number, simulated in enumerate(one):
+                simulated.instrument.command_velocity(np.array([0.01 * number, 0.005, -0.02]))
+        group.control_step(np.ones(2, dtype=np.bool_), 50, np.inf)
+        for simulated in (*alone, *together):
+            simulated.control_step(50)
+            assert simulated.end_control_step(), simulated.fault
+    for one, other in zip(alone, together, strict=True):
+        assert one.contact_force[2] > 0.1
+        if dtype is np.float64:
+            for name, array in one.get_state().items():
+                assert other.get_state()[name].tobytes() == array.tobytes(), name
+        assert np.abs(other.contact_force - one.contact_force).max() < 0.005 * np.linalg.norm(one.contact_force)
+        stretch = one.organ_state.support_stretch, other.organ_state.support_stretch
+        assert np.abs(stretch[0]).max() > 1e-6
+        np.testing.assert_allclose(*stretch, atol=0.02 * np.abs(stretch[0]).max())

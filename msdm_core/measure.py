@@ -30,7 +30,8 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     U = sum_s k_s (l_s - l0_s)^2 / 2 + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
         + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) - sum_i m_i g . (x_i - X_i)
     where a is a volume averaged at a node, K'_t the share averaged and the fourth sum over tets below
-    s = SQUEEZED_RATIO (infinite for one that is inside out). A resting tool's `contact_energy` is not in it.
+    s = SQUEEZED_RATIO (infinite for one that is inside out). A resting tool's `contact_energy` is not in it, nor
+    what supports store.
     """
     ends = state.node_position[model.spring_nodes]
     stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length

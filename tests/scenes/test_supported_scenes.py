@@ -102,11 +102,13 @@ def test_saved_and_restored_to_the_bit():
         assert other.get_state()[name].tobytes() == array.tobytes(), name
 
 
-@pytest.mark.parametrize("place", ["bare bed", "lobe"])
-def test_a_probe_meets_the_bed_alike_in_both_loops(place: str):
+@pytest.mark.parametrize(
+    ("place", "instrument"), [("bare bed", None), ("lobe", None), ("bare bed", "psm_palpator"), ("bare bed", "grasper")]
+)
+def test_a_tool_meets_the_bed_alike_in_both_loops(place: str, instrument: str | None):
     """Pressed 10 mm into the bare bed, or through the lobe towards it: calm, and to the bit in the compiled loop."""
     start = BARE if place == "bare bed" else ABOVE
-    both = simulation(compiled=True, tip=start), simulation(compiled=False, tip=start)
+    both = tuple(simulation(compiled=compiled, instrument=instrument, tip=start) for compiled in (True, False))
     speeds = [(0.0, 0.0, -0.02)] * (22 if place == "bare bed" else 5) + [(0.005, 0.0, 0.0)] * 4 + [(0.0, 0.0, 0.02)] * 2
     met = 0
     for speed in speeds:

@@ -118,8 +118,16 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     Raises:
         OrganDivergedError: gravity turns the organ inside out or it does not settle.
     """
+    state = blank_state(model, shape_count=shape_count)
+    if np.any(model.gravity != 0.0):
+        settle(model, state)
+    return state
+
+
+def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
+    """A state as the organ was scanned, still and untouched, with contact memory for `shape_count` shapes."""
     point_count = len(model.surface_triangles) * QUADRATURE_COUNT
-    state = OrganState(
+    return OrganState(
         node_position=model.node_rest_position.copy(),
         node_velocity=np.zeros_like(model.node_rest_position),
         node_force=np.zeros_like(model.node_rest_position),
@@ -135,9 +143,6 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         support_stretch=np.zeros(support_shape(model)),
         volume_ratio_smallest=np.ones(1),
     )
-    if np.any(model.gravity != 0.0):
-        settle(model, state)
-    return state
 
 
 def support_shape(model: OrganModel | LaneModel) -> tuple[int, int, int]:

@@ -6,8 +6,11 @@ import gymnasium as gym
 
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.scenes import make_scene, with_instrument
+from surgsim_env.simulation import Simulation
 from surgsim_env.surgical_env import SurgicalEnv
-from surgsim_env.tasks.palpate import EPISODE_STEPS, PalpateTask
+from surgsim_env.tasks import palpate, retract
+from surgsim_env.tasks.palpate import PalpateTask
+from surgsim_env.tasks.retract import RetractTask
 
 
 class PalpateEnv(SurgicalEnv):
@@ -79,15 +82,110 @@ class PalpateEnv(SurgicalEnv):
         self, scene: str = "phantom", instrument: str | None = None, render_mode: str | None = None, **pictures: Any
     ) -> None:
         anatomy = load_anatomy(with_instrument(make_scene(scene), instrument))
-        super().__init__(anatomy, PalpateTask(anatomy), render_mode=render_mode, pictures=pictures)
+        task = PalpateTask(anatomy)
+        super().__init__(Simulation(anatomy), task, render_mode=render_mode, pictures=pictures)
+
+
+class RetractEnv(SurgicalEnv):
+    """Grasp a lobe and fold it back until the endoscope sees what it hides.
+
+    ## Description
+    A lobe of soft tissue, held along one edge, lies on its bed and hides a disc. A robot's jaw grasps it near its free
+    edge, with friction alone, and lifts or folds it until the endoscope sees at least 80 % of the disc for half a
+    second. Tissue and jaw exchange forces 1000 times a second; the agent acts 20 times a second.
+
+    ## Action Space
+    `Box(-1, 1, (4 + n,), float32)`; n numbers turn the wrist: 0 for an instrument that does not turn, 1 or 3.
+
+    | num | meaning | full scale |
+    |---|---|---|
+    | 0-2 | tip velocity along x, y, z | 20 mm/s |
+    | 3 to 2 + n | how the tip turns | 0.5 rad/s |
+    | last | where the jaw goes, at its limited speed: -1 closed, 1 open | |
+
+    ## Observation Space
+    `Box((50,), float32)`, all bounds finite; 6 more (in brackets) for an instrument that turns
+
+    | num | meaning | bounds |
+    |---|---|---|
+    | 0-2 | tip position [m] | the lobe's bounding box with a margin |
+    | 3-5 | tip velocity [m/s] | +-0.5 |
+    | (6-11) | the tip's x and z axes in the world | +-1 |
+    | 6 | gap between the pads [m] | +-0.1 |
+    | 7-9 | contact force on the jaw [N], mean of the last haptic step, through the sensor model | +-range |
+    | 10-12 | its torque about the tip [N m], likewise | +-range x 10 mm |
+    | 13 | grip force: the smaller of the two pads' normal forces [N] | 0 to 200 |
+    | 14 | pull force: the size of the sum of both fingers' forces [N] | 0 to 200 |
+    | 15 | 1 where both pads press tissue | 0 to 1 |
+    | 16-30 | five points of the free edge, on top, along x [m] | the lobe's box and 0.1 m |
+    | 31-45 | five points half way to the held edge, likewise [m] | the lobe's box and 0.1 m |
+    | 46 | share of the target that the endoscope sees | 0 to 1 |
+    | 47-48 | the target's place: x, y [m] | the scene's ranges |
+    | 49 | share of the time left | 0 to 1 |
+
+    With `obs_mode="rgb"` it is the endoscope's picture instead: `Box(0, 255, (84, 84, 3), uint8)`.
+
+    ## Rewards
+    Named terms, weighted in `surgsim_env.rewards.RETRACT_WEIGHTS`; `info["reward_<term>"]` shows each. What is seen and
+    what is grasped pay by their changes, so that neither can be farmed. An episode that ends in harm pays less than any
+    that runs its time.
+
+    ## Starting State
+    The lobe's size and stiffness, its capsule, how much of its edge is held, the target's place, where the endoscope
+    stands and looks, the sensors' biases and the tip's place are drawn anew; their ranges are in the scene file. The
+    lobe rests settled on its bed, the jaw is open, and at most 10 % of the target is seen: other draws are made again.
+
+    ## Episode End
+    Terminated: 80 % of the target were seen for 0.5 s (success); the contact force passed the hard limit, or the jaw's
+    pull what the tissue bears, in any haptic step; the simulation came to a fault (`info["sim_fault"]` says which, the
+    observation is the last finite one). Truncated: 600 control steps (30 s).
+
+    ## Info
+    Fixed keys and types. Of the step: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`,
+    `hard_limit`, `torn`, `success`, `holds` (bool), `visible` (share), `grip_force`, `pull_force`, `friction_left`
+    (what friction could still hold) and `force_peak` [N], `trocar_error_mm`, `added_mass` [kg], one `reward_<term>`
+    each. Of the episode so far: `grip_force_peak`, `grip_force_mean`, `pull_force_peak`, `pull_force_mean` [N] (means
+    over the steps that held something), `pull_impulse` [N s], `slips` (holds that began to slip, or were lost with the
+    jaw told to be closed), `path_length` of the tip [m], `strain_held`, `strain_middle`, `strain_free`: largest strain
+    of an edge of the mesh in the lobe's thirds, from the held edge to the free one.
+
+    ## Arguments
+    * `scene`: a scene's name or the path of a scene file with a `[retract]` table; default "lobe".
+    * `instrument`: the scene's own by default, or the name of an arm with a jaw, or the path of its TOML file.
+    * `obs_mode`: "state" (default) or "rgb" (needs OpenGL).
+    * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
+    * `camera`, `width`, `height` and the other fields of `surgsim_env.rendering.options.RenderOptions`.
+
+    ## Version History
+    * v0: first version.
+    """
+
+    task: RetractTask
+
+    def __init__(
+        self,
+        scene: str = "lobe",
+        instrument: str | None = None,
+        obs_mode: str = "state",
+        render_mode: str | None = None,
+        **pictures: Any,
+    ) -> None:
+        anatomy = load_anatomy(with_instrument(make_scene(scene), instrument))
+        simulation = Simulation(anatomy)
+        task = RetractTask(anatomy, simulation.instrument)
+        super().__init__(simulation, task, render_mode=render_mode, pictures=pictures, obs_mode=obs_mode)
 
 
 def register() -> None:
     """Register the environment ids with Gymnasium; importing `surgsim_env` does it."""
-    if "SurgSim/Palpate-v0" not in gym.registry:
-        gym.register(
-            id="SurgSim/Palpate-v0",
-            entry_point="surgsim_env.env:PalpateEnv",
-            vector_entry_point="surgsim_env.vector_env:PalpateVectorEnv",
-            max_episode_steps=EPISODE_STEPS,
-        )
+    if "SurgSim/Palpate-v0" in gym.registry:
+        return
+    gym.register(
+        id="SurgSim/Palpate-v0",
+        entry_point="surgsim_env.env:PalpateEnv",
+        vector_entry_point="surgsim_env.vector_env:PalpateVectorEnv",
+        max_episode_steps=palpate.EPISODE_STEPS,
+    )
+    gym.register(
+        id="SurgSim/Retract-v0", entry_point="surgsim_env.env:RetractEnv", max_episode_steps=retract.EPISODE_STEPS
+    )

@@ -13,6 +13,26 @@ PALPATE_WEIGHTS: Mapping[str, float] = {
     "forgone": -0.015,  # each step left when it ends without finding: the dearest step, so that ending pays less
 }
 
+# Weights of SurgSim/Retract-v0.
+#
+# `visible` and `grasped` are CHANGES of numbers in [0, 1]: over an episode they sum to what is reached at its end less
+# what it began with (at most 0.1 seen, nothing grasped), however often it is won and lost again: they cannot be farmed.
+# The worst full episode of n steps returns at least n (time + soft_force) - 0.1 visible; one that fails after k steps
+# at most k time + visible + grasped + failure + (n - k) forgone. As forgone = time + soft_force, the first is larger by
+#   -0.1 visible + k soft_force - visible - grasped - failure  >=  -0.4 - 600 x 0.01 - 4 - 1 + 12  =  0.6  at least:
+# a failed, faulted or aborted episode never returns more than the worst full one.
+RETRACT_WEIGHTS: Mapping[str, float] = {
+    "time": -0.005,  # each control step
+    "soft_force": -0.010,  # share of the way from the soft to the hard limit, largest of the step
+    "visible": 4.0,  # change of the target's visible share
+    "grasped": 1.0,  # 1 where tissue comes between the pads, -1 where it is lost
+    "success": 10.0,  # seen for long enough
+    "torn": -12.0,  # a jaw pulled more than the tissue bears
+    "hard_force": -12.0,  # the hard limit was passed: a safety stop
+    "fault": -12.0,  # the simulation could not go on
+    "forgone": -0.015,  # each step left when it ends without success
+}
+
 
 def weighted(terms: Mapping[str, float], weights: Mapping[str, float]) -> dict[str, float]:
     """Each term times its weight, in the table's order; a term that the table lacks is our own mistake."""

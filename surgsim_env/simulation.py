@@ -13,7 +13,7 @@ from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels import SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
-from msdm_core.organ import rest_state
+from msdm_core.organ import blank_state, rest_state
 from msdm_core.stability import stable_dt
 from surgsim_env import mujoco_library
 from surgsim_env.anatomy import Anatomy
@@ -258,10 +258,19 @@ class Simulation:
             "fault": np.array(self.fault),
         }
 
+    def state_shapes(self, organ_model: OrganModel) -> dict[str, tuple[int, ...]]:
+        """Shapes of what `get_state` gives with another organ of the same scene, by name."""
+        shapes = {name: array.shape for name, array in self.get_state().items()}
+        blank = blank_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        shapes |= {f"organ_{name}": getattr(blank, name).shape for name in KEPT_FIELDS}
+        return shapes | {"rest_position": blank.node_position.shape, "rest_stretch": blank.support_stretch.shape}
+
     def set_state(self, organ_model: OrganModel, arrays: dict[str, np.ndarray]) -> None:
         """Restore what `get_state` gave, to the bit."""
         self.organ_model = organ_model
-        self.organ_state = self.organ_state._replace(**{name: arrays[f"organ_{name}"].copy() for name in KEPT_FIELDS})
+        # Scratch too is as large as this organ asks.
+        blank = blank_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        self.organ_state = blank._replace(**{name: arrays[f"organ_{name}"].copy() for name in KEPT_FIELDS})
         self.instrument.set_state(arrays["instrument"])
         self._rest_position = arrays["rest_position"].copy()
         self._rest_stretch = arrays["rest_stretch"].copy()

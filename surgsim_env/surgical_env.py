@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.simulation import Simulation
@@ -44,22 +43,22 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     def __init__(
         self,
-        anatomy: Anatomy,
+        simulation: Simulation,
         task: Task,
         *,
         render_mode: str | None,
         pictures: dict[str, Any],
         obs_mode: str = "state",
     ) -> None:
-        """Set up a simulation of an anatomy; `pictures` are fields of `RenderOptions`.
+        """Put a simulation and a task together; `pictures` are fields of `RenderOptions`.
 
         Raises:
             ValueError: an obs_mode, a render_mode or a picture's option that is unknown.
         """
         if obs_mode not in OBSERVATION_MODES:
             raise ValueError(f"obs_mode {obs_mode!r} is unknown; the modes are {', '.join(OBSERVATION_MODES)}")
-        self.scene = anatomy.scene
-        self.simulation = Simulation(anatomy)
+        self.scene = simulation.anatomy.scene
+        self.simulation = simulation
         self._view = EpisodeView(self.simulation, render_mode, pictures)
         self.render_mode = render_mode
         # The modes that this machine offers; the class names all that there are.
@@ -114,7 +113,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self.last_action = self._checked(action)
         self.task.begin(self.last_action)
         count = self.scene.timing.haptic_steps_per_control
-        force_peak = self.simulation.control_step(count, self.task.force_limit)
+        force_peak = self.simulation.control_step(count, self.task.force_limit, self.task.pull_limit)
         fault = self.simulation.fault
         saturated = False
         if not fault:
@@ -201,8 +200,18 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             raise ValueError(f"not a saved state of this kind of environment: {error}") from None
         if made_by != self._fingerprint():
             raise ValueError(f"the state was saved by {made_by}, this is {self._fingerprint()}: use the same scene")
-        self._check_entries(arrays)
-        self.simulation.set_state(self.task.set_state(str(arrays["task"])), arrays)
+        shapes = {"task": (), "random": (), "running": (), "observation": self._observation.shape}
+        _check_entries(arrays, shapes)
+        before = self.task.get_state() if self._begun else None
+        organ = self.task.set_state(str(arrays["task"]))
+        try:
+            _check_entries(arrays, self.simulation.state_shapes(organ))
+        except ValueError:
+            # Nothing is changed by what is refused.
+            if before is not None:
+                self.task.set_state(before)
+            raise
+        self.simulation.set_state(organ, arrays)
         self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
         self._observation = arrays["observation"]
         self._begun, self._running = True, bool(arrays["running"])
@@ -233,15 +242,6 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _show(self) -> None:
         if self.render_mode == "human":
             self._view.show(self._shown())
-
-    def _check_entries(self, arrays: dict[str, np.ndarray]) -> None:
-        """Refuse an archive that lacks an entry or has one of another shape, before anything is changed."""
-        wanted = {name: array.shape for name, array in self.simulation.get_state().items()}
-        wanted |= {"task": (), "random": (), "running": (), "observation": self._observation.shape}
-        for name, shape in wanted.items():
-            if name not in arrays or arrays[name].shape != shape:
-                found = arrays[name].shape if name in arrays else "nothing"
-                raise ValueError(f"not a saved state of this environment: {name} has shape {shape}, found {found}")
 
     def _fingerprint(self) -> str:
         """What a saved state must agree with: the environment, its scene and mesh, the rates."""
@@ -281,3 +281,11 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }
+
+
+def _check_entries(arrays: dict[str, np.ndarray], shapes: dict[str, tuple[int, ...]]) -> None:
+    """Refuse an archive that lacks an entry or has one of another shape."""
+    for name, shape in shapes.items():
+        if name not in arrays or arrays[name].shape != shape:
+            found = arrays[name].shape if name in arrays else "nothing"
+            raise ValueError(f"not a saved state of this environment: {name} has shape {shape}, found {found}")

@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from itertools import islice
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.rendering import gl, stage
 from surgsim_env.rendering.episode_view import offered_modes
+from tests.envs.walks import walk
 
 IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
 needs_opengl = pytest.mark.usefixtures("opengl")
@@ -19,15 +21,6 @@ needs_opengl = pytest.mark.usefixtures("opengl")
 @pytest.fixture(params=IDS)
 def env_id(request):
     return request.param
-
-
-def pressing_walk(env, steps=40):
-    """Actions of a walk that presses."""
-    rng = np.random.default_rng(7)
-    for _ in range(steps):
-        action = rng.uniform(-0.5, 0.5, env.action_space.shape).astype(np.float32)
-        action[2] -= 0.3
-        yield action
 
 
 @needs_opengl
@@ -53,7 +46,7 @@ def test_pictures_change_no_bit_of_an_episode(env_id):
     start = [env.reset(seed=3) for env in (plain, drawn)]
     assert start[0][0].tobytes() == start[1][0].tobytes()
     touched = False
-    for action in pressing_walk(plain):
+    for action in islice(walk(plain, np.random.default_rng(7)), 40):
         one, other = plain.step(action), drawn.step(action)
         drawn.render()
         drawn.renderer.depth("side")
@@ -72,7 +65,7 @@ def test_loaded_state_looks_like_the_saved_one(env_id):
     env, other = (gym.make(env_id, render_mode="rgb_array", show_lesion=True).unwrapped for _ in range(2))
     env.reset(seed=5)
     other.reset(seed=6)
-    for action in pressing_walk(env, 20):
+    for action in islice(walk(env, np.random.default_rng(7)), 20):
         env.step(action)
     assert env.render().tobytes() != other.render().tobytes()
     other.load_state(env.save_state())
@@ -217,7 +210,7 @@ def test_videos_are_recorded(env_id, tmp_path):
     pytest.importorskip("moviepy", reason="needs the `video` extra")
     env = gym.wrappers.RecordVideo(gym.make(env_id, render_mode="rgb_array"), str(tmp_path / "videos"))
     env.reset(seed=0)
-    for action in pressing_walk(env, 5):
+    for action in islice(walk(env, np.random.default_rng(7)), 5):
         env.step(action)
     env.close()
     (video,) = (tmp_path / "videos").glob("*.mp4")

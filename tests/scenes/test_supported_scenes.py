@@ -32,7 +32,8 @@ ABOVE = np.array([0.040, 0.020, 0.022])
 
 @cache
 def scene() -> Scene:
-    return make_scene("lobe")
+    """The lobe, palpated."""
+    return with_instrument(make_scene("lobe"), "probe")
 
 
 def simulation(*, compiled: bool = True, instrument: str | None = None, tip=ABOVE) -> Simulation:

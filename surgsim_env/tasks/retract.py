@@ -1,0 +1,356 @@
+"""Retraction: grasp a lobe near its free edge and fold it back, so that the endoscope sees what lies under it."""
+
+import json
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.kernels import OrganModel
+from msdm_core.mesh import FloatArray
+from msdm_core.regions import Lesion
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.grasp import Grasp, read_grasp
+from surgsim_env.instrument import Instrument
+from surgsim_env.retraction import Retraction
+from surgsim_env.rewards import RETRACT_WEIGHTS, weighted
+from surgsim_env.scenes import Endoscope, ForceSensor
+from surgsim_env.sensors import ForceReading
+from surgsim_env.simulation import Simulation
+from surgsim_env.tasks.retraction_draw import RetractionDraw, draw_retraction, drawn_organ
+from surgsim_env.tasks.retraction_record import RetractionRecord, region_strains
+from surgsim_env.tasks.task import Bounds, InfoValue, Start, Verdict
+from surgsim_env.visibility import Disc, hiding_geoms, visible
+
+EPISODE_STEPS = 600
+SPEED_FULL_SCALE = 0.02
+# The wrist's turning [rad/s].
+TURNING_FULL_SCALE = 0.5
+# Success: this share of the target is seen for so long [s].
+SUCCESS_SHARE = 0.8
+SUCCESS_TIME = 0.5
+# No more of it is seen when an episode begins.
+HIDDEN_SHARE = 0.1
+
+# The torque sensor is as good as the force sensor at this lever [m].
+TORQUE_LEVER = 0.01
+# Bounds of the observation beyond workspace and lobe [m], on speed [m/s], opening [m] and forces [N]; leaving them is a
+# fault.
+POSITION_SLACK = 0.005
+LOBE_SLACK = 0.1
+SPEED_BOUND = 0.5
+OPENING_BOUND = 0.1
+FORCE_BOUND = 200.0
+# Places of the lobe whose nodes are observed: shares of its length along the edge, its depth and its thickness.
+TRACKED = tuple((along, depth, 1.0) for depth in (1.0, 0.5) for along in (0.0, 0.25, 0.5, 0.75, 1.0))
+
+
+class RetractTask:
+    """SurgSim/Retract-v0 on one anatomy with one instrument that has a jaw."""
+
+    weights = RETRACT_WEIGHTS
+    lesions: tuple[Lesion, ...] = ()
+
+    def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
+        """Retract the lobe of an anatomy.
+
+        Raises:
+            ValueError: a scene without a [retract] table or an endoscope, or an instrument without a jaw.
+        """
+        scene = anatomy.scene
+        self.table, self._endoscope = _checked_scene(anatomy)
+        if instrument.jaw is None:
+            raise ValueError(
+                f"scene {scene.name!r}: instrument {scene.instrument.model!r} has no jaw to grasp with; "
+                'take one that has, such as instrument="psm_retractor"'
+            )
+        self.anatomy = anatomy
+        self.limits = scene.limits
+        self.turning_size = instrument.turning_size
+        self.action_size = 3 + self.turning_size + 1
+        sensor = scene.sensor
+        self.force_reading = ForceReading(sensor)
+        self.torque_reading = ForceReading(
+            ForceSensor(sensor.noise * TORQUE_LEVER, sensor.bias * TORQUE_LEVER, sensor.range * TORQUE_LEVER)
+        )
+        self.tracked_nodes = _nearest_nodes(anatomy.mesh.points)
+        self._hiding = hiding_geoms(instrument.model)
+        self.drawn: RetractionDraw | None = None
+        self.record = RetractionRecord()
+        self.step_count = 0
+        self.seen_count = 0
+        self.jaw_target = 1.0
+        self.visible_share = self._visible_before = 0.0
+        self._held_before = False
+
+    # What the environment and pictures ask ---------------------------------------------------------------------------
+
+    @property
+    def force_limit(self) -> float:
+        """A control step ends with the haptic step whose force passes this, and the episode with it [N]."""
+        return self.limits.hard_force
+
+    @property
+    def pull_limit(self) -> float:
+        """Likewise with the pull of the jaw: tissue tears [N]."""
+        return self.limits.tear_force
+
+    @property
+    def target(self) -> Disc | None:
+        """The disc that is to be seen; None before the first episode."""
+        if self.drawn is None:
+            return None
+        return Disc(np.array(self.drawn.target), np.array([0.0, 0.0, 1.0]), self.table.target_radius)
+
+    @property
+    def endoscope(self) -> Endoscope | None:
+        """Where the endoscope stands in this episode; None before the first."""
+        if self.drawn is None:
+            return None
+        return Endoscope(self.drawn.eye, self.drawn.looks_at, self._endoscope.fov_deg)
+
+    def bounds(self, instrument: Instrument) -> Bounds:
+        """Bounds of the observation, from the tip's workspace and the lobe's box [m]."""
+        points = self.anatomy.mesh.points
+        sensor = self.force_reading.sensor
+        wrench = np.repeat([sensor.range, self.torque_reading.sensor.range], 3)
+        tracked = np.tile(points.min(axis=0) - LOBE_SLACK, len(TRACKED))
+        tracked_high = np.tile(points.max(axis=0) + LOBE_SLACK, len(TRACKED))
+        along, distance = self.table.target_along, self.table.target_distance
+        speed, axes = np.full(3, SPEED_BOUND), np.full(6 if self.turning_size else 0, 1.0 + 1e-6)
+        low = [instrument.lower - POSITION_SLACK, -speed, -axes, [-OPENING_BOUND], -wrench, np.zeros(3), tracked]
+        high = [instrument.upper + POSITION_SLACK, speed, axes, [OPENING_BOUND], wrench]
+        high += [[FORCE_BOUND, FORCE_BOUND, 1.0], tracked_high]
+        return Bounds(
+            np.concatenate([*low, [0.0, along[0], distance[0], 0.0]]),
+            np.concatenate([*high, [1.0, along[1], distance[1], 1.0]]),
+        )
+
+    # What scripts ask ------------------------------------------------------------------------------------------------
+
+    @property
+    def speed_limit(self) -> float:
+        """The fastest that an action can ask the tip to move along an axis [m/s]."""
+        return SPEED_FULL_SCALE
+
+    def action(
+        self, velocity: FloatArray, *, turning: FloatArray | None = None, jaw: float | None = None
+    ) -> FloatArray:
+        """The action that asks for a tip velocity [m/s] (3,), turning [rad/s] and a jaw target; shape (action_size,).
+
+        The tip does not turn, and the jaw goes on to its last target, where nothing else is said.
+        """
+        turn = np.zeros(self.turning_size) if turning is None else np.asarray(turning) / TURNING_FULL_SCALE
+        return np.concatenate(
+            [np.asarray(velocity, dtype=np.float64) / SPEED_FULL_SCALE, turn, [self.jaw_target if jaw is None else jaw]]
+        )
+
+    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
+        """The force sensor's reading in an observation [N], shape (3,)."""
+        first = 7 + (6 if self.turning_size else 0)
+        return np.asarray(observation[first : first + 3], dtype=np.float64)
+
+    # An episode ------------------------------------------------------------------------------------------------------
+
+    def reset(self, rng: np.random.Generator) -> Start:
+        """Draw the lobe, the target, the endoscope, the sensor's bias and the tip's start."""
+        self.drawn = draw_retraction(self.table, self._endoscope, rng)
+        self.force_reading.reset(rng)
+        self.torque_reading.reset(rng)
+        self.record = RetractionRecord()
+        self.step_count = self.seen_count = 0
+        self.jaw_target = 1.0
+        self.visible_share = self._visible_before = 0.0
+        self._held_before = False
+        return Start(drawn_organ(self.anatomy, self.drawn), np.array(self.drawn.start))
+
+    def accepts(self, simulation: Simulation) -> bool:
+        """Whether the lobe hides the target: at most HIDDEN_SHARE of it is seen."""
+        self._visible_before = self.visible_share = self._look(simulation)
+        return self.visible_share <= HIDDEN_SHARE
+
+    def command(self, action: FloatArray, instrument: Instrument) -> None:
+        """Set the tip's velocity and turning, and the jaw's target."""
+        turning = action[3:-1] * TURNING_FULL_SCALE if self.turning_size else None
+        instrument.command_velocity(action[:3] * SPEED_FULL_SCALE, turning)
+        # Actions may leave [-1, 1] by rounding, a jaw's target may not.
+        self.jaw_target = min(max(float(action[-1]), -1.0), 1.0)
+        instrument.command_jaw(self.jaw_target)
+
+    def begin(self, action: FloatArray) -> None:
+        """Begin a control step: count it."""
+        self.step_count += 1
+
+    def observe(self, simulation: Simulation, rng: np.random.Generator) -> tuple[FloatArray, bool]:
+        """What the table of `RetractEnv` says; and whether a sensor saturated."""
+        instrument, drawn = simulation.instrument, self.drawn
+        assert drawn is not None
+        grasp = self._grasp(simulation)
+        self.visible_share = self._look(simulation)
+        force, torque = self._jaw_wrench(simulation)
+        force, force_cut = self.force_reading.read(force, rng)
+        torque, torque_cut = self.torque_reading.read(torque, rng)
+        values = np.concatenate(
+            [
+                instrument.tip_position,
+                instrument.tip_velocity,
+                self._tip_axes(instrument),
+                [grasp.opening],
+                force,
+                torque,
+                [grasp.grip_force, grasp.pull_force, float(grasp.holds)],
+                simulation.organ_state.node_position[self.tracked_nodes].ravel(),
+                [self.visible_share, drawn.target[0], drawn.target[1], 1.0 - self.step_count / EPISODE_STEPS],
+            ]
+        )
+        return values, force_cut or torque_cut
+
+    def judge(self, simulation: Simulation, force_peak: float, fault: str) -> Verdict:
+        """End a control step: see what is seen, what was grasped and what it took.
+
+        Args:
+            simulation: as the step left it.
+            force_peak: largest contact force of its haptic steps [N].
+            fault: what the simulation came to, or an empty string.
+        """
+        pull_peak = simulation.pull_peak
+        torn = not fault and pull_peak > self.pull_limit
+        hard = not fault and not torn and force_peak > self.force_limit
+        harm = bool(fault) or torn or hard
+        visible_before, held_before = self._visible_before, self._held_before
+        grasp = None
+        if not fault:
+            grasp = self._grasp(simulation)
+            self._note(simulation, grasp, pull_peak)
+            self._visible_before, self._held_before = self.visible_share, grasp.holds
+        self.seen_count = self.seen_count + 1 if self.visible_share >= SUCCESS_SHARE and not harm else 0
+        needed = round(SUCCESS_TIME / self.anatomy.scene.timing.control_step)
+        success = self.seen_count >= needed
+        terminated = harm or success
+        excess = (force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force)
+        terms = {
+            "time": 1.0,
+            "soft_force": min(max(excess, 0.0), 1.0),
+            "visible": self._visible_before - visible_before,
+            "grasped": float(self._held_before) - float(held_before),
+            "success": float(success),
+            "torn": float(torn),
+            "hard_force": float(hard),
+            "fault": float(bool(fault)),
+            "forgone": float(EPISODE_STEPS - self.step_count) if harm else 0.0,
+        }
+        return Verdict(
+            terminated=terminated,
+            truncated=not terminated and self.step_count >= EPISODE_STEPS,
+            rewards=weighted(terms, self.weights),
+            info=self._info(grasp, force_peak, hard=hard, torn=torn, success=success),
+        )
+
+    def blank_info(self) -> dict[str, InfoValue]:
+        """The info of a reset: the same keys and types as a verdict's."""
+        return self._info(None, 0.0, hard=False, torn=False, success=False)
+
+    def get_state(self) -> str:
+        """Draw, biases, counters and measures as JSON, exact."""
+        assert self.drawn is not None
+        return json.dumps(
+            {
+                "drawn": self.drawn.to_json(),
+                "record": self.record.to_json(),
+                "bias": [self.force_reading.bias.tolist(), self.torque_reading.bias.tolist()],
+                "counts": [self.step_count, self.seen_count],
+                "jaw_target": self.jaw_target,
+                "visible": [self.visible_share, self._visible_before],
+                "held": self._held_before,
+            }
+        )
+
+    def set_state(self, text: str) -> OrganModel:
+        """Restore what `get_state` gave; returns the lobe of that episode."""
+        table = json.loads(text)
+        self.drawn = RetractionDraw.from_json(table["drawn"])
+        self.record = RetractionRecord.from_json(table["record"])
+        self.force_reading.bias, self.torque_reading.bias = map(np.array, table["bias"])
+        self.step_count, self.seen_count = table["counts"]
+        self.jaw_target = table["jaw_target"]
+        self.visible_share, self._visible_before = table["visible"]
+        self._held_before = table["held"]
+        return drawn_organ(self.anatomy, self.drawn)
+
+    # Its parts -------------------------------------------------------------------------------------------------------
+
+    def _look(self, simulation: Simulation) -> float:
+        """Share of the target that the endoscope sees."""
+        instrument, target, drawn = simulation.instrument, self.target, self.drawn
+        assert target is not None and drawn is not None
+        triangles = self.anatomy.mesh.boundary_triangles
+        nodes = simulation.organ_state.node_position
+        seen = visible(
+            np.array(drawn.eye), target.points(), nodes, triangles, instrument.model, instrument.data, self._hiding
+        )
+        return float(seen.mean())
+
+    def _grasp(self, simulation: Simulation) -> Grasp:
+        grasp = read_grasp(simulation.instrument, simulation.contact_wrench, self.anatomy.scene.contact.friction)
+        assert grasp is not None
+        return grasp
+
+    def _jaw_wrench(self, simulation: Simulation) -> tuple[FloatArray, FloatArray]:
+        """Tissue's force [N] and torque about the tip [N m] on both fingers, (3,) each."""
+        instrument = simulation.instrument
+        assert instrument.jaw is not None
+        tools = instrument.jaw.tools
+        wrench = simulation.contact_wrench[tools]
+        levers = instrument.shapes.tool_centre[tools] - instrument.tip_position
+        torque = (wrench[:, 3:] + np.cross(levers, wrench[:, :3])).sum(axis=0)
+        return wrench[:, :3].sum(axis=0), torque
+
+    def _tip_axes(self, instrument: Instrument) -> FloatArray:
+        """Two axes of the tip in the world, (6,), where it turns; nothing (0,) where it does not."""
+        if not self.turning_size:
+            return np.zeros(0)
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, instrument.tip_pose_in(instrument.data)[1])
+        return rotation.reshape(3, 3)[:, [0, 2]].T.ravel()
+
+    def _note(self, simulation: Simulation, grasp: Grasp, pull_peak: float) -> None:
+        strain = region_strains(simulation.organ_model, simulation.organ_state.node_position)
+        tip = simulation.instrument.tip_position
+        duration = self.anatomy.scene.timing.control_step
+        self.record.note(grasp, pull_peak, tip, strain, self.jaw_target < 0.0, duration)
+
+    def _info(
+        self, grasp: Grasp | None, force_peak: float, *, hard: bool, torn: bool, success: bool
+    ) -> dict[str, InfoValue]:
+        return {
+            "force_peak": force_peak,
+            "hard_limit": hard,
+            "torn": torn,
+            "success": success,
+            "visible": self.visible_share,
+            "holds": grasp is not None and grasp.holds,
+            "grip_force": 0.0 if grasp is None else grasp.grip_force,
+            "pull_force": 0.0 if grasp is None else grasp.pull_force,
+            "friction_left": 0.0 if grasp is None else grasp.friction_left,
+            **self.record.info(),
+        }
+
+
+def _checked_scene(anatomy: Anatomy) -> tuple[Retraction, Endoscope]:
+    """The tables of a scene that a retraction needs."""
+    scene = anatomy.scene
+    for name, table in (("retract", scene.retract), ("endoscope", scene.endoscope)):
+        if table is None:
+            raise ValueError(
+                f"scene {scene.name!r} has no [{name}] table, which a retraction needs: add one, or take a scene that "
+                "has it, such as 'lobe'"
+            )
+    assert scene.retract is not None and scene.endoscope is not None
+    return scene.retract, scene.endoscope
+
+
+def _nearest_nodes(points: FloatArray) -> NDArray[np.int64]:
+    """The nodes nearest to the TRACKED places of a lobe, (n_tracked,)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    places = low + np.array(TRACKED) * (high - low)
+    return np.array([int(np.argmin(((points - place) ** 2).sum(axis=1))) for place in places])

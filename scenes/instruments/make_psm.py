@@ -44,12 +44,14 @@ DRIVE = {
 SHAFT_RADIUS = 0.004  # an 8 mm instrument
 TIP_LENGTH = {"palpator": 0.020, "grasper": 0.0102, "retractor": 0.026}  # beyond the wrist's yaw axis [m]
 # The retractor's pads: half their width, thickness and length; half the gap at which they are parallel [m].
-PAD_HALF, PARALLEL_GAP = (0.004, 0.0015, 0.007), 0.0035
-# From where the pads' middles meet to 24 mm between them [rad]; how hard a pad closes, at its middle [N].
-PAD_RANGE = (-math.asin(PARALLEL_GAP / TIP_LENGTH["retractor"]), math.radians(19.0))
-PAD_FORCE = 0.4
+PAD_HALF, PARALLEL_GAP = (0.006, 0.0022, 0.008), 0.0035
+# From 4 mm between the pads' middles to 24 mm [rad]; how hard a pad closes, at its middle [N].
+PAD_RANGE = (-math.asin((PARALLEL_GAP - 0.002) / TIP_LENGTH["retractor"]), math.radians(19.0))
+PAD_FORCE = 0.5
 # Serrated: this times the contact law's coefficient of friction.
-PAD_ROUGHNESS = 3.0
+PAD_ROUGHNESS = 4.0
+# Keeps the jaw's middle where the wrist is: 0.3 N at the pads shift it by 0.2 mm [N m/rad, N m s/rad].
+GEAR = (1.0, 2e-3)
 LIGHT, METAL, DARK = "0.86 0.87 0.89 1", "0.72 0.74 0.78 1", "0.13 0.14 0.16 1"
 BRIGHT, GREY, ACCENT = "0.90 0.91 0.94 1", "0.45 0.47 0.50 1", "0.10 0.42 0.60 1"
 ARC_RADIUS, ARC_SIDE, RAIL_SIDE = 0.285, 0.078, 0.048  # arc about the remote centre; beside the shaft [m]
@@ -270,7 +272,14 @@ def model(tool: str) -> str:
     middle = MIDDLE
     if tool == "retractor":
         pads = [f'    <numeric name="roughness_pad_{side}" data="{PAD_ROUGHNESS:g}"/>' for side in ("left", "right")]
-        middle = MIDDLE.replace("  <actuator>\n", "\n".join(["  <custom>", *pads, "  </custom>", "  <actuator>\n"]))
+        gear = [
+            f'    <fixed name="gear" stiffness="{GEAR[0]:g}" damping="{GEAR[1]:g}">',
+            '      <joint joint="finger_left" coef="1"/>',
+            '      <joint joint="finger_right" coef="-1"/>',
+            "    </fixed>",
+        ]
+        more = ["  <custom>", *pads, "  </custom>", "  <tendon>", *gear, "  </tendon>", "  <actuator>\n"]
+        middle = MIDDLE.replace("  <actuator>\n", "\n".join(more))
     return HEAD.format(tool=tool) + "\n".join(lines) + middle + "\n".join(actuators) + TAIL
 
 

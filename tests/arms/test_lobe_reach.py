@@ -16,8 +16,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:scene 'lobe'")
 # 100 mm from each other on the free side, 15 cm from the edge and 5 cm above it.
 LEFT_PORT = Port((-0.01, 0.20, 0.06), (0.2, -0.9, -0.35))
 RIGHT_PORT = Port((0.09, 0.20, 0.06), (-0.2, -0.9, -0.35))
-# Along the free edge, a third of a pad from it, at half height; lifted and folded back.
-EDGE = [(x, 0.044, 0.006) for x in (0.02, 0.04, 0.06)]
+# Along the free edge, the pads beyond the bed, at half height; lifted and folded back.
+EDGE = [(x, 0.045, 0.006) for x in (0.02, 0.04, 0.06)]
 FOLDED = [(x, 0.020, 0.035) for x in (0.03, 0.05)]
 # Targets lie on the bed 15 to 30 mm from the grown edge.
 TARGETS = [(x, y, 0.0035) for x in (0.03, 0.05) for y in (0.015, 0.030)]
@@ -61,7 +61,7 @@ def test_a_jaw_gets_around_the_edge_that_stands_over(model: str):
     """Open, level, one pad above and one below the edge of the lobe at rest: nothing touches anything."""
     one = Simulation(lobe(model, port=LEFT_PORT))
     edge = one.organ_state.node_position[one.organ_model.node_rest_position[:, 1] > 0.0479]
-    one.restart(np.array([0.04, 0.044, edge[:, 2].mean()]))
+    one.restart(np.array([0.04, 0.045, edge[:, 2].mean()]))
     one.control_step(50)
     assert one.end_control_step(), one.fault
     assert not one.contact_wrench.any() and one.instrument.data.ncon == 0
@@ -69,7 +69,7 @@ def test_a_jaw_gets_around_the_edge_that_stands_over(model: str):
     for _ in range(14):
         one.control_step(50)
         assert one.end_control_step(), one.fault
-    assert one.grasp.holds and one.grasp.grip_force == pytest.approx(0.4, rel=0.1)
+    assert one.grasp.holds and one.grasp.grip_force == pytest.approx(0.5, rel=0.2)
 
 
 def test_a_ball_that_touches_the_bed_tells_its_force():

@@ -115,6 +115,20 @@ def test_what_parts_from_a_support_forgets_where_it_stuck():
     assert not stretch.any()
 
 
+@pytest.mark.parametrize(("speed", "share"), [(-0.01, 1.1), (0.0, 1.0), (0.05, 0.5), (0.2, 0.0)])
+def test_damping_pushes_what_comes_and_pulls_nothing_back(speed: float, share: float):
+    """A max(0, k_p d - c v) of a node 1 mm deep that leaves with v, as a share of k_p d A."""
+    floor = Support("floor", "plane", position=(0.0, 0.0, 0.001))
+    model = organ(floor, law=SupportLaw(1e7, 1e5))
+    force, velocity = np.zeros_like(model.node_rest_position), np.zeros_like(model.node_rest_position)
+    velocity[:, 2] = speed
+    stretch = np.zeros((len(model.support_nodes), 1, 3))
+    add_support_forces(model, model.node_rest_position, velocity, force, stretch, 1e-4)
+    low = model.node_rest_position[model.support_nodes, 2] < 0.001
+    np.testing.assert_allclose(force[model.support_nodes, 2], np.where(low, share * 1e4 * model.support_area, 0.0))
+    assert not force[:, :2].any()
+
+
 def test_only_free_surface_nodes_are_held():
     mesh = box_mesh((0.02, 0.01, 0.01), (4, 2, 2))
     anchors = np.flatnonzero(mesh.points[:, 0] < 1e-9)

@@ -364,7 +364,7 @@ def target_pixels(env, camera, width, height):
 def test_what_is_seen_is_what_a_picture_shows(width, height, tolerance):
     """With the lobe half folded back; coarse pixels count the border to a pixel or so."""
     env = RetractEnv(render_mode="rgb_array", width=width, height=height, smooth_edges=False)
-    env.reset(seed=3)
+    env.reset(seed=6)
     nodes, rest = env.simulation.organ_state.node_position, env.simulation.organ_state.node_position.copy()
     compared = 0
     for turn in (0.2, 0.35, 0.5, 0.7, 0.9):

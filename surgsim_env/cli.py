@@ -1,4 +1,4 @@
-"""The command line: `surgsim palpate`, `arms`, `organ`, `scenes`, `validate`, `bench`."""
+"""The command line: `surgsim palpate`, `retract`, `arms`, `organ`, `scenes`, `validate`, `bench`."""
 
 import contextlib
 import io
@@ -76,6 +76,26 @@ class Palpate:
 
 
 @dataclass(frozen=True)
+class Retract:
+    """Let a script that knows the truth grasp a lobe, fold it back and expose what it hides; with two arms, touch it.
+
+    Writes trace.csv, trace_control.csv, forces.png, retraction.png (before and after) and summary.json. Exit status 1:
+    it did not succeed.
+    """
+
+    scene: MaybeText = None
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML); default: lobe."""
+    instrument: MaybeText = None
+    """An arm with a jaw, such as psm_retractor, or a TOML file; default: the scene's own."""
+    bimanual: bool = False
+    """Two arms: the left one lifts the lobe, the right one reaches under it and touches the target."""
+    seed: int = 0
+    """Of the episode."""
+    out: Path = Path("runs/retract")
+    """Folder for the results."""
+
+
+@dataclass(frozen=True)
 class Arms:
     """Evaluate two arms on a patient's organ: what each reaches and both at once, clearances, forces, dexterity.
 
@@ -150,6 +170,7 @@ class Bench:
 
 Command = (
     Annotated[Palpate, tyro.conf.subcommand("palpate")]
+    | Annotated[Retract, tyro.conf.subcommand("retract")]
     | Annotated[Organ, tyro.conf.subcommand("organ")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Arms, tyro.conf.subcommand("arms")]
@@ -159,7 +180,7 @@ Command = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; exit status 0, 1 (validate: a row is not met), 2 (bad input, one line) or 130 (Ctrl-C)."""
+    """Run the command line; exit status 0, 1 (a row not met, no success), 2 (bad input, one line), 130 (Ctrl-C)."""
     given = _joined(list(sys.argv[1:] if arguments is None else arguments))
     said = io.StringIO()
     try:
@@ -184,10 +205,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run(command: Palpate | Arms | Organ | Scenes | Validate | Bench) -> int:
+def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench) -> int:
     console = Console()
     if isinstance(command, Palpate):
         _palpate(command, console)
+    elif isinstance(command, Retract):
+        from surgsim_env.scripting.retract_command import Request as Retraction
+        from surgsim_env.scripting.retract_command import retract
+
+        default = "lobe"
+        return 0 if retract(Retraction(**{**vars(command), "scene": command.scene or default}), console) else 1
     elif isinstance(command, Arms):
         from surgsim_env.evaluation.arms_command import Request, report_arms
 

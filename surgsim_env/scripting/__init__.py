@@ -1,8 +1,10 @@
 """Scripted episodes: steps such as MoveTo and PressUntil, run in an environment, give a Trace in newtons."""
 
+from surgsim_env.scripting.jaw_steps import CloseJaw, OpenJaw
 from surgsim_env.scripting.oracle import oracle_script
 from surgsim_env.scripting.run import ScriptError, run_script
 from surgsim_env.scripting.steps import (
+    AwaitEnd,
     Control,
     Declare,
     Hold,
@@ -16,13 +18,18 @@ from surgsim_env.scripting.steps import (
 )
 from surgsim_env.scripting.trace import StepInterval, Trace
 from surgsim_env.scripting.view import View
+from surgsim_env.scripting.wrapped_steps import MayEnd, Until
 
 __all__ = [
+    "AwaitEnd",
+    "CloseJaw",
     "Control",
     "Declare",
     "Hold",
     "Lift",
+    "MayEnd",
     "MoveTo",
+    "OpenJaw",
     "PressUntil",
     "Script",
     "ScriptError",
@@ -30,6 +37,7 @@ __all__ = [
     "StepFailed",
     "StepInterval",
     "Trace",
+    "Until",
     "View",
     "WaitUntil",
     "oracle_script",

@@ -7,13 +7,16 @@ import numpy as np
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.env import PalpateEnv
-from surgsim_env.scripting.steps import Declare, Hold, MoveTo, PressUntil, Step
+from surgsim_env.env import PalpateEnv, RetractEnv
+from surgsim_env.scripting.retract_oracle import retraction_steps
+from surgsim_env.scripting.steps import AwaitEnd, Declare, Hold, MoveTo, PressUntil, Step
 
 # The oracle presses with this share of the soft force limit.
 GENTLE_SHARE = 0.4
 # Between the tip ball and the tissue while it moves sideways, and where a press begins [m].
 TRAVEL_GAP = 0.004
+# A lobe is carried no farther once enough of the target was seen for so many control steps.
+SEEN_STEPS = 5
 # Tissue this far beside the ball's way counts as under it [m].
 CORRIDOR = 0.004
 
@@ -54,8 +57,21 @@ def palpate_oracle(env: PalpateEnv) -> list[Step]:
     ]
 
 
+def retract_oracle(env: RetractEnv) -> list[Step]:
+    """Grasp the free edge beside the target, fold the lobe back and wait for success."""
+    target = env.task.target
+    if target is None:
+        raise ValueError("the oracle uncovers the target of an episode, and none has begun: call env.reset(seed=...)")
+    return [
+        *retraction_steps(
+            env.simulation, target.centre, env.task.turning_size, lambda _: env.task.seen_count >= SEEN_STEPS
+        ),
+        AwaitEnd(10.0, name="keep it open"),
+    ]
+
+
 # An oracle for each environment.
-ORACLES: dict[type, Callable[..., list[Step]]] = {PalpateEnv: palpate_oracle}
+ORACLES: dict[type, Callable[..., list[Step]]] = {PalpateEnv: palpate_oracle, RetractEnv: retract_oracle}
 
 
 def _travel_height(anatomy: Anatomy, start: FloatArray, end: FloatArray) -> float:

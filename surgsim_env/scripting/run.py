@@ -8,11 +8,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.env import PalpateEnv
 from surgsim_env.haptic_record import HapticRecord
 from surgsim_env.scripting.steps import Control, Script, Step, StepFailed
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
 from surgsim_env.scripting.view import Action, View, look
+from surgsim_env.surgical_env import SurgicalEnv
 
 
 class ScriptError(Exception):
@@ -28,8 +28,9 @@ def run_script(
 ) -> Trace:
     """Run the steps of a script one after the other and record all of it; recording changes no bit of the episode.
 
-    The episode may end in a step that is made for that (Declare, Control) if it is the last one. Anything else that
-    keeps the script from its end is an error; so are the hard force limit and a fault in any step.
+    The episode may end in a step that is made for that (Declare, Control, AwaitEnd) if it is the last one, and come to
+    its success in one that says so (MayEnd), which ends the script. Anything else that keeps the script from its end is
+    an error; so are a force limit and a fault in any step.
 
     Args:
         env: one environment of this project, wrapped or not.
@@ -56,6 +57,8 @@ def run_script(
             began = inner.simulation.time
             failure = run.make(step, name, last=index == len(script) - 1)
             run.steps.append(StepInterval(name, began, inner.simulation.time))
+            if run.ended:
+                break
             if failure:
                 failure = f"step {index + 1} of {len(script)}, {name!r}, {failure}"
                 break
@@ -70,7 +73,7 @@ class _Run:
     """What a run gathers, control step by control step."""
 
     env: gym.Env
-    inner: PalpateEnv
+    inner: SurgicalEnv
     record: HapticRecord
     observation: NDArray[np.floating]
     start: float
@@ -82,6 +85,8 @@ class _Run:
     steps: list[StepInterval] = field(default_factory=list)
     terminated: bool = False
     truncated: bool = False
+    # Whether the episode came to an end that the script meant.
+    ended: bool = False
 
     def make(self, step: Step, name: str, *, last: bool) -> str:
         """Make one step of the script; "" or why it failed."""
@@ -96,7 +101,8 @@ class _Run:
                 self._take(action, name, checked=not isinstance(step, Control))
                 view = self._look(began, first)
                 if self.terminated or self.truncated:
-                    meant = last and step.ends_episode and not self._harm()
+                    meant = step.ends_episode and not self._harm() and (last or self._succeeded())
+                    self.ended = meant
                     return "" if meant else f"{self._harm() or self._cut_short()}; {view.reached()}"
                 action = plan.send(view)
         except StopIteration:
@@ -151,22 +157,27 @@ class _Run:
         self.rewards.append(float(reward))
         self.infos.append(dict(info))
 
+    def _succeeded(self) -> bool:
+        return bool(self.infos[-1].get("success"))
+
     def _harm(self) -> str:
-        """The fault or the force limit that ended the episode; "" for none."""
+        """The fault, the tear or the force limit that ended the episode; "" for none."""
         info = self.infos[-1]
         if info.get("sim_fault"):
             return f"came to a fault of the simulation ({info['sim_fault']})"
+        if info.get("torn"):
+            return f"tore the tissue ({info['pull_force_peak']:.3f} N)"
         return f"passed the hard force limit ({info['force_peak']:.3f} N)" if info.get("hard_limit") else ""
 
     def _cut_short(self) -> str:
         return "was cut short: the episode is over" + (", its time is up" if self.truncated else "")
 
 
-def _inner(env: gym.Env) -> PalpateEnv:
+def _inner(env: gym.Env) -> SurgicalEnv:
     if isinstance(env, gym.vector.VectorEnv):
         raise TypeError("a script runs in one environment, not in several abreast: make one with gym.make")
     inner = env.unwrapped
-    if not isinstance(inner, PalpateEnv):
+    if not isinstance(inner, SurgicalEnv):
         raise TypeError(f'{type(inner).__name__} is no environment of this project: use gym.make("SurgSim/Palpate-v0")')
     return inner
 
@@ -189,7 +200,7 @@ def _names(script: Sequence[Step]) -> list[str]:
     return names
 
 
-def _check_speeds(script: Sequence[Step], names: Sequence[str], inner: PalpateEnv) -> None:
+def _check_speeds(script: Sequence[Step], names: Sequence[str], inner: SurgicalEnv) -> None:
     for step, name in zip(script, names, strict=True):
         if step.speed > inner.task.speed_limit * (1.0 + 1e-9):
             raise ValueError(

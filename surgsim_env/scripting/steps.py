@@ -62,11 +62,16 @@ Script = Sequence[Step]
 
 @dataclass(frozen=True)
 class MoveTo:
-    """Move the tip straight to a point [m], until it is within `tolerance` [m] of it, at `speed` [m/s] or slower."""
+    """Move the tip straight to a point [m], until it is within `tolerance` [m] of it, at `speed` [m/s] or slower.
+
+    `turn` is how far the wrist turns on the way, evenly, in the instrument's own terms: an angle [rad] about its hinge,
+    or a rotation vector (3,) of an arm's tip.
+    """
 
     point: tuple[float, float, float]
     speed: float = 0.02
     tolerance: float = 0.0005
+    turn: float | tuple[float, ...] = 0.0
     timeout: float = 10.0
     name: str = ""
     ends_episode: bool = field(default=False, init=False, repr=False)
@@ -77,8 +82,15 @@ class MoveTo:
 
     def actions(self, view: View) -> Plan:
         """Towards the point, slower on the last millimetre."""
+        left = np.atleast_1d(np.asarray(self.turn, dtype=np.float64))
         while np.linalg.norm(gap := np.array(self.point) - view.tip_position) > self.tolerance:
-            view = yield view.action(_towards(gap, self.speed, view.control_step))
+            velocity = _towards(gap, self.speed, view.control_step)
+            if not left.any():
+                view = yield view.action(velocity)
+                continue
+            share = float(np.linalg.norm(velocity) / np.linalg.norm(gap))
+            view = yield view.action(velocity, turning=left * share)
+            left = left * (1.0 - share * view.control_step)
 
 
 @dataclass(frozen=True)
@@ -207,6 +219,24 @@ class Declare:
         """Declare on and on: the episode's end ends it."""
         while True:
             view = yield view.still(declare=True)
+
+
+@dataclass(frozen=True)
+class AwaitEnd:
+    """Keep the tip still until the episode ends by itself, such as by success; fails after `timeout` [s]."""
+
+    timeout: float
+    name: str = ""
+    ends_episode: bool = field(default=True, init=False, repr=False)
+    speed: float = field(default=0.0, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        above_zero(self, "timeout")
+
+    def actions(self, view: View) -> Plan:
+        """No motion: the episode's end ends it."""
+        while True:
+            view = yield view.still()
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from surgsim_env.scripting.trace import Trace
 
 if TYPE_CHECKING:
@@ -27,6 +29,9 @@ def write_picture(trace: Trace, path: Path) -> None:
 
 def draw(trace: Trace, force: Axes, depth: Axes) -> None:
     """Draw the force [N] into one pair of axes and the depth [mm] into another, the steps as bands with names."""
+    if "visible" in trace.info:
+        _draw_retraction(trace, force, depth)
+        return
     force.plot(trace.haptic_time, trace.force_size, color=FORCE, linewidth=1.3)
     force.set_ylabel("contact force [N]")
     force.set_ylim(0.0, max(1.15 * trace.peak_force, 0.01))
@@ -37,6 +42,26 @@ def draw(trace: Trace, force: Axes, depth: Axes) -> None:
     if len(trace.haptic_time):
         depth.set_xlim(trace.start, float(trace.haptic_time[-1]))
     _mark_steps(trace, force, depth)
+    if trace.failure:
+        force.set_xlabel(trace.failure, color=FORCE, fontsize=8, wrap=True)
+
+
+def _draw_retraction(trace: Trace, force: Axes, seen: Axes) -> None:
+    """What the jaw holds and pulls with [N], and the share of the target that is seen [%]."""
+    grip, pull, share = (
+        np.array([info[name] for info in trace.infos]) for name in ("grip_force", "pull_force", "visible")
+    )
+    force.plot(trace.control_time, grip, color=DEPTH, linewidth=1.3, label="grip, the weaker pad")
+    force.plot(trace.control_time, pull, color=FORCE, linewidth=1.3, label="pull")
+    force.set_ylabel("force [N]")
+    force.set_ylim(0.0, 1.15 * max(float(grip.max()), float(pull.max()), 0.01))
+    force.legend(loc="upper left", frameon=False)
+    seen.plot(trace.control_time, 100.0 * share, color=INK, linewidth=1.3)
+    seen.set_ylabel("target seen [%]")
+    seen.set_ylim(-3.0, 103.0)
+    seen.set_xlabel("time since the reset [s]")
+    seen.set_xlim(trace.start, float(trace.control_time[-1]))
+    _mark_steps(trace, force, seen)
     if trace.failure:
         force.set_xlabel(trace.failure, color=FORCE, fontsize=8, wrap=True)
 

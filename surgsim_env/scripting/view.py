@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
+from surgsim_env.grasp import Grasp
 from surgsim_env.simulation import Simulation
 
 Action = NDArray[np.floating]
@@ -43,6 +44,7 @@ class View:
         sensed_force: the same through the sensor model, as observed [N]                    (3,)
         contact_position: the tip at the first contact since the step began [m]; None before it  (3,)
         approach: unit vector along which the instrument comes                              (3,)
+        grasp: what the jaw holds and how; None without a jaw
         task: how actions are laid out
     """
 
@@ -56,6 +58,7 @@ class View:
     sensed_force: FloatArray
     contact_position: FloatArray | None
     approach: FloatArray
+    grasp: Grasp | None
     task: ScriptedTask
 
     def __post_init__(self) -> None:
@@ -64,12 +67,27 @@ class View:
                 value.flags.writeable = False
 
     def action(self, velocity: FloatArray, **commands: Any) -> Action:
-        """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`)."""
+        """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`).
+
+        A jaw stays as it was last told (`jaw=-1.0` closes it).
+        """
         return self.task.action(velocity, **commands)
 
     def still(self, **commands: Any) -> Action:
         """The action that keeps the tip where it is."""
         return self.action(np.zeros(3), **commands)
+
+    def grasped(self, step: object) -> Grasp:
+        """What the jaw holds, for a step that needs one.
+
+        Raises:
+            TypeError: the instrument has no jaw.
+        """
+        if self.grasp is None:
+            raise TypeError(
+                f"{type(step).__name__} needs an instrument with a jaw; this one has none: choose a grasper"
+            )
+        return self.grasp
 
     def pressing_force(self, direction: FloatArray, *, sensed: bool = False) -> float:
         """The force with which the tissue pushes back against a unit direction [N], true or sensed."""
@@ -117,5 +135,6 @@ def look(
         sensed_force=task.sensed_force(raw_observation),
         contact_position=contact_position,
         approach=simulation.anatomy.face.approach.copy(),
+        grasp=simulation.grasp,
         task=task,
     )

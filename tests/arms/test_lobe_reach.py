@@ -17,8 +17,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:scene 'lobe'")
 LEFT_PORT = Port((-0.01, 0.20, 0.06), (0.2, -0.9, -0.35))
 RIGHT_PORT = Port((0.09, 0.20, 0.06), (-0.2, -0.9, -0.35))
 # Along the free edge, the pads beyond the bed, at half height; lifted and folded back.
-EDGE = [(x, 0.045, 0.006) for x in (0.02, 0.04, 0.06)]
-FOLDED = [(x, 0.020, 0.035) for x in (0.03, 0.05)]
+EDGE = [(x, 0.049, 0.006) for x in (0.02, 0.04, 0.06)]
+FOLDED = [(x, 0.022, 0.038) for x in (0.03, 0.05)]
 # Targets lie on the bed 15 to 30 mm from the grown edge.
 TARGETS = [(x, y, 0.0035) for x in (0.03, 0.05) for y in (0.015, 0.030)]
 
@@ -60,8 +60,8 @@ def test_the_arms_are_apart_where_they_work(pair: Pair):
 def test_a_jaw_gets_around_the_edge_that_stands_over(model: str):
     """Open, level, one pad above and one below the edge of the lobe at rest: nothing touches anything."""
     one = Simulation(lobe(model, port=LEFT_PORT))
-    edge = one.organ_state.node_position[one.organ_model.node_rest_position[:, 1] > 0.0479]
-    one.restart(np.array([0.04, 0.045, edge[:, 2].mean()]))
+    edge = one.organ_state.node_position[one.organ_model.node_rest_position[:, 1] > 0.0519]
+    one.restart(np.array([0.04, 0.049, edge[:, 2].mean()]))
     one.control_step(50)
     assert one.end_control_step(), one.fault
     assert not one.contact_wrench.any() and one.instrument.data.ncon == 0

@@ -18,7 +18,7 @@ CASES = [(env_id, {}) for env_id in IDS] + [("SurgSim/Palpate-v0", {"instrument"
 # The scene that an id has by default, its number of cells, and fewer.
 SCENES = {
     "SurgSim/Palpate-v0": ("phantom", "[12, 12, 6]", "[6, 6, 3]"),
-    "SurgSim/Retract-v0": ("lobe", "[20, 12, 3]", "[20, 12, 2]"),
+    "SurgSim/Retract-v0": ("lobe", "[20, 13, 3]", "[20, 13, 2]"),
 }
 # Entries of an observation that a walk of some steps leaves as they are: the axis of a wrist that is a hinge, what is
 # grasped and what is seen.

@@ -46,7 +46,7 @@ def simulation(*, compiled: bool = True, instrument: str | None = None, tip=ABOV
 def test_a_scene_file_says_what_the_organ_rests_on(tmp_path):
     text = (scenes_folder() / "organs" / "lobe.toml").read_text(encoding="utf-8")
     assert scene().supports == (
-        Support("bed", "box", position=(0.04, -0.012, -0.015), size=(0.08, 0.048, 0.015), friction=0.2),
+        Support("bed", "box", position=(0.04, -0.01075, -0.015), size=(0.08, 0.04925, 0.015), friction=0.2),
     )
     organ = load_anatomy(scene()).organ()
     assert organ.gravity.tolist() == [0.0, 0.0, -9.81]

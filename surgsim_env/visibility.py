@@ -41,7 +41,10 @@ class Disc:
         return np.stack([across, np.cross(self.normal, across), self.normal], axis=1)
 
     def points(self, count: int = POINT_COUNT) -> FloatArray:
-        """Points spread evenly over the disc as a sunflower's seeds are [m], shape (count, 3)."""
+        """Points spread evenly over the disc as a sunflower's seeds are [m], shape (count, 3).
+
+        Each stands for as much of the disc's area, not of its picture, in which what is nearer is larger.
+        """
         index = np.arange(count)
         distance = self.radius * np.sqrt((index + 0.5) / count)
         angle = index * GOLDEN_ANGLE

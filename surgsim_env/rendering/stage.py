@@ -29,7 +29,7 @@ MESH_LABELS = dict.fromkeys(("organ", "held", "section"), LABELS["organ"]) | {"s
 # Geoms that a picture may have beyond those of the model: lesions, and a target.
 LESIONS_MOST = 100
 SHADOW_MAP = 2048
-# A target is drawn this thick [m], half of it above the disc itself.
+# A target is drawn this thick [m], all of it below the disc itself.
 TARGET_THICKNESS = 2e-4
 
 _stages: dict[tuple, "Stage"] = {}
@@ -172,7 +172,8 @@ class Stage:
 
     def _add_target(self, disc: Disc) -> None:
         size = np.array([disc.radius, 0.5 * TARGET_THICKNESS, 0.0])
-        self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, disc.centre, disc.rotation, TARGET_COLOUR, "target")
+        centre = disc.centre - 0.5 * TARGET_THICKNESS * disc.normal
+        self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, disc.rotation, TARGET_COLOUR, "target")
 
     def _add(
         self, kind: mujoco.mjtGeom, size: FloatArray, centre: FloatArray, rotation: FloatArray,

@@ -10,7 +10,7 @@ from msdm_core.kernels import OrganModel
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.grasp import Grasp, read_grasp
+from surgsim_env.grasp import Grasp
 from surgsim_env.instrument import Instrument
 from surgsim_env.retraction import Retraction
 from surgsim_env.rewards import RETRACT_WEIGHTS, weighted
@@ -49,6 +49,8 @@ class RetractTask:
     """SurgSim/Retract-v0 on one anatomy with one instrument that has a jaw."""
 
     weights = RETRACT_WEIGHTS
+    # Reward terms of what ends an episode in harm; the first that is true counts.
+    failures: tuple[str, ...] = ("fault", "torn", "hard_force")
     lesions: tuple[Lesion, ...] = ()
 
     def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
@@ -78,10 +80,10 @@ class RetractTask:
         self.drawn: RetractionDraw | None = None
         self.record = RetractionRecord()
         self.step_count = 0
-        self.seen_count = 0
+        self.goal_count = 0
         self.jaw_target = 1.0
-        self.visible_share = self._visible_before = 0.0
-        self._held_before = False
+        self.visible_share = 0.0
+        self._reached = dict[str, float]()
 
     # What the environment and pictures ask ---------------------------------------------------------------------------
 
@@ -158,15 +160,14 @@ class RetractTask:
         self.force_reading.reset(rng)
         self.torque_reading.reset(rng)
         self.record = RetractionRecord()
-        self.step_count = self.seen_count = 0
+        self.step_count = self.goal_count = 0
         self.jaw_target = 1.0
-        self.visible_share = self._visible_before = 0.0
-        self._held_before = False
         return Start(drawn_organ(self.anatomy, self.drawn), np.array(self.drawn.start))
 
     def accepts(self, simulation: Simulation) -> bool:
         """Whether the lobe hides the target: at most HIDDEN_SHARE of it is seen."""
-        self._visible_before = self.visible_share = self._look(simulation)
+        self.visible_share = self._look(simulation)
+        self._reached = self._progress(simulation, self._grasp(simulation))
         return self.visible_share <= HIDDEN_SHARE
 
     def command(self, action: FloatArray, instrument: Instrument) -> None:
@@ -213,42 +214,35 @@ class RetractTask:
             force_peak: largest contact force of its haptic steps [N].
             fault: what the simulation came to, or an empty string.
         """
-        pull_peak = simulation.pull_peak
-        torn = not fault and pull_peak > self.pull_limit
-        hard = not fault and not torn and force_peak > self.force_limit
-        harm = bool(fault) or torn or hard
-        visible_before, held_before = self._visible_before, self._held_before
-        grasp = None
+        harm = self._harm(simulation, force_peak, fault)
+        before, grasp = self._reached, None
         if not fault:
             grasp = self._grasp(simulation)
-            self._note(simulation, grasp, pull_peak)
-            self._visible_before, self._held_before = self.visible_share, grasp.holds
-        self.seen_count = self.seen_count + 1 if self.visible_share >= SUCCESS_SHARE and not harm else 0
-        needed = round(SUCCESS_TIME / self.anatomy.scene.timing.control_step)
-        success = self.seen_count >= needed
-        terminated = harm or success
+            self._note(simulation, grasp)
+            self._reached = self._progress(simulation, grasp)
+        at_goal = grasp is not None and not harm and self._at_goal(simulation, grasp)
+        self.goal_count = self.goal_count + 1 if at_goal else 0
+        success = self.goal_count >= round(SUCCESS_TIME / self.anatomy.scene.timing.control_step)
+        terminated = bool(harm) or success
         excess = (force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force)
         terms = {
             "time": 1.0,
             "soft_force": min(max(excess, 0.0), 1.0),
-            "visible": self._visible_before - visible_before,
-            "grasped": float(self._held_before) - float(held_before),
+            **{name: self._reached[name] - before[name] for name in before},
             "success": float(success),
-            "torn": float(torn),
-            "hard_force": float(hard),
-            "fault": float(bool(fault)),
+            **{name: float(harm == name) for name in self.failures},
             "forgone": float(EPISODE_STEPS - self.step_count) if harm else 0.0,
         }
         return Verdict(
             terminated=terminated,
             truncated=not terminated and self.step_count >= EPISODE_STEPS,
             rewards=weighted(terms, self.weights),
-            info=self._info(grasp, force_peak, hard=hard, torn=torn, success=success),
+            info={**self._info(grasp, force_peak, harm), "success": success},
         )
 
     def blank_info(self) -> dict[str, InfoValue]:
         """The info of a reset: the same keys and types as a verdict's."""
-        return self._info(None, 0.0, hard=False, torn=False, success=False)
+        return {**self._info(None, 0.0, ""), "success": False}
 
     def get_state(self) -> str:
         """Draw, biases, counters and measures as JSON, exact."""
@@ -258,10 +252,10 @@ class RetractTask:
                 "drawn": self.drawn.to_json(),
                 "record": self.record.to_json(),
                 "bias": [self.force_reading.bias.tolist(), self.torque_reading.bias.tolist()],
-                "counts": [self.step_count, self.seen_count],
+                "counts": [self.step_count, self.goal_count],
                 "jaw_target": self.jaw_target,
-                "visible": [self.visible_share, self._visible_before],
-                "held": self._held_before,
+                "visible": self.visible_share,
+                "reached": self._reached,
             }
         )
 
@@ -271,27 +265,43 @@ class RetractTask:
         self.drawn = RetractionDraw.from_json(table["drawn"])
         self.record = RetractionRecord.from_json(table["record"])
         self.force_reading.bias, self.torque_reading.bias = map(np.array, table["bias"])
-        self.step_count, self.seen_count = table["counts"]
+        self.step_count, self.goal_count = table["counts"]
         self.jaw_target = table["jaw_target"]
-        self.visible_share, self._visible_before = table["visible"]
-        self._held_before = table["held"]
+        self.visible_share, self._reached = table["visible"], table["reached"]
         return drawn_organ(self.anatomy, self.drawn)
 
     # Its parts -------------------------------------------------------------------------------------------------------
 
-    def _look(self, simulation: Simulation) -> float:
-        """Share of the target that the endoscope sees."""
+    def _harm(self, simulation: Simulation, force_peak: float, fault: str) -> str:
+        """Which of `failures` a control step came to; "" for none."""
+        if fault:
+            return "fault"
+        if simulation.pull_peak > self.pull_limit:
+            return "torn"
+        return "hard_force" if force_peak > self.force_limit else ""
+
+    def _progress(self, simulation: Simulation, grasp: Grasp) -> dict[str, float]:
+        """What is reached, each from 0 to 1: its changes pay."""
+        return {"visible": self.visible_share, "grasped": float(grasp.holds)}
+
+    def _at_goal(self, simulation: Simulation, grasp: Grasp) -> bool:
+        """Whether this is what shall last for SUCCESS_TIME."""
+        return self.visible_share >= SUCCESS_SHARE
+
+    def _look(self, simulation: Simulation, *, past_instruments: bool = True) -> float:
+        """Share of the target that the endoscope sees; past the organ alone where instruments shall not count."""
         instrument, target, drawn = simulation.instrument, self.target, self.drawn
         assert target is not None and drawn is not None
         triangles = self.anatomy.mesh.boundary_triangles
         nodes = simulation.organ_state.node_position
+        hiding = self._hiding if past_instruments else self._hiding[:0]
         seen = visible(
-            np.array(drawn.eye), target.points(), nodes, triangles, instrument.model, instrument.data, self._hiding
+            np.array(drawn.eye), target.points(), nodes, triangles, instrument.model, instrument.data, hiding
         )
         return float(seen.mean())
 
     def _grasp(self, simulation: Simulation) -> Grasp:
-        grasp = read_grasp(simulation.instrument, simulation.contact_wrench, self.anatomy.scene.contact.friction)
+        grasp = simulation.grasp
         assert grasp is not None
         return grasp
 
@@ -313,20 +323,17 @@ class RetractTask:
         mujoco.mju_quat2Mat(rotation, instrument.tip_pose_in(instrument.data)[1])
         return rotation.reshape(3, 3)[:, [0, 2]].T.ravel()
 
-    def _note(self, simulation: Simulation, grasp: Grasp, pull_peak: float) -> None:
+    def _note(self, simulation: Simulation, grasp: Grasp) -> None:
         strain = region_strains(simulation.organ_model, simulation.organ_state.node_position)
         tip = simulation.instrument.tip_position
         duration = self.anatomy.scene.timing.control_step
-        self.record.note(grasp, pull_peak, tip, strain, self.jaw_target < 0.0, duration)
+        self.record.note(grasp, simulation.pull_peak, tip, strain, self.jaw_target < 0.0, duration)
 
-    def _info(
-        self, grasp: Grasp | None, force_peak: float, *, hard: bool, torn: bool, success: bool
-    ) -> dict[str, InfoValue]:
+    def _info(self, grasp: Grasp | None, force_peak: float, harm: str) -> dict[str, InfoValue]:
         return {
             "force_peak": force_peak,
-            "hard_limit": hard,
-            "torn": torn,
-            "success": success,
+            "hard_limit": harm == "hard_force",
+            "torn": harm == "torn",
             "visible": self.visible_share,
             "holds": grasp is not None and grasp.holds,
             "grip_force": 0.0 if grasp is None else grasp.grip_force,

@@ -189,8 +189,9 @@ def test_pictures_show_the_bed_as_background():
     bare = Simulation(load_anatomy(replace(scene(), supports=(), gravity=(0.0, 0.0, 0.0), name="bare")))
     bare.reset(bare.organ_model, np.array([0.06, 0.09, 0.03]))
     without = OrganRenderer(bare, render_options({"width": 160, "height": 120, "camera": "endoscope"}))
-    drape = without.depth()
+    drape, tool = without.depth(), without.segmentation() == LABELS["instrument"]
     without.close()
+    np.testing.assert_array_equal(labels == LABELS["instrument"], tool, err_msg="the bed is no instrument")
     below = (labels == LABELS["background"]) & (np.arange(120)[:, None] > 90)
     # The drape of the bare scene lies at z = -0.5 mm, the bed's side face stands nearer, its drape is 30 mm lower.
     assert (depth[below] > drape[below] + 0.005).any(), "the drape is below the bed"

@@ -366,26 +366,26 @@ def target_areas(env, camera, width, height):
 
 
 @pytest.mark.usefixtures("opengl")
-@pytest.mark.parametrize(("width", "height", "tolerance"), [(640, 480, 0.015), (84, 84, 0.05)])
+@pytest.mark.parametrize(("width", "height", "tolerance"), [(640, 480, 0.015), (84, 84, 0.10)])
 def test_what_is_seen_is_what_a_picture_shows(width, height, tolerance):
     """With the lobe half folded back; coarse pixels count the border to a pixel or so."""
     env = RetractEnv(render_mode="rgb_array", width=width, height=height, smooth_edges=False)
     env.reset(seed=6)
     nodes, rest = env.simulation.organ_state.node_position, env.simulation.organ_state.node_position.copy()
-    compared = 0
-    instrument = env.simulation.instrument
-    for turn, beside in ((0.2, 0.09), (0.22, 0.09), (0.24, 0.09), (0.5, 0.06), (0.5, 0.062), (0.5, 0.064), (0.9, 0.09)):
-        # The lobe turned up about its held edge, as a plate on a hinge; the jaw more or less in the way.
+    compared, instrument = np.zeros(2, dtype=int), env.simulation.instrument
+    # The lobe turned up about its held edge, as a plate on a hinge, the jaw far aside; then the jaw in the way.
+    lifted = [(turn, 0.12) for turn in np.arange(0.12, 0.30, 0.02)]
+    crossed = [(0.9, beside) for beside in np.arange(0.03, 0.08, 0.004)]
+    for turn, beside in lifted + crossed:
         instrument.place(np.array([beside, 0.07, 0.006]))
         nodes[:, 1] = rest[:, 1] * math.cos(turn) - rest[:, 2] * math.sin(turn)
         nodes[:, 2] = rest[:, 1] * math.sin(turn) + rest[:, 2] * math.cos(turn)
         seen = env.task._look(env.simulation)
         labels = env.renderer.segmentation("endoscope")
-        camera = env.renderer.cameras["endoscope"]
-        areas = target_areas(env, camera, width, height)
+        areas = target_areas(env, env.renderer.cameras["endoscope"], width, height)
         assert areas[labels == LABELS["target"]].sum() == pytest.approx(seen, abs=tolerance)
-        compared += 0.02 < seen < 0.98
-    assert compared >= 2, "some must be half covered to prove anything"
+        compared[int(turn == 0.9)] += 0.02 < seen < 0.98
+    assert (compared >= 2).all(), "some must be half covered to prove anything"
     env.close()
 
 

@@ -64,7 +64,7 @@ def retract_oracle(env: RetractEnv) -> list[Step]:
         raise ValueError("the oracle uncovers the target of an episode, and none has begun: call env.reset(seed=...)")
     return [
         *retraction_steps(
-            env.simulation, target.centre, env.task.turning_size, lambda _: env.task.seen_count >= SEEN_STEPS
+            env.simulation, target.centre, env.task.turning_size, lambda _: env.task.goal_count >= SEEN_STEPS
         ),
         AwaitEnd(10.0, name="keep it open"),
     ]

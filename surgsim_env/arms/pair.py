@@ -1,5 +1,8 @@
 """Two arms in one model: the left grasps, the right touches; they meet the organ, its supports and each other."""
 
+import math
+from itertools import product
+
 import mujoco
 import numpy as np
 
@@ -12,7 +15,7 @@ from surgsim_env.arms.steering import SteeredArm, millimetres, missing, placed
 from surgsim_env.instrument import Instrument
 from surgsim_env.jaw import Jaw
 from surgsim_env.scenes import Scene
-from surgsim_env.supports import SUPPORT_PREFIX, add_supports
+from surgsim_env.supports import SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
 from surgsim_env.tool_bodies import CONTACT_GROUP, ROUGHNESS
 
 # Instruments of two arms that a scene may name: what stands left and right.
@@ -22,6 +25,9 @@ SIDES = ("left", "right")
 ARM_BITS = {"left": 4, "right": 8}
 # Arms meet softly: critically damped, with a time constant of five haptic steps [s].
 CONTACT_SOFTNESS = (0.005, 1.0)
+# The right arm on a support: 2000 N/m, so that 0.1 N is 0.05 mm and not lost in one control step. As MuJoCo makes
+# a contact as stiff as its tool is heavy (`supports.SOLREF`), that is a sixth of the stiffness per mass of other tools.
+TOUCH_SOFTNESS = (SOLREF[0] / 6.5, SOLREF[1] / math.sqrt(6.5))
 # Half the distance of the tips from each other before the first reset [m].
 PARKED_ASIDE = 0.025
 # Beyond this the distance of the arms is not looked at [m].
@@ -198,6 +204,10 @@ def _compile(arms: dict[str, Arm], scene: Scene) -> mujoco.MjModel:
         for name, value in rough.items():
             spec.add_numeric(name=f"{ROUGHNESS}{side}_{name.removeprefix(ROUGHNESS)}", data=value, size=1)
     add_supports(spec, scene.supports)
+    for name, support in product(arms["right"].description.contact, scene.supports):
+        friction = [support.friction, support.friction, 0.005, 1e-4, 1e-4]
+        touch = {"solref": TOUCH_SOFTNESS, "solimp": SOLIMP, "friction": friction, "condim": 3}
+        spec.add_pair(geomname1=f"right_{name}", geomname2=SUPPORT_PREFIX + support.name, **touch)
     return spec.compile()
 
 

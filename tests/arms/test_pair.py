@@ -49,7 +49,7 @@ def test_each_arm_stands_as_it_would_alone():
     # The gear of the jaw and its serrated pads stay so beside another arm.
     assert pair.model.ntendon == 1
     assert pair.jaw is pair.arms["left"].jaw
-    assert (pair.jaw.friction == 4.0).all() and (pair.shapes.shape_friction == 4.0).sum() == 2
+    assert (pair.jaw.friction == 5.0).all() and (pair.shapes.shape_friction == 5.0).sum() == 2
 
 
 def test_each_tip_follows_its_own_line():

@@ -103,7 +103,7 @@ class Arms:
     """
 
     left: str
-    """The left arm: a shipped arm's name (psm_grasper, psm_palpator, six_axis) or a TOML file (docs/arms.md)."""
+    """The left arm: a shipped arm's name (psm_grasper, psm_retractor, ...) or a TOML file (docs/arms.md)."""
     right: str
     """The right arm, likewise."""
     ports: Path | None = None

@@ -18,7 +18,7 @@ from surgsim_env.scripting.steps import (
 )
 from surgsim_env.scripting.trace import StepInterval, Trace
 from surgsim_env.scripting.view import View
-from surgsim_env.scripting.wrapped_steps import MayEnd, Until
+from surgsim_env.scripting.wrapped_steps import MayEnd, OfArm, Until
 
 __all__ = [
     "AwaitEnd",
@@ -29,6 +29,7 @@ __all__ = [
     "Lift",
     "MayEnd",
     "MoveTo",
+    "OfArm",
     "OpenJaw",
     "PressUntil",
     "Script",

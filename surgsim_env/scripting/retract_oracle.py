@@ -30,7 +30,9 @@ TURNS = (math.radians(35.0), math.radians(40.0))
 APPROACH_SPEED, CARRYING_SPEED = 0.015, 0.015
 
 
-def retraction_steps(simulation: Simulation, target: FloatArray, turning_size: int, enough: Predicate) -> list[Step]:
+def retraction_steps(
+    simulation: Simulation, target: FloatArray, turning_size: int, enough: Predicate, *, aside: float = 0.0
+) -> list[Step]:
     """Grasp the free edge beside a target [m] (3,) and fold it back; the lobe as it rests now.
 
     Args:
@@ -38,11 +40,12 @@ def retraction_steps(simulation: Simulation, target: FloatArray, turning_size: i
         target: what shall be seen.
         enough: whether the target is seen well enough to carry the lobe no farther.
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
+        aside: how far beside the target the edge is grasped, along x [m].
     """
     rest, nodes = simulation.organ_model.node_rest_position, simulation.organ_state.node_position
     depth = float(rest[:, 1].max())
     edge = rest[:, 1] > depth - 1e-6
-    along = float(target[0])
+    along = float(target[0]) + aside
     near = edge & (np.abs(rest[:, 0] - along) <= GRASP_DEPTH)
     _, border, height = nodes[near].mean(axis=0).tolist()
     bed = _reach_of_supports(simulation.anatomy.scene.supports, border)

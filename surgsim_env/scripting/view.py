@@ -1,12 +1,14 @@
 """What a step of a script sees between two control steps; nothing in it can be written to."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
+from surgsim_env.arms.pair import SIDES, Pair
 from surgsim_env.grasp import Grasp
 from surgsim_env.simulation import Simulation
 
@@ -46,6 +48,9 @@ class View:
         approach: unit vector along which the instrument comes                              (3,)
         grasp: what the jaw holds and how; None without a jaw
         task: how actions are laid out
+        support_force: with which the tool presses on what the organ rests on [N]; told for arms of several
+        arm: which of several arms this is a view of; "" for all or the only one
+        arms: views of each of several arms, by name
     """
 
     time: float
@@ -60,6 +65,9 @@ class View:
     approach: FloatArray
     grasp: Grasp | None
     task: ScriptedTask
+    support_force: float = 0.0
+    arm: str = ""
+    arms: Mapping[str, "View"] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for value in vars(self).values():
@@ -69,8 +77,10 @@ class View:
     def action(self, velocity: FloatArray, **commands: Any) -> Action:
         """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`).
 
-        A jaw stays as it was last told (`jaw=-1.0` closes it).
+        A jaw stays as it was last told (`jaw=-1.0` closes it); of several arms the others stay where they are.
         """
+        if self.arm:
+            commands = {"arm": self.arm, **commands}
         return self.task.action(velocity, **commands)
 
     def still(self, **commands: Any) -> Action:
@@ -88,6 +98,17 @@ class View:
                 f"{type(step).__name__} needs an instrument with a jaw; this one has none: choose a grasper"
             )
         return self.grasp
+
+    def of(self, arm: str) -> "View":
+        """The view of one of several arms.
+
+        Raises:
+            ValueError: there is no such arm (says which there are).
+        """
+        if arm not in self.arms:
+            known = ", ".join(self.arms) or "none: the instrument is one alone"
+            raise ValueError(f"arm {arm!r} is not there; the arms are {known}")
+        return self.arms[arm]
 
     def pressing_force(self, direction: FloatArray, *, sensed: bool = False) -> float:
         """The force with which the tissue pushes back against a unit direction [N], true or sensed."""
@@ -124,7 +145,7 @@ def look(
         began: when the step of the script began [s].
         contact_position: the tip at the first contact since then [m] (3,), or None.
     """
-    return View(
+    view = View(
         time=simulation.time,
         step_time=simulation.time - began,
         control_step=simulation.anatomy.scene.timing.control_step,
@@ -137,4 +158,23 @@ def look(
         approach=simulation.anatomy.face.approach.copy(),
         grasp=simulation.grasp,
         task=task,
+    )
+    if not isinstance(simulation.instrument, Pair):
+        return view
+    return replace(view, arms={side: _of_arm(view, simulation, simulation.instrument, side) for side in SIDES})
+
+
+def _of_arm(view: View, simulation: Simulation, pair: Pair, side: str) -> View:
+    """The view as one arm of a pair has it; its force is not sensed apart."""
+    arm, force = pair.arms[side], pair.contact_force(side, simulation.contact_wrench)
+    supports = simulation.anatomy.scene.supports
+    return replace(
+        view,
+        tip_position=arm.tip_position,
+        tip_velocity=arm.tip_velocity,
+        true_force=force,
+        sensed_force=force.copy(),
+        grasp=view.grasp if arm.jaw is not None else None,
+        support_force=max((pair.touch_force(side, support.name) for support in supports), default=0.0),
+        arm=side,
     )

@@ -49,6 +49,24 @@ class MayEnd(_Wrapped):
 
 
 @dataclass(frozen=True)
+class OfArm(_Wrapped):
+    """Another step, made by one of several arms; the others stay where they are."""
+
+    arm: str
+
+    def actions(self, view: View) -> Plan:
+        """What the step does, seen from that arm."""
+        plan = self.step.actions(view.of(self.arm))
+        try:
+            action = next(plan)
+            while True:
+                view = yield action
+                action = plan.send(view.of(self.arm))
+        except StopIteration:
+            return
+
+
+@dataclass(frozen=True)
 class Until(_Wrapped):
     """Another step, which is over as soon as `predicate(view)` is true, or by itself."""
 

@@ -37,6 +37,7 @@ class Arm:
         jaw_range: least and largest opening of the jaw [rad], (0, 0) without one
         shape_names, shape_radius: outer shapes (felt ones first) and radii [m]; of a box, those of the capsule that
             is as long as it and holds its cross-section                          (n_shape,)
+        shape_half_axis: from the middle of each shape to its end, in its geom's frame [m]  (n_shape, 3)
         felt: whether tissue feels a shape                                       (n_shape,)
     """
 
@@ -59,8 +60,8 @@ class Arm:
         box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
         thin, middle, long = np.sort(size, axis=1).T
         self.shape_radius = np.where(box, np.hypot(thin, middle), size[:, 0])
-        self._axis = np.where(box, size.argmax(axis=1), 2)
-        self._half_length = np.where(box, long, np.where(capsule, size[:, 1], 0.0))
+        half_length = np.where(box, long, np.where(capsule, size[:, 1], 0.0))
+        self.shape_half_axis = np.eye(3)[np.where(box, size.argmax(axis=1), 2)] * half_length[:, None]
         self.tip_site = model.site(description.tip.site or TIP_SITE).id
         self._tip_axis = _unit(description.tip.direction)
         trocar = description.trocar
@@ -118,7 +119,7 @@ class Arm:
         """Ends of the outer shapes' axes at joint values (n,) and a jaw angle [rad], shape (n_shape, 2, 3) [m]."""
         data = self._at(joints, jaw)
         rotations = data.geom_xmat[self._shapes].reshape(-1, 3, 3)
-        axis = rotations[np.arange(len(rotations)), :, self._axis] * self._half_length[:, None]
+        axis = np.einsum("sxy,sy->sx", rotations, self.shape_half_axis)
         centre = data.geom_xpos[self._shapes]
         return np.stack([centre - axis, centre + axis], axis=1)
 

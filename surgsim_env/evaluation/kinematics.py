@@ -74,8 +74,7 @@ class BatchKinematics:
         self._shape_body = model.geom_bodyid[geoms]
         local = np.zeros((len(geoms), 2, 3))
         for index, geom in enumerate(geoms):
-            half = model.geom_size[geom, 1] if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
-            axis = _rotation(model.geom_quat[geom])[:, 2] * half
+            axis = _rotation(model.geom_quat[geom]) @ arm.shape_half_axis[index]
             local[index] = model.geom_pos[geom] - axis, model.geom_pos[geom] + axis
         self._shape_local = local
         self.shaft_index: IntArray = np.flatnonzero(self._shape_body == self._shaft).astype(np.int32)

@@ -12,7 +12,7 @@ from tests.arms.joints import random_joints
 PORT = Port((0.03, -0.02, 0.15), (0.3, 0.2, -0.9), 0.7)
 
 
-@pytest.fixture(scope="module", params=["psm_palpator", "psm_grasper", "six_axis"])
+@pytest.fixture(scope="module", params=["psm_palpator", "psm_grasper", "psm_retractor", "six_axis"])
 def arm(request):
     return load_arm(request.param, PORT)
 

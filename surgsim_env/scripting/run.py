@@ -12,6 +12,7 @@ from surgsim_env.haptic_record import HapticRecord
 from surgsim_env.scripting.steps import Control, Script, Step, StepFailed
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
 from surgsim_env.scripting.view import Action, View, look
+from surgsim_env.scripting.wrapped_steps import MayEnd
 from surgsim_env.surgical_env import SurgicalEnv
 
 
@@ -101,7 +102,7 @@ class _Run:
                 self._take(action, name, checked=not isinstance(step, Control))
                 view = self._look(began, first)
                 if self.terminated or self.truncated:
-                    meant = step.ends_episode and not self._harm() and (last or self._succeeded())
+                    meant = step.ends_episode and not self._harm() and (last or (isinstance(step, MayEnd) and self._succeeded()))
                     self.ended = meant
                     return "" if meant else f"{self._harm() or self._cut_short()}; {view.reached()}"
                 action = plan.send(view)

@@ -14,7 +14,7 @@ from surgsim_env.arms.psm import JAW_RANGE, PSM_LINKS, psm_frames, psm_manipulab
 from tests.arms.joints import random_joints
 
 INSTRUMENTS = Path(__file__).resolve().parents[2] / "scenes" / "instruments"
-TIP_LENGTH = {"psm_palpator": 0.020, "psm_grasper": 0.0102}
+TIP_LENGTH = {"psm_palpator": 0.020, "psm_grasper": 0.0102, "psm_retractor": 0.026}
 PORT = Port((0.11, -0.02, 0.3), (0.3, 0.2, -1.0), 0.4)
 EXACT = 1e-9
 
@@ -107,7 +107,9 @@ def test_limits_and_efforts_are_the_tables(arm):
         assert tuple(arm.model.jnt_actfrcrange[joint.id]) == pytest.approx((-link.effort, link.effort))
     assert [math.degrees(link.upper) for link in PSM_LINKS[:2]] == pytest.approx([91.0, 53.0])
     if arm.description.jaw:
-        assert arm.jaw_range == pytest.approx(JAW_RANGE)
+        # The retractor's pads are 7 mm apart at 0, 26 mm from the axis: 4 mm at the stop.
+        stop = -2.0 * math.asin(0.0015 / 0.026), 2.0 * math.radians(19.0)
+        assert arm.jaw_range == pytest.approx(JAW_RANGE if arm.description.name == "psm_grasper" else stop)
 
 
 def test_jaw_opens_both_fingers_alike():

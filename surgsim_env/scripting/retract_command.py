@@ -44,7 +44,7 @@ def retract(request: Request, console: Console) -> bool:
     if request.bimanual and request.instrument is not None:
         raise ValueError("--instrument: a bimanual retraction has the two arms of its scene; leave one of both out")
     env_id = "SurgSim/BimanualRetract-v0" if request.bimanual else "SurgSim/Retract-v0"
-    settings = {} if request.instrument is None else {"instrument": request.instrument}
+    settings: dict[str, Any] = {} if request.instrument is None else {"instrument": request.instrument}
     env = gym.make(env_id, scene=request.scene, **settings)
     folder = writable_folder(request.out, (TRACE_NAME, PLOT_NAME, PICTURE_NAME, SUMMARY_NAME))
     env.reset(seed=request.seed)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from surgsim_env.haptic_record import HapticRecord
 from surgsim_env.scripting.steps import Control, Script, Step, StepFailed
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
-from surgsim_env.scripting.view import Action, View, look
+from surgsim_env.scripting.view import Action, ScriptedTask, View, look
 from surgsim_env.scripting.wrapped_steps import MayEnd
 from surgsim_env.surgical_env import SurgicalEnv
 
@@ -41,18 +41,19 @@ def run_script(
 
     Raises:
         ScriptError: a step ran out of time or depth, or the episode ended too soon; its `trace` is what was reached.
-        TypeError: not an environment of this project, or several in one.
+        TypeError: not an environment of this project, several in one, or one whose task scripts cannot command.
         ValueError: an empty script, two steps of one name, a speed or an action beyond what the environment takes.
     """
     inner = _inner(env)
     names = _names(script)
-    _check_speeds(script, names, inner)
+    task = _scripted(inner)
+    _check_speeds(script, names, task)
     if seed is not None:
         observation, _ = env.reset(seed=seed)
     elif observation is None:
         observation = inner.observation
     with inner.simulation.recording() as record:
-        run = _Run(env, inner, record, np.asarray(observation), inner.simulation.time)
+        run = _Run(env, inner, task, record, np.asarray(observation), inner.simulation.time)
         failure = ""
         for index, (step, name) in enumerate(zip(script, names, strict=True)):
             began = inner.simulation.time
@@ -75,6 +76,7 @@ class _Run:
 
     env: gym.Env
     inner: SurgicalEnv
+    task: ScriptedTask
     record: HapticRecord
     observation: NDArray[np.floating]
     start: float
@@ -102,7 +104,11 @@ class _Run:
                 self._take(action, name, checked=not isinstance(step, Control))
                 view = self._look(began, first)
                 if self.terminated or self.truncated:
-                    meant = step.ends_episode and not self._harm() and (last or (isinstance(step, MayEnd) and self._succeeded()))
+                    meant = (
+                        step.ends_episode
+                        and not self._harm()
+                        and (last or (isinstance(step, MayEnd) and self._succeeded()))
+                    )
                     self.ended = meant
                     return "" if meant else f"{self._harm() or self._cut_short()}; {view.reached()}"
                 action = plan.send(view)
@@ -140,7 +146,7 @@ class _Run:
     def _look(self, began: float, first: int) -> View:
         simulation, touched = self.inner.simulation, self.record.first_contact(first)
         place = None if touched is None else self.record.tip_position_at(touched)
-        return look(simulation, self.inner.task, self.observation, self.inner.observation, began, place)
+        return look(simulation, self.task, self.observation, self.inner.observation, began, place)
 
     def _take(self, action: Action, name: str, *, checked: bool) -> None:
         values = np.asarray(action, dtype=np.float32)
@@ -183,6 +189,15 @@ def _inner(env: gym.Env) -> SurgicalEnv:
     return inner
 
 
+def _scripted(inner: SurgicalEnv) -> ScriptedTask:
+    if not isinstance(inner.task, ScriptedTask):
+        raise TypeError(
+            f"{type(inner.task).__name__} does not say how its actions are laid out: give it `speed_limit`, `action` "
+            "and `sensed_force`, as `ScriptedTask` asks"
+        )
+    return inner.task
+
+
 def _names(script: Sequence[Step]) -> list[str]:
     """A name for each step: its own, or its class's, from the second on with a number."""
     if not script:
@@ -201,10 +216,10 @@ def _names(script: Sequence[Step]) -> list[str]:
     return names
 
 
-def _check_speeds(script: Sequence[Step], names: Sequence[str], inner: SurgicalEnv) -> None:
+def _check_speeds(script: Sequence[Step], names: Sequence[str], task: ScriptedTask) -> None:
     for step, name in zip(script, names, strict=True):
-        if step.speed > inner.task.speed_limit * (1.0 + 1e-9):
+        if step.speed > task.speed_limit * (1.0 + 1e-9):
             raise ValueError(
                 f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
-                f"{inner.task.speed_limit:g} m/s: ask for that or less"
+                f"{task.speed_limit:g} m/s: ask for that or less"
             )

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from surgsim_env.simulation import Simulation
 Action = NDArray[np.floating]
 
 
+@runtime_checkable
 class ScriptedTask(Protocol):
     """What a script asks of a task: how its actions and observations are laid out."""
 

@@ -159,6 +159,10 @@ def test_other_environments_and_several_at_once():
         run_script(gym.make("CartPole-v1"), [Hold(0.1)])
     with pytest.raises(TypeError, match="not in several abreast"):
         run_script(gym.make_vec("CartPole-v1", num_envs=2), [Hold(0.1)])
+    silent = gym.make("SurgSim/Palpate-v0")
+    silent.unwrapped.task = object()  # type: ignore[attr-defined]
+    with pytest.raises(TypeError, match=r"object does not say how its actions are laid out.*`sensed_force`"):
+        run_script(silent, [Hold(0.1)])
     with pytest.raises(ValueError, match="no oracle is known for CartPoleEnv; there is one for PalpateEnv"):
         oracle_script(gym.make("CartPole-v1"))
 

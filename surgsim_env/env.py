@@ -9,6 +9,7 @@ from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.surgical_env import SurgicalEnv
 from surgsim_env.tasks import palpate, retract
+from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.retract import RetractTask
 
@@ -176,6 +177,80 @@ class RetractEnv(SurgicalEnv):
         super().__init__(simulation, task, render_mode=render_mode, pictures=pictures, obs_mode=obs_mode)
 
 
+class BimanualRetractEnv(SurgicalEnv):
+    """Lift a lobe with one arm and touch with the other what lay under it.
+
+    ## Description
+    The lobe of `SurgSim/Retract-v0` hides a disc on its bed. The left of two robot arms grasps the lobe and folds it
+    back; the right one reaches under it and touches the disc gently for half a second. Tissue, bed and arms press each
+    other 1000 times a second; one agent commands both arms 20 times a second. `surgsim_env.bimanual_parallel` is the
+    same for two agents.
+
+    ## Action Space
+    `Box(-1, 1, (13,), float32)`
+
+    | num | meaning | full scale |
+    |---|---|---|
+    | 0-2 | left tip's velocity along x, y, z | 20 mm/s |
+    | 3-5 | how the left tip turns | 0.5 rad/s |
+    | 6 | where the left jaw goes, at its limited speed: -1 closed, 1 open | |
+    | 7-9 | right tip's velocity | 20 mm/s |
+    | 10-12 | how the right tip turns | 0.5 rad/s |
+
+    ## Observation Space
+    `Box((74,), float32)`, all bounds finite: the 56 numbers of `SurgSim/Retract-v0` with an arm, the left one's, then
+
+    | num | meaning | bounds |
+    |---|---|---|
+    | 56-58 | right tip's position: the centre of its ball [m] | the lobe's bounding box with a margin |
+    | 59-61 | right tip's velocity [m/s] | +-0.5 |
+    | 62-67 | the right tip's x and z axes in the world | +-1 |
+    | 68-70 | tissue's force on the right arm [N], through the sensor model | +-range |
+    | 71 | force between the right arm and the bed [N] | 0 to 200 |
+    | 72 | share of the target that the organ leaves uncovered, seen from the endoscope | 0 to 1 |
+    | 73 | distance of the arms, at most 0.05 [m] | +-0.1 |
+
+    ## Rewards
+    Named terms, weighted in `surgsim_env.rewards.BIMANUAL_WEIGHTS`; `info["reward_<term>"]` shows each. What is reached
+    pays by its changes. An episode that ends in harm pays less than any that runs its time.
+
+    ## Starting State
+    That of `SurgSim/Retract-v0`, and the right tip somewhere on the free side.
+
+    ## Episode End
+    Terminated: for 0.5 s, at the end of each control step, the left jaw held tissue, the organ left at least 80 % of
+    the target uncovered as seen from the endoscope (instruments do not count), and the right tip, its centre above the
+    disc, pressed what lies under it with 0.3 to 1.0 N (success); the contact force on the tissue, or the right arm's on
+    the bed, passed the hard limit, or the jaw's pull what the tissue bears; the arms pressed each other with more than
+    2 N; the simulation came to a fault. Truncated: 600 control steps (30 s).
+
+    ## Info
+    That of `SurgSim/Retract-v0`, and `collided`, `touches` (bool), `uncovered` (share), `touch_force`,
+    `collision_force` [N].
+
+    ## Arguments
+    Those of `SurgSim/Retract-v0`; `instrument` is "psm_pair".
+
+    ## Version History
+    * v0: first version.
+    """
+
+    task: BimanualRetractTask
+
+    def __init__(
+        self,
+        scene: str = "lobe",
+        instrument: str = "psm_pair",
+        obs_mode: str = "state",
+        render_mode: str | None = None,
+        **pictures: Any,
+    ) -> None:
+        anatomy = load_anatomy(with_instrument(make_scene(scene), instrument))
+        simulation = Simulation(anatomy)
+        task = BimanualRetractTask(anatomy, simulation.instrument)
+        super().__init__(simulation, task, render_mode=render_mode, pictures=pictures, obs_mode=obs_mode)
+
+
 def register() -> None:
     """Register the environment ids with Gymnasium; importing `surgsim_env` does it."""
     if "SurgSim/Palpate-v0" in gym.registry:
@@ -188,4 +263,9 @@ def register() -> None:
     )
     gym.register(
         id="SurgSim/Retract-v0", entry_point="surgsim_env.env:RetractEnv", max_episode_steps=retract.EPISODE_STEPS
+    )
+    gym.register(
+        id="SurgSim/BimanualRetract-v0",
+        entry_point="surgsim_env.env:BimanualRetractEnv",
+        max_episode_steps=retract.EPISODE_STEPS,
     )

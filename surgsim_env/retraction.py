@@ -44,6 +44,7 @@ class Retraction:
         capsule_stiffness: range of that capsule's modulus times thickness [N/m].
         held_share: range of the share of the anchored edge, about its middle, that is held.
         camera: how the endoscope moves.
+        right_start_lower, right_start_upper: corners of the box in which the right one of two tips starts [m].
     """
 
     target_distance: Range
@@ -57,6 +58,8 @@ class Retraction:
     capsule_stiffness: Range = (1.0, 1.0)
     held_share: Range = (1.0, 1.0)
     camera: RetractionCamera = RetractionCamera()
+    right_start_lower: Vector | None = None
+    right_start_upper: Vector | None = None
 
     def __post_init__(self) -> None:
         for name in ("target_distance", "target_along", "scale", "youngs_modulus", "capsule_stiffness", "held_share"):
@@ -69,6 +72,10 @@ class Retraction:
             raise ValueError(f"retract.target_radius is {self.target_radius:g} m; it must be finite and above 0")
         if not 0.0 <= self.capsule_share <= 1.0:
             raise ValueError(f"retract.capsule_share is {self.capsule_share:g}; it must be from 0 to 1")
-        for low, high, axis in zip(self.start_lower, self.start_upper, "xyz"):
-            if not -math.inf < low <= high < math.inf:
-                raise ValueError(f"retract: the tip starts from {axis} = {low:g} to {high:g} m; give low <= high")
+        for lower, upper in (
+            (self.start_lower, self.start_upper),
+            (self.right_start_lower or (), self.right_start_upper or ()),
+        ):
+            for low, high, axis in zip(lower, upper, "xyz"):
+                if not -math.inf < low <= high < math.inf:
+                    raise ValueError(f"retract: the tip starts from {axis} = {low:g} to {high:g} m; give low <= high")

@@ -33,6 +33,23 @@ RETRACT_WEIGHTS: Mapping[str, float] = {
     "forgone": -0.015,  # each step left when it ends without success
 }
 
+# Weights of SurgSim/BimanualRetract-v0, by the same reckoning: `near` may begin as high as 1, so that the margin is
+#   -0.4 - 1 - 6 - 4 - 1 - 1 - 1 + 15  =  0.6  at least.
+BIMANUAL_WEIGHTS: Mapping[str, float] = {
+    "time": -0.005,  # each control step
+    "soft_force": -0.010,  # share of the way from the soft to the hard limit, largest of the step
+    "visible": 4.0,  # change of the share of the target that the organ leaves uncovered
+    "grasped": 1.0,  # 1 where tissue comes between the pads, -1 where it is lost
+    "near": 1.0,  # change of the right tip's nearness to the target: 1 on it, 0 from 0.1 m on
+    "touched": 1.0,  # 1 where the right tip begins to touch the target as it shall, -1 where it ends
+    "success": 10.0,  # touched, while exposed, for long enough
+    "torn": -15.0,  # a jaw pulled more than the tissue bears
+    "hard_force": -15.0,  # the hard limit was passed: a safety stop
+    "collided": -15.0,  # the arms pressed each other
+    "fault": -15.0,  # the simulation could not go on
+    "forgone": -0.015,  # each step left when it ends without success
+}
+
 
 def weighted(terms: Mapping[str, float], weights: Mapping[str, float]) -> dict[str, float]:
     """Each term times its weight, in the table's order; a term that the table lacks is our own mistake."""

@@ -3,9 +3,10 @@
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.arms.arm_instrument import ArmInstrument, is_arm
-from surgsim_env.arms.pair import PAIRS, Pair
+from surgsim_env.arms.pair import Pair
 from surgsim_env.grasper import Grasper
 from surgsim_env.instrument import Instrument, Probe, read_model
+from surgsim_env.scenes import PAIRS
 
 
 def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> Instrument:

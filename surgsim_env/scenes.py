@@ -20,6 +20,8 @@ from surgsim_env.toml_tables import fill, nearest, read_toml
 
 # Instruments carried by slides; their models are NAME.xml in scenes/instruments.
 CARTESIAN = ("probe", "grasper")
+# Instruments of two arms: what stands left and right.
+PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
 
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
@@ -340,12 +342,12 @@ def make_scene(name: str | Path) -> Scene:
 
 
 def with_instrument(scene: Scene, instrument: str | None) -> Scene:
-    """The scene with another instrument: one of CARTESIAN, an arm's name or the path of its TOML file, or its own."""
+    """The scene with another instrument: one of CARTESIAN or PAIRS, an arm, the path of one; None: its own."""
     if instrument is None:
         return scene
     if not isinstance(instrument, str | Path):
         raise ValueError(f'instrument is {instrument!r}; it must be "probe", an arm\'s name or the path of a TOML file')
-    known = [*CARTESIAN, *list_arms()]
+    known = [*CARTESIAN, *list_arms(), *PAIRS]
     if Path(instrument).suffix != ".toml" and instrument not in known:
         raise ValueError(
             f"instrument {str(instrument)!r} is unknown{nearest(str(instrument), known)}; the instruments are "

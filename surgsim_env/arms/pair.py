@@ -14,12 +14,10 @@ from surgsim_env.arms.model import LINK_GROUP, arm_spec
 from surgsim_env.arms.steering import SteeredArm, millimetres, missing, placed
 from surgsim_env.instrument import Instrument
 from surgsim_env.jaw import Jaw
-from surgsim_env.scenes import Scene
+from surgsim_env.scenes import PAIRS, Scene
 from surgsim_env.supports import SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
 from surgsim_env.tool_bodies import CONTACT_GROUP, ROUGHNESS
 
-# Instruments of two arms that a scene may name: what stands left and right.
-PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
 SIDES = ("left", "right")
 # Which geoms MuJoCo lets meet, beside supports: those of one arm meet the other's, never their own.
 ARM_BITS = {"left": 4, "right": 8}

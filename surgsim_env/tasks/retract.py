@@ -70,6 +70,8 @@ class RetractTask:
         self.limits = scene.limits
         self.turning_size = instrument.turning_size
         self.action_size = 3 + self.turning_size + 1
+        # Where an action has the jaw's target.
+        self.jaw_place = 3 + self.turning_size
         sensor = scene.sensor
         self.force_reading = ForceReading(sensor)
         self.torque_reading = ForceReading(
@@ -174,8 +176,11 @@ class RetractTask:
         """Set the tip's velocity and turning, and the jaw's target."""
         turning = action[3:-1] * TURNING_FULL_SCALE if self.turning_size else None
         instrument.command_velocity(action[:3] * SPEED_FULL_SCALE, turning)
-        # Actions may leave [-1, 1] by rounding, a jaw's target may not.
-        self.jaw_target = min(max(float(action[-1]), -1.0), 1.0)
+        self.command_jaw(float(action[-1]), instrument)
+
+    def command_jaw(self, target: float, instrument: Instrument) -> None:
+        """Set the jaw's target from -1 to 1; actions may leave that by rounding, the jaw's own command may not."""
+        self.jaw_target = min(max(target, -1.0), 1.0)
         instrument.command_jaw(self.jaw_target)
 
     def begin(self, action: FloatArray) -> None:
@@ -237,12 +242,12 @@ class RetractTask:
             terminated=terminated,
             truncated=not terminated and self.step_count >= EPISODE_STEPS,
             rewards=weighted(terms, self.weights),
-            info={**self._info(grasp, force_peak, harm), "success": success},
+            info={**self._info(simulation, grasp, force_peak, harm), "success": success},
         )
 
     def blank_info(self) -> dict[str, InfoValue]:
         """The info of a reset: the same keys and types as a verdict's."""
-        return {**self._info(None, 0.0, ""), "success": False}
+        return {**self._info(None, None, 0.0, ""), "success": False}
 
     def get_state(self) -> str:
         """Draw, biases, counters and measures as JSON, exact."""
@@ -329,7 +334,9 @@ class RetractTask:
         duration = self.anatomy.scene.timing.control_step
         self.record.note(grasp, simulation.pull_peak, tip, strain, self.jaw_target < 0.0, duration)
 
-    def _info(self, grasp: Grasp | None, force_peak: float, harm: str) -> dict[str, InfoValue]:
+    def _info(
+        self, simulation: Simulation | None, grasp: Grasp | None, force_peak: float, harm: str
+    ) -> dict[str, InfoValue]:
         return {
             "force_peak": force_peak,
             "hard_limit": harm == "hard_force",

@@ -19,10 +19,11 @@ CASES = [(env_id, {}) for env_id in IDS] + [("SurgSim/Palpate-v0", {"instrument"
 SCENES = {
     "SurgSim/Palpate-v0": ("phantom", "[12, 12, 6]", "[6, 6, 3]"),
     "SurgSim/Retract-v0": ("lobe", "[20, 13, 3]", "[20, 13, 2]"),
+    "SurgSim/BimanualRetract-v0": ("lobe", "[20, 13, 3]", "[20, 13, 2]"),
 }
 # Entries of an observation that a walk of some steps leaves as they are: the axis of a wrist that is a hinge, what is
 # grasped and what is seen.
-STILL = {"SurgSim/Retract-v0": {6, 7, 8, 9, 19, 21, 52}}
+STILL = {"SurgSim/Retract-v0": {6, 7, 8, 9, 19, 21, 52}, "SurgSim/BimanualRetract-v0": {19, 21, 52, 71, 72}}
 
 
 @pytest.fixture(params=CASES, ids=lambda case: "-".join([case[0], *case[1].values()]))

@@ -9,7 +9,8 @@ def walk(env, rng):
         action = rng.uniform(-0.5, 0.5, env.action_space.shape)
         if "Retract" in env.spec.id:
             action[1] = 0.4 * action[1] - 0.8  # towards the free edge
-            action[-1] -= 0.5  # the jaw nearly closed, so that it does not pass above and below the lobe
+            # The jaw nearly closed, so that it does not pass above and below the lobe.
+            action[env.unwrapped.task.jaw_place] -= 0.5
         else:
             action[2] -= 0.3  # press
         yield action.astype(np.float32)

@@ -49,7 +49,18 @@ ALLOCATING = {
     *("zeros_like", "ones_like", "empty_like", "full_like", "copy", "concatenate", "stack", "vstack", "hstack"),
     *("column_stack", "cross", "outer", "append", "repeat", "tile", "where", "nonzero", "unique", "astype", "flatten"),
 }
-HEAVY = {"PIL", "matplotlib", "meshio", "sb3_contrib", "skfem", "stable_baselines3", "torch", "trimesh", "tyro"}
+HEAVY = {
+    "PIL",
+    "matplotlib",
+    "meshio",
+    "pettingzoo",
+    "sb3_contrib",
+    "skfem",
+    "stable_baselines3",
+    "torch",
+    "trimesh",
+    "tyro",
+}
 
 
 class Source(NamedTuple):

@@ -1,0 +1,172 @@
+"""SurgSim/BimanualRetract-v0: what counts as touched and exposed, what ends it, what it pays and refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.arms.pair import Pair
+from surgsim_env.env import BimanualRetractEnv
+from surgsim_env.grasp import Grasp
+from surgsim_env.rewards import BIMANUAL_WEIGHTS
+from surgsim_env.scenes import make_scene, with_instrument
+from surgsim_env.simulation import Simulation
+from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
+from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE
+
+HELD = Grasp(opening=0.01, grip_force=0.4, pull_force=0.1, friction_left=0.2, holds=True)
+EMPTY = Grasp(opening=0.02, grip_force=0.0, pull_force=0.0, friction_left=0.0, holds=False)
+
+
+@pytest.fixture(scope="module")
+def shared():
+    return BimanualRetractEnv()
+
+
+@pytest.fixture
+def env(shared):
+    shared.reset(seed=1)
+    return shared
+
+
+class Told:
+    """A task's verdicts on what it is told was felt; nothing moves."""
+
+    def __init__(self, env, monkeypatch):
+        self.task, self.simulation = env.task, env.simulation
+        self.returned, self.holds, self.place, self.uncovered, self.force, self.collision = (
+            0.0,
+            True,
+            0.0,
+            1.0,
+            0.5,
+            0.0,
+        )
+        monkeypatch.setattr(self.task, "_grasp", lambda _: HELD if self.holds else EMPTY)
+        monkeypatch.setattr(self.task, "_feel", self._feel)
+        monkeypatch.setattr(self.task, "_from_target", lambda _: np.array([self.place, 0.0, 0.0]))
+        monkeypatch.setattr(Pair, "collision_force", property(lambda _: self.collision))
+
+    def _feel(self, _):
+        self.task.uncovered_share, self.task.touch_force = self.uncovered, self.force
+
+    def step(self, count=1, force_peak=0.0, fault="", **told):
+        for name, value in {
+            "holds": True,
+            "place": 0.0,
+            "uncovered": 1.0,
+            "force": 0.5,
+            "collision": 0.0,
+            **told,
+        }.items():
+            setattr(self, name, value)
+        for _ in range(count):
+            self.task.begin(np.zeros(13))
+            self._feel(None)
+            verdict = self.task.judge(self.simulation, force_peak, fault)
+            self.returned += sum(verdict.rewards.values())
+        return verdict
+
+
+@pytest.fixture
+def told(env, monkeypatch):
+    return Told(env, monkeypatch)
+
+
+def test_success_is_a_gentle_touch_of_the_exposed_target_for_half_a_second(told):
+    assert not told.step(9).terminated
+    verdict = told.step()
+    assert verdict.terminated and verdict.info["success"] and verdict.rewards["success"] == 10.0
+
+
+@pytest.mark.parametrize(
+    "missing", [{"holds": False}, {"uncovered": 0.79}, {"force": 0.29}, {"force": 1.01}, {"place": 0.0081}]
+)
+def test_nothing_of_it_may_be_missing(told, missing):
+    """Neither all the time nor in one step of ten."""
+    assert not told.step(20, **missing).info["success"]
+    told.step(9)
+    assert not told.step(**missing).terminated
+    assert not told.step(9).terminated
+    assert told.step().info["success"]
+
+
+@pytest.mark.parametrize(
+    ("harm", "key"),
+    [
+        ({"collision": 2.1}, "collided"),
+        ({"force": 2.1}, "hard_limit"),
+        ({"force_peak": 2.1}, "hard_limit"),
+        ({"fault": "told so"}, None),
+    ],
+)
+def test_harm_ends_it_and_is_named(told, harm, key):
+    told.step(9)
+    verdict = told.step(**harm)
+    assert verdict.terminated and not verdict.info["success"]
+    assert key is None or verdict.info[key]
+
+
+def test_the_weights_put_every_failure_below_every_full_episode():
+    """The inequality of the table's comment."""
+    w = BIMANUAL_WEIGHTS
+    gains = w["visible"] + w["grasped"] + w["near"] + w["touched"]
+    assert w["forgone"] == pytest.approx(w["time"] + w["soft_force"])
+    for failure in ("torn", "hard_force", "collided", "fault"):
+        assert -HIDDEN_SHARE * w["visible"] - w["near"] + EPISODE_STEPS * w["soft_force"] - gains - w[failure] > 0.5
+
+
+@pytest.mark.parametrize("harm", [{"collision": 9.0}, {"force": 9.0}, {"force_peak": 9.0}, {"fault": "told so"}])
+def test_no_failed_episode_returns_more_than_the_worst_full_one(told, harm):
+    start = {"visible": HIDDEN_SHARE, "grasped": 0.0, "near": 1.0, "touched": 0.0}
+    told.task._reached = dict(start)
+    lost = {"holds": False, "uncovered": 0.0, "place": 1.0, "force": 0.0}
+    assert told.step(EPISODE_STEPS, force_peak=told.task.force_limit, **lost).truncated
+    worst, told.returned = told.returned, 0.0
+    for steps in (1, 5, 300, 600):
+        told.task.reset(np.random.default_rng(0))
+        told.task._reached, told.returned = dict.fromkeys(start, 0.0), 0.0
+        for step in range(steps - 1):
+            told.step(force=0.0 if step % 9 == 8 else 0.5)
+        assert told.step(**harm).terminated
+        assert told.returned < worst
+
+
+def test_both_arms_go_as_told_and_only_the_left_jaw_closes(env):
+    pair = env.simulation.instrument
+    tips = [pair.arms[side].tip_position for side in ("left", "right")]
+    action = env.task.action(np.array([0.0, 0.004, 0.0]), jaw=-1.0, right=np.array([0.002, 0.0, 0.004]))
+    assert action.shape == (13,)
+    for _ in range(10):
+        observation = env.step(action.astype(np.float32))[0]
+    moved = [pair.arms[side].tip_position - tip for side, tip in zip(("left", "right"), tips)]
+    np.testing.assert_allclose(moved[0], [0.0, 0.002, 0.0], atol=2e-4)
+    np.testing.assert_allclose(moved[1], [0.001, 0.0, 0.002], atol=2e-4)
+    np.testing.assert_allclose(observation[56:59], pair.arms["right"].tip_position, atol=1e-7)
+    assert observation[12] < 0.010 and observation[73] == pytest.approx(pair.distance, abs=1e-6)
+
+
+def test_a_touch_beside_the_lobe_is_felt(env):
+    """The right tip driven into the bare bed: its force is told, and no tissue is."""
+    left = env.simulation.instrument.arms["left"].tip_position
+    radius = env.scene.instrument.tip_radius
+    env.simulation.restart(np.stack([left, [0.105, 0.020, radius + 0.001]]))
+    for _ in range(40):
+        action = env.task.action(np.zeros(3), right=np.array([0.0, 0.0, -0.002])).astype(np.float32)
+        observation, _, terminated, _, info = env.step(action)
+        if info["touch_force"] > 0.2:
+            break
+    assert not terminated and 0.2 < info["touch_force"] < 1.5 and not info["touches"]
+    assert observation[71] == pytest.approx(info["touch_force"], rel=1e-6)
+
+
+def test_one_arm_and_scenes_for_one_are_refused():
+    with pytest.raises(ValueError, match="is one arm, and two are needed"):
+        BimanualRetractEnv(instrument="grasper")
+    scene = with_instrument(make_scene("lobe"), "psm_pair")
+    assert scene.retract is not None
+    anatomy = load_anatomy(replace(scene, retract=replace(scene.retract, right_start_lower=None)))
+    with pytest.raises(ValueError, match="two hands need"):
+        BimanualRetractTask(anatomy, Simulation(anatomy).instrument)

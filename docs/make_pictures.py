@@ -1,4 +1,4 @@
-"""Make the pictures of the README and docs/scripting.md: python docs/make_pictures.py (about a minute)."""
+"""Make the pictures of README, docs/scripting.md and docs/retraction.md: python docs/make_pictures.py (a minute)."""
 
 from pathlib import Path
 
@@ -13,8 +13,9 @@ from surgsim_env.palpation.job import run_palpation
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scenes import make_scene
-from surgsim_env.scripting import Hold, Lift, MoveTo, PressUntil, run_script
+from surgsim_env.scripting import Hold, Lift, MoveTo, PressUntil, oracle_script, run_script
 from surgsim_env.simulation import Simulation
+from surgsim_env.surgical_env import SurgicalEnv
 
 IMAGES = Path(__file__).parent / "images"
 # Options and camera of each quarter of the picture of the views.
@@ -54,10 +55,29 @@ def write_trace(path: Path) -> None:
     run_script(gym.make("SurgSim/Palpate-v0", scene="phantom"), script, seed=0).plot(path)
 
 
+def write_retraction(path: Path) -> None:
+    """The oracle's retraction of a lobe at rest, grasped and folded back, from above and through the endoscope."""
+    env = gym.make("SurgSim/Retract-v0", width=1280, height=960)
+    env.reset(seed=4)
+    inner = env.unwrapped
+    assert isinstance(inner, SurgicalEnv)
+    *approach, lift, fold, wait = oracle_script(env)
+    columns = []
+    for part in ([], approach, [lift, fold, wait]):
+        if part:
+            run_script(env, part)
+        shots = [Image.fromarray(inner.renderer.rgb(camera)) for camera in ("overview", "endoscope")]
+        small = [np.asarray(shot.resize((400, 300), Image.Resampling.LANCZOS)) for shot in shots]
+        columns.append(np.concatenate(small))
+    Image.fromarray(np.concatenate(columns, axis=1)).save(path, optimize=True)
+    env.close()
+
+
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     write_trace(IMAGES / "trace.png")
     write_views(IMAGES / "views.png")
+    write_retraction(IMAGES / "retraction.png")
     palpation = run_palpation(load_anatomy(make_scene("liver")), console=Console())
     write_organ_picture(palpation, IMAGES / "palpation.png")
 

@@ -46,8 +46,8 @@ TIP_LENGTH = {"palpator": 0.020, "grasper": 0.0102, "retractor": 0.026}  # beyon
 # The retractor's pads: half their width, thickness and length; half the gap at which they are parallel [m].
 PAD_HALF, PARALLEL_GAP = (0.007, 0.0025, 0.008), 0.0035
 # From 4 mm between the pads' middles to 24 mm [rad]; how hard a pad closes, at its middle [N].
-PAD_RANGE = (-math.asin((PARALLEL_GAP - 0.002) / TIP_LENGTH["retractor"]), math.radians(19.0))
-PAD_FORCE = 0.5
+PAD_RANGE = (-math.asin((PARALLEL_GAP - 0.00275) / TIP_LENGTH["retractor"]), math.radians(19.0))
+PAD_FORCE = 0.4
 # Serrated: this times the contact law's coefficient of friction.
 PAD_ROUGHNESS = 5.0
 # Keeps the jaw's middle where the wrist is: 0.3 N at the pads shift it by 0.2 mm [N m/rad, N m s/rad].

@@ -7,7 +7,8 @@ import numpy as np
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
-from surgsim_env.env import PalpateEnv, RetractEnv
+from surgsim_env.env import BimanualRetractEnv, PalpateEnv, RetractEnv
+from surgsim_env.scripting.bimanual_oracle import bimanual_steps
 from surgsim_env.scripting.retract_oracle import retraction_steps
 from surgsim_env.scripting.steps import AwaitEnd, Declare, Hold, MoveTo, PressUntil, Step
 
@@ -17,6 +18,8 @@ GENTLE_SHARE = 0.4
 TRAVEL_GAP = 0.004
 # A lobe is carried no farther once enough of the target was seen for so many control steps.
 SEEN_STEPS = 5
+# With two arms, once the organ leaves so much of it uncovered.
+OPEN_SHARE = 2.0
 # Tissue this far beside the ball's way counts as under it [m].
 CORRIDOR = 0.004
 
@@ -70,8 +73,22 @@ def retract_oracle(env: RetractEnv) -> list[Step]:
     ]
 
 
+def bimanual_oracle(env: BimanualRetractEnv) -> list[Step]:
+    """Fold the lobe back with the left arm, reach under it with the right one and press on the target."""
+    task, radius = env.task, env.simulation.anatomy.scene.instrument.tip_radius
+    if task.target is None:
+        raise ValueError("the oracle touches the target of an episode, and none has begun: call env.reset(seed=...)")
+    return bimanual_steps(
+        env.simulation, task.target.centre, task.turning_size, radius, lambda _: task.uncovered_share >= OPEN_SHARE
+    )
+
+
 # An oracle for each environment.
-ORACLES: dict[type, Callable[..., list[Step]]] = {PalpateEnv: palpate_oracle, RetractEnv: retract_oracle}
+ORACLES: dict[type, Callable[..., list[Step]]] = {
+    PalpateEnv: palpate_oracle,
+    RetractEnv: retract_oracle,
+    BimanualRetractEnv: bimanual_oracle,
+}
 
 
 def _travel_height(anatomy: Anatomy, start: FloatArray, end: FloatArray) -> float:

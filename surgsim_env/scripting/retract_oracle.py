@@ -31,7 +31,13 @@ APPROACH_SPEED, CARRYING_SPEED = 0.015, 0.015
 
 
 def retraction_steps(
-    simulation: Simulation, target: FloatArray, turning_size: int, enough: Predicate, *, aside: float = 0.0
+    simulation: Simulation,
+    target: FloatArray,
+    turning_size: int,
+    enough: Predicate,
+    *,
+    aside: float = 0.0,
+    fold: float = 1.0,
 ) -> list[Step]:
     """Grasp the free edge beside a target [m] (3,) and fold it back; the lobe as it rests now.
 
@@ -41,6 +47,7 @@ def retraction_steps(
         enough: whether the target is seen well enough to carry the lobe no farther.
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
         aside: how far beside the target the edge is grasped, along x [m].
+        fold: share of the second way, on which the lifted edge is folded back.
     """
     rest, nodes = simulation.organ_model.node_rest_position, simulation.organ_state.node_position
     depth = float(rest[:, 1].max())
@@ -51,8 +58,9 @@ def retraction_steps(
     bed = _reach_of_supports(simulation.anatomy.scene.supports, border)
     grasp = (along, max(border - GRASP_DEPTH, bed + SUPPORT_GAP + PAD_REACH), height)
     waiting = (along, border + WAITING_GAP, height)
-    turns = [_turn(angle, turning_size) for angle in TURNS]
-    risen, folded = ((along, share[0] * depth, height + share[1] * depth) for share in (RISEN, FOLDED))
+    turns = [_turn(angle, turning_size) for angle in (TURNS[0], fold * TURNS[1])]
+    shares = np.array([RISEN, np.array(RISEN) + fold * np.subtract(FOLDED, RISEN)])
+    risen, folded = ((along, y * depth, height + z * depth) for y, z in shares.tolist())
     return [
         MoveTo(waiting, tolerance=0.001, name="wait before it"),
         MoveTo(grasp, APPROACH_SPEED, name="go around the edge"),

@@ -80,8 +80,9 @@ class View:
 
         A jaw stays as it was last told (`jaw=-1.0` closes it); of several arms the others stay where they are.
         """
-        if self.arm:
-            commands = {"arm": self.arm, **commands}
+        if self.arm == "right":
+            own = {f"right_{name}": value for name, value in commands.items()}
+            return self.task.action(np.zeros(3), right=velocity, **own)
         return self.task.action(velocity, **commands)
 
     def still(self, **commands: Any) -> Action:

@@ -56,8 +56,8 @@ def test_the_arms_are_apart_where_they_work(pair: Pair):
         assert pair.distance > 0.004, target
 
 
-@pytest.mark.parametrize("model", ["grasper.xml", "psm_retractor"])
-def test_a_jaw_gets_around_the_edge_that_stands_over(model: str):
+@pytest.mark.parametrize(("model", "force"), [("grasper.xml", 0.5), ("psm_retractor", 0.4)])
+def test_a_jaw_gets_around_the_edge_that_stands_over(model: str, force: float):
     """Open, level, one pad above and one below the edge of the lobe at rest: nothing touches anything."""
     one = Simulation(lobe(model, port=LEFT_PORT))
     edge = one.organ_state.node_position[one.organ_model.node_rest_position[:, 1] > 0.0519]
@@ -69,7 +69,7 @@ def test_a_jaw_gets_around_the_edge_that_stands_over(model: str):
     for _ in range(14):
         one.control_step(50)
         assert one.end_control_step(), one.fault
-    assert one.grasp.holds and one.grasp.grip_force == pytest.approx(0.5, rel=0.2)
+    assert one.grasp.holds and one.grasp.grip_force == pytest.approx(force, rel=0.2)
 
 
 def test_a_ball_that_touches_the_bed_tells_its_force():

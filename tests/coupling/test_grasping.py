@@ -12,7 +12,7 @@ from tests.coupling.slab import HOLD, slab
 
 JAWS = ["grasper.xml", "psm_retractor"]
 # Force of each pad [N]: the range of its joint, over the lever of the pad's middle.
-PAD_FORCE = 0.5
+PAD_FORCE = {"grasper.xml": 0.5, "psm_retractor": 0.4}
 
 
 def simulation(model: str, *, compiled: bool = True) -> Simulation:
@@ -56,11 +56,11 @@ def test_a_closed_jaw_grips_with_its_joints_force(model: str):
     grasp = one.grasp
     print(f"\n{model}: {grasp}")
     assert grasp.holds
-    assert grasp.grip_force == pytest.approx(PAD_FORCE, rel=0.05)
+    assert grasp.grip_force == pytest.approx(PAD_FORCE[model], rel=0.05)
     assert 0.002 < grasp.opening < 0.012
     # Nobody pulls, but the squeezed slab grows away from its wall and drags the pads along, as far as they stick.
-    assert grasp.pull_force < 0.4 * PAD_FORCE
-    assert grasp.friction_left > 1.2 * one.contact.friction * 4.0 * PAD_FORCE
+    assert grasp.pull_force < 0.4 * PAD_FORCE[model]
+    assert grasp.friction_left > 1.2 * one.contact.friction * 4.0 * PAD_FORCE[model]
     one.instrument.command_jaw(1.0)
     run(one, 20)
     assert one.grasp.opening > 0.018

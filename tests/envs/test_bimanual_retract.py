@@ -36,32 +36,24 @@ class Told:
 
     def __init__(self, env, monkeypatch):
         self.task, self.simulation = env.task, env.simulation
-        self.returned, self.holds, self.place, self.uncovered, self.force, self.collision = (
-            0.0,
-            True,
-            0.0,
-            1.0,
-            0.5,
-            0.0,
-        )
+        self.returned = 0.0
+        self._tell({})
         monkeypatch.setattr(self.task, "_grasp", lambda _: HELD if self.holds else EMPTY)
         monkeypatch.setattr(self.task, "_feel", self._feel)
         monkeypatch.setattr(self.task, "_from_target", lambda _: np.array([self.place, 0.0, 0.0]))
         monkeypatch.setattr(Pair, "collision_force", property(lambda _: self.collision))
 
+    def _tell(self, told):
+        """What is felt from now on: all as success asks, but for what is told."""
+        usual = {"holds": True, "place": 0.0, "uncovered": 1.0, "force": 0.5, "collision": 0.0}
+        for name, value in {**usual, **told}.items():
+            setattr(self, name, value)
+
     def _feel(self, _):
         self.task.uncovered_share, self.task.touch_force = self.uncovered, self.force
 
     def step(self, count=1, force_peak=0.0, fault="", **told):
-        for name, value in {
-            "holds": True,
-            "place": 0.0,
-            "uncovered": 1.0,
-            "force": 0.5,
-            "collision": 0.0,
-            **told,
-        }.items():
-            setattr(self, name, value)
+        self._tell(told)
         for _ in range(count):
             self.task.begin(np.zeros(13))
             self._feel(None)
@@ -160,6 +152,7 @@ def test_a_touch_beside_the_lobe_is_felt(env):
             break
     assert not terminated and 0.2 < info["touch_force"] < 1.5 and not info["touches"]
     assert observation[71] == pytest.approx(info["touch_force"], rel=1e-6)
+    assert info["touch_force"] == env.simulation.instrument.touch_force("right", "bed")
 
 
 def test_one_arm_and_scenes_for_one_are_refused():

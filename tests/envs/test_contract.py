@@ -13,8 +13,11 @@ from surgsim_env.scene_files import scenes_folder
 from tests.envs.walks import rollout
 
 IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
-# Every id with its scene's own instrument, and the palpation with an arm.
-CASES = [(env_id, {}) for env_id in IDS] + [("SurgSim/Palpate-v0", {"instrument": "psm_palpator"})]
+# Every id with its scene's own instrument, and some with an arm.
+CASES = [(env_id, {}) for env_id in IDS] + [
+    ("SurgSim/Palpate-v0", {"instrument": "psm_palpator"}),
+    ("SurgSim/Retract-v0", {"instrument": "psm_retractor"}),
+]
 # The scene that an id has by default, its number of cells, and fewer.
 SCENES = {
     "SurgSim/Palpate-v0": ("phantom", "[12, 12, 6]", "[6, 6, 3]"),

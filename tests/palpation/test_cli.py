@@ -162,7 +162,7 @@ def test_help(arguments, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "palpate, organ, scenes"),
+        ([], "palpate, retract, organ, scenes"),
         (["palpat"], "palpat"),
         (["palpate", "--sceen", "liver"], "--sceen"),
         (["palpate", "--seed", "x"], "--seed"),

@@ -21,6 +21,13 @@ def test_python_example_runs_and_is_short(capsys):
     assert re.search(r"contact force \[.*\] N, largest 0\.\d\d N", capsys.readouterr().out)
 
 
+def test_retraction_example_runs(capsys):
+    (code,) = (example for example in EXAMPLES if "Retract-v0" in example)
+    exec(compile(code, "README.md", "exec"), {})
+    grip, pull, seen = re.findall(r"[\d.]+", capsys.readouterr().out)
+    assert 0.3 < float(grip) < 0.6 and 0.1 < float(pull) < 1.0 and float(seen) >= 80
+
+
 def test_video_example_runs_and_writes_a_video(tmp_path, monkeypatch):
     (code,) = (example for example in EXAMPLES if "RecordVideo" in example)
     pytest.importorskip("moviepy", reason="needs the `video` extra")

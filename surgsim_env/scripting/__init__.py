@@ -16,6 +16,7 @@ from surgsim_env.scripting.steps import (
     StepFailed,
     WaitUntil,
 )
+from surgsim_env.scripting.support_steps import PressSupport
 from surgsim_env.scripting.trace import StepInterval, Trace
 from surgsim_env.scripting.view import View
 from surgsim_env.scripting.wrapped_steps import MayEnd, OfArm, Until
@@ -31,6 +32,7 @@ __all__ = [
     "MoveTo",
     "OfArm",
     "OpenJaw",
+    "PressSupport",
     "PressUntil",
     "Script",
     "ScriptError",

@@ -46,6 +46,14 @@ def test_the_other_examples_run(tmp_path, monkeypatch, capsys):
     assert {path.name for path in tmp_path.iterdir()} == {"run.csv", "run_control.csv", "run.png"}
 
 
+def test_the_guide_to_retraction_runs(capsys):
+    text = (ROOT / "docs" / "retraction.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.S)
+    exec(compile(code, "docs/retraction.md", "exec"), {})
+    grip, pull, left = map(float, re.findall(r"[\d.]+", capsys.readouterr().out))
+    assert 0.3 < grip < 0.6 and pull < 0.3 and left > 0.2
+
+
 def test_every_step_and_every_name_of_the_view_is_there():
     steps = re.findall(r"^\| `(\w+)\(", DOCS, flags=re.M)
     assert len(steps) == 11 and all(hasattr(surgsim_env.scripting, name) for name in steps)

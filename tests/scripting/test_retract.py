@@ -12,6 +12,7 @@ from surgsim_env.scripting import (
     Hold,
     MayEnd,
     MoveTo,
+    OfArm,
     OpenJaw,
     PressUntil,
     ScriptError,
@@ -86,20 +87,25 @@ def test_only_a_step_that_may_end_in_success_does(env):
     assert run_script(env, oracle_script(env)).info["success"]
 
 
-@pytest.mark.parametrize("instrument", [None, "psm_retractor"])
-def test_oracle_retracts(instrument):
-    check_oracle(instrument, range(2))
+@pytest.mark.parametrize(
+    ("env_id", "instrument"), [("Retract", "grasper"), ("Retract", "psm_retractor"), ("BimanualRetract", "psm_pair")]
+)
+def test_oracle_retracts(env_id, instrument):
+    check_oracle(env_id, instrument, range(1))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("instrument", "seeds"), [(None, 100), ("psm_retractor", 30)])
-def test_oracle_retracts_on_many_seeds(instrument, seeds):
-    check_oracle(instrument, range(seeds))
+@pytest.mark.parametrize(
+    ("env_id", "instrument", "seeds"),
+    [("Retract", "grasper", 100), ("Retract", "psm_retractor", 30), ("BimanualRetract", "psm_pair", 100)],
+)
+def test_oracle_retracts_on_many_seeds(env_id, instrument, seeds):
+    check_oracle(env_id, instrument, range(seeds))
 
 
-def check_oracle(instrument, seeds):
+def check_oracle(env_id, instrument, seeds):
     """At least 95 % of the seeds succeed, none comes to a fault; the target was hidden when they began."""
-    env = gym.make("SurgSim/Retract-v0", **({} if instrument is None else {"instrument": instrument}))
+    env = gym.make(f"SurgSim/{env_id}-v0", instrument=instrument)
     failed = []
     for seed in seeds:
         env.reset(seed=seed)
@@ -115,8 +121,10 @@ def check_oracle(instrument, seeds):
 
 
 @pytest.mark.slow
-def test_random_actions_do_not_retract(env):
+@pytest.mark.parametrize("env_id", ["Retract", "BimanualRetract"])
+def test_random_actions_do_not_retract(env_id):
     """At most 5 % of the seeds."""
+    env = gym.make(f"SurgSim/{env_id}-v0")
     env.action_space.seed(0)
     successes = 0
     for seed in range(20):
@@ -157,6 +165,20 @@ def test_pressing_at_the_speed_limit_neither_tunnels_nor_rings(env):
     last = trace.between("rest").force_size[-300:]
     assert np.ptp(last) < 0.02 * last.mean()
     assert not trace.info["sim_fault"]
+
+
+def test_steps_of_one_arm_leave_the_other_where_it_is():
+    """Its tip goes 20 mm up; the other one stays to 10 um, and a third arm is not there."""
+    env = gym.make("SurgSim/BimanualRetract-v0")
+    env.reset(seed=0)
+    arms = env.unwrapped.simulation.instrument.arms
+    places = {side: arm.tip_position for side, arm in arms.items()}
+    goal = tuple((places["right"] + [0.0, 0.0, 0.02]).tolist())
+    run_script(env, [OfArm(MoveTo(goal), "right"), OfArm(Hold(0.2), "left")])
+    assert arms["right"].tip_position == pytest.approx(goal, abs=1e-3)
+    assert arms["left"].tip_position == pytest.approx(places["left"], abs=1e-5)
+    with pytest.raises(ValueError, match=r"arm 'middle' is not there; the arms are left, right"):
+        run_script(env, [OfArm(Hold(0.1), "middle")])
 
 
 def test_command_retracts_and_writes(tmp_path, capsys):

@@ -81,8 +81,8 @@ class View:
         A jaw stays as it was last told (`jaw=-1.0` closes it); of several arms the others stay where they are.
         """
         if self.arm == "right":
-            own = {f"right_{name}": value for name, value in commands.items()}
-            return self.task.action(np.zeros(3), right=velocity, **own)
+            own = {"right": velocity, **{f"right_{name}": value for name, value in commands.items()}}
+            return self.task.action(np.zeros(3), **own)
         return self.task.action(velocity, **commands)
 
     def still(self, **commands: Any) -> Action:

@@ -63,7 +63,7 @@ def test_each_tip_follows_its_own_line():
     assert not one.instrument.workspace_limited
     one.instrument.arms["left"].command_jaw(-1.0)
     run(one, 12)
-    assert one.instrument.opening == pytest.approx(0.004, abs=2e-4)
+    assert one.instrument.opening == pytest.approx(0.0055, abs=2e-4)
     with pytest.raises(ValueError, match=r"psm_palpator.* has no jaw: it carries a palpator"):
         one.instrument.arms["right"].command_jaw(0.0)
 

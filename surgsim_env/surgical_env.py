@@ -75,6 +75,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self.observation_space = gym.spaces.Box(self._low, self._high, dtype=np.float32)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (task.action_size,), dtype=np.float32)
         self._observation = np.zeros(self._low.shape, dtype=np.float32)
+        # What the eye saw when the numbers were taken; None until it is asked for.
+        self._picture: NDArray[np.uint8] | None = None
         # What the last step was told, after what wrappers made of it.
         self.last_action = np.zeros(task.action_size)
         self._begun = False
@@ -87,7 +89,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
         self._draw()
         values, saturated = self.task.observe(self.simulation, self.np_random)
-        self._observation = values.astype(np.float32)
+        self._take(values)
         self._begun = self._running = True
         rewards = dict.fromkeys(self.task.weights, 0.0)
         info = self._info("", saturated, self.task.blank_info(), rewards)
@@ -121,7 +123,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             values, saturated = self.task.observe(self.simulation, self.np_random)
             fault = self.simulation.fault or self._out_of_bounds(values)
             if not fault:
-                self._observation = values.astype(np.float32)
+                self._take(values)
         verdict = self.task.judge(self.simulation, force_peak, fault)
         self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
@@ -159,6 +161,11 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def observation(self) -> Observation:
         """The last observation that reset or step gave."""
         return self._observed()
+
+    @property
+    def task_observation(self) -> NDArray[np.float32]:
+        """The task's own numbers of that moment, whatever obs_mode observes."""
+        return self._observation.copy()
 
     def close(self) -> None:
         """Close the window and give back the graphics; more than once is no harm."""
@@ -213,7 +220,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             raise
         self.simulation.set_state(organ, arrays)
         self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
-        self._observation = arrays["observation"]
+        self._take(arrays["observation"])
         self._begun, self._running = True, bool(arrays["running"])
 
     def _draw(self) -> None:
@@ -228,11 +235,17 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             "narrow the ranges of the scene's draw"
         )
 
+    def _take(self, values: NDArray[np.floating]) -> None:
+        """Take the task's numbers as the last observation; its picture is of this moment too."""
+        self._observation, self._picture = values.astype(np.float32), None
+
     def _observed(self) -> Observation:
         """The last observation, as obs_mode has it."""
-        if self._eye is not None:
-            return self._eye.frame(self._shown())
-        return self._observation.copy()
+        if self._eye is None:
+            return self._observation.copy()
+        if self._picture is None:
+            self._picture = self._eye.frame(self._shown())
+        return self._picture.copy()
 
     def _shown(self) -> Shown:
         if not self._begun:

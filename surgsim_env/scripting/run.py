@@ -146,7 +146,7 @@ class _Run:
     def _look(self, began: float, first: int) -> View:
         simulation, touched = self.inner.simulation, self.record.first_contact(first)
         place = None if touched is None else self.record.tip_position_at(touched)
-        return look(simulation, self.task, self.observation, self.inner.observation, began, place)
+        return look(simulation, self.task, self.observation, self.inner.task_observation, began, place)
 
     def _take(self, action: Action, name: str, *, checked: bool) -> None:
         values = np.asarray(action, dtype=np.float32)

@@ -4,6 +4,9 @@ import csv
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from surgsim_env.scripting.trace import Trace
 
 POSE_COLUMNS = ("tip_x_m", "tip_y_m", "tip_z_m", "tip_qw", "tip_qx", "tip_qy", "tip_qz")
@@ -39,25 +42,30 @@ def haptic_rows(trace: Trace) -> Iterable[list]:
 
 
 def control_columns(trace: Trace) -> list[str]:
-    """Time, step, each entry of observation and action, reward, and the info's entries by their names."""
-    observation = [f"observation_{index}" for index in range(trace.observation.shape[1])]
+    """Time, step, each entry of observation (pictures are left out) and action, reward, and the info's by their names."""
+    observation = [f"observation_{index}" for index in range(_numbers(trace).shape[1])]
     action = [f"action_{index}" for index in range(trace.action.shape[1])]
     return ["time_s", "step", *observation, *action, "reward", *sorted(trace.info)]
 
 
 def control_rows(trace: Trace) -> Iterable[list]:
     """One row a control step."""
-    names, keys = trace.step_names(trace.control_time), sorted(trace.info)
+    names, keys, numbers = trace.step_names(trace.control_time), sorted(trace.info), _numbers(trace)
     for row, time in enumerate(trace.control_time.tolist()):
         info = [trace.infos[row].get(key, "") for key in keys]
         yield [
             time,
             names[row],
-            *trace.observation[row].tolist(),
+            *numbers[row].tolist(),
             *trace.action[row].tolist(),
             float(trace.reward[row]),
             *info,
         ]
+
+
+def _numbers(trace: Trace) -> NDArray[np.floating]:
+    """Observations (m, n_obs); (m, 0) where they are pictures."""
+    return trace.observation if trace.observation.ndim == 2 else np.zeros((len(trace.observation), 0))
 
 
 def _write(path: Path, columns: list[str], rows: Iterable[list]) -> None:

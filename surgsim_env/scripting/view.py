@@ -133,7 +133,7 @@ def look(
     simulation: Simulation,
     task: ScriptedTask,
     observation: NDArray[np.floating],
-    raw_observation: NDArray[np.floating],
+    task_observation: NDArray[np.floating],
     began: float,
     contact_position: FloatArray | None,
 ) -> View:
@@ -143,7 +143,7 @@ def look(
         simulation: between two control steps.
         task: how its actions and observations are laid out.
         observation: as wrappers gave it.
-        raw_observation: as the environment itself gave it.
+        task_observation: the task's own numbers, as no wrapper or picture has changed them.
         began: when the step of the script began [s].
         contact_position: the tip at the first contact since then [m] (3,), or None.
     """
@@ -155,7 +155,7 @@ def look(
         tip_position=simulation.instrument.tip_position,
         tip_velocity=simulation.instrument.tip_velocity,
         true_force=simulation.contact_force,
-        sensed_force=task.sensed_force(raw_observation),
+        sensed_force=task.sensed_force(task_observation),
         contact_position=contact_position,
         approach=simulation.anatomy.face.approach.copy(),
         grasp=simulation.grasp,

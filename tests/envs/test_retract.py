@@ -18,6 +18,7 @@ from surgsim_env.rendering import gl
 from surgsim_env.rendering.stage import LABELS
 from surgsim_env.rewards import RETRACT_WEIGHTS
 from surgsim_env.scenes import make_scene
+from surgsim_env.scripting import Hold, Until, run_script
 from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE, SPEED_FULL_SCALE, SUCCESS_SHARE
 from surgsim_env.tasks.retraction_record import RetractionRecord, region_strains
 
@@ -95,18 +96,13 @@ def worst_full_return(told):
 def test_no_failed_episode_returns_more_than_the_worst_full_one(told, failure):
     """The best way to fail: all seen but never for long, grasped, without pressing; then, sooner or later, harm."""
     worst = worst_full_return(told)
-    rng = np.random.default_rng(0)
-    for step in (1, 2, 9, 100, 599, 600, *rng.integers(1, 600, 20)):
+    for step in (1, 2, 9, 100, 333, 599, 600):
         told.task.reset(np.random.default_rng(0))
         told.task._reached = {"visible": 0.0, "grasped": 0.0}
         told.returned = 0.0
-        for _ in range(step - 1):
+        for before in range(1, step):
             # Never for SUCCESS_TIME on end.
-            verdict = told.step(visible=float(rng.uniform() < 0.8), holds=True)
-            if verdict.terminated:
-                break
-        if verdict.terminated if step > 1 else False:
-            continue
+            assert not told.step(visible=float(before % 10 > 0), holds=True).terminated
         verdict = told.step(visible=1.0, holds=True, **FAILURES[failure])
         assert verdict.terminated and verdict.rewards[failure] == RETRACT_WEIGHTS[failure]
         assert told.returned < worst
@@ -163,7 +159,8 @@ def test_a_step_that_tears_ends_in_its_very_haptic_step(shared):
     assert info["torn"] and not info["hard_limit"] and not info["success"]
     assert info["reward_torn"] == RETRACT_WEIGHTS["torn"]
     assert 0.08 < info["pull_force_peak"] < 0.085
-    assert shared.simulation.time % STEP != pytest.approx(0.0, abs=1e-6)
+    steps = shared.simulation.time / STEP
+    assert abs(steps - round(steps)) > 0.01
 
 
 def test_the_hard_limit_ends_it(shared):
@@ -400,6 +397,34 @@ def test_observing_pictures_changes_no_bit_of_the_episode():
     assert one[1:] == other[1:]
     assert plain.save_state() == seeing.save_state()
     seeing.close()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_fault_shows_the_last_picture_before_it():
+    """Not one of a lobe whose nodes are nowhere."""
+    env = RetractEnv(obs_mode="rgb")
+    env.reset(seed=6)
+    before = act(env)[0]
+    env.simulation.organ_state.node_velocity[100] = np.nan
+    observation, _, terminated, _, info = act(env)
+    assert terminated and "no longer finite" in info["sim_fault"]
+    np.testing.assert_array_equal(observation, before)
+    env.close()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_scripts_feel_forces_where_pictures_are_observed(tmp_path):
+    """The sensor's reading is a force, not rows of the picture, and a trace's table has no pictures in it."""
+    env, felt = RetractEnv(obs_mode="rgb"), []
+    wait = Until(Hold(0.2), lambda view: felt.append(view.sensed_force) or False)
+    trace = run_script(env, [wait], seed=6)
+    assert trace.observation.shape == (4, 84, 84, 3)
+    bias, noise = env.task.force_reading.bias, env.scene.sensor.noise
+    np.testing.assert_allclose(np.array(felt), np.tile(bias, (len(felt), 1)), atol=6 * noise)
+    _, table = trace.to_csv(tmp_path / "run.csv")
+    columns = table.read_text().splitlines()[0].split(",")
+    assert columns[:3] == ["time_s", "step", "action_0"]
+    env.close()
 
 
 @pytest.mark.usefixtures("opengl")

@@ -63,7 +63,8 @@ class Grasper(Instrument):
         joints = np.append(position - self._tip_from_hinge(self._start_pitch), self._start_pitch)
         self.data.qpos[:4] = joints
         self.data.ctrl[:4] = joints
-        self._open_jaw()
+        assert self.jaw is not None
+        self.jaw.rest()
         mujoco.mj_forward(self.model, self.data)
 
     def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:

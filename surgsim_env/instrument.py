@@ -14,7 +14,7 @@ SLIDES = ("x", "y", "z")
 
 
 class Instrument(ToolBodies):
-    """A tool with a ball tip that is steered by the tip's velocity within a box; its servo moves joint targets.
+    """A tool that is steered by its tip's velocity within a box; its servo moves joint targets.
 
     Fields:
         lower, upper: the box that the tip may move in [m]                       (3,)
@@ -53,12 +53,12 @@ class Instrument(ToolBodies):
 
     @property
     def tip_position(self) -> FloatArray:
-        """Centre of the tip ball [m], shape (3,)."""
+        """Centre of the tip's ball, or the middle between the pads [m], shape (3,)."""
         return self.data.site_xpos[self._tip].copy()
 
     @property
     def tip_velocity(self) -> FloatArray:
-        """Velocity of the tip's centre [m/s], shape (3,)."""
+        """Velocity of the tip [m/s], shape (3,)."""
         mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_SITE, self._tip, self._velocity, 0)
         return self._velocity[3:].copy()
 
@@ -134,11 +134,6 @@ class Instrument(ToolBodies):
 
     def _set_jaw(self, jaw: Jaw) -> None:
         self.jaw, self.jaws = jaw, jaw.tools[None]
-
-    def _open_jaw(self) -> None:
-        """Open a jaw that has pads to hold tissue with; others stay as they are."""
-        if self.jaw is not None and self.jaw.has_pads:
-            self.jaw.put(1.0)
 
     def _where(self) -> str:
         """What an error calls this instrument."""

@@ -94,12 +94,16 @@ class Jaw:
         servo.lower[self._places] = np.where(goal < now, goal, self.closed)
         servo.upper[self._places] = np.where(goal > now, goal, self.opened)
 
-    def put(self, target: float) -> None:
-        """Put the fingers at rest at a target; MuJoCo's positions are brought up to date by the caller."""
-        goal = self.closed + 0.5 * (target + 1.0) * (self.opened - self.closed)
-        self._instrument.data.qpos[self._qpos] = goal
-        self._instrument.data.ctrl[self._controls] = goal
-        self._instrument.servo.command[self._places] = 0.0
+    def rest(self) -> None:
+        """Be as at the start, under no command: open with pads, without them as MuJoCo's data say.
+
+        MuJoCo's positions are brought up to date by the caller.
+        """
+        servo, data = self._instrument.servo, self._instrument.data
+        servo.command[self._places] = 0.0
+        servo.lower[self._places], servo.upper[self._places] = self.closed, self.opened
+        if self.has_pads:
+            data.qpos[self._qpos] = data.ctrl[self._controls] = self.opened
 
     @property
     def _controls(self) -> NDArray[np.int64]:

@@ -77,7 +77,8 @@ class Instrument:
     """The instrument that touches the organ.
 
     Args:
-        model: MJCF file of a probe in scenes/instruments, a shipped arm's name or the path of an arm's TOML file.
+        model: MJCF file of a probe or grasper in scenes/instruments, a shipped arm's name, the path of an arm's TOML
+            file, or one of PAIRS.
         tip_radius: of the ball tip [m].
         approach: direction in which it comes to the organ; the shaft lies along it.
         tip_direction: where a grasper's jaw and an arm's tip point; along the approach if it is not given.

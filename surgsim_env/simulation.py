@@ -254,6 +254,7 @@ class Simulation:
             "rest_position": self._rest_position.copy(),
             "rest_stretch": self._rest_stretch.copy(),
             "wrench": self._wrench.copy(),
+            "pull_peak": np.array(self.pull_peak),
             "step": np.array(self._step),
             "fault": np.array(self.fault),
         }
@@ -275,8 +276,10 @@ class Simulation:
         self._rest_position = arrays["rest_position"].copy()
         self._rest_stretch = arrays["rest_stretch"].copy()
         self._wrench[:] = arrays["wrench"]
+        self.pull_peak = float(arrays["pull_peak"])
         self._step = int(arrays["step"])
         self.fault = str(arrays["fault"])
+        self._taken = None
 
     def _check_step(self) -> None:
         limit = stable_dt(self.organ_model, self.contact)

@@ -135,7 +135,9 @@ class ToolBodies:
 
         With the inertia M, the joints' damping D (which MuJoCo's integrators take implicitly) and all forces but the
         tissue's q, a wrench w on a tool of Jacobian J changes its twist at the rate J (M + dt D)^-1 (q + J^T w).
-        Centripetal terms are left out, and the implicit share of a velocity servo, which only brakes.
+        Centripetal terms are left out, as are the implicit shares of velocity servos and of a tendon's damping, which
+        only brake, the wrenches on other tools (a finger's on its wrist) and MuJoCo's own contacts: MuJoCo counts them
+        all at the step's end.
         """
         model, data, response = self.model, self.data, self.response
         data.xfrc_applied[self._tools] = 0.0

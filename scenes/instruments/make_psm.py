@@ -45,12 +45,13 @@ SHAFT_RADIUS = 0.004  # an 8 mm instrument
 TIP_LENGTH = {"palpator": 0.020, "grasper": 0.0102, "retractor": 0.026}  # beyond the wrist's yaw axis [m]
 # The retractor's pads: half their width, thickness and length; half the gap at which they are parallel [m].
 PAD_HALF, PARALLEL_GAP = (0.007, 0.0025, 0.008), 0.0035
-# From 4 mm between the pads' middles to 24 mm [rad]; how hard a pad closes, at its middle [N].
+# From 5.5 mm between the pads' middles to 23 mm [rad]; how hard a pad closes, at its middle [N].
 PAD_RANGE = (-math.asin((PARALLEL_GAP - 0.00275) / TIP_LENGTH["retractor"]), math.radians(19.0))
 PAD_FORCE = 0.4
 # Serrated: this times the contact law's coefficient of friction.
 PAD_ROUGHNESS = 5.0
-# Keeps the jaw's middle where the wrist is: 0.3 N at the pads shift it by 0.2 mm [N m/rad, N m s/rad].
+# Keeps the jaw's middle where the wrist is: a load L across it shifts it by L l^2 / (4 k), 0.17 mm for 1 N, l being
+# the pads' distance from their hinge [N m/rad, N m s/rad].
 GEAR = (1.0, 2e-3)
 LIGHT, METAL, DARK = "0.86 0.87 0.89 1", "0.72 0.74 0.78 1", "0.13 0.14 0.16 1"
 BRIGHT, GREY, ACCENT = "0.90 0.91 0.94 1", "0.45 0.47 0.50 1", "0.10 0.42 0.60 1"

@@ -23,8 +23,8 @@ SIDES = ("left", "right")
 ARM_BITS = {"left": 4, "right": 8}
 # Arms meet softly: critically damped, with a time constant of five haptic steps [s].
 CONTACT_SOFTNESS = (0.005, 1.0)
-# The right arm on a support: 2000 N/m, so that 0.1 N is 0.05 mm and not lost in one control step. As MuJoCo makes
-# a contact as stiff as its tool is heavy (`supports.SOLREF`), that is a sixth of the stiffness per mass of other tools.
+# The right arm on a support: 1240 N/m at its ball, so that 0.1 N is 0.08 mm and not lost in one control step. As MuJoCo
+# makes a contact as stiff as its tool is heavy (`supports.SOLREF`), that is 1 / 6.5 of other tools' stiffness per mass.
 TOUCH_SOFTNESS = (SOLREF[0] / 6.5, SOLREF[1] / math.sqrt(6.5))
 # Half the distance of the tips from each other before the first reset [m].
 PARKED_ASIDE = 0.025

@@ -138,8 +138,8 @@ class SteeredArm:
         data.qpos[self._qpos] = found.joints
         data.ctrl[servo.position[self._places]] = found.joints
         servo.command[self._places] = 0.0
-        if self.jaw is not None and self.jaw.has_pads:
-            self.jaw.put(1.0)
+        if self.jaw is not None:
+            self.jaw.rest()
 
     def reach(self, position: FloatArray) -> PoseSolution:
         """Joint values for a place, pointing as at the start if they can, else as near to it as they come."""

@@ -107,7 +107,7 @@ def test_limits_and_efforts_are_the_tables(arm):
         assert tuple(arm.model.jnt_actfrcrange[joint.id]) == pytest.approx((-link.effort, link.effort))
     assert [math.degrees(link.upper) for link in PSM_LINKS[:2]] == pytest.approx([91.0, 53.0])
     if arm.description.jaw:
-        # The retractor's pads are 7 mm apart at 0, 26 mm from the axis: 4 mm at the stop.
+        # The retractor's pads are 7 mm apart at 0, 26 mm from the axis: 5.5 mm at the stop.
         stop = -2.0 * math.asin(0.00075 / 0.026), 2.0 * math.radians(19.0)
         assert arm.jaw_range == pytest.approx(JAW_RANGE if arm.description.name == "psm_grasper" else stop)
 

@@ -56,7 +56,7 @@ def test_supports_bear_the_weight(bed: str):
 
 @pytest.mark.parametrize("bed", BEDS)
 def test_a_settled_organ_stays(bed: str):
-    """Run freely for 100 ms no node is ever faster than 1 mm/s, nor does anything slide."""
+    """Run freely for 100 ms no node is ever faster than 0.1 mm/s, nor does anything slide."""
     model = bedded(bed)
     state = rest_state(model)
     before, fastest = state.node_position.copy(), 0.0
@@ -183,8 +183,8 @@ STEPS = {
 
 @pytest.mark.parametrize("part", STEPS)
 def test_stable_just_below_and_unstable_beyond(part: str):
-    supports, law = STEPS[part]
     """A free block drifts from its twin in proportion to time, at any stable step alike; beyond it, exponentially."""
+    supports, law = STEPS[part]
     model = free_block(*supports, law=law)
     assert growth(model, None, 0.95 * model.stable_step) < 5.0 * growth(model, None, 0.5 * model.stable_step) < 1e3
     assert growth(model, None, 1.1 * model.stable_step) > 1e3

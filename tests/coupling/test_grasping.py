@@ -69,6 +69,20 @@ def test_a_closed_jaw_grips_with_its_joints_force(model: str):
 
 
 @pytest.mark.parametrize("model", JAWS)
+def test_a_restart_forgets_where_the_jaw_was_told_to_go(model: str):
+    """Opened again and stopped on its way: restarted it is as the first time, and stays open."""
+    one = simulation(model)
+    first = one.instrument.get_state()
+    for target in (-1.0, -0.3):
+        one.instrument.command_jaw(target)
+        run(one, 10)
+    one.restart(HOLD)
+    assert one.instrument.get_state().tobytes() == first.tobytes()
+    one.control_step(1)
+    assert one.instrument.jaw.target == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("model", JAWS)
 def test_no_joint_of_the_jaw_pushes_beyond_its_range(model: str):
     one = simulation(model)
     one.instrument.command_jaw(-1.0)
@@ -199,7 +213,7 @@ def test_a_state_in_mid_closing_is_restored_to_the_bit(model: str):
     one.instrument.command_jaw(-0.7)
     turning = np.full(one.instrument.turning_size, 0.2)
     run(one, 6, (0.0, 0.005, 0.0), turning)
-    saved = one.get_state()
+    saved, pull_peak = one.get_state(), one.pull_peak
     ends = []
     for spoil in (False, True):
         if spoil:
@@ -208,6 +222,7 @@ def test_a_state_in_mid_closing_is_restored_to_the_bit(model: str):
             one.set_state(one.organ_model, saved)
             for name, array in one.get_state().items():
                 assert saved[name].tobytes() == array.tobytes(), name
+            assert one.pull_peak == pull_peak > 0.0
         run(one, 12, (0.0, 0.005, 0.0), turning)
         ends.append({name: array.tobytes() for name, array in one.get_state().items()})
     assert ends[0] == ends[1]

@@ -29,16 +29,19 @@ def settle(model: OrganModel, state: OrganState) -> None:
         OrganDivergedError: gravity turns the organ inside out or it does not settle.
     """
     key = _content(model)
-    if key not in _settled:
+    settled = _settled.pop(key, None)
+    if settled is None:
         _relax(model, state)
-        _settled[key] = state.node_position.copy(), state.support_stretch.copy()
-        if len(_settled) > REMEMBERED:
-            _settled.popitem(last=False)
-    _settled.move_to_end(key)
-    position, stretch = _settled[key]
-    state.node_position[:], state.support_stretch[:] = position, stretch
+        settled = state.node_position.copy(), state.support_stretch.copy()
+    # To the end of the line: the one that was asked for longest ago is forgotten first.
+    _settled[key] = settled
+    if len(_settled) > REMEMBERED:
+        _settled.popitem(last=False)
+    state.node_position[:], state.support_stretch[:] = settled
     state.node_velocity[:] = 0.0
     state.node_force[:] = 0.0
+    # What the way there squeezed is past.
+    state.volume_ratio_smallest[:] = 1.0
 
 
 def _content(model: OrganModel) -> bytes:

@@ -208,10 +208,12 @@ def test_the_same_organ_settles_once(monkeypatch):
     monkeypatch.setattr(settling, "REMEMBERED", 2)
     monkeypatch.setattr(settling, "_relax", lambda *given: (calls.append(1), relax(*given)))
     first = rest_state(free_block(FLOOR))
-    again = rest_state(free_block(FLOOR), shape_count=3)
+    again = rest_state(free_block(FLOOR))
     assert len(calls) == 1
-    assert again.node_position.tobytes() == first.node_position.tobytes()
-    assert again.support_stretch.tobytes() == first.support_stretch.tobytes()
+    for name in (name for name in OrganState._fields if name not in SCRATCH_FIELDS):
+        assert getattr(again, name).tobytes() == getattr(first, name).tobytes(), name
+    assert rest_state(free_block(FLOOR), shape_count=3).node_position.tobytes() == first.node_position.tobytes()
+    assert len(calls) == 1
     again.node_position[:] = 0.0
     assert rest_state(free_block(FLOOR)).node_position.tobytes() == first.node_position.tobytes()
     rest_state(free_block(FLOOR, modulus=6000.0))

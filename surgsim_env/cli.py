@@ -83,8 +83,8 @@ class Retract:
     it did not succeed.
     """
 
-    scene: MaybeText = None
-    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML); default: lobe."""
+    scene: str = "lobe"
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     instrument: MaybeText = None
     """An arm with a jaw, such as psm_retractor, or a TOML file; default: the scene's own."""
     bimanual: bool = False
@@ -213,8 +213,7 @@ def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench) 
         from surgsim_env.scripting.retract_command import Request as Retraction
         from surgsim_env.scripting.retract_command import retract
 
-        default = "lobe"
-        return 0 if retract(Retraction(**{**vars(command), "scene": command.scene or default}), console) else 1
+        return 0 if retract(Retraction(**vars(command)), console) else 1
     elif isinstance(command, Arms):
         from surgsim_env.evaluation.arms_command import Request, report_arms
 

@@ -56,7 +56,7 @@ class Pair(Instrument):
         if len(scene.ports) != 2:
             raise ValueError(
                 f"scene {scene.name!r} has {len(scene.ports)} [[ports]]; {scene.instrument.model!r} needs two, the "
-                "left arm's first"
+                "left arm's first: add them, or take a scene that has them, such as 'lobe'"
             )
         made = {side: load_scene_arm(anatomy, name, port) for side, name, port in zip(SIDES, names, scene.ports)}
         model = _compile(made, scene)

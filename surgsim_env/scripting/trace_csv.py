@@ -42,7 +42,7 @@ def haptic_rows(trace: Trace) -> Iterable[list]:
 
 
 def control_columns(trace: Trace) -> list[str]:
-    """Time, step, each entry of observation (pictures are left out) and action, reward, and the info's by their names."""
+    """Time, step, each entry of observation (none of a picture) and action, reward, the info's entries by name."""
     observation = [f"observation_{index}" for index in range(_numbers(trace).shape[1])]
     action = [f"action_{index}" for index in range(trace.action.shape[1])]
     return ["time_s", "step", *observation, *action, "reward", *sorted(trace.info)]

@@ -48,6 +48,7 @@ class BimanualRetractTask(RetractTask):
 
     weights = BIMANUAL_WEIGHTS
     failures = ("fault", "torn", "hard_force", "collided")
+    takes_pair = True
 
     def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
         """Retract the lobe of an anatomy with two arms.

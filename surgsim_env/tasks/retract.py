@@ -10,6 +10,7 @@ from msdm_core.kernels import OrganModel
 from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
+from surgsim_env.arms.pair import Pair
 from surgsim_env.grasp import Grasp
 from surgsim_env.instrument import Instrument
 from surgsim_env.retraction import Retraction
@@ -52,15 +53,22 @@ class RetractTask:
     # Reward terms of what ends an episode in harm; the first that is true counts.
     failures: tuple[str, ...] = ("fault", "torn", "hard_force")
     lesions: tuple[Lesion, ...] = ()
+    # Whether two arms do it.
+    takes_pair = False
 
     def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
         """Retract the lobe of an anatomy.
 
         Raises:
-            ValueError: a scene without a [retract] table or an endoscope, or an instrument without a jaw.
+            ValueError: a scene without a [retract] table or an endoscope, an instrument without a jaw or of two arms.
         """
         scene = anatomy.scene
         self.table, self._endoscope = _checked_scene(anatomy)
+        if isinstance(instrument, Pair) and not self.takes_pair:
+            raise ValueError(
+                f"scene {scene.name!r}: instrument {scene.instrument.model!r} is two arms, and one is needed: take one "
+                'such as instrument="psm_retractor", or SurgSim/BimanualRetract-v0'
+            )
         if instrument.jaw is None:
             raise ValueError(
                 f"scene {scene.name!r}: instrument {scene.instrument.model!r} has no jaw to grasp with; "

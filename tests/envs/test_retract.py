@@ -467,6 +467,11 @@ def test_instruments_without_a_jaw_are_refused():
         RetractEnv(instrument="probe")
 
 
+def test_two_arms_are_refused():
+    with pytest.raises(ValueError, match="'psm_pair' is two arms, and one is needed"):
+        RetractEnv(instrument="psm_pair")
+
+
 def test_unknown_observations_are_refused():
     with pytest.raises(ValueError, match="obs_mode 'pixels' is unknown; the modes are state, rgb"):
         RetractEnv(obs_mode="pixels")

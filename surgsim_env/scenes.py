@@ -347,7 +347,7 @@ def with_instrument(scene: Scene, instrument: str | None) -> Scene:
     if instrument is None:
         return scene
     if not isinstance(instrument, str | Path):
-        raise ValueError(f'instrument is {instrument!r}; it must be "probe", an arm\'s name or the path of a TOML file')
+        raise ValueError(f"instrument is {instrument!r}; it must be an instrument's name or the path of a TOML file")
     known = [*CARTESIAN, *list_arms(), *PAIRS]
     if Path(instrument).suffix != ".toml" and instrument not in known:
         raise ValueError(

@@ -108,7 +108,7 @@ def _hold_off(
     give = 0.0
     for row in range(6):
         for column in range(6):
-            give += dt * lever[row] * mobility[tool, row, column] * lever[column]
+            give += dt * lever[row] * mobility[tool, tool, row, column] * lever[column]
     for node, weight in ((a, 1.0 - wb - wc), (b, wb), (c, wc)):
         rate = dt * inverse_mass[node]
         speed += weight * (

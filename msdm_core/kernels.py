@@ -179,7 +179,7 @@ class ToolResponse(NamedTuple):
 
     Fields:
         tool_acceleration: rate of the twist without the tissue [m/s^2, rad/s^2]  (n_tool, 6)
-        tool_mobility: rate of the twist per wrench [1/kg, ...]                  (n_tool, 6, 6)
+        tool_mobility: rate of a tool's twist per wrench on each tool [1/kg, ...]  (n_tool, n_tool, 6, 6)
         tool_wrench: scratch: sum of the wrenches before the substep [N, N m]    (n_tool, 6)
         tool_lag: scratch: how far the tool ends behind twist times step [m, rad] (n_tool, 6)
     """
@@ -238,10 +238,12 @@ def push_tools(shapes, response, dt, substep, wrench):
     for tool in range(twist.shape[0]):
         for row in range(6):
             rate = acceleration[tool, row]
-            for column in range(6):
-                rate += mobility[tool, row, column] * (wrench[tool, column] - before[tool, column])
+            for other in range(twist.shape[0]):
+                for column in range(6):
+                    rate += mobility[tool, other, row, column] * (wrench[other, column] - before[other, column])
             twist[tool, row] += dt * rate
             lag[tool, row] += dt * dt * substep * rate
+    for tool in range(twist.shape[0]):
         for row in range(6):
             before[tool, row] = wrench[tool, row]
 

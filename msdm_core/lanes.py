@@ -18,6 +18,7 @@ from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel,
 from msdm_core.lane_kernels import LANE_EMPTY, LaneModel, LaneState, advance_lane_substeps
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state, support_shape
+from msdm_core.stepping import unyielding
 from msdm_core.vector import aligned_zeros, lane_counts
 
 # Of an organ's arrays, those that each lane has of its own; all others are shared.
@@ -197,8 +198,7 @@ def lane_shapes(shapes: ContactShapes, lane: int) -> ContactShapes:
 
 def lane_responses(tool_count: int, lanes: int = 8) -> ToolResponse:
     """The responses of every lane's tools, with the lane as first index; zeros: tools that move as told."""
-    sizes = ((6,), (6, 6), (6,), (6,))
-    return ToolResponse(*(np.zeros((lanes, tool_count, *size)) for size in sizes))
+    return ToolResponse(*(np.stack([array] * lanes) for array in unyielding(tool_count)))
 
 
 def advance_lanes(
@@ -261,7 +261,7 @@ def _check_fit(
         "shape_span": (shapes.shape_span, (lanes, count, 3)),
         "shape_friction": (shapes.shape_friction, (lanes, count)),
         "tool_twist": (shapes.tool_twist, (lanes, tools, 6)),
-        "tool_mobility": (response.tool_mobility, (lanes, tools, 6, 6)),
+        "tool_mobility": (response.tool_mobility, (lanes, tools, tools, 6, 6)),
         "wrench": (wrench, (lanes, tools, 6)),
     }
     for name, (array, shape) in fits.items():

@@ -137,7 +137,7 @@ def advance_organ(
 
 def unyielding(tool_count: int) -> ToolResponse:
     """The response of tools that move as told, whatever the tissue does."""
-    return ToolResponse(*(np.zeros((tool_count, *shape)) for shape in ((6,), (6, 6), (6,), (6,))))
+    return ToolResponse(*(np.zeros((tool_count, *shape)) for shape in ((6,), (tool_count, 6, 6), (6,), (6,))))
 
 
 def describe_fault(model: OrganModel, state: OrganState, fault: int) -> str:

@@ -71,7 +71,7 @@ class ToolViews(NamedTuple):
         axis, half_length: which axis of the geom the core lies along, its half length [m]  (n_shape,), (n_shape,)
         across, half_width: which axis of the geom a rounded box spans, its half width [m]  (n_shape,), (n_shape,)
         bodies: the tools                                                        (n_tool,)
-        joint_damping: [N s/m, N m s]                                            (nv,)
+        brake: what MuJoCo takes implicitly: joints' and tendons' damping, velocity servos [N s/m, N m s]  (nv, nv)
         geom_position, geom_rotation: of all geoms, world frame [m]              (n_geom, 3), (n_geom, 9)
         body_centre: centres of mass [m]                                         (n_body, 3)
         smooth_force: on the joints, without constraints [N, N m]                (nv,)
@@ -79,7 +79,7 @@ class ToolViews(NamedTuple):
         control: of all actuators                                                (nu,)
         servo: what moves the controls
         jaws: the two fingers of each jaw, as tools                              (n_jaw, 2)
-        velocity, jacobian, inertia, yielded: scratch                            (6,), (6, nv), (nv, nv), (nv, 6)
+        velocity, jacobians, inertia, yielded: scratch             (6,), (n_tool, 6, nv), (nv, nv), (nv, 6)
         reference, wrench: scratch: the step's first tool_centre [m], its mean wrench   (n_tool, 3), (n_tool, 6)
     """
 
@@ -92,7 +92,7 @@ class ToolViews(NamedTuple):
     across: NDArray[np.int64]
     half_width: FloatArray
     bodies: NDArray[np.int32]
-    joint_damping: FloatArray
+    brake: FloatArray
     geom_position: FloatArray
     geom_rotation: FloatArray
     body_centre: FloatArray
@@ -102,7 +102,7 @@ class ToolViews(NamedTuple):
     servo: Servo
     jaws: NDArray[np.int32]
     velocity: FloatArray
-    jacobian: FloatArray
+    jacobians: FloatArray
     inertia: FloatArray
     yielded: FloatArray
     reference: FloatArray
@@ -121,13 +121,16 @@ def factorise(matrix):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def yield_tool(factors, jacobian, smooth_force, yielded, mobility, acceleration):
-    """How one tool yields: mobility J A^-1 J^T (6, 6), acceleration J A^-1 q (6,); A^-1 J^T into yielded (nv, 6).
+def yield_tool(factors, jacobians, tool, smooth_force, yielded, mobility, acceleration):
+    """How all tools i yield to a wrench on one, t: mobility[i, t] = J_i A^-1 J_t^T; A^-1 J_t^T into yielded (nv, 6).
 
-    `factors` is A after `factorise`. Both the compiled and the plain loop call this: a library's solver rounds its
-    own way.
+    And how that one moves on without any: acceleration[t] = J_t A^-1 q. Tools of one arm share its joints: two fingers
+    that tissue pushes apart leave the wrist where it is, and a response of each to its own wrench alone would not.
+    `factors` is A after `factorise`, `jacobians` are all tools' (n_tool, 6, nv). Both the compiled and the plain loop
+    call this: a library's solver rounds its own way.
     """
     count = factors.shape[0]
+    jacobian = jacobians[tool]
     for part in range(6):
         for row in range(count):
             value = jacobian[part, row]
@@ -143,12 +146,14 @@ def yield_tool(factors, jacobian, smooth_force, yielded, mobility, acceleration)
         rate = 0.0
         for k in range(count):
             rate += smooth_force[k] * yielded[k, part]
-        acceleration[part] = rate
-        for row in range(6):
-            value = 0.0
-            for k in range(count):
-                value += jacobian[row, k] * yielded[k, part]
-            mobility[row, part] = value
+        acceleration[tool, part] = rate
+    for other in range(jacobians.shape[0]):
+        for part in range(6):
+            for row in range(6):
+                value = 0.0
+                for k in range(count):
+                    value += jacobians[other, row, k] * yielded[k, part]
+                mobility[other, tool, row, part] = value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -198,18 +203,20 @@ def _read_response(tools, response):
         tools.applied_wrench[tools.bodies[tool], :] = 0.0
     _mj_actuation(tools.model, tools.data)
     _mj_acceleration(tools.model, tools.data)
-    inertia, jacobian = tools.inertia, tools.jacobian
+    inertia, jacobians = tools.inertia, tools.jacobians
     _mj_inertia(tools.model, tools.data, inertia.ctypes.data)
     for joint in range(inertia.shape[0]):
-        inertia[joint, joint] += tools.timestep * tools.joint_damping[joint]
+        for other in range(inertia.shape[0]):
+            inertia[joint, other] += tools.timestep * tools.brake[joint, other]
     factorise(inertia)
     for tool in range(tools.bodies.shape[0]):
-        linear = jacobian.ctypes.data
-        angular = jacobian[3:].ctypes.data
+        linear = jacobians[tool].ctypes.data
+        angular = jacobians[tool, 3:].ctypes.data
         _mj_jacobian(tools.model, tools.data, linear, angular, np.int32(tools.bodies[tool]))
+    for tool in range(tools.bodies.shape[0]):
         yield_tool(
-            inertia, jacobian, tools.smooth_force, tools.yielded,
-            response.tool_mobility[tool], response.tool_acceleration[tool],
+            inertia, jacobians, tool, tools.smooth_force, tools.yielded, response.tool_mobility,
+            response.tool_acceleration,
         )  # fmt: skip
 
 

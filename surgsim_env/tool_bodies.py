@@ -62,6 +62,26 @@ def _roughness(model: mujoco.MjModel, geom: int) -> float:
     return 1.0 if number < 0 else float(model.numeric_data[model.numeric_adr[number]])
 
 
+def _brake(model: mujoco.MjModel) -> FloatArray:
+    """How joint speeds brake themselves, as MuJoCo's implicit integrator counts it [N s/m, N m s], (nv, nv).
+
+    Damping of joints and of fixed tendons, and the velocity servos of joints, at the limit of their force too.
+    """
+    brake = np.diag(model.dof_damping.copy())
+    for actuator in np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT):
+        joint = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
+        gear = model.actuator_gear[actuator, 0]
+        brake[joint, joint] -= gear * gear * model.actuator_biasprm[actuator, 2]
+    for tendon in range(model.ntendon):
+        first, count = model.tendon_adr[tendon], model.tendon_num[tendon]
+        parts = np.arange(first, first + count)
+        if (model.wrap_type[parts] == mujoco.mjtWrap.mjWRAP_JOINT).all():
+            arm = np.zeros(model.nv)
+            arm[model.jnt_dofadr[model.wrap_objid[parts]]] = model.wrap_prm[parts]
+            brake += model.tendon_damping[tendon].ravel()[0] * np.outer(arm, arm)
+    return brake
+
+
 class ToolBodies:
     """The tools of a MuJoCo model: every body that carries contact shapes. Their `servo` has no joints to drive here.
 
@@ -89,9 +109,10 @@ class ToolBodies:
         self.servo = make_servo(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
         self.jaws = np.zeros((0, 2), dtype=np.int32)
         self._velocity = np.zeros(6)
-        self._jacobian = np.zeros((6, model.nv))
+        self._jacobians = np.zeros((count, 6, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
         self._yielded = np.zeros((model.nv, 6))
+        self._brake = _brake(model)
 
     @property
     def tool_count(self) -> int:
@@ -133,26 +154,30 @@ class ToolBodies:
     def read_response(self) -> None:
         """How the tools move on without the tissue and yield to it, into `response`; call after `drive`.
 
-        With the inertia M, the joints' damping D (which MuJoCo's integrators take implicitly) and all forces but the
-        tissue's q, a wrench w on a tool of Jacobian J changes its twist at the rate J (M + dt D)^-1 (q + J^T w).
-        Centripetal terms are left out, as are the implicit shares of velocity servos and of a tendon's damping, which
-        only brake, the wrenches on other tools (a finger's on its wrist) and MuJoCo's own contacts: MuJoCo counts them
-        all at the step's end.
+        With the inertia M, what MuJoCo's integrator takes implicitly D (`_brake`), and all forces but the tissue's q,
+        wrenches w_j on the tools j change the twist of tool i at the rate J_i (M + dt D)^-1 (q + sum_j J_j^T w_j), J
+        being the tools' Jacobians: those of one arm share its joints.
+        Centripetal terms are left out, and MuJoCo's own contacts, which it counts at the step's end.
         """
         model, data, response = self.model, self.data, self.response
         data.xfrc_applied[self._tools] = 0.0
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
-        inertia = self.damped_inertia(model.opt.timestep)
+        inertia = self._inertia
+        mujoco.mj_fullM(model, data, inertia)
+        inertia += model.opt.timestep * self._brake
         factorise(inertia)
+        for index in range(self.tool_count):
+            self.jacobian(index)
         for index in range(self.tool_count):
             yield_tool(
                 inertia,
-                self.jacobian(index),
+                self._jacobians,
+                index,
                 data.qfrc_smooth,
                 self._yielded,
-                response.tool_mobility[index],
-                response.tool_acceleration[index],
+                response.tool_mobility,
+                response.tool_acceleration,
             )
 
     def damped_inertia(self, dt: float) -> FloatArray:
@@ -165,9 +190,10 @@ class ToolBodies:
         return self._inertia
 
     def jacobian(self, tool: int) -> FloatArray:
-        """From joint velocities to a tool's twist at its centre of mass, shape (6, nv); overwritten by the next."""
-        mujoco.mj_jacBodyCom(self.model, self.data, self._jacobian[:3], self._jacobian[3:], self._tools[tool])
-        return self._jacobian
+        """From joint velocities to a tool's twist at its centre of mass, shape (6, nv); overwritten by its next."""
+        jacobian = self._jacobians[tool]
+        mujoco.mj_jacBodyCom(self.model, self.data, jacobian[:3], jacobian[3:], self._tools[tool])
+        return jacobian
 
     def apply_wrench(self, wrench: FloatArray) -> None:
         """Write the tissue's mean wrench on each tool (overwritten each step), shape (n_tool, 6)."""
@@ -186,7 +212,7 @@ class ToolBodies:
             across=self._core.across,
             half_width=self._core.half_width,
             bodies=self._tools,
-            joint_damping=model.dof_damping,
+            brake=self._brake,
             geom_position=data.geom_xpos,
             geom_rotation=data.geom_xmat,
             body_centre=data.xipos,
@@ -196,7 +222,7 @@ class ToolBodies:
             servo=self.servo,
             jaws=self.jaws,
             velocity=self._velocity,
-            jacobian=self._jacobian,
+            jacobians=self._jacobians,
             inertia=self._inertia,
             yielded=self._yielded,
             reference=np.zeros((self.tool_count, 3)),

@@ -269,14 +269,18 @@ def test_the_solve_is_that_of_linear_algebra():
         root = rng.normal(size=(count, count))
         matrix = root @ root.T + 0.1 * np.eye(count)
         jacobian, force = rng.normal(size=(6, count)), rng.normal(size=count)
-        factors, yielded, mobility, rate = matrix.copy(), np.zeros((count, 6)), np.zeros((6, 6)), np.zeros(6)
+        other = rng.normal(size=(6, count))
+        factors, yielded = matrix.copy(), np.zeros((count, 6))
+        mobilities, rates = np.zeros((2, 2, 6, 6)), np.zeros((2, 6))
         factorise(factors)
-        yield_tool(factors, jacobian, force, yielded, mobility, rate)
-        wanted = np.linalg.solve(matrix, jacobian.T)
+        yield_tool(factors, np.stack([other, jacobian]), 1, force, yielded, mobilities, rates)
+        wanted, mobility, rate = np.linalg.solve(matrix, jacobian.T), mobilities[1, 1], rates[1]
         accuracy = 1e-13 * np.linalg.cond(matrix)
         np.testing.assert_allclose(yielded, wanted, rtol=0, atol=accuracy * np.abs(wanted).max())
         np.testing.assert_allclose(mobility, jacobian @ wanted, rtol=0, atol=accuracy * np.abs(mobility).max())
+        np.testing.assert_allclose(mobilities[0, 1], other @ wanted, rtol=0, atol=accuracy * np.abs(mobility).max())
         np.testing.assert_allclose(rate, force @ wanted, rtol=0, atol=accuracy * np.abs(mobility).max())
+        assert not mobilities[:, 0].any() and not rates[0].any()
 
 
 def test_a_copy_goes_on_by_itself():

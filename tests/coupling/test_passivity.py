@@ -38,12 +38,10 @@ def lopsided_body() -> ToolBodies:
     return ToolBodies(mujoco.MjModel.from_xml_string(LOPSIDED))
 
 
-def probe_without_servo() -> ToolBodies:
-    """Slides damped with 2 N s/m, which MuJoCo takes implicitly."""
+def probe_at_its_servo() -> ToolBodies:
+    """Slides damped with 2 N s/m and driven by servos of 60 N s/m, which MuJoCo takes implicitly."""
     probe = Probe(make_scene("phantom"), np.full(3, -0.1), np.full(3, 0.1))
     probe.place(np.zeros(3))
-    probe.model.actuator_gainprm[:] = 0.0
-    probe.model.actuator_biasprm[:] = 0.0
     probe.data.qvel[:] = 0.03, -0.02, 0.05
     return probe
 
@@ -67,23 +65,37 @@ def damped_arm() -> ToolBodies:
     return arm
 
 
-@pytest.mark.parametrize("tool", [lopsided_body, probe_without_servo, damped_arm])
+def two_fingers() -> ToolBodies:
+    """Two fingers on slides at the end of a light wrist that hangs on a slide and a hinge."""
+    finger = """<body name="{0}" pos="0 0 -0.03"><joint type="slide" axis="0 {1} 0" damping="0.5"/>
+      <geom name="pad_{0}" type="box" size="0.005 0.002 0.006" mass="0.008" group="3"/></body>"""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="{DT}" integrator="implicitfast" gravity="0 0 0"/><worldbody>
+        <body name="wrist"><joint type="slide" axis="0 1 0" damping="1"/><joint type="hinge" axis="0 0 1"/>
+        <geom type="sphere" size="0.004" mass="0.03"/>{finger.format("left", 1)}{finger.format("right", -1)}</body>
+        </worldbody></mujoco>"""
+    )
+    return ToolBodies(model)
+
+
+@pytest.mark.parametrize("tool", [lopsided_body, probe_at_its_servo, damped_arm, two_fingers])
 def test_tools_yield_as_mujoco_will(tool):
     """Change of the twist in mj_step2 under a wrench: dt (a + B w), to rounding; what was applied before is gone."""
     body = tool()
-    body.apply_wrench(np.full((1, 6), 3.0))
+    body.apply_wrench(np.full((body.tool_count, 6), 3.0))
     mujoco.mj_step1(body.model, body.data)
     body.read_shapes()
     before = body.shapes.tool_twist.copy()
     body.read_response()
-    wrench = np.array([[0.3, -0.2, 0.5, 1e-3, 2e-3, -1e-3]])
+    wrench = np.array([[0.3, -0.2, 0.5, 1e-3, 2e-3, -1e-3], [0.1, 0.4, 0.2, 2e-3, -1e-3, 1e-3]])[: body.tool_count]
     body.apply_wrench(wrench)
-    jacobian = body.jacobian(0).copy()
+    jacobians = np.array([body.jacobian(index) for index in range(body.tool_count)])
     mujoco.mj_step2(body.model, body.data)
-    after = jacobian @ body.data.qvel
-    change = DT * (body.response.tool_acceleration[0] + body.response.tool_mobility[0] @ wrench[0])
+    after = jacobians @ body.data.qvel
+    response = body.response
+    change = DT * (response.tool_acceleration + np.einsum("ijrc,jc->ir", response.tool_mobility, wrench))
     assert np.abs(change).max() > 1e-4
-    np.testing.assert_allclose(before[0] + change, after, rtol=0, atol=1e-10 * np.abs(after).max())
+    np.testing.assert_allclose(before + change, after, rtol=0, atol=1e-10 * np.abs(after).max())
 
 
 def test_the_response_follows_the_pose():

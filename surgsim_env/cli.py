@@ -115,6 +115,8 @@ class Arms:
     """Other ports files, or arms to use on both sides: ranked in one table with the reasons."""
     points: int = 500
     """How many points of the organ are tried."""
+    episodes: int = 3
+    """How many episodes a script runs with the arms: it lifts a lobe and touches what lies under it; 0: none."""
     seed: int = 0
     """Of the points and of where the search for joints starts."""
     out: Path = Path("runs/arms")

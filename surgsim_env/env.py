@@ -230,7 +230,8 @@ class BimanualRetractEnv(SurgicalEnv):
     `collision_force` [N].
 
     ## Arguments
-    Those of `SurgSim/Retract-v0`; `instrument` is "psm_pair".
+    Those of `SurgSim/Retract-v0`; `instrument` is "psm_pair", or two arms (names or TOML files) as "LEFT+RIGHT":
+    the left one has a jaw with flat pads, the right one a ball at its tip, as "psm_retractor+six_axis".
 
     ## Version History
     * v0: first version.

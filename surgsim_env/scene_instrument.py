@@ -6,7 +6,7 @@ from surgsim_env.arms.arm_instrument import ArmInstrument, is_arm
 from surgsim_env.arms.pair import Pair
 from surgsim_env.grasper import Grasper
 from surgsim_env.instrument import Instrument, Probe, read_model
-from surgsim_env.scenes import PAIRS
+from surgsim_env.scenes import pair_names
 
 
 def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> Instrument:
@@ -16,7 +16,7 @@ def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> I
         ValueError: an unknown model; an arm that is wrongly described or does not reach the palpable face.
     """
     scene = anatomy.scene
-    if scene.instrument.model in PAIRS:
+    if pair_names(scene.instrument.model) is not None:
         return Pair(anatomy, lower, upper)
     if is_arm(scene.instrument.model):
         return ArmInstrument(anatomy, lower, upper)

@@ -20,7 +20,7 @@ from surgsim_env.toml_tables import fill, nearest, read_toml
 
 # Instruments carried by slides; their models are NAME.xml in scenes/instruments.
 CARTESIAN = ("probe", "grasper")
-# Instruments of two arms: what stands left and right.
+# Instruments of two arms: what stands left and right. Any two arms are a pair as "LEFT+RIGHT", see `pair_names`.
 PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
 
 Vector = tuple[float, float, float]
@@ -78,7 +78,7 @@ class Instrument:
 
     Args:
         model: MJCF file of a probe or grasper in scenes/instruments, a shipped arm's name, the path of an arm's TOML
-            file, or one of PAIRS.
+            file, or a pair of arms: one of PAIRS, or two as "LEFT+RIGHT".
         tip_radius: of the ball tip [m].
         approach: direction in which it comes to the organ; the shaft lies along it.
         tip_direction: where a grasper's jaw and an arm's tip point; along the approach if it is not given.
@@ -343,19 +343,29 @@ def make_scene(name: str | Path) -> Scene:
 
 
 def with_instrument(scene: Scene, instrument: str | None) -> Scene:
-    """The scene with another instrument: one of CARTESIAN or PAIRS, an arm, the path of one; None: its own."""
+    """The scene with another instrument: one of CARTESIAN or PAIRS, an arm, its path, two of these; None: its own."""
     if instrument is None:
         return scene
     if not isinstance(instrument, str | Path):
         raise ValueError(f"instrument is {instrument!r}; it must be an instrument's name or the path of a TOML file")
     known = [*CARTESIAN, *list_arms(), *PAIRS]
-    if Path(instrument).suffix != ".toml" and instrument not in known:
+    if Path(instrument).suffix != ".toml" and instrument not in known and pair_names(str(instrument)) is None:
         raise ValueError(
             f"instrument {str(instrument)!r} is unknown{nearest(str(instrument), known)}; the instruments are "
-            f"{', '.join(known)}, or the path of an arm's TOML file"
+            f"{', '.join(known)}, the path of an arm's TOML file, or two arms as LEFT+RIGHT"
         )
     model = f"{instrument}.xml" if instrument in CARTESIAN else str(instrument)
     return replace(scene, instrument=replace(scene.instrument, model=model))
+
+
+def pair_names(model: str) -> tuple[str, str] | None:
+    """The left and the right arm of an instrument that is a pair: of PAIRS, or two arms joined by "+"; else None."""
+    known = list_arms()
+    for place in (place for place, sign in enumerate(model) if sign == "+"):
+        left, right = model[:place], model[place + 1 :]
+        if all(name in known or Path(name).suffix == ".toml" for name in (left, right)):
+            return left, right
+    return PAIRS.get(model)
 
 
 def load_scene(path: Path) -> Scene:

@@ -38,8 +38,9 @@ LONGER_FILES: dict[str, int] = {}
 # One contact law, unrolled: calls cost there.
 LONGER_FUNCTIONS = {"msdm_core/contact_kernels.py:add_contact_forces": 150}
 
-# Commands that run scripts.
-SCRIPT_USERS = {"surgsim_env/cli.py"}
+# What runs scripts: commands, and what a report has run.
+EPISODE_RUNNERS = {"surgsim_env/evaluation/episodes.py"}
+SCRIPT_USERS = {"surgsim_env/cli.py"} | EPISODE_RUNNERS
 
 EMPTY_NAMES = {"util", "utils", "helper", "helpers", "manager", "managers", "misc", "common"}
 ADVANCING = re.compile(r"mj_step\w*|step|haptic_step|control_step|compiled_steps|begin_step|end_step|advance\w*")
@@ -180,7 +181,9 @@ def tasks_do_not_advance(source: Source) -> Iterator[str]:
 
 
 def arms_know_no_task(source: Source) -> Iterator[str]:
-    """An arm is an instrument: it, and what evaluates it, know neither tasks nor environments nor a simulation."""
+    """An arm is an instrument: it, and what evaluates it at rest, know no task, no environment and no simulation."""
+    if source.path in EPISODE_RUNNERS:
+        return
     if source.path.startswith(("surgsim_env/arms/", "surgsim_env/evaluation/")):
         for name, line in imported(source.tree):
             if name.split(".")[0] == "gymnasium" or re.match(r"surgsim_env\.(tasks|env|vector_env|simulation)\b", name):
@@ -192,7 +195,7 @@ def pictures_are_asked_for(source: Source) -> Iterator[str]:
     may = (
         *("surgsim_env/rendering/", "surgsim_env/__init__.py", "surgsim_env/surgical_env.py", "surgsim_env/cli.py"),
         *("surgsim_env/evaluation/arms.py", "surgsim_env/evaluation/arm_pictures.py"),
-        "surgsim_env/scripting/retract_command.py",
+        *("surgsim_env/scripting/retract_command.py", "surgsim_env/evaluation/episodes.py"),
     )
     if not source.path.startswith(may):
         for name, line in imported(source.tree):

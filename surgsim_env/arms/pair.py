@@ -14,7 +14,7 @@ from surgsim_env.arms.model import LINK_GROUP, arm_spec
 from surgsim_env.arms.steering import SteeredArm, millimetres, missing, placed
 from surgsim_env.instrument import Instrument
 from surgsim_env.jaw import Jaw
-from surgsim_env.scenes import PAIRS, Scene
+from surgsim_env.scenes import Scene, pair_names
 from surgsim_env.supports import SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
 from surgsim_env.tool_bodies import CONTACT_GROUP, ROUGHNESS
 
@@ -52,7 +52,8 @@ class Pair(Instrument):
             ValueError: not two ports, a wrong description or model, a port inside the organ, an organ out of reach.
         """
         scene = anatomy.scene
-        names = PAIRS[scene.instrument.model]
+        names = pair_names(scene.instrument.model)
+        assert names is not None
         if len(scene.ports) != 2:
             raise ValueError(
                 f"scene {scene.name!r} has {len(scene.ports)} [[ports]]; {scene.instrument.model!r} needs two, the "

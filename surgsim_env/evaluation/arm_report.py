@@ -24,6 +24,7 @@ from surgsim_env.evaluation.arm_quantities import (
 )
 from surgsim_env.evaluation.arm_results import REASONS, ArmsEvaluation
 from surgsim_env.evaluation.arm_table import RANKING_RULE, Ranked, columns
+from surgsim_env.evaluation.episode_figures import FIGURES, Episodes, clause, median_of, what_was_run
 
 # Nothing is loaded from anywhere: the browser itself refuses it.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -50,6 +51,7 @@ tbody th { font-weight: 500; }
 td.number, th.number { text-align: right; }
 td.number { white-space: nowrap; }
 td.wide { min-width: 14rem; }
+.total th, .total td { border-top: 2px solid #20242c; font-weight: 600; }
 .group { border-left: 1px solid #d9dce1; }
 code, pre { font: .9rem/1.45 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; }
 pre { background: #f3f4f6; padding: .75rem 1rem; white-space: pre-wrap; overflow-wrap: anywhere; }
@@ -77,6 +79,8 @@ def write_report(
     maps: Sequence[Picture],
     command: str,
     ranking: Sequence[Ranked] = (),
+    episodes: Episodes | None = None,
+    episode_pictures: Sequence[Picture] = (),
 ) -> None:
     """Write the report.
 
@@ -87,13 +91,18 @@ def write_report(
         maps: heat maps.
         command: that makes this report.
         ranking: of several placements or robots; left out if there is none.
+        episodes: run by a script; left out if there are none.
+        episode_pictures: of how they ended.
     """
+    said = " ".join(filter(None, (verdict(evaluation), clause(episodes, evaluation.scene))))
     title = f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)"
+    ends = _figures(path.parent, episode_pictures)
     sections = [
         ("ranking", "Ranking", _ranking(ranking)) if ranking else None,
         ("patient", "The arms in the patient", _figures(path.parent, pictures)),
         ("maps", "Maps on the organ", _legend(evaluation) + _figures(path.parent, maps)),
         ("numbers", "Numbers", _shares(evaluation) + _values(evaluation) + _pair(evaluation) + _reasons(evaluation)),
+        ("episodes", "Scripted episodes", _episodes(episodes, evaluation.scene, ends)) if episodes else None,
         ("definitions", "What each figure means", _definitions()),
         ("columns", "Columns of points.csv", _columns(evaluation)),
         ("inputs", "Inputs, versions, seed", _inputs(evaluation.summary)),
@@ -111,7 +120,7 @@ def write_report(
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n<style>{STYLE}</style>\n</head>\n<body>\n'
-        f'<header>\n<h1>{escape(title)}</h1>\n<p class="verdict">{escape(verdict(evaluation))}</p>\n'
+        f'<header>\n<h1>{escape(title)}</h1>\n<p class="verdict">{escape(said)}</p>\n'
         f'<nav aria-label="Contents"><ul>{links}</ul></nav>\n</header>\n<main>\n{body}\n</main>\n</body>\n</html>\n',
         encoding="utf-8",
         newline="\n",
@@ -246,6 +255,41 @@ def _ranking(ranking: Sequence[Ranked]) -> str:
         f"<p>{escape(RANKING_RULE)} All else in this report is about the arms and ports of the command itself.</p>\n"
         + (_table(caption, head, rows))
     )
+
+
+def _episodes(episodes: Episodes, organ: str, ends: str) -> str:
+    """What was run, a row an episode, the medians, and what the columns mean."""
+    text = "".join(f"<p>{escape(said)}</p>\n" for said in what_was_run(episodes, organ))
+    if not episodes.runs:
+        return text
+    failed = not all(one.success for one in episodes.runs)
+    rows = []
+    for one in episodes.runs:
+        figures = [figure.text(getattr(one, figure.field)) for figure in FIGURES]
+        rows.append(
+            _episode_row(str(one.seed), "yes" if one.success else "no", figures, one.reason if failed else None)
+        )
+    count = f"{sum(one.success for one in episodes.runs)} of {len(episodes.runs)}"
+    medians = [figure.text(median_of(episodes.runs, figure)) for figure in FIGURES]
+    rows.append(_episode_row("medians", count, medians, "" if failed else None, kind=' class="total"'))
+    numbers = "".join(f'<th scope="col" class="number">{escape(figure.title)}</th>' for figure in FIGURES)
+    head = f'<tr><th scope="col">seed</th><th scope="col">success</th>{numbers}'
+    head += '<th scope="col">why it failed</th></tr>' if failed else "</tr>"
+    items = [f"<dt>{escape(one.title)}</dt><dd>{escape(one.definition)}</dd>" for one in FIGURES]
+    return (
+        text
+        + _table("Episodes; the last row has how many succeeded and the medians of what was measured", head, rows)
+        + ends
+        + "\n<dl>\n"
+        + "\n".join(items)
+        + "\n</dl>"
+    )
+
+
+def _episode_row(seed: str, success: str, figures: Iterable[str], reason: str | None, *, kind: str = "") -> str:
+    cells = "".join(f'<td class="number">{escape(text)}</td>' for text in figures)
+    why = "" if reason is None else f'<td class="wide">{escape(reason)}</td>'
+    return f'<tr{kind}><th scope="row">{escape(seed)}</th><td>{escape(success)}</td>{cells}{why}</tr>'
 
 
 def _definitions() -> str:

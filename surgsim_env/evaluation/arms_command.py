@@ -17,13 +17,15 @@ from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.arms.arm import Arm, load_arm
 from surgsim_env.arms.description import ArmDescription, read_description
 from surgsim_env.arms.port import Port
-from surgsim_env.evaluation.arm_maps import ArmMaps
-from surgsim_env.evaluation.arm_picture import write_pictures
+from surgsim_env.evaluation.arm_maps import ArmMaps, Picture
+from surgsim_env.evaluation.arm_picture import write_given_pictures, write_pictures
 from surgsim_env.evaluation.arm_quantities import extreme, number_text, verdict, worst_clearance
 from surgsim_env.evaluation.arm_report import write_report
 from surgsim_env.evaluation.arm_results import ArmsEvaluation
 from surgsim_env.evaluation.arm_table import Candidate, Ranked, rank, write_points
 from surgsim_env.evaluation.arms import evaluate_arms
+from surgsim_env.evaluation.episode_figures import Episodes, clause, plain_episodes
+from surgsim_env.evaluation.episodes import run_episodes
 from surgsim_env.evaluation.ports import Ports, default_ports, read_ports
 from surgsim_env.out_folder import writable_folder
 from surgsim_env.palpation.report import package_version, plain_json
@@ -46,6 +48,7 @@ class Request:
     ports: Path | None
     compare: tuple[str, ...]
     points: int
+    episodes: int
     seed: int
     out: Path
 
@@ -73,7 +76,7 @@ def report_arms(request: Request, console: Console) -> ArmsEvaluation:
     Raises:
         ValueError: one line about what is asked for and cannot be.
     """
-    for name, least in (("points", FEWEST_POINTS), ("seed", 0)):
+    for name, least in (("points", FEWEST_POINTS), ("episodes", 0), ("seed", 0)):
         if getattr(request, name) < least:
             raise ValueError(f"--{name} is {getattr(request, name)}; it must be a whole number of at least {least}")
     anatomy = load_anatomy(_scene(request.scene))
@@ -86,21 +89,31 @@ def report_arms(request: Request, console: Console) -> ArmsEvaluation:
         found.append(replace(one, ports=_by_name(setup.ports)))
     first = found[0]
     ranking = rank([Candidate(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
-    summary = _summary(first, request, ranking)
+    episodes = scripted_episodes(setups[0], request, console) if request.episodes else None
+    said = " ".join(filter(None, (verdict(first), clause(episodes, first.scene))))
+    summary = {**_summary(first, request, ranking), **plain_json(plain_episodes(episodes), digits=12), "verdict": said}
     first = replace(first, summary=summary)
     (folder / SUMMARY_NAME).write_text(
         json.dumps(summary, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
     write_points(first, folder / POINTS_NAME)
     pictures = write_pictures(first, (setups[0].left, setups[0].right), folder)
+    ends = _write_ends(episodes, folder)
     maps = ArmMaps(first).write_all(folder)
     write_report(
-        first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command_text(request), ranking=ranking
+        first,
+        folder / REPORT_NAME,
+        pictures=pictures,
+        maps=maps,
+        command=command_text(request),
+        ranking=ranking,
+        episodes=episodes,
+        episode_pictures=ends,
     )
-    console.print(verdict(first), highlight=False)
+    console.print(said, highlight=False)
     if ranking:
         _print_ranking(ranking, console)
-    names = ",".join((REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps))))
+    names = ",".join((REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps, *ends))))
     console.print(f"written: {folder}/{{{names}}}", highlight=False, soft_wrap=True)
     return first
 
@@ -119,6 +132,18 @@ def evaluate(setup: Setup, anatomy: Anatomy, request: Request, console: Console,
         )
 
 
+def scripted_episodes(setup: Setup, request: Request, console: Console) -> Episodes:
+    """Episodes of the oracle script with the command's arms, with a progress bar."""
+    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console) as bar:
+        task = bar.add_task("episodes", total=1.0)
+        return run_episodes(
+            (request.left, request.right),
+            (setup.left, setup.right),
+            range(request.seed, request.seed + request.episodes),
+            lambda what, share: bar.update(task, description=what, completed=share),
+        )
+
+
 def command_text(request: Request) -> str:
     """The command that makes the same report, but for --out; files outside the working folder by their names alone."""
     words = ["surgsim", "arms", "--scene", _shown(request.scene), "--left", _shown(request.left)]
@@ -127,7 +152,9 @@ def command_text(request: Request) -> str:
         words += ["--ports", _shown(request.ports)]
     if request.compare:
         words += ["--compare", *map(_shown, request.compare)]
-    return shlex.join([*words, "--points", str(request.points), "--seed", str(request.seed)])
+    return shlex.join(
+        [*words, "--points", str(request.points), "--episodes", str(request.episodes), "--seed", str(request.seed)]
+    )
 
 
 def _scene(name: str) -> Scene:
@@ -167,6 +194,15 @@ def _read(option: str, source: str) -> ArmDescription:
         return read_description(source)
     except ValueError as error:
         raise ValueError(f"{option}: {error}") from None
+
+
+def _write_ends(episodes: Episodes | None, folder: Path) -> list[Picture]:
+    """Pictures of how episodes ended."""
+    told = "Drawn with OpenGL: the lobe and both arms in the overview and through the endoscope; "
+    told += "the target is green, arrows are the tissue's force on each tool."
+    given = {} if episodes is None else episodes.pictures
+    written = write_given_pictures(given, folder, name="episode")
+    return [replace(one, description=told) for one in written]
 
 
 def _ports_name(request: Request) -> str:
@@ -212,6 +248,7 @@ def _summary(evaluation: ArmsEvaluation, request: Request, ranking: Sequence[Ran
     inputs: dict[str, Any] = {
         "scene": _shown(request.scene) if not request.scene.endswith(".toml") else _file_input(Path(request.scene)),
         "points": request.points,
+        "episodes": request.episodes,
         "left": _arm_input(request.left),
         "right": _arm_input(request.right),
         "ports": _ports_input(request.ports, evaluation),
@@ -226,7 +263,6 @@ def _summary(evaluation: ArmsEvaluation, request: Request, ranking: Sequence[Ran
         "seed": request.seed,
         "worst_clearance": {"value_m": clearance.value, "arm": clearance.side, "from": what, "point": clearance.point},
         "smallest_tip_force": {"value_N": force.value, "arm": force.side, "point": force.point},
-        "verdict": verdict(evaluation),
         "compared": [vars(one) for one in ranking],
     }
     given = dict(evaluation.summary)

@@ -174,7 +174,10 @@ class _Run:
             return f"came to a fault of the simulation ({info['sim_fault']})"
         if info.get("torn"):
             return f"tore the tissue ({info['pull_force_peak']:.3f} N)"
-        return f"passed the hard force limit ({info['force_peak']:.3f} N)" if info.get("hard_limit") else ""
+        if info.get("collided"):
+            return f"pressed the arms on each other ({info['collision_force']:.3f} N)"
+        force = max(info["force_peak"], info.get("touch_force", 0.0))
+        return f"passed the hard force limit ({force:.3f} N)" if info.get("hard_limit") else ""
 
     def _cut_short(self) -> str:
         return "was cut short: the episode is over" + (", its time is up" if self.truncated else "")

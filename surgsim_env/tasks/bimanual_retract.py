@@ -54,14 +54,15 @@ class BimanualRetractTask(RetractTask):
         """Retract the lobe of an anatomy with two arms.
 
         Raises:
-            ValueError: what RetractTask refuses, an instrument that is no pair, a scene without a place for the right
-                tip to start from or without supports that can be touched.
+            ValueError: what RetractTask refuses, an instrument that is no pair of a jaw with pads and a ball, a scene
+                without a place for the right tip to start from or without supports that can be touched.
         """
         if not isinstance(instrument, Pair):
             raise ValueError(
                 f"scene {anatomy.scene.name!r}: instrument {anatomy.scene.instrument.model!r} is one arm, and two are "
-                'needed: take instrument="psm_pair"'
+                'needed: take instrument="psm_pair", or two arms such as "psm_retractor+six_axis"'
             )
+        _check_tips(instrument)
         super().__init__(anatomy, instrument)
         if self.table.right_start_lower is None or self.table.right_start_upper is None or not anatomy.scene.supports:
             raise ValueError(
@@ -200,6 +201,20 @@ class BimanualRetractTask(RetractTask):
             "touches": touches,
             "collision_force": collision,
         }
+
+
+def _check_tips(pair: Pair) -> None:
+    """The left arm can hold tissue, the right one can touch."""
+    left, right = pair.arms["left"], pair.arms["right"]
+    if left.jaw is None or not left.jaw.has_pads:
+        raise ValueError(
+            f"the left {left.where} has no jaw with flat pads to hold tissue with; take one that has, such as "
+            "'psm_retractor'"
+        )
+    if right.arm.description.tip.ball is None:
+        raise ValueError(
+            f"the right {right.where} has no ball at its tip to touch with; take one that has, such as 'psm_palpator'"
+        )
 
 
 def _pair(simulation: Simulation) -> Pair:

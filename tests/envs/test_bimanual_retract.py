@@ -11,7 +11,7 @@ from surgsim_env.arms.pair import Pair
 from surgsim_env.env import BimanualRetractEnv
 from surgsim_env.grasp import Grasp
 from surgsim_env.rewards import BIMANUAL_WEIGHTS
-from surgsim_env.scenes import make_scene, with_instrument
+from surgsim_env.scenes import make_scene, pair_names, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE
@@ -163,3 +163,27 @@ def test_one_arm_and_scenes_for_one_are_refused():
     anatomy = load_anatomy(replace(scene, retract=replace(scene.retract, right_start_lower=None)))
     with pytest.raises(ValueError, match="two hands need"):
         BimanualRetractTask(anatomy, Simulation(anatomy).instrument)
+
+
+def test_any_two_arms_are_a_pair(tmp_path):
+    assert pair_names("psm_pair") == pair_names("psm_retractor+psm_palpator") == ("psm_retractor", "psm_palpator")
+    assert pair_names("a+b/mine.toml+six_axis") == ("a+b/mine.toml", "six_axis")
+    for model in ("psm_retractor", "my+arm.toml", "psm_retractor+", "+six_axis", "probe.xml"):
+        assert pair_names(model) is None, model
+    with pytest.raises(ValueError, match="two arms as LEFT"):
+        BimanualRetractEnv(instrument="psm_retractor+psm_palpater")
+    pair = BimanualRetractEnv(instrument="psm_retractor+six_axis").simulation.instrument
+    assert [arm.arm.description.name for arm in pair.arms.values()] == ["psm_retractor", "six_axis"]
+
+
+@pytest.mark.parametrize(
+    ("instrument", "message"),
+    [
+        ("psm_grasper+psm_palpator", r"the left arm 'psm_grasper' at its port .* has no jaw with flat pads"),
+        ("psm_palpator+psm_palpator", r"the left arm 'psm_palpator' at its port .* has no jaw with flat pads"),
+        ("psm_retractor+psm_retractor", r"the right arm 'psm_retractor' at its port .* has no ball at its tip"),
+    ],
+)
+def test_arms_that_cannot_do_it_are_refused(instrument, message):
+    with pytest.raises(ValueError, match=message):
+        BimanualRetractEnv(instrument=instrument)

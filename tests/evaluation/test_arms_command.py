@@ -57,7 +57,7 @@ def made(monkeypatch):
 def arguments(*more, left="psm_grasper", right="psm_palpator", ports="ports.toml", out="out"):
     return [
         *("arms", "--scene", "phantom", "--left", left, "--right", right, "--ports", ports),
-        *("--points", "40", "--out", str(out), *more),
+        *("--points", "40", "--episodes", "0", "--out", str(out), *more),
     ]
 
 
@@ -76,7 +76,7 @@ def test_the_files_and_the_summary(folder, made, capsys):
     made_one = made_evaluation(count=40, seed=3)
     least = min(np.nanmin(arm.tip_force) for arm in (made_one.left, made_one.right))
     assert summary["smallest_tip_force"]["value_N"] == pytest.approx(least, abs=1e-11)
-    assert summary["compared"] == []
+    assert summary["compared"] == [] and summary["episodes"] == [] and summary["inputs"]["episodes"] == 0
     said = " ".join(capsys.readouterr().out.split())
     assert summary["verdict"] in said and "written: out/{report.html" in said
     assert made[0][0].ports.endoscope.point == (0.03, -0.02, 0.15)
@@ -103,11 +103,12 @@ def test_a_run_repeats_to_the_byte_wherever_it_is_written(folder, made, tmp_path
 @pytest.mark.slow
 def test_a_real_run_repeats_to_the_byte_and_says_what_was_found(folder):
     for out in ("a", "b"):
-        assert main(arguments("--compare", "wide.toml", out=out)) == 0
+        assert main(arguments("--compare", "wide.toml", "--episodes", "1", out=out)) == 0
     names = {path.name for path in (folder / "a").iterdir()}
     for name in names:
         assert (folder / "a" / name).read_bytes() == (folder / "b" / name).read_bytes(), name
     summary = json.loads((folder / "a" / "summary.json").read_text(encoding="utf-8"))
+    assert "episode_1.png" in names and summary["episodes"][0]["success"]
     assert summary["points"] == 40 and summary["reachable"]["both"] > 0.5
     assert f"both at once {100 * summary['reachable']['both']:.0f} %" in summary["verdict"]
     assert [one["place"] for one in summary["compared"]] == [1, 2]
@@ -123,7 +124,7 @@ def test_the_command_in_the_report_makes_it_again(folder, made):
     command = text.split("<pre><code>")[1].split("</code>")[0]
     assert command == (
         "surgsim arms --scene phantom --left mine.toml --right psm_palpator --ports ports.toml "
-        "--compare wide.toml six_axis --points 40 --seed 0"
+        "--compare wide.toml six_axis --points 40 --episodes 0 --seed 0"
     )
     assert main([*command.split()[1:], "--out", "again"]) == 0
     assert (folder / "again" / "report.html").read_bytes() == (folder / "out" / "report.html").read_bytes()
@@ -224,6 +225,7 @@ def test_a_urdf_whose_mesh_is_missing_is_refused(folder, made, capsys):
         (["--points", "0"], "--points is 0; it must be a whole number of at least 10"),
         (["--points", "some"], "--points"),
         (["--seed", "-1"], "--seed is -1"),
+        (["--episodes", "-1"], "--episodes is -1; it must be a whole number of at least 0"),
         (["--left", "psm_grabber"], "--left: arm 'psm_grabber' is unknown; the arms are"),
         (["--scene", "lever"], "scene 'lever' is unknown"),
         (["--scene", "nowhere.toml"], "nowhere.toml cannot be read"),
@@ -255,5 +257,5 @@ def test_without_a_ports_file_they_stand_as_laparoscopy_places_them(folder, made
 def test_help_says_what_it_does(capsys):
     assert main(["arms", "--help"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    for word in ("--left", "--compare", "report.html", "[endoscope]", "runs/arms"):
+    for word in ("--left", "--compare", "--episodes", "report.html", "[endoscope]", "runs/arms"):
         assert word in said, word

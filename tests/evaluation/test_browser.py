@@ -13,7 +13,7 @@ from surgsim_env.evaluation.arm_maps import ArmMaps
 from surgsim_env.evaluation.arm_picture import write_given_pictures
 from surgsim_env.evaluation.arm_report import POLICY, write_report
 from surgsim_env.evaluation.arm_table import Candidate, rank
-from tests.evaluation.made import made_evaluation
+from tests.evaluation.made import made_episodes, made_evaluation
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium (.ci/run does)")
@@ -50,6 +50,7 @@ def report(tmp_path_factory) -> Path:
     evaluation = made_evaluation()
     others = [Candidate("ports.toml", "as given", evaluation), Candidate("wide.toml", "ports", made_evaluation(seed=1))]
     path = folder / "report.html"
+    episodes = made_episodes(failing=True)
     write_report(
         evaluation,
         path,
@@ -57,6 +58,8 @@ def report(tmp_path_factory) -> Path:
         maps=ArmMaps(evaluation).write_all(folder),
         command="surgsim arms --scene liver --left psm_grasper --right psm_palpator --ports ports.toml",
         ranking=rank(others),
+        episodes=episodes,
+        episode_pictures=write_given_pictures(episodes.pictures, folder, name="episode"),
     )
     return path
 
@@ -98,11 +101,11 @@ def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, t
     found = re.fullmatch(r"images ([\d ]+) widest (\d+) of (\d+) loaded (\d+)", title)
     assert found, title
     widths = [int(one) for one in found[1].split()]
-    assert len(widths) == text.count("<img") == 12
+    assert len(widths) == text.count("<img") == 13
     assert min(widths) >= 60
     assert int(found[2]) <= int(found[3])
     assert int(found[4]) == 0
-    assert done.stdout.count("<img") == 12
+    assert done.stdout.count("<img") == 13
 
 
 def test_it_prints(report, tmp_path):

@@ -9,7 +9,7 @@ from surgsim_env.cli import main
 from surgsim_env.evaluation import arms_command
 from surgsim_env.evaluation.ports import default_ports, ports_from_table
 from surgsim_env.scenes import make_scene
-from tests.evaluation.made import made_evaluation
+from tests.evaluation.made import made_episodes, made_evaluation
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = (ROOT / "docs" / "arms_report.md").read_text(encoding="utf-8")
@@ -35,10 +35,11 @@ def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch)
     for name in ("ports.toml", "wide.toml"):
         Path(name).write_text(text)
     monkeypatch.setattr(arms_command, "evaluate", lambda *_, **__: made_evaluation(pictures=False))
+    monkeypatch.setattr(arms_command, "scripted_episodes", lambda *_: made_episodes())
     # The made evaluation's arms stand anywhere: enough to be drawn.
     assert main(command.split()) == 0
     listed = re.findall(r"^\| `([\w.*]+)` \|", DOCS, flags=re.M)
-    assert len(listed) == 5
+    assert len(listed) == 6
     for pattern in listed:
         assert list(Path("runs/arms").glob(pattern)), pattern
 

@@ -219,7 +219,7 @@ class BimanualRetractEnv(SurgicalEnv):
 
     ## Episode End
     Terminated: for 0.5 s, at the end of each control step, the left jaw held tissue, the organ left at least 80 % of
-    the target uncovered as seen from the endoscope (instruments do not count), and the right tip, its centre above the
+    the target uncovered as seen from the endoscope (instruments do not count), and the right ball, its centre above the
     disc, pressed what lies under it with 0.3 to 1.0 N (success); the contact force on the tissue passed the hard limit,
     or the jaw's pull what the tissue bears, in any haptic step; at the end of a control step, the right arm pressed the
     bed with more than the hard limit or the left arm with more than 2 N; the simulation came to a fault. Truncated: 600

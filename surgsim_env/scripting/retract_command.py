@@ -105,6 +105,7 @@ def _verdict(trace: Trace, success: bool) -> str:
     if not success:
         return f"not retracted: {trace.failure or 'the time was up'}"
     return (
-        f"retracted in {trace.duration:.1f} s: {100.0 * info['visible']:.0f} % of the target seen, grip up to "
+        f"retracted in {trace.duration:.1f} s: {100.0 * info.get('uncovered', info['visible']):.0f} % of the target "
+        f"{'left uncovered' if 'uncovered' in info else 'seen'}, grip up to "
         f"{info['grip_force_peak']:.2f} N, pull up to {info['pull_force_peak']:.2f} N, {info['slips']:.0f} slips"
     )

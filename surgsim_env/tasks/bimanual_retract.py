@@ -1,6 +1,7 @@
 """Retraction with two hands: the left arm exposes the target, the right one touches it."""
 
 import json
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ from surgsim_env.tasks.task import Bounds, InfoValue, Start
 
 # The right tip touches the target with such a force [N].
 TOUCH_FORCE = (0.3, 1.0)
+# And with its ball, not with the neck behind it: nothing of the ball is farther above the target than this [m].
+TOUCH_GAP = 0.0002
 # The arms may press each other with no more than this [N].
 COLLISION_FORCE = 2.0
 # The right tip is near the target within this distance: what nearness pays is measured by it [m].
@@ -177,8 +180,9 @@ class BimanualRetractTask(RetractTask):
         return grasp.holds and self.uncovered_share >= SUCCESS_SHARE and self._touches(simulation)
 
     def _touches(self, simulation: Simulation) -> bool:
-        level = float(np.linalg.norm(self._from_target(simulation)[:2]))
-        return TOUCH_FORCE[0] <= self.touch_force <= TOUCH_FORCE[1] and level <= self.table.target_radius
+        x, y, height = self._from_target(simulation)
+        above = math.hypot(x, y) <= self.table.target_radius and float(height) <= TOUCH_GAP
+        return above and TOUCH_FORCE[0] <= self.touch_force <= TOUCH_FORCE[1]
 
     def _from_target(self, simulation: Simulation) -> FloatArray:
         """From the target's centre to the right tip's lowest point [m], (3,)."""

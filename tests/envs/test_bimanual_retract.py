@@ -187,3 +187,22 @@ def test_any_two_arms_are_a_pair(tmp_path):
 def test_arms_that_cannot_do_it_are_refused(instrument, message):
     with pytest.raises(ValueError, match=message):
         BimanualRetractEnv(instrument=instrument)
+
+
+@pytest.mark.parametrize(
+    ("offset", "force", "touches"),
+    [
+        ((0.0, 0.0, 0.0), 0.6, True),
+        ((0.0079, 0.0, 0.0001), 0.3, True),
+        ((0.0, 0.0081, 0.0), 0.6, False),
+        ((0.0, 0.0, 0.0005), 0.6, False),  # the neck bears, the ball is lifted off
+        ((0.0, 0.0, 0.0), 0.29, False),
+        ((0.0, 0.0, 0.0), 1.01, False),
+    ],
+)
+def test_target_is_touched_with_the_ball_alone(env, monkeypatch, offset, force, touches):
+    """On the disc of 8 mm, the ball's lowest point down on it, with 0.3 to 1.0 N."""
+    env.reset(seed=0)
+    monkeypatch.setattr(env.task, "_from_target", lambda _: np.array(offset))
+    monkeypatch.setattr(env.task, "touch_force", force)
+    assert env.task._touches(env.simulation) is touches

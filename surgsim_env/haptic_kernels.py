@@ -71,7 +71,8 @@ class ToolViews(NamedTuple):
         axis, half_length: which axis of the geom the core lies along, its half length [m]  (n_shape,), (n_shape,)
         across, half_width: which axis of the geom a rounded box spans, its half width [m]  (n_shape,), (n_shape,)
         bodies: the tools                                                        (n_tool,)
-        brake: what MuJoCo takes implicitly: joints' and tendons' damping, velocity servos [N s/m, N m s]  (nv, nv)
+        joint_damping: [N s/m, N m s]                                            (nv,)
+        brake: what MuJoCo takes implicitly beside it, velocity servos and tendons  (nv, nv)
         geom_position, geom_rotation: of all geoms, world frame [m]              (n_geom, 3), (n_geom, 9)
         body_centre: centres of mass [m]                                         (n_body, 3)
         smooth_force: on the joints, without constraints [N, N m]                (nv,)
@@ -92,6 +93,7 @@ class ToolViews(NamedTuple):
     across: NDArray[np.int64]
     half_width: FloatArray
     bodies: NDArray[np.int32]
+    joint_damping: FloatArray
     brake: FloatArray
     geom_position: FloatArray
     geom_rotation: FloatArray
@@ -206,6 +208,7 @@ def _read_response(tools, response):
     inertia, jacobians = tools.inertia, tools.jacobians
     _mj_inertia(tools.model, tools.data, inertia.ctypes.data)
     for joint in range(inertia.shape[0]):
+        inertia[joint, joint] += tools.timestep * tools.joint_damping[joint]
         for other in range(inertia.shape[0]):
             inertia[joint, other] += tools.timestep * tools.brake[joint, other]
     factorise(inertia)

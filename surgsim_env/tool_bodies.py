@@ -63,11 +63,11 @@ def _roughness(model: mujoco.MjModel, geom: int) -> float:
 
 
 def _brake(model: mujoco.MjModel) -> FloatArray:
-    """How joint speeds brake themselves, as MuJoCo's implicit integrator counts it [N s/m, N m s], (nv, nv).
+    """How joint speeds brake themselves beside the joints' damping, as MuJoCo's implicit integrator has it, (nv, nv).
 
-    Damping of joints and of fixed tendons, and the velocity servos of joints, at the limit of their force too.
+    Velocity servos of joints, at the limit of their force too, and the damping of fixed tendons [N s/m, N m s].
     """
-    brake = np.diag(model.dof_damping.copy())
+    brake = np.zeros((model.nv, model.nv))
     for actuator in np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT):
         joint = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
         gear = model.actuator_gear[actuator, 0]
@@ -154,17 +154,16 @@ class ToolBodies:
     def read_response(self) -> None:
         """How the tools move on without the tissue and yield to it, into `response`; call after `drive`.
 
-        With the inertia M, what MuJoCo's integrator takes implicitly D (`_brake`), and all forces but the tissue's q,
-        wrenches w_j on the tools j change the twist of tool i at the rate J_i (M + dt D)^-1 (q + sum_j J_j^T w_j), J
-        being the tools' Jacobians: those of one arm share its joints.
+        With the inertia M, what MuJoCo's integrator takes implicitly D (joints' damping, `_brake`), and all forces but
+        the tissue's q, wrenches w_j on the tools j change the twist of tool i at the rate
+        J_i (M + dt D)^-1 (q + sum_j J_j^T w_j), J being the tools' Jacobians: those of one arm share its joints.
         Centripetal terms are left out, and MuJoCo's own contacts, which it counts at the step's end.
         """
         model, data, response = self.model, self.data, self.response
         data.xfrc_applied[self._tools] = 0.0
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
-        inertia = self._inertia
-        mujoco.mj_fullM(model, data, inertia)
+        inertia = self.damped_inertia(model.opt.timestep)
         inertia += model.opt.timestep * self._brake
         factorise(inertia)
         for index in range(self.tool_count):
@@ -212,6 +211,7 @@ class ToolBodies:
             across=self._core.across,
             half_width=self._core.half_width,
             bodies=self._tools,
+            joint_damping=model.dof_damping,
             brake=self._brake,
             geom_position=data.geom_xpos,
             geom_rotation=data.geom_xmat,

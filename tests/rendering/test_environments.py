@@ -14,6 +14,7 @@ from surgsim_env.rendering import gl, stage
 from surgsim_env.rendering.episode_view import offered_modes
 from tests.envs.walks import walk
 
+PALPATE = "SurgSim/Palpate-v0"
 IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
 needs_opengl = pytest.mark.usefixtures("opengl")
 
@@ -146,14 +147,14 @@ def test_bad_options_are_refused(env_id, options, message):
 def test_vector_environments_give_a_frame_for_each(mode):
     """Frames equal those of single environments, and all are drawn by one stage."""
     held = len(stage._stages)
-    envs = gym.make_vec(IDS[0], num_envs=3, vectorization_mode=mode, render_mode="rgb_array", width=160, height=120)
+    envs = gym.make_vec(PALPATE, num_envs=3, vectorization_mode=mode, render_mode="rgb_array", width=160, height=120)
     assert envs.render_mode == "rgb_array" and envs.metadata["render_fps"] == 20
     envs.reset(seed=[3, 4, 5])
     envs.step(np.tile(np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32), (3, 1)))
     frames = envs.render()
     assert isinstance(frames, tuple) and len(frames) == 3
     assert len(stage._stages) == held + 1
-    alone = gym.make(IDS[0], render_mode="rgb_array", width=160, height=120)
+    alone = gym.make(PALPATE, render_mode="rgb_array", width=160, height=120)
     alone.reset(seed=4)
     alone.step(np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32))
     assert alone.render().tobytes() == frames[1].tobytes() != frames[2].tobytes()
@@ -189,7 +190,7 @@ def test_forked_process_is_told(monkeypatch):
 def test_windows_are_not_opened_by_the_dozen(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     with pytest.raises(ValueError, match="shows one environment, not 4"):
-        gym.make_vec(IDS[0], num_envs=4, vectorization_mode="vector_entry_point", render_mode="human")
+        gym.make_vec(PALPATE, num_envs=4, vectorization_mode="vector_entry_point", render_mode="human")
 
 
 @needs_opengl

@@ -2,7 +2,7 @@
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.scripting.retract_oracle import retraction_steps
-from surgsim_env.scripting.steps import MoveTo, Predicate, Step
+from surgsim_env.scripting.steps import MoveTo, Step
 from surgsim_env.scripting.support_steps import PressSupport
 from surgsim_env.scripting.wrapped_steps import MayEnd, OfArm
 from surgsim_env.simulation import Simulation
@@ -19,17 +19,14 @@ TOUCH_FORCE = 0.6
 REACHING_SPEED = 0.015
 
 
-def bimanual_steps(
-    simulation: Simulation, target: FloatArray, turning_size: int, tip_radius: float, enough: Predicate
-) -> list[Step]:
-    """Fold the lobe back beside a target [m] (3,), go under it, press on it.
+def bimanual_steps(simulation: Simulation, target: FloatArray, turning_size: int, tip_radius: float) -> list[Step]:
+    """Fold the lobe back beside a target [m] (3,), all the way however much is seen, go under it, press on it.
 
     Args:
         simulation: at rest, with a pair of arms on the free side, the left jaw open.
         target: on the bed.
         turning_size: entries of an arm's turning.
         tip_radius: of the right tip [m].
-        enough: whether the target is seen well enough to carry the lobe no farther.
     """
     edge = float(simulation.organ_model.node_rest_position[:, 1].max())
     x, y, z = target.tolist()
@@ -40,5 +37,5 @@ def bimanual_steps(
         MoveTo(over, REACHING_SPEED, name="stand over the target"),
         PressSupport(TOUCH_FORCE, over, name="touch it"),
     ]
-    left = retraction_steps(simulation, target, turning_size, enough, aside=ASIDE, fold=FOLD)
+    left = retraction_steps(simulation, target, turning_size, lambda _: False, aside=ASIDE, fold=FOLD)
     return [*(MayEnd(OfArm(step, "left")) for step in left), *(MayEnd(OfArm(step, "right")) for step in right)]

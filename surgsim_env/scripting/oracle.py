@@ -18,8 +18,6 @@ GENTLE_SHARE = 0.4
 TRAVEL_GAP = 0.004
 # A lobe is carried no farther once enough of the target was seen for so many control steps.
 SEEN_STEPS = 5
-# With two arms, once the organ leaves so much of it uncovered.
-OPEN_SHARE = 2.0
 # Tissue this far beside the ball's way counts as under it [m].
 CORRIDOR = 0.004
 
@@ -78,9 +76,7 @@ def bimanual_oracle(env: BimanualRetractEnv) -> list[Step]:
     task, radius = env.task, env.simulation.anatomy.scene.instrument.tip_radius
     if task.target is None:
         raise ValueError("the oracle touches the target of an episode, and none has begun: call env.reset(seed=...)")
-    return bimanual_steps(
-        env.simulation, task.target.centre, task.turning_size, radius, lambda _: task.uncovered_share >= OPEN_SHARE
-    )
+    return bimanual_steps(env.simulation, task.target.centre, task.turning_size, radius)
 
 
 # An oracle for each environment.

@@ -77,13 +77,12 @@ class Until(_Wrapped):
 
     def actions(self, view: View) -> Plan:
         """What the step does, as long as it shall."""
-        plan = self.step.actions(view)
         if self.predicate(view):
             return
-        for action in plan:
+        plan = self.step.actions(view)
+        try:
+            action = next(plan)
             while not self.predicate(view := (yield action)):
-                try:
-                    action = plan.send(view)
-                except StopIteration:
-                    return
+                action = plan.send(view)
+        except StopIteration:
             return

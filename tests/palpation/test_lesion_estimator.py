@@ -1,0 +1,147 @@
+"""The common estimator: its posterior against brute conditioning and scikit-learn, its lesions against made maps."""
+
+import numpy as np
+import pytest
+
+from surgsim_env.palpation import lesion_estimator as module
+from surgsim_env.palpation.lesion_estimator import LesionEstimator
+
+EXTENT = (0.040, 0.044)
+TIP_RADIUS = 0.008
+NOISE = 0.03
+
+
+def estimator() -> LesionEstimator:
+    return LesionEstimator(EXTENT, tip_radius=TIP_RADIUS, noise=NOISE)
+
+
+def scattered(count: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(count)
+    return rng.uniform(0.0, EXTENT, (count, 2)), rng.normal(0.1, 0.4, count)
+
+
+def raster(count: int = 9) -> np.ndarray:
+    return np.stack(np.meshgrid(*(np.linspace(0.0, length, count) for length in EXTENT)), axis=-1).reshape(-1, 2)
+
+
+def bumps(places: np.ndarray, centres: list[tuple[float, float]], height: float = 0.7) -> np.ndarray:
+    """Log contrast of lesions at centres [m]: bell curves of 6 mm."""
+    squared = ((places[:, None] - np.array(centres).reshape(-1, 2)) ** 2).sum(axis=2)
+    return height * np.exp(-0.5 * squared / 0.006**2).sum(axis=1)
+
+
+def map_points(made: LesionEstimator) -> np.ndarray:
+    return np.stack(np.meshgrid(*made.axes), axis=-1).reshape(-1, 2)
+
+
+def squared_distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return ((first[:, None] - second) ** 2).sum(axis=2)
+
+
+def test_posterior_is_that_of_the_joint_normal() -> None:
+    """E[b, e | y] = C_ey C_yy^-1 y, with every covariance written out."""
+    made, (places, values) = estimator(), scattered(25)
+
+    def covariance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return module.EXCESS_SPREAD**2 * np.exp(-0.5 * squared_distances(a, b) / module.EXCESS_LENGTH**2)
+
+    noise = NOISE**2 + module.MODEL_SPREAD**2
+    solved = np.linalg.solve(covariance(places, places) + module.BACKGROUND_SPREAD**2 + noise * np.eye(25), values)
+    background, excess = made.posterior(places, values)
+    assert background == pytest.approx(module.BACKGROUND_SPREAD**2 * solved.sum(), abs=1e-10)
+    expected = covariance(map_points(made), places) @ solved
+    np.testing.assert_allclose(excess.ravel(), expected, atol=1e-10)
+
+
+def test_posterior_is_that_of_scikit_learn() -> None:
+    pytest.importorskip("sklearn", reason="compares with scikit-learn's Gaussian process")
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+    made, (places, values) = estimator(), scattered(25)
+    rbf = ConstantKernel(module.EXCESS_SPREAD**2) * RBF(module.EXCESS_LENGTH)
+    peer = GaussianProcessRegressor(
+        ConstantKernel(module.BACKGROUND_SPREAD**2) + rbf,
+        alpha=NOISE**2 + module.MODEL_SPREAD**2,
+        optimizer=None,  # pyright: ignore[reportArgumentType]  (None is documented)
+    )
+    expected = peer.fit(places, values).predict(map_points(made))
+    background, excess = made.posterior(places, values)
+    np.testing.assert_allclose(background + excess.ravel(), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "centres", [[(0.020, 0.022)], [(0.010, 0.012), (0.030, 0.035)], [(0.008, 0.008), (0.032, 0.010), (0.020, 0.036)]]
+)
+def test_lesions_are_found_where_they_are(centres: list[tuple[float, float]]) -> None:
+    """Presses 5 mm apart tell a lesion's place to a fraction of that."""
+    places = raster()
+    estimate = estimator().estimate(places, bumps(places, centres))
+    distance = np.sqrt(squared_distances(np.array(centres), estimate.points))
+    assert len(estimate.points) == len(centres)
+    assert distance.min(axis=1).max() < 0.001
+    assert (np.diff(estimate.strength) <= 0.0).all()
+
+
+def test_stiffer_tissue_throughout_is_no_lesion() -> None:
+    """log 1.3 everywhere, and as much on top of a lesion: the background takes it up."""
+    places = raster()
+    assert len(estimator().estimate(places, np.full(len(places), np.log(1.3))).points) == 0
+    lesion = bumps(places, [(0.020, 0.022)])
+    with_offset = estimator().estimate(places, lesion + np.log(1.3))
+    without = estimator().estimate(places, lesion)
+    np.testing.assert_allclose(with_offset.points, without.points, atol=5e-4)
+    # What e takes of the offset: it averages to a spread of se / sqrt(patches) over area / (2 pi l^2) = 6 patches.
+    taken = module.EXCESS_SPREAD**2 / 6.0 / (module.EXCESS_SPREAD**2 / 6.0 + module.BACKGROUND_SPREAD**2)
+    assert (1.0 - taken) * np.log(1.3) < with_offset.background - without.background < np.log(1.3)
+
+
+def test_no_press_no_lesion() -> None:
+    estimate = estimator().estimate(np.zeros((0, 2)), np.zeros(0))
+    assert estimate.points.shape == (0, 2) and estimate.strength.shape == (0,)
+    assert not estimate.outline.any() and not estimate.excess.any()
+
+
+def test_at_most_three_lesions() -> None:
+    places = raster(15)
+    centres = [(x, y) for x in (0.006, 0.034) for y in (0.006, 0.038)]
+    assert len(estimator().estimate(places, bumps(places, centres)).points) == module.LESIONS_MOST
+
+
+def test_outline_is_a_disc_around_the_lesion() -> None:
+    """A bell curve of spread s is above a share q of its height within s sqrt(-2 log q); the map smooths it."""
+    places = raster(15)
+    estimate = estimator().estimate(places, bumps(places, [(0.020, 0.022)]))
+    cell = (estimate.axes[0][1] - estimate.axes[0][0]) * (estimate.axes[1][1] - estimate.axes[1][0])
+    radius = np.sqrt(estimate.outline.sum() * cell / np.pi)
+    assert radius == pytest.approx(0.006 * np.sqrt(-2.0 * np.log(module.OUTLINE_SHARE)), rel=0.15)
+
+
+def test_lengths_go_with_the_tip() -> None:
+    """Everything twice as large gives the same estimate, twice as large."""
+    places = raster()
+    values = bumps(places, [(0.012, 0.030), (0.030, 0.012)])
+    small = estimator().estimate(places, values)
+    large = LesionEstimator(2.0 * np.array(EXTENT), tip_radius=2.0 * TIP_RADIUS, noise=NOISE)
+    np.testing.assert_allclose(large.estimate(2.0 * places, values).points, 2.0 * small.points, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"extent": (0.04, 0.0)}, "extent is"),
+        ({"extent": (0.04,)}, "extent is"),
+        ({"tip_radius": 0.0}, "tip_radius is 0 m"),
+        ({"noise": -0.1}, "noise is -0.1"),
+    ],
+)
+def test_refusals_at_construction(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        LesionEstimator(**({"extent": EXTENT, "tip_radius": TIP_RADIUS, "noise": NOISE} | arguments))
+
+
+def test_refusals_of_presses() -> None:
+    with pytest.raises(ValueError, match="2 places but log contrasts"):
+        estimator().estimate(np.zeros((2, 2)), np.zeros(3))
+    with pytest.raises(ValueError, match="not finite"):
+        estimator().estimate(np.zeros((1, 2)), np.array([np.nan]))

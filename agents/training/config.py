@@ -1,0 +1,168 @@
+"""What a training run is told: one YAML file read into frozen dataclasses, every entry checked."""
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from surgsim_env.toml_tables import fill
+
+
+@dataclass(frozen=True)
+class EnvironmentSettings:
+    """The environments that are learned on.
+
+    Fields:
+        id: of the environment, such as "SurgSim/Palpate-v0"
+        kwargs: its arguments (scene, level, memory, ...)
+        kind: "lanes" (side by side in vector registers), "library" (presses looked up, PalpateSites only) or "dummy"
+            (one after the other, any Gymnasium id)
+        count: how many
+        dtype, threads: of lanes
+        library: the file of a "library"
+        action_repeat: control steps that one decision lasts
+        without_force: force entries of the observation are set to 0
+        normalize_observation, normalize_reward: running mean and variance, as stable-baselines3's VecNormalize
+    """
+
+    id: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    kind: Literal["lanes", "library", "dummy"] = "lanes"
+    count: int = 16
+    dtype: Literal["float64", "float32"] = "float32"
+    threads: int = 1
+    library: str | None = None
+    action_repeat: int = 1
+    without_force: bool = False
+    normalize_observation: bool = True
+    normalize_reward: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("count", "threads", "action_repeat"):
+            _at_least(f"environment.{name}", getattr(self, name), 1)
+        if (self.kind == "library") != (self.library is not None):
+            raise ValueError(
+                f"environment.kind is {self.kind!r} and environment.library is {self.library!r}: "
+                'a library file goes with kind "library", and with no other'
+            )
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """Periodic evaluation, deterministic, on seeds of its own.
+
+    Fields:
+        every: environment steps between evaluations; 0 for none
+        episodes: of each evaluation
+        score: what the best policy is chosen by: "return", or an entry of the episodes' last info
+        score_sign: 1 where more is better, -1 where less is
+    """
+
+    every: int = 50_000
+    episodes: int = 16
+    score: str = "return"
+    score_sign: Literal[1, -1] = 1
+
+    def __post_init__(self) -> None:
+        _at_least("evaluation.every", self.every, 0)
+        _at_least("evaluation.episodes", self.episodes, 1)
+
+
+@dataclass(frozen=True)
+class CheckpointSettings:
+    """Checkpoints, written between rollouts.
+
+    Fields:
+        every: environment steps between them
+        keep: how many of the newest are kept
+        replay_buffer: save it too (off-policy algorithms): without it a resumed run fills a new one before it learns on
+    """
+
+    every: int = 50_000
+    keep: int = 2
+    replay_buffer: bool = True
+
+    def __post_init__(self) -> None:
+        _at_least("checkpoint.every", self.every, 1)
+        _at_least("checkpoint.keep", self.keep, 1)
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One run.
+
+    Fields:
+        name: of the run and its policy
+        algorithm: a class of stable_baselines3 or sb3_contrib, such as "PPO", "SAC", "RecurrentPPO"
+        policy: its policy's name
+        environment: what is learned on
+        total_steps: environment steps (decisions, summed over environments)
+        seed: of everything
+        hyperparameters: handed to the algorithm; `{linear: x}` falls from x to 0, activation functions go by name
+        warm_start: a policy file that the run begins with, its normalisation included
+        critic_first: so many steps train the value alone, which a cloned policy has not learned
+        torch_threads: cores that the networks may use
+    """
+
+    name: str
+    algorithm: str
+    environment: EnvironmentSettings
+    total_steps: int
+    policy: str = "MlpPolicy"
+    seed: int = 0
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+    warm_start: str | None = None
+    critic_first: int = 0
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    checkpoint: CheckpointSettings = field(default_factory=CheckpointSettings)
+    torch_threads: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("total_steps", 1), ("seed", 0), ("critic_first", 0), ("torch_threads", 1)):
+            _at_least(name, getattr(self, name), least)
+        _refuse_texts_of_numbers(self.hyperparameters, "hyperparameters")
+        _refuse_texts_of_numbers(self.environment.kwargs, "environment.kwargs")
+
+
+def read_config(path: Path, **changes: Any) -> TrainingConfig:
+    """The configuration in a YAML file, top-level entries replaced by those of `changes` that are not None.
+
+    Raises:
+        ValueError: a file that cannot be read or is no YAML table; an entry that is unknown (suggests the nearest),
+            missing or wrong.
+    """
+    try:
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"configuration {path} cannot be read: {error.strerror}") from None
+    except yaml.YAMLError as error:
+        raise ValueError(f"configuration {path} is not valid YAML: {error}") from None
+    if not isinstance(table, dict):
+        raise ValueError(f"configuration {path} is no table of entries but {type(table).__name__}")
+    table |= {name: value for name, value in changes.items() if value is not None}
+    parts = (EnvironmentSettings, EvaluationSettings, CheckpointSettings)
+    return fill(TrainingConfig, table, f"configuration {path}", parts)
+
+
+def config_text(config: TrainingConfig) -> str:
+    """The configuration as YAML, every entry written out."""
+    return yaml.safe_dump(asdict(config), sort_keys=False)
+
+
+def _at_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise ValueError(f"{name} is {value}; it must be at least {least}")
+
+
+def _refuse_texts_of_numbers(value: Any, where: str) -> None:
+    """YAML reads 3e-4 as a text: without a point it is no number there."""
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            _refuse_texts_of_numbers(entry, f"{where}.{key}")
+    elif isinstance(value, str):
+        try:
+            number = float(value)
+        except ValueError:
+            return
+        raise ValueError(f"{where} is the text {value!r}; write the number {number!r} with a point: 3.0e-4")

@@ -1,0 +1,121 @@
+"""Policies as files: NAME.zip is stable-baselines3's, NAME.json says what it plays on and how it sees it.
+
+A zip holds pickles: load only those that you trust.
+"""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.training.algorithms import algorithm_class
+from agents.training.wrappers import blinded
+
+# What VecNormalize adds to variances, and where it cuts, by default.
+VARIANCE_SLACK = 1e-8
+CUT = 10.0
+
+
+@dataclass(frozen=True)
+class PolicyDescription:
+    """What NAME.json holds.
+
+    Fields:
+        algorithm: the class that wrote NAME.zip
+        env_id, env_kwargs: what the policy plays on
+        action_repeat: control steps that one decision lasts
+        force_entries: entries of the observation that it sees as 0; empty for one that feels
+        observation_mean, observation_variance: of the normalisation, None without one
+        trained_steps, seed, score: of its training
+    """
+
+    algorithm: str
+    env_id: str
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    action_repeat: int = 1
+    force_entries: list[int] = field(default_factory=list)
+    observation_mean: list[float] | None = None
+    observation_variance: list[float] | None = None
+    trained_steps: int = 0
+    seed: int = 0
+    score: float | None = None
+
+
+class TrainedPolicy:
+    """A policy with its normalisation, its blindness and its action repeat: call it each control step.
+
+    policy = load_policy(Path("agents/policies/NAME.zip"))
+    policy.reset(env_count)
+    actions = policy.act(observations, begins)
+    """
+
+    def __init__(self, model: BaseAlgorithm, description: PolicyDescription) -> None:
+        self.model = model
+        self.description = description
+        self.reset(1)
+
+    def reset(self, count: int) -> None:
+        """Begin episodes in so many environments."""
+        self._state: Any = None
+        self._since = np.zeros(count, dtype=np.int64)
+        self._actions = np.zeros((count, *self.model.action_space.shape), dtype=np.float32)  # type: ignore[misc]
+
+    def act(self, observations: NDArray[Any], begins: NDArray[np.bool_], *, deterministic: bool = True) -> NDArray:
+        """Actions (n, n_action) for raw observations (n, n_observation); `begins` (n,): a new episode begins there."""
+        self._since[begins] = 0
+        deciding = self._since % self.description.action_repeat == 0
+        self._since += 1
+        if deciding.any():
+            seen = self.seen(observations)
+            actions, state = self.model.predict(
+                seen, state=self._state, episode_start=begins, deterministic=deterministic
+            )
+            self._actions[deciding] = actions[deciding]
+            self._state = _updated(self._state, state, deciding)
+        return self._actions.copy()
+
+    def seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
+        """Observations as the network takes them: blinded, then normalised."""
+        one = self.description
+        values = blinded(observations, one.force_entries) if one.force_entries else observations
+        if one.observation_mean is None or one.observation_variance is None:
+            return values
+        scale = np.sqrt(np.asarray(one.observation_variance) + VARIANCE_SLACK)
+        return np.clip((values - np.asarray(one.observation_mean)) / scale, -CUT, CUT).astype(np.float32)
+
+
+def save_policy(model: BaseAlgorithm, description: PolicyDescription, path: Path) -> None:
+    """Write NAME.zip and, beside it, NAME.json."""
+    model.save(path.with_suffix(".zip"))
+    text = json.dumps(asdict(description), indent=1)
+    path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+
+
+def load_policy(path: Path) -> TrainedPolicy:
+    """The policy of NAME.zip, which NAME.json describes.
+
+    Raises:
+        ValueError: one of the two files is missing.
+    """
+    for suffix in (".zip", ".json"):
+        if not path.with_suffix(suffix).is_file():
+            raise ValueError(f"policy {path}: there is no file {path.with_suffix(suffix).name} beside it")
+    description = read_description(path)
+    model = algorithm_class(description.algorithm).load(path.with_suffix(".zip"), device="cpu")
+    return TrainedPolicy(model, description)
+
+
+def read_description(path: Path) -> PolicyDescription:
+    """What NAME.json says."""
+    return PolicyDescription(**json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
+
+
+def _updated(before: Any, after: Any, deciding: NDArray[np.bool_]) -> Any:
+    """The recurrent state (layers, n, size) of those that decided, the former of the others."""
+    if after is None or before is None or deciding.all():
+        return after
+    return tuple(np.where(deciding[None, :, None], new, old) for old, new in zip(before, after, strict=True))

@@ -1,0 +1,161 @@
+"""One training run in its folder: begun, or gone on with from its last whole checkpoint."""
+
+import json
+from pathlib import Path
+
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from agents.training.algorithms import algorithm_class, keywords
+from agents.training.config import TrainingConfig, config_text
+from agents.training.environments import force_entries, make_environments, normalized, training_seed
+from agents.training.policy_files import PolicyDescription, load_policy
+from agents.training.whole_folders import keep_newest, whole_folders, write_file, write_folder
+
+# The observations that a warm start's mean and variance count for: new ones hardly move what the policy was cloned on.
+WARM_COUNT = 1e9
+
+
+class Run:
+    """The algorithm, its environments and its folder.
+
+    The folder holds config.yaml, checkpoints/STEPS/, best/STEPS/ (policy.zip and policy.json), evaluations.csv, one
+    progress csv and one TensorBoard file for each start, and when the run is over final/STEPS/.
+    """
+
+    def __init__(self, config: TrainingConfig, folder: Path) -> None:
+        """Begin a run, or go on where its folder's last whole checkpoint left it.
+
+        Raises:
+            ValueError: the folder holds a run with another configuration.
+        """
+        self.config, self.folder = config, folder
+        torch.set_num_threads(config.torch_threads)
+        self._claim_folder()
+        saved = whole_folders(folder / "checkpoints")
+        self.resumed_from = saved[-1] if saved else None
+        self.gamma = float(config.hyperparameters.get("gamma", 0.99))
+        self.bare = make_environments(config.environment)
+        self.blind_entries = force_entries(self.bare) if config.environment.without_force else []
+        self.model = self._begin() if self.resumed_from is None else self._resume(self.resumed_from)
+        self.model.set_logger(self._logger())
+
+    @property
+    def normalization(self) -> VecNormalize | None:
+        """The environments' normalisation, if they have one."""
+        return self.model.get_vec_normalize_env()
+
+    def description(self, score: float | None = None) -> PolicyDescription:
+        """The policy as it is now, in words."""
+        settings, scaled = self.config.environment, self.normalization
+        mean = variance = None
+        if scaled is not None and scaled.norm_obs:
+            mean, variance = scaled.obs_rms.mean.tolist(), scaled.obs_rms.var.tolist()
+        return PolicyDescription(
+            algorithm=self.config.algorithm,
+            env_id=settings.id,
+            env_kwargs=settings.kwargs,
+            action_repeat=settings.action_repeat,
+            force_entries=self.blind_entries,
+            observation_mean=mean,
+            observation_variance=variance,
+            trained_steps=self.model.num_timesteps,
+            seed=self.config.seed,
+            score=score,
+        )
+
+    def save_checkpoint(self, notes: dict) -> None:
+        """Write what goes on from here: model, normalisation, replay buffer, and the callbacks' own notes."""
+
+        def fill(folder: Path) -> None:
+            self.model.save(folder / "model.zip")
+            if self.normalization is not None:
+                self.normalization.save(str(folder / "normalization.pkl"))
+            if isinstance(self.model, OffPolicyAlgorithm) and self.config.checkpoint.replay_buffer:
+                self.model.save_replay_buffer(folder / "replay_buffer.pkl")
+            (folder / "notes.json").write_text(json.dumps(notes), encoding="utf-8")
+
+        place = self.folder / "checkpoints"
+        write_folder(place, f"{self.model.num_timesteps:012d}", fill)
+        keep_newest(place, self.config.checkpoint.keep)
+
+    def notes(self) -> dict:
+        """What the callbacks noted at the checkpoint that the run goes on from; empty for a new one."""
+        if self.resumed_from is None:
+            return {}
+        return json.loads((self.resumed_from / "notes.json").read_text(encoding="utf-8"))
+
+    def _claim_folder(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        file, text = self.folder / "config.yaml", config_text(self.config)
+        if file.exists():
+            # A run may be made longer.
+            old, new = (
+                {line for line in one.splitlines() if not line.startswith("total_steps")}
+                for one in (file.read_text(encoding="utf-8"), text)
+            )
+            if old != new:
+                raise ValueError(
+                    f"{self.folder} holds a run with other settings ({'; '.join(sorted(old - new))} there, "
+                    f"{'; '.join(sorted(new - old))} here): name another folder with --out"
+                )
+        write_file(file, text)
+
+    def _begin(self) -> BaseAlgorithm:
+        config = self.config
+        envs = normalized(self.bare, config.environment, self.gamma)
+        kind = algorithm_class(config.algorithm)
+        model = kind(config.policy, envs, seed=config.seed, device="cpu", **keywords(config.hyperparameters))
+        if config.warm_start is not None:
+            self._warm(model, Path(config.warm_start))
+        envs.seed(training_seed(config.seed, 0))
+        return model
+
+    def _warm(self, model: BaseAlgorithm, path: Path) -> None:
+        """Take over a policy's weights and normalisation.
+
+        Raises:
+            ValueError: it was made for other networks, or with a normalisation that this run lacks, or the reverse.
+        """
+        warm = load_policy(path)
+        try:
+            model.policy.load_state_dict(warm.model.policy.state_dict())
+        except RuntimeError as error:
+            raise ValueError(
+                f"warm_start {path}: its networks are not those of this run; set policy and policy_kwargs alike: "
+                f"{error}"
+            ) from None
+        mean, scaled = warm.description.observation_mean, model.get_vec_normalize_env()
+        here = scaled is not None and scaled.norm_obs
+        if (mean is not None) != here:
+            raise ValueError(
+                f"warm_start {path} was made {'with' if mean is not None else 'without'} a normalisation of its "
+                f"observation: set environment.normalize_observation: {str(mean is not None).lower()}"
+            )
+        if scaled is not None and mean is not None:
+            scaled.obs_rms.mean[:] = mean
+            scaled.obs_rms.var[:] = warm.description.observation_variance
+            scaled.obs_rms.count = WARM_COUNT
+
+    def _resume(self, saved: Path) -> BaseAlgorithm:
+        envs: VecEnv = self.bare
+        if (saved / "normalization.pkl").exists():
+            envs = VecNormalize.load(str(saved / "normalization.pkl"), self.bare)
+        model = algorithm_class(self.config.algorithm).load(saved / "model.zip", env=envs, device="cpu")
+        if (saved / "replay_buffer.pkl").exists():
+            assert isinstance(model, OffPolicyAlgorithm)
+            model.load_replay_buffer(saved / "replay_buffer.pkl")
+        elif isinstance(model, OffPolicyAlgorithm):
+            # Nothing to learn from yet: it is filled anew before learning goes on.
+            model.learning_starts += model.num_timesteps
+        envs.seed(training_seed(self.config.seed, model.num_timesteps))
+        return model
+
+    def _logger(self) -> Logger:
+        """One progress file for each start: the steps that it begins with are in its name."""
+        start = f"_{self.model.num_timesteps:012d}"
+        kinds = ("csv", "tensorboard")
+        return Logger(str(self.folder), [make_output_format(kind, str(self.folder), start) for kind in kinds])

@@ -9,11 +9,11 @@ SUITABLE := $(if $(PYTHON),sys.version_info >= (3, 11),(3, 11) <= sys.version_in
 
 # Asked for before the `agents` extra, so that a CPU build of just this version is taken where pip is shown one.
 TORCH := torch==2.13.0
-WITH_AGENTS := --editable=.[dev,agents]
+WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
 
 PYTEST_ARGS ?= -n 2
 
-.PHONY: help demo test test-all test-agents bench lint clean distclean
+.PHONY: help demo test test-all test-agents test-distributed bench lint clean distclean
 .NOTPARALLEL:
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo "make test         the tests (PYTEST_ARGS='-n 2' is the default)"
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
+	@echo "make test-distributed  those that need Ray (installs it: 0.6 GB)"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
 	@echo "make lint         ruff and pyright"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
@@ -37,6 +38,9 @@ test-all: $(VENV)/.ready-dev
 
 test-agents: $(VENV)/.ready-agents
 	$(PY) -m pytest $(PYTEST_ARGS) -m "agents and not slow"
+
+test-distributed: $(VENV)/.ready-distributed
+	$(PY) -m pytest -m "distributed and not slow"
 
 bench: $(VENV)/.ready-bench
 	$(VENV)/bin/surgsim bench --out docs
@@ -75,6 +79,10 @@ $(VENV)/.ready-dev: pyproject.toml $(VENV)/.made
 $(VENV)/.ready-agents: pyproject.toml $(VENV)/.made
 	$(call install,$(TORCH) $(WITH_AGENTS))
 	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
+
+$(VENV)/.ready-distributed: pyproject.toml $(VENV)/.made
+	$(call install,$(TORCH) $(WITH_AGENTS) --editable=.[distributed])
+	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev $(VENV)/.ready-agents
 
 $(VENV)/.ready-bench: pyproject.toml $(VENV)/.made
 	$(call install,--editable=.[bench])

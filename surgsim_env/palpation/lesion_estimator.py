@@ -12,17 +12,19 @@ from msdm_core.mesh import FloatArray
 REFERENCE_TIP_RADIUS = 0.008
 # Prior of the background's log contrast, one number for the organ: moduli of +-30 % and a capsule.
 BACKGROUND_SPREAD = 0.25
-# Prior of what lesions add to it: spread, and length [m] over which it changes.
-EXCESS_SPREAD = 0.35
-EXCESS_LENGTH = 0.007
-# What no press of a healthy organ explains besides the sensor's noise: a capsule that the map has not, its mesh.
+# Prior of what lesions add to it: spread, and length [m] over which it changes. A lesion is felt as a bell curve of
+# spread s = 7 mm, and a sum of such curves at random places has the correlation length sqrt(2) s.
+EXCESS_SPREAD = 0.225
+EXCESS_LENGTH = 0.010
+# What no press of a healthy organ explains besides the sensor's noise: a capsule that the map has not, the mesh.
 MODEL_SPREAD = 0.05
-# A lesion is a maximum of the excess above this,
-EXCESS_LEAST = 0.20
+# A lesion is a maximum of the excess above the first of these and so many standard deviations of the sensor's noise,
+EXCESS_LEAST = 0.07
+EXCESS_LEAST_NOISE = 0.75
 # at least so far [m] from a stronger one,
 DISTANCE_LEAST = 0.012
 # placed at the centroid of the excess within this [m] of it,
-CENTROID_RADIUS = 0.005
+CENTROID_RADIUS = 0.009
 # and its outline is where the excess is above this share of it.
 OUTLINE_SHARE = 0.6
 LESIONS_MOST = 3
@@ -77,6 +79,7 @@ class LesionEstimator:
         self.scale = tip_radius / REFERENCE_TIP_RADIUS
         self.length = EXCESS_LENGTH * self.scale
         self.noise_variance = noise**2 + MODEL_SPREAD**2
+        self.excess_least = EXCESS_LEAST + EXCESS_LEAST_NOISE * noise
         self.axes = (self._axis(0), self._axis(1))
 
     def _axis(self, index: int) -> FloatArray:
@@ -121,7 +124,7 @@ class LesionEstimator:
 
     def _maxima(self, excess: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where the lesions are [m], shape (k, 2), and how strong, shape (k,)."""
-        rows, columns = _local_maxima(excess, EXCESS_LEAST)
+        rows, columns = _local_maxima(excess, self.excess_least)
         order = np.argsort(-excess[rows, columns], kind="stable")
         points, strength = np.zeros((0, 2)), []
         for row, column in zip(rows[order], columns[order], strict=True):

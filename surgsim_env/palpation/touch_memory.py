@@ -1,0 +1,93 @@
+"""What a moving tip has felt so far, site by site of a chart: a memory that an observation can hold."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from msdm_core.regions import Material
+from surgsim_env.palpation.chart import Chart
+
+
+@dataclass(frozen=True)
+class Indenter:
+    """A ball on a soft half space: what a press of healthy tissue would feel like.
+
+    Args:
+        radius: of the ball [m].
+        material: of the tissue.
+    """
+
+    radius: float
+    material: Material
+
+    def force(self, depth: float) -> float:
+        """Hertz's force [N] at a depth [m]: 4/3 E / (1 - nu^2) sqrt(R) d^1.5 (Johnson, Contact Mechanics, 1985)."""
+        modulus = self.material.youngs_modulus / (1.0 - self.material.poisson_ratio**2)
+        return 4.0 / 3.0 * modulus * math.sqrt(self.radius) * max(depth, 0.0) ** 1.5
+
+
+class TouchMemory:
+    """Contrast felt at each site of a chart: force over Hertz's for nominal tissue, fitted to all readings there.
+
+    Readings f_i at depths with Hertz's forces h_i give the least-squares contrast sum(f_i h_i) / sum(h_i^2), so that
+    deep presses, which noise spoils least, count most. Readings of less than half the scene's press depth are left
+    out: so |contrast| is at most the sensor's range over Hertz's force there (`bound`).
+    """
+
+    def __init__(self, chart: Chart, indenter: Indenter, *, press_depth: float, force_range: float) -> None:
+        """Remember nothing yet.
+
+        Args:
+            chart: whose sites are remembered.
+            indenter: the healthy press.
+            press_depth: of the scene [m].
+            force_range: of the sensor, each axis [N].
+        """
+        self.chart, self.indenter = chart, indenter
+        self.least_depth = 0.5 * press_depth
+        self.bound = math.sqrt(3.0) * force_range / indenter.force(self.least_depth)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin an episode."""
+        self.product, self.square = np.zeros((2, self.chart.side_count**2))
+
+    def feel(self, place: FloatArray, depth: float, force: float) -> None:
+        """Take in a reading of the force along the normal [N], at a place of the chart (2,) and a depth [m]."""
+        site = self.chart.site(place)
+        if site is None or depth < self.least_depth:
+            return
+        healthy = self.indenter.force(depth)
+        self.product[site] += force * healthy
+        self.square[site] += healthy**2
+
+    @property
+    def visited(self) -> FloatArray:
+        """1 where a site was felt, else 0, shape (n_site,)."""
+        return (self.square > 0.0).astype(np.float64)
+
+    @property
+    def contrast(self) -> FloatArray:
+        """Contrast of each site, 0 where it was not felt, shape (n_site,)."""
+        return _ratio(self.product, self.square)
+
+    def stiffest(self) -> FloatArray:
+        """Place (2,) and contrast of the stiffest neighbourhood: a site with the eight around it; zeros before any."""
+        if not self.square.any():
+            return np.zeros(3)
+        around = _ratio(self._with_neighbours(self.product), self._with_neighbours(self.square))
+        best = int(np.argmax(np.where(self.square > 0.0, around, -np.inf)))
+        return np.append(self.chart.sites[best], around[best])
+
+    def _with_neighbours(self, values: FloatArray) -> FloatArray:
+        """Sums over three by three sites."""
+        side = self.chart.side_count
+        padded = np.pad(values.reshape(side, side), 1)
+        rows = padded[:-2] + padded[1:-1] + padded[2:]
+        return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]).ravel()
+
+
+def _ratio(product: FloatArray, square: FloatArray) -> FloatArray:
+    return np.divide(product, square, out=np.zeros_like(product), where=square > 0.0)

@@ -6,8 +6,10 @@ import sb3_contrib
 import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
+from agents.site_policy import SitePolicy
 from surgsim_env.toml_tables import nearest
 
 ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU}
@@ -22,6 +24,11 @@ def algorithms() -> dict[str, type[BaseAlgorithm]]:
             if isinstance(kind, type) and issubclass(kind, BaseAlgorithm):
                 found[name] = kind
     return found
+
+
+def policy_class(name: str) -> str | type[BasePolicy]:
+    """A policy of this project by name; a name of stable-baselines3's as it is."""
+    return {"SitePolicy": SitePolicy}.get(name, name)
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:

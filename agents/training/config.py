@@ -23,6 +23,7 @@ class EnvironmentSettings:
         library: the file of a "library"
         action_repeat: control steps that one decision lasts
         without_force: force entries of the observation are set to 0
+        belief: PalpateSites with memory as maps of belief, its action as a site's number: for the policy "SitePolicy"
         normalize_observation, normalize_reward: running mean and variance, as stable-baselines3's VecNormalize
     """
 
@@ -35,6 +36,7 @@ class EnvironmentSettings:
     library: str | None = None
     action_repeat: int = 1
     without_force: bool = False
+    belief: bool = False
     normalize_observation: bool = True
     normalize_reward: bool = True
 

@@ -5,6 +5,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from agents.site_belief import BeliefSettings, BelievingEnvs, SiteBelief
 from agents.training.config import EnvironmentSettings
 from agents.training.wrappers import EpisodeMonitor, RepeatedAction, WithoutForce
 from surgsim_env.stable_baselines import VectorEnvForStableBaselines
@@ -23,6 +24,8 @@ def make_environments(settings: EnvironmentSettings, count: int | None = None) -
         envs = RepeatedAction(envs, settings.action_repeat)
     if settings.without_force:
         envs = WithoutForce(envs, force_entries(envs))
+    if settings.belief:
+        envs = BelievingEnvs(envs, SiteBelief(belief_settings(envs)))
     return EpisodeMonitor(envs)
 
 
@@ -54,6 +57,18 @@ def force_entries(envs: VecEnv) -> list[int]:
             "or train with without_force: false"
         )
     return list(task.force_entries)
+
+
+def belief_settings(envs: VecEnv) -> BeliefSettings:
+    """What the belief of environments of SurgSim/PalpateSites-v0 is built on."""
+    task = envs.get_attr("unwrapped", indices=[0])[0].task
+    estimator = task.estimator
+    return BeliefSettings(
+        extent=tuple(estimator.extent.tolist()),
+        site_count=task.site_count,
+        tip_radius=estimator.tip_radius,
+        noise=estimator.noise,
+    )
 
 
 def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from agents.site_belief import BeliefSettings, SiteBelief
 from agents.training.algorithms import algorithm_class
 from agents.training.wrappers import blinded
 
@@ -29,6 +30,7 @@ class PolicyDescription:
         env_id, env_kwargs: what the policy plays on
         action_repeat: control steps that one decision lasts
         force_entries: entries of the observation that it sees as 0; empty for one that feels
+        belief: fields of `BeliefSettings` where it sees maps of belief and names a site; None otherwise
         observation_mean, observation_variance: of the normalisation, None without one
         trained_steps, seed, score: of its training
     """
@@ -38,6 +40,7 @@ class PolicyDescription:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     action_repeat: int = 1
     force_entries: list[int] = field(default_factory=list)
+    belief: dict[str, Any] | None = None
     observation_mean: list[float] | None = None
     observation_variance: list[float] | None = None
     trained_steps: int = 0
@@ -56,13 +59,18 @@ class TrainedPolicy:
     def __init__(self, model: BaseAlgorithm, description: PolicyDescription) -> None:
         self.model = model
         self.description = description
+        self.belief = None if description.belief is None else SiteBelief(BeliefSettings(**description.belief))
         self.reset(1)
 
     def reset(self, count: int) -> None:
         """Begin episodes in so many environments."""
         self._state: Any = None
         self._since = np.zeros(count, dtype=np.int64)
-        self._actions = np.zeros((count, *self.model.action_space.shape), dtype=np.float32)  # type: ignore[misc]
+        self._actions = np.zeros((count, *self._action_shape), dtype=np.float32)
+
+    @property
+    def _action_shape(self) -> tuple[int, ...]:
+        return (2,) if self.belief is not None else self.model.action_space.shape  # type: ignore[return-value]
 
     def act(self, observations: NDArray[Any], begins: NDArray[np.bool_], *, deterministic: bool = True) -> NDArray:
         """Actions (n, n_action) for raw observations (n, n_observation); `begins` (n,): a new episode begins there."""
@@ -74,14 +82,18 @@ class TrainedPolicy:
             actions, state = self.model.predict(
                 seen, state=self._state, episode_start=begins, deterministic=deterministic
             )
+            if self.belief is not None:
+                actions = self.belief.action(actions)
             self._actions[deciding] = actions[deciding]
             self._state = _updated(self._state, state, deciding)
         return self._actions.copy()
 
     def seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
-        """Observations as the network takes them: blinded, then normalised."""
+        """Observations as the network takes them: blinded, then as belief, then normalised."""
         one = self.description
         values = blinded(observations, one.force_entries) if one.force_entries else observations
+        if self.belief is not None:
+            values = self.belief.features(values)
         if one.observation_mean is None or one.observation_variance is None:
             return values
         scale = np.sqrt(np.asarray(one.observation_variance) + VARIANCE_SLACK)

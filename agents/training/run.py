@@ -1,6 +1,7 @@
 """One training run in its folder: begun, or gone on with from its last whole checkpoint."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -9,9 +10,9 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from agents.training.algorithms import algorithm_class, keywords
+from agents.training.algorithms import algorithm_class, keywords, policy_class
 from agents.training.config import TrainingConfig, config_text
-from agents.training.environments import force_entries, make_environments, normalized, training_seed
+from agents.training.environments import belief_settings, force_entries, make_environments, normalized, training_seed
 from agents.training.policy_files import PolicyDescription, load_policy
 from agents.training.whole_folders import keep_newest, whole_folders, write_file, write_folder
 
@@ -60,6 +61,7 @@ class Run:
             env_kwargs=settings.kwargs,
             action_repeat=settings.action_repeat,
             force_entries=self.blind_entries,
+            belief=asdict(belief_settings(self.bare)) if settings.belief else None,
             observation_mean=mean,
             observation_variance=variance,
             trained_steps=self.model.num_timesteps,
@@ -108,7 +110,9 @@ class Run:
         config = self.config
         envs = normalized(self.bare, config.environment, self.gamma)
         kind = algorithm_class(config.algorithm)
-        model = kind(config.policy, envs, seed=config.seed, device="cpu", **keywords(config.hyperparameters))
+        model = kind(
+            policy_class(config.policy), envs, seed=config.seed, device="cpu", **keywords(config.hyperparameters)
+        )
         if config.warm_start is not None:
             self._warm(model, Path(config.warm_start))
         envs.seed(training_seed(config.seed, 0))

@@ -76,6 +76,7 @@ class LesionEstimator:
             raise ValueError(f"tip_radius is {tip_radius:g} m; it must be above 0")
         if not 0.0 <= noise < np.inf:
             raise ValueError(f"noise is {noise:g}; it must be a standard deviation of log contrast, 0 or more")
+        self.tip_radius, self.noise = tip_radius, noise
         self.scale = tip_radius / REFERENCE_TIP_RADIUS
         self.length = EXCESS_LENGTH * self.scale
         self.noise_variance = noise**2 + MODEL_SPREAD**2

@@ -1,0 +1,72 @@
+"""The learned acquisition function: what it sees is the estimator's belief, and what it names is the site pressed."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+import gymnasium as gym
+import torch
+from agents.site_belief import BeliefSettings, SiteBelief
+from agents.site_policy import CURIOSITY, SHARPNESS, SitePolicy
+from surgsim_env.palpation.lesion_estimator import EXCESS_SPREAD, LesionEstimator
+
+pytestmark = pytest.mark.agents
+SETTINGS = BeliefSettings(extent=(0.04, 0.03), site_count=7, tip_radius=0.008, noise=0.04)
+SITES = SETTINGS.site_count**2
+
+
+def observed(contrast: dict[int, float], left: float = 0.6) -> np.ndarray:
+    """An observation that remembers the log contrast of some sites."""
+    values = np.zeros(2 * SITES + 6, dtype=np.float32)
+    for site, value in contrast.items():
+        values[site], values[SITES + site] = value, 1.0
+    values[-1] = left
+    return values
+
+
+def place(site: int) -> tuple[float, float]:
+    row, column = divmod(site, SETTINGS.site_count)
+    return column / 6 * SETTINGS.extent[0], row / 6 * SETTINGS.extent[1]
+
+
+def test_expected_excess_is_the_estimators():
+    contrast = {3: 0.1, 17: 0.5, 24: -0.2, 40: 0.05}
+    features = SiteBelief(SETTINGS).features(observed(contrast)[None])[0]
+    estimator = LesionEstimator(SETTINGS.extent, tip_radius=0.008, noise=0.04)
+    estimator.axes = tuple(np.linspace(0.0, extent, 7) for extent in SETTINGS.extent)
+    _, excess = estimator.posterior(np.array([place(site) for site in contrast]), np.array(list(contrast.values())))
+    np.testing.assert_allclose(features[:SITES] * EXCESS_SPREAD, excess.ravel(), atol=1e-6)
+
+
+def test_doubt_is_that_of_scikit_learns_process():
+    process = pytest.importorskip("sklearn.gaussian_process")
+    kernels = pytest.importorskip("sklearn.gaussian_process.kernels")
+    belief = SiteBelief(SETTINGS)
+    contrast = {3: 0.1, 17: 0.5, 24: -0.2}
+    # A press where the background is known for sure tells of the excess alone: far from all others nothing is known.
+    doubt = belief.features(observed(contrast)[None])[0][SITES : 2 * SITES]
+    assert belief.features(observed({})[None])[0][SITES : 2 * SITES].tolist() == [1.0] * SITES
+    assert doubt[[3, 17, 24]].max() < 0.75 < 0.95 < doubt[48]
+    kernel = kernels.ConstantKernel(EXCESS_SPREAD**2) * kernels.RBF(0.007)
+    known = process.GaussianProcessRegressor(kernel, alpha=belief.noise_variance, optimizer=None)
+    known.fit([place(site) for site in contrast], list(contrast.values()))
+    _, least = known.predict([place(site) for site in range(SITES)], return_std=True)
+    # Not knowing the background can only add to the doubt.
+    assert (doubt * EXCESS_SPREAD > least - 1e-6).all()
+
+
+def test_sites_and_actions_are_the_grids():
+    belief = SiteBelief(SETTINGS)
+    np.testing.assert_allclose(belief.action(np.array([0, 6, 42, 24])), [[-1, -1], [1, -1], [-1, 1], [0, 0]], atol=1e-7)
+
+
+def test_an_untrained_policy_is_an_upper_confidence_bound():
+    belief = SiteBelief(SETTINGS)
+    policy = SitePolicy(belief.space, gym.spaces.Discrete(SITES), lambda _: 1e-3)
+    features = belief.features(np.stack([observed({3: 0.1, 17: 0.5}), observed({40: 0.3})]))
+    logits = policy.get_distribution(torch.as_tensor(features)).distribution.logits
+    bound = SHARPNESS * (features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES])
+    difference = logits.detach().numpy() - bound
+    np.testing.assert_allclose(difference, np.broadcast_to(difference[:, :1], difference.shape), atol=1e-4)
+    chosen, _ = policy.predict(features, deterministic=True)
+    assert chosen.tolist() == bound.argmax(axis=1).tolist()

@@ -6,6 +6,7 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 import gymnasium as gym
 import torch
+
 from agents.site_belief import BeliefSettings, SiteBelief
 from agents.site_policy import CURIOSITY, SHARPNESS, SitePolicy
 from surgsim_env.palpation.lesion_estimator import EXCESS_SPREAD, LesionEstimator

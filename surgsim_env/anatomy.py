@@ -21,7 +21,7 @@ from msdm_core.surface import triangles_facing
 from msdm_core.triangles import nearest_triangle
 from surgsim_env.cell_share import warn_of_coarse_cells
 from surgsim_env.palpable_face import PalpableFace, find_palpable_face
-from surgsim_env.scenes import Anchor, FixedLesion, Scene, SurfaceMesh
+from surgsim_env.scenes import Anchor, FixedLesion, LesionDraw, Scene, SurfaceMesh
 from surgsim_env.timing import step_needed
 
 # How exactly a drawn lesion's cover is met [m].
@@ -87,21 +87,28 @@ class Anatomy:
         needed = step_needed(timing.haptic_step, timing.substep_count)
         return scale_mass(organ, needed, self.scene.contact.law)
 
-    def random_lesion(self, rng: np.random.Generator) -> Lesion:
-        """A lesion drawn from the scene's ranges, below a random point of the palpable face.
+    def random_lesion(
+        self, rng: np.random.Generator, draw: LesionDraw | None = None, *, modulus_factor: float = 1.0
+    ) -> Lesion:
+        """A lesion below a random point of the palpable face.
 
         Its cover is the true distance from its ball to the organ's surface, to 0.1 mm; a place where a ball of that
         size cannot have it (a thin or sharply bent one) is drawn again.
 
+        Args:
+            rng: where chance comes from.
+            draw: its ranges; the scene's by default.
+            modulus_factor: of the tissue around it, which its modulus ratio is over.
+
         Raises:
             ValueError: the scene says nothing of lesions, or the organ has no room for such a one in 200 draws.
         """
-        draw = self.scene.lesion
+        draw = self.scene.lesion if draw is None else draw
         if draw is None:
             raise ValueError(f"scene {self.scene.name!r} has no [lesion] table to draw a lesion from: add one")
         radius = float(rng.uniform(*draw.radius))
         cover = float(rng.uniform(*draw.cover))
-        ratio = float(rng.uniform(*draw.modulus_ratio))
+        ratio = float(rng.uniform(*draw.modulus_ratio)) * modulus_factor
         for _ in range(200):
             point, normal = self.face.random_point(rng, draw.rim_distance)
             centre = self._centre_below(point, normal, cover + radius)

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 
 from surgsim_env.anatomy import load_anatomy
+from surgsim_env.levels import find_level
 from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.surgical_env import SurgicalEnv
@@ -47,7 +48,8 @@ class PalpateEnv(SurgicalEnv):
 
     ## Starting State
     Radius, cover and modulus ratio of the lesion, its place on the palpable face, the sensor's bias and the tip's place
-    2 to 6 mm above the surface are drawn anew; their ranges are in the scene file. The organ is at rest.
+    2 to 6 mm above the surface are drawn anew; their ranges are in the scene file. The organ is at rest. With a `level`
+    its modulus and a capsule are drawn too, lesions and sensor are as the level has them (`surgsim_env.levels`).
 
     ## Episode End
     Terminated: the lesion was declared (success within 10 mm of its centre, measured along the surface); the contact
@@ -56,15 +58,17 @@ class PalpateEnv(SurgicalEnv):
 
     ## Info
     Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited` (the box, or an arm's
-    joint and speed limits), `hard_limit`, `declared`, `success` (bool), `force_peak` [N], `error_mm` (-1 if nothing was
-    declared), `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through
-    none), `added_mass` [kg] (of the scene's mass scaling, 0 without), one `reward_<term>` each.
+    joint and speed limits), `hard_limit`, `declared`, `success` (bool), `force_peak` [N], `cost` (force over the soft
+    limit, 1 at the hard one: a constraint for safe learning), `error_mm` (-1 if nothing was declared),
+    `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through none),
+    `added_mass` [kg] (of mass scaling, 0 without), one `reward_<term>` each.
 
     ## Arguments
     * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
     * `instrument`: "probe", the name of an arm (`surgsim_env.list_arms()`, such as "psm_palpator") or the path of an
       arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
       its tip points along the scene's approach as far as its joints allow.
+    * `level`: "easy", "standard" or "hard" (`surgsim_env.levels`); None, the default: the scene's ranges as they are.
     * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
     * `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of
       `surgsim_env.rendering.options.RenderOptions`: what pictures show. `env.unwrapped.renderer` also draws depth and
@@ -80,10 +84,17 @@ class PalpateEnv(SurgicalEnv):
     task: PalpateTask
 
     def __init__(
-        self, scene: str = "phantom", instrument: str | None = None, render_mode: str | None = None, **pictures: Any
+        self,
+        scene: str = "phantom",
+        instrument: str | None = None,
+        level: str | None = None,
+        render_mode: str | None = None,
+        **pictures: Any,
     ) -> None:
-        anatomy = load_anatomy(with_instrument(make_scene(scene), instrument))
-        task = PalpateTask(anatomy)
+        chosen = None if level is None else find_level(level)
+        described = with_instrument(make_scene(scene), instrument)
+        anatomy = load_anatomy(described if chosen is None else chosen.scene(described))
+        task = PalpateTask(anatomy, chosen)
         super().__init__(Simulation(anatomy), task, render_mode=render_mode, pictures=pictures)
 
 

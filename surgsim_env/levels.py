@@ -137,8 +137,8 @@ class DrawnOrgan:
     """
 
     lesions: tuple[Lesion, ...]
-    background: float
-    capsule_stiffness: float
+    background: float = 1.0
+    capsule_stiffness: float = 0.0
 
     def compiled(self, anatomy: Anatomy) -> OrganModel:
         """The organ of an anatomy with all that was drawn."""

@@ -29,6 +29,7 @@ class PalpateVectorEnv(SyncVectorEnv):
             where groups of 16 would leave a thread idle.
         scene: a scene's name or the path of a scene file.
         instrument: "probe", an arm's name or the path of its TOML file; the scene's own by default.
+        level: "easy", "standard" or "hard"; the scene's ranges by default.
         autoreset_mode: "NextStep", "SameStep" or "Disabled" (reset with `options={"reset_mask": ...}`).
         dtype: "float64", or "float32" for up to half the speed more, with forces within 0.5 %.
         threads: groups of organs that advance at the same time; as many as there are cores by default.
@@ -42,6 +43,7 @@ class PalpateVectorEnv(SyncVectorEnv):
         num_envs: int = 1,
         scene: str = "phantom",
         instrument: str | None = None,
+        level: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         dtype: Literal["float64", "float32"] = "float64",
         threads: int | None = None,
@@ -53,7 +55,7 @@ class PalpateVectorEnv(SyncVectorEnv):
             raise ValueError(f'render_mode "human" shows one environment, not {num_envs}: use "rgb_array"')
 
         def make() -> gym.Env:
-            env = PalpateEnv(scene, instrument, render_mode=render_mode, **pictures)
+            env = PalpateEnv(scene, instrument, level, render_mode=render_mode, **pictures)
             steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
             return gym.wrappers.TimeLimit(env, steps) if steps < EPISODE_STEPS else env
 

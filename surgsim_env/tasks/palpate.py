@@ -11,6 +11,7 @@ from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.instrument import Instrument
+from surgsim_env.levels import DrawnOrgan, Level
 from surgsim_env.rewards import PALPATE_WEIGHTS, weighted
 from surgsim_env.scenes import Endoscope
 from surgsim_env.sensors import ForceReading
@@ -40,8 +41,12 @@ class PalpateTask:
     target: Disc | None = None
     endoscope: Endoscope | None = None
 
-    def __init__(self, anatomy: Anatomy) -> None:
+    def __init__(self, anatomy: Anatomy, level: Level | None = None) -> None:
         """Palpate an anatomy.
+
+        Args:
+            anatomy: of a scene, or of what `level.scene` made of one.
+            level: what an episode draws, but for the number of lesions, which is one; the scene's ranges by default.
 
         Raises:
             ValueError: the scene says of no lesion how it is drawn.
@@ -54,7 +59,8 @@ class PalpateTask:
         self.anatomy = anatomy
         self.limits = anatomy.scene.limits
         self.reading = ForceReading(anatomy.scene.sensor)
-        self.lesion: Lesion | None = None
+        self.level = level
+        self.drawn: DrawnOrgan | None = None
         self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
@@ -62,7 +68,12 @@ class PalpateTask:
     @property
     def lesions(self) -> tuple[Lesion, ...]:
         """The lesion of the episode; none before the first."""
-        return () if self.lesion is None else (self.lesion,)
+        return () if self.drawn is None else self.drawn.lesions
+
+    @property
+    def lesion(self) -> Lesion | None:
+        """The lesion of the episode; None before the first."""
+        return self.lesions[0] if self.lesions else None
 
     def bounds(self, instrument: Instrument) -> Bounds:
         """Bounds of the observation, from the tip's workspace [m]."""
@@ -72,15 +83,18 @@ class PalpateTask:
         return Bounds(low, high)
 
     def reset(self, rng: np.random.Generator) -> Start:
-        """Draw the lesion, the sensor's bias and the tip's start."""
-        self.lesion = self.anatomy.random_lesion(rng)
+        """Draw the lesion (and what else the level draws), the sensor's bias and the tip's start."""
+        if self.level is None:
+            self.drawn = DrawnOrgan((self.anatomy.random_lesion(rng),))
+        else:
+            self.drawn = self.level.draw(self.anatomy, rng, lesion_count=1)
         self.reading.reset(rng)
         self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
         above, outward = self.anatomy.face.random_point(rng, self.anatomy.scene.palpation.face_margin)
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
-        return Start(self.anatomy.organ(self.lesions), above + outward * gap)
+        return Start(self.drawn.compiled(self.anatomy), above + outward * gap)
 
     def accepts(self, simulation: Simulation) -> bool:
         """Every drawn lesion can be found."""
@@ -153,6 +167,7 @@ class PalpateTask:
             rewards=weighted(terms, PALPATE_WEIGHTS),
             info={
                 "force_peak": force_peak,
+                "cost": max(excess, 0.0),
                 "hard_limit": hard,
                 "declared": declared,
                 "success": found,
@@ -162,7 +177,14 @@ class PalpateTask:
 
     def blank_info(self) -> dict[str, InfoValue]:
         """The info of a reset: the same keys and types as a verdict's."""
-        return {"force_peak": 0.0, "hard_limit": False, "declared": False, "success": False, "error_mm": -1.0}
+        return {
+            "force_peak": 0.0,
+            "cost": 0.0,
+            "hard_limit": False,
+            "declared": False,
+            "success": False,
+            "error_mm": -1.0,
+        }
 
     def _declares(self, simulation: Simulation) -> bool:
         pressing = self._declare_value > DECLARE_VALUE and simulation.contact_centre is not None
@@ -177,14 +199,11 @@ class PalpateTask:
         return float(self.anatomy.along_surface(truth, place[None])[0])
 
     def get_state(self) -> str:
-        """Lesion, bias and counters as JSON, exact (numbers are written in full)."""
-        lesion = self.lesion
-        assert lesion is not None and lesion.material is not None
+        """What was drawn, bias and counters as JSON, exact (numbers are written in full)."""
+        assert self.drawn is not None
         return json.dumps(
             {
-                "centre": lesion.centre,
-                "radius": lesion.radius,
-                "youngs_modulus": lesion.material.youngs_modulus,
+                "drawn": self.drawn.to_json(),
                 "bias": self.reading.bias.tolist(),
                 "counts": [self.step_count, self.declare_count],
                 "declare_value": self._declare_value,
@@ -192,12 +211,10 @@ class PalpateTask:
         )
 
     def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the organ with the lesion of that episode."""
+        """Restore what `get_state` gave; returns the organ of that episode."""
         table = json.loads(text)
-        self.lesion = self.anatomy.lesion_of_modulus(
-            table["centre"], table["radius"], table["youngs_modulus"], "lesion"
-        )
+        self.drawn = DrawnOrgan.from_json(table["drawn"], self.anatomy)
         self.reading.bias = np.array(table["bias"])
         self.step_count, self.declare_count = table["counts"]
         self._declare_value = table["declare_value"]
-        return self.anatomy.organ(self.lesions)
+        return self.drawn.compiled(self.anatomy)

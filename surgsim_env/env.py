@@ -41,6 +41,15 @@ class PalpateEnv(SurgicalEnv):
     | 6-8 | contact force on the tip [N], mean of the last haptic step, through the sensor model | +-range |
     | 9 | share of the time left | 0 to 1 |
 
+    With `memory=True`, for a grid of n sites on the palpable face (`surgsim_env.palpation.chart`), what the sensor felt
+    there so far (`surgsim_env.palpation.touch_memory`), `Box((13 + 2 n,), float32)`; n is 169 on `phantom`:
+
+    | num | meaning | bounds |
+    |---|---|---|
+    | 10 to 9 + n | contrast: force over healthy tissue's at that depth; 0 where nothing was felt | +-bound |
+    | 10 + n to 9 + 2 n | 1 where something was felt | 0 to 1 |
+    | last 3 | where it was stiffest, on the face's chart, and its contrast there | +-1, +-bound |
+
     ## Rewards
     Named terms, weighted in `surgsim_env.rewards.PALPATE_WEIGHTS`; `info["reward_<term>"]` shows each. Ending without
     finding (a wrong declare, the hard limit, a fault) also pays the dearest step for every step left, so that it never
@@ -69,6 +78,7 @@ class PalpateEnv(SurgicalEnv):
       arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
       its tip points along the scene's approach as far as its joints allow.
     * `level`: "easy", "standard" or "hard" (`surgsim_env.levels`); None, the default: the scene's ranges as they are.
+    * `memory`: whether the observation holds what was felt so far; without it the agent must remember by itself.
     * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
     * `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of
       `surgsim_env.rendering.options.RenderOptions`: what pictures show. `env.unwrapped.renderer` also draws depth and
@@ -89,12 +99,13 @@ class PalpateEnv(SurgicalEnv):
         instrument: str | None = None,
         level: str | None = None,
         render_mode: str | None = None,
+        memory: bool = False,
         **pictures: Any,
     ) -> None:
         chosen = None if level is None else find_level(level)
         described = with_instrument(make_scene(scene), instrument)
         anatomy = load_anatomy(described if chosen is None else chosen.scene(described))
-        task = PalpateTask(anatomy, chosen)
+        task = PalpateTask(anatomy, chosen, memory=memory)
         super().__init__(Simulation(anatomy), task, render_mode=render_mode, pictures=pictures)
 
 

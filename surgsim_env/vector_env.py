@@ -34,6 +34,7 @@ class PalpateVectorEnv(SyncVectorEnv):
         dtype: "float64", or "float32" for up to half the speed more, with forces within 0.5 %.
         threads: groups of organs that advance at the same time; as many as there are cores by default.
         max_episode_steps: truncate after so many control steps, at most the environment's own number.
+        memory: as for a single environment.
         render_mode: None, or "rgb_array": `render()` gives a tuple of pictures, drawn with shared graphics.
         pictures: what the pictures show, as for a single environment.
     """
@@ -48,6 +49,7 @@ class PalpateVectorEnv(SyncVectorEnv):
         dtype: Literal["float64", "float32"] = "float64",
         threads: int | None = None,
         max_episode_steps: int | None = None,
+        memory: bool = False,
         render_mode: str | None = None,
         **pictures: Any,
     ) -> None:
@@ -55,7 +57,7 @@ class PalpateVectorEnv(SyncVectorEnv):
             raise ValueError(f'render_mode "human" shows one environment, not {num_envs}: use "rgb_array"')
 
         def make() -> gym.Env:
-            env = PalpateEnv(scene, instrument, level, render_mode=render_mode, **pictures)
+            env = PalpateEnv(scene, instrument, level, render_mode, memory, **pictures)
             steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
             return gym.wrappers.TimeLimit(env, steps) if steps < EPISODE_STEPS else env
 

@@ -12,6 +12,8 @@ from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.instrument import Instrument
 from surgsim_env.levels import DrawnOrgan, Level
+from surgsim_env.palpation.chart import make_chart
+from surgsim_env.palpation.touch_memory import Indenter, TouchMemory
 from surgsim_env.rewards import PALPATE_WEIGHTS, weighted
 from surgsim_env.scenes import Endoscope
 from surgsim_env.sensors import ForceReading
@@ -32,6 +34,17 @@ POSITION_SLACK = 0.005
 SPEED_BOUND = 0.5
 
 
+def touch_memory(anatomy: Anatomy) -> TouchMemory:
+    """An empty memory for an anatomy's palpable face and its scene's sensor."""
+    scene = anatomy.scene
+    return TouchMemory(
+        make_chart(anatomy.face, scene.instrument.tip_radius),
+        Indenter(scene.instrument.tip_radius, scene.material),
+        press_depth=scene.palpation.press_depth,
+        force_range=scene.sensor.range,
+    )
+
+
 class PalpateTask:
     """SurgSim/Palpate-v0 on one anatomy."""
 
@@ -41,12 +54,13 @@ class PalpateTask:
     target: Disc | None = None
     endoscope: Endoscope | None = None
 
-    def __init__(self, anatomy: Anatomy, level: Level | None = None) -> None:
+    def __init__(self, anatomy: Anatomy, level: Level | None = None, *, memory: bool = False) -> None:
         """Palpate an anatomy.
 
         Args:
             anatomy: of a scene, or of what `level.scene` made of one.
             level: what an episode draws, but for the number of lesions, which is one; the scene's ranges by default.
+            memory: whether the observation holds what was felt so far.
 
         Raises:
             ValueError: the scene says of no lesion how it is drawn.
@@ -61,6 +75,7 @@ class PalpateTask:
         self.reading = ForceReading(anatomy.scene.sensor)
         self.level = level
         self.drawn: DrawnOrgan | None = None
+        self.memory = touch_memory(anatomy) if memory else None
         self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
@@ -80,7 +95,21 @@ class PalpateTask:
         speed, force = np.full(3, SPEED_BOUND), np.full(3, self.anatomy.scene.sensor.range)
         low = np.concatenate([instrument.lower - POSITION_SLACK, -speed, -force, [0.0]])
         high = np.concatenate([instrument.upper + POSITION_SLACK, speed, force, [1.0]])
-        return Bounds(low, high)
+        if self.memory is None:
+            return Bounds(low, high)
+        felt = np.full(self.memory.chart.side_count**2, self.memory.bound)
+        still = np.zeros_like(felt)
+        return Bounds(
+            np.concatenate([low, -felt, still, [-1.0, -1.0, -self.memory.bound]]),
+            np.concatenate([high, felt, still + 1.0, [1.0, 1.0, self.memory.bound]]),
+        )
+
+    @property
+    def force_entries(self) -> list[int]:
+        """Numbers of the observation that come from the force sensor: the reading, what memory makes of it."""
+        felt = 0 if self.memory is None else self.memory.chart.side_count**2
+        last = [] if self.memory is None else [10 + 2 * felt + index for index in range(3)]
+        return [6, 7, 8, *range(10, 10 + felt), *last]
 
     def reset(self, rng: np.random.Generator) -> Start:
         """Draw the lesion (and what else the level draws), the sensor's bias and the tip's start."""
@@ -92,6 +121,8 @@ class PalpateTask:
         self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
+        if self.memory is not None:
+            self.memory.forget()
         above, outward = self.anatomy.face.random_point(rng, self.anatomy.scene.palpation.face_margin)
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
         return Start(self.drawn.compiled(self.anatomy), above + outward * gap)
@@ -132,11 +163,21 @@ class PalpateTask:
         return self.limits.hard_force
 
     def observe(self, simulation: Simulation, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """Tip position, tip velocity, force reading, time left; and whether the sensor saturated."""
+        """Tip position, tip velocity, force reading, time left, what is remembered; whether the sensor saturated."""
         reading, saturated = self.reading.read(simulation.contact_force, rng)
         left = 1.0 - self.step_count / EPISODE_STEPS
         instrument = simulation.instrument
-        return np.concatenate([instrument.tip_position, instrument.tip_velocity, reading, [left]]), saturated
+        seen = [instrument.tip_position, instrument.tip_velocity, reading, [left]]
+        if self.memory is not None:
+            self._remember(self.memory, instrument.tip_position, reading)
+            seen += [self.memory.contrast, self.memory.visited, self.memory.stiffest()]
+        return np.concatenate(seen), saturated
+
+    def _remember(self, memory: TouchMemory, tip: FloatArray, reading: FloatArray) -> None:
+        """Take a reading in, at the depth of the ball below the resting surface."""
+        surface, normal = self.anatomy.face.project(tip)
+        depth = memory.indenter.radius - float((tip - surface) @ normal)
+        memory.feel(memory.chart.place(surface), depth, float(reading @ normal))
 
     def judge(self, simulation: Simulation, force_peak: float, fault: str) -> Verdict:
         """End a control step: see whether something was declared, and say how it ends.
@@ -207,6 +248,7 @@ class PalpateTask:
                 "bias": self.reading.bias.tolist(),
                 "counts": [self.step_count, self.declare_count],
                 "declare_value": self._declare_value,
+                "memory": None if self.memory is None else [self.memory.product.tolist(), self.memory.square.tolist()],
             }
         )
 
@@ -217,4 +259,6 @@ class PalpateTask:
         self.reading.bias = np.array(table["bias"])
         self.step_count, self.declare_count = table["counts"]
         self._declare_value = table["declare_value"]
+        if self.memory is not None:
+            self.memory.product, self.memory.square = np.array(table["memory"])
         return self.drawn.compiled(self.anatomy)

@@ -15,7 +15,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.cloning import CloningOptions, clone, is_recurrent, normalise_by
-from agents.saved_policy import SavedPolicy
 
 # Actions (n_env, n_action) for observations (n_env, n_observation); the second argument (n_env,) says whose episode
 # begins with this observation, for an expert with a memory.
@@ -74,7 +73,7 @@ def dagger(
         raise ValueError(f'autoreset_mode is {mode.value!r}; DAgger needs "SameStep"')
     if is_recurrent(model):
         raise ValueError("DAgger labels single steps; clone a recurrent policy from whole episodes (agents/cloning.py)")
-    rng, policy = np.random.default_rng(seed), SavedPolicy(model, normalisation)
+    rng = np.random.default_rng(seed)
     seen: list[NDArray] = []
     told: list[NDArray] = []
     play = _Play(envs, seed)
@@ -88,7 +87,7 @@ def dagger(
             taken = told[-1]
             if share < 1.0:
                 by_expert = rng.random(envs.num_envs) < share
-                taken = np.where(by_expert[:, None], taken, policy.act(play.observation, play.begun))
+                taken = np.where(by_expert[:, None], taken, _of_policy(model, normalisation, play.observation))
             endings += play.step(taken)
         observations, actions = np.concatenate(seen), np.concatenate(told)
         if normalisation is not None:
@@ -99,6 +98,12 @@ def dagger(
         won = [float(info["success"]) for info in endings if "success" in info]
         success = float(np.mean(won)) if won else float("nan")
         yield DaggerRound(index, share, len(actions), len(endings), success, curve.validation[curve.best])
+
+
+def _of_policy(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: NDArray) -> NDArray[np.float32]:
+    """The mean actions of the policy so far."""
+    seen = observation if normalisation is None else normalisation.normalize_obs(observation)
+    return model.predict(seen, deterministic=True)[0]
 
 
 class _Play:

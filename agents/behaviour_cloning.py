@@ -1,0 +1,122 @@
+"""Clone a policy from a Minari dataset and say how often the clone succeeds.
+
+    python -m agents.behaviour_cloning surgsim/retract/oracle-v0 --out runs/clone.zip
+
+The dataset says which environment it comes from (`agents/record_demonstrations.py` writes such). What comes out is a
+PPO or RecurrentPPO of stable-baselines3 with its normalisation: reinforcement learning goes on from it with
+`warm_start: runs/clone.zip` in a configuration of `agents/train.py`.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import minari
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from agents.cloning import CloningCurve, CloningOptions, clone, normalise_by, pad
+from agents.training.algorithms import algorithm_class
+from agents.training.policy_files import PolicyDescription, TrainedPolicy, save_policy
+
+# Episodes are scored on seeds from here on; demonstrations come from lower ones.
+FIRST_SEED = 500_000
+
+
+def clone_dataset(
+    dataset: minari.MinariDataset, *, recurrent: bool = False, width: int = 128, options: CloningOptions | None = None
+) -> tuple[TrainedPolicy, CloningCurve]:
+    """Fit a new policy to a dataset; it, and the losses of each epoch.
+
+    Args:
+        dataset: of flat observations and actions.
+        recurrent: a policy with a memory of its own (LSTM), from whole episodes.
+        width: of the two layers (of the LSTM).
+        options: how long and how fast.
+    """
+    episodes = list(dataset.iterate_episodes())
+    observations = [np.asarray(episode.observations)[:-1] for episode in episodes]
+    actions = [np.asarray(episode.actions) for episode in episodes]
+    normalisation = VecNormalize(DummyVecEnv([dataset.recover_environment]), norm_reward=False)
+    normalise_by(normalisation, np.concatenate(observations))
+    model = _new_model(normalisation, recurrent, width)
+    seen, taken, weight = np.concatenate(observations), np.concatenate(actions), 1.0
+    if recurrent:
+        (seen, weight), (taken, _) = pad(observations), pad(actions)
+    curve = clone(model, seen, taken, sample_weight=weight, normalisation=normalisation, options=options)
+    return TrainedPolicy(model, _description(model, normalisation, dataset)), curve
+
+
+def _new_model(normalisation: VecNormalize, recurrent: bool, width: int) -> BaseAlgorithm:
+    kind, policy, network = "PPO", "MlpPolicy", {"net_arch": [width, width]}
+    if recurrent:
+        kind, policy, network = "RecurrentPPO", "MlpLstmPolicy", {"lstm_hidden_size": width, "net_arch": []}
+    return algorithm_class(kind)(policy, normalisation, policy_kwargs=network, seed=0, device="cpu")
+
+
+def _description(model: BaseAlgorithm, normalisation: VecNormalize, dataset: minari.MinariDataset) -> PolicyDescription:
+    spec, statistics = dataset.spec.env_spec, normalisation.obs_rms
+    assert spec is not None and isinstance(statistics, RunningMeanStd)
+    return PolicyDescription(
+        algorithm=type(model).__name__,
+        env_id=spec.id,
+        env_kwargs=dict(spec.kwargs),
+        observation_mean=statistics.mean.tolist(),
+        observation_variance=statistics.var.tolist(),
+    )
+
+
+def play(env: gym.Env, policy: TrainedPolicy, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """The last info of an episode for each seed, with its return and its steps added."""
+    records = []
+    for seed in seeds:
+        observation, info = env.reset(seed=seed)
+        policy.reset(1)
+        begun: NDArray[np.bool_] = np.ones(1, dtype=np.bool_)
+        total, steps, over = 0.0, 0, False
+        while not over:
+            observation, reward, terminated, truncated, info = env.step(policy.act(observation[None], begun)[0])
+            begun = np.zeros(1, dtype=np.bool_)
+            total, steps, over = total + float(reward), steps + 1, terminated or truncated
+        records.append({**info, "return": total, "steps": steps})
+    return records
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Clone, keep, play, tell."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", help="its name, such as surgsim/retract/oracle-v0")
+    parser.add_argument("--out", type=Path, default=Path("runs/clone.zip"), help="where the policy is written")
+    parser.add_argument("--epochs", type=int, default=CloningOptions.epochs)
+    parser.add_argument("--recurrent", action="store_true", help="a policy with a memory of its own")
+    parser.add_argument("--width", type=int, default=128, help="of the layers")
+    parser.add_argument("--episodes", type=int, default=10, help="how many the clone plays")
+    parser.add_argument("--seed", type=int, default=0, help="of the fit")
+    given = parser.parse_args(arguments)
+    dataset = minari.load_dataset(given.dataset)
+    options = CloningOptions(
+        epochs=given.epochs, seed=given.seed, batch_size=16 if given.recurrent else CloningOptions.batch_size
+    )
+    policy, curve = clone_dataset(dataset, recurrent=given.recurrent, width=given.width, options=options)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    save_policy(policy.model, policy.description, given.out)
+    held = curve.validation[curve.best]
+    print(
+        f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps; "
+        f"mean squared error {held:.4f} on held-out ones, after {len(curve.validation)} epochs; {given.out}"
+    )
+    records = play(dataset.recover_environment(), policy, range(FIRST_SEED, FIRST_SEED + given.episodes))
+    for record in records:
+        print(f"success {record['success']}, return {record['return']:.2f}, {record['steps']} steps")
+    won, returns = [record["success"] for record in records], [record["return"] for record in records]
+    print(f"success {np.mean(won):.0%} of {len(won)} episodes, mean return {np.mean(returns):.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,240 @@
+"""Record episodes of an oracle, an agent, a trained policy or a person as a Minari dataset.
+
+    python -m agents.record_demonstrations SurgSim/Retract-v0 --episodes 100 --dataset surgsim/retract/oracle-v0
+    python -m agents.record_demonstrations SurgSim/Palpate-v0 --by agents.raster:RasterAgent \
+        --dataset surgsim/palpate/raster-v0
+
+Datasets lie in the folder that MINARI_DATASETS_PATH names, by default ~/.minari/datasets. Each episode is kept with its
+seed: `dataset.recover_environment()` reset with it and given the actions again gives the same observations to the bit.
+Anything else that steps an environment, a person too, is recorded by `Recorder`:
+
+    env = Recorder(gym.make("SurgSim/Palpate-v0", render_mode="human"))
+    ...  # reset and step it, from a joystick say
+    write_dataset(env.episodes, env.env, "surgsim/palpate/human-v0", algorithm_name="a person")
+"""
+
+import argparse
+import importlib
+import json
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import minari
+import numpy as np
+from minari.data_collector.episode_buffer import EpisodeBuffer
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.scripting import ScriptError, oracle_script, run_script
+
+# Seeds for scores alone (surgsim_env.evaluation.palpation): nobody learns from them.
+SEEDS_FOR_SCORES = range(1_000_000, 1_000_100)
+CODE = "agents/record_demonstrations.py of surgsim"
+
+# Plays one episode in an environment, from its reset with a seed on.
+Player = Callable[[gym.Env, int], None]
+
+
+@dataclass
+class Episode:
+    """What an episode showed: one observation and one info more than actions."""
+
+    seed: int | None
+    observations: list[NDArray] = field(default_factory=list)
+    infos: list[dict[str, float]] = field(default_factory=list)
+    actions: list[NDArray] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    terminated: bool = False
+    truncated: bool = False
+
+    @property
+    def success(self) -> bool:
+        """What the last info says."""
+        return bool(self.infos[-1].get("success", False))
+
+    def buffer(self, index: int) -> EpisodeBuffer:
+        """The episode as Minari writes it; one that nothing ended was cut short."""
+        ends = np.zeros((2, len(self.actions)), dtype=np.bool_)
+        ends[:, -1] = self.terminated, self.truncated or not self.terminated
+        return EpisodeBuffer(
+            id=index,
+            seed=self.seed,
+            observations=list(self.observations),
+            actions=list(self.actions),
+            rewards=list(self.rewards),
+            terminations=list(ends[0]),
+            truncations=list(ends[1]),
+            infos={name: [info[name] for info in self.infos] for name in self.infos[0]},
+        )
+
+
+class Recorder(gym.Wrapper):
+    """Keeps every episode that is played in an environment; those without a step are forgotten."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.all_episodes: list[Episode] = []
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """Those that have a step at least."""
+        return [episode for episode in self.all_episodes if episode.actions]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.all_episodes.append(Episode(seed))
+        self._see(observation, info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One step, kept."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        episode = self.all_episodes[-1]
+        episode.actions.append(np.array(action, dtype=self.action_space.dtype))
+        episode.rewards.append(float(reward))
+        episode.terminated, episode.truncated = bool(terminated), bool(truncated)
+        self._see(observation, info)
+        return observation, reward, terminated, truncated, info
+
+    def _see(self, observation: Any, info: dict[str, Any]) -> None:
+        """Minari holds infos as arrays of one type each: numbers and truths are kept, words are not."""
+        episode = self.all_episodes[-1]
+        episode.observations.append(np.array(observation))
+        episode.infos.append({name: value for name, value in info.items() if isinstance(value, bool | int | float)})
+
+
+def play_oracle(env: gym.Env, seed: int) -> None:
+    """The oracle, which knows the truth; an episode in which it fails is one that failed."""
+    env.reset(seed=seed)
+    try:
+        run_script(env, oracle_script(env))
+    except ScriptError as failure:
+        print(f"seed {seed}: {failure}")
+
+
+def player(by: str, env: gym.Env) -> Player:
+    """Who plays: "oracle", a policy's NAME.zip, or MODULE:CLASS with `reset()` and `act(observation)`."""
+    if by == "oracle":
+        return play_oracle
+    if by.endswith(".zip"):
+        from agents.training.policy_files import load_policy
+
+        policy = load_policy(Path(by))
+        return lambda env, seed: play_agent(env, seed, _PolicyAgent(policy))
+    module, _, name = by.partition(":")
+    if not name:
+        raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.zip or MODULE:CLASS")
+    agent = getattr(importlib.import_module(module), name)(env)
+    return lambda env, seed: play_agent(env, seed, agent)
+
+
+def play_agent(env: gym.Env, seed: int, agent: Any) -> None:
+    """One episode of an agent with `reset()` and `act(observation)`."""
+    observation, _ = env.reset(seed=seed)
+    agent.reset()
+    over = False
+    while not over:
+        observation, _, terminated, truncated, _ = env.step(agent.act(observation))
+        over = terminated or truncated
+
+
+class _PolicyAgent:
+    """A trained policy in one environment."""
+
+    def __init__(self, policy: Any) -> None:
+        self._policy = policy
+        self.reset()
+
+    def reset(self) -> None:
+        self._policy.reset(1)
+        self._begun = np.ones(1, dtype=np.bool_)
+
+    def act(self, observation: NDArray) -> NDArray:
+        action = self._policy.act(observation[None], self._begun)[0]
+        self._begun = np.zeros(1, dtype=np.bool_)
+        return action
+
+
+def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[Episode]:
+    """Play an episode for each seed; those that came to success, or all.
+
+    Raises:
+        ValueError: seeds that are kept for scores.
+    """
+    kept = next((seed for seed in seeds if seed in SEEDS_FOR_SCORES), None)
+    if kept is not None:
+        raise ValueError(f"seed {kept} is kept for scores, as all in {SEEDS_FOR_SCORES}: record from others")
+    recorder = Recorder(env)
+    progress = tqdm(seeds, unit="episode")
+    for seed in progress:
+        play(recorder, seed)
+        progress.set_postfix(success=f"{np.mean([episode.success for episode in recorder.episodes]):.0%}")
+    return [episode for episode in recorder.episodes if keep_failures or episode.success]
+
+
+def write_dataset(
+    episodes: Sequence[Episode], env: gym.Env, name: str, *, algorithm_name: str, author: str = "surgsim"
+) -> minari.MinariDataset:
+    """Write episodes as a Minari dataset that knows how its environment was made.
+
+    `minari.DataCollector` records too; it needs jax, and keeps failures. This is what it writes, without both.
+
+    Args:
+        episodes: one at least.
+        env: they were played in it; made with gym.make.
+        name: of the dataset, such as "surgsim/retract/oracle-v0".
+        algorithm_name: who played.
+        author: of the dataset.
+
+    Raises:
+        ValueError: no episode, an environment that was not made with gym.make, or a name that is taken.
+    """
+    if not episodes:
+        raise ValueError("there is no episode to write: none was played, or none succeeded (--keep-failures)")
+    if env.spec is None:
+        raise ValueError("the environment does not know how it was made, so that nobody could make it again: gym.make")
+    with warnings.catch_warnings():
+        # That neither an email nor another environment for evaluation is given.
+        warnings.filterwarnings("ignore", message=".*is set to None")
+        return minari.create_dataset_from_buffers(
+            name,
+            [episode.buffer(index) for index, episode in enumerate(episodes)],
+            env=env,
+            algorithm_name=algorithm_name,
+            author=author,
+            code_permalink=CODE,
+            description=f"{len(episodes)} episodes of {env.spec.id} by {algorithm_name}",
+            requirements=["surgsim"],
+            jpeg_encoding=False,
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Play and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
+    parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
+    parser.add_argument("--by", default="oracle", help="oracle, NAME.zip, or MODULE:CLASS with reset() and act()")
+    parser.add_argument("--episodes", type=int, default=10, help="how many are played")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
+    parser.add_argument("--dataset", required=True, help="the dataset's name, such as surgsim/retract/oracle-v0")
+    given = parser.parse_args(arguments)
+    env = gym.make(given.env, **given.env_arguments)
+    seeds = range(given.first_seed, given.first_seed + given.episodes)
+    episodes = record(env, player(given.by, env), seeds, keep_failures=given.keep_failures)
+    who = Path(given.by).stem if given.by.endswith(".zip") else given.by
+    dataset = write_dataset(episodes, env, given.dataset, algorithm_name=who)
+    print(
+        f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps, in {dataset.spec.data_path}"
+    )
+
+
+if __name__ == "__main__":
+    main()

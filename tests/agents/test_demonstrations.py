@@ -1,0 +1,136 @@
+"""Episodes are recorded as Minari datasets, come back to the bit, and a policy is cloned from them in one script."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+
+pytestmark = pytest.mark.agents
+pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
+minari = pytest.importorskip("minari", reason="needs the `demonstrations` extra")
+
+NAME = "surgsim/palpate/oracle-v0"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("minari")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(path))
+        yield path
+
+
+@pytest.fixture(scope="module")
+def dataset(folder):
+    """Two oracle episodes, written by the script."""
+    from agents.record_demonstrations import main
+
+    short = '{"max_episode_steps": 80}'
+    main(["SurgSim/Palpate-v0", "--env-arguments", short, "--episodes", "2", "--first-seed", "3", "--dataset", NAME])
+    return minari.load_dataset(NAME)
+
+
+def test_an_episode_comes_back_to_the_bit(dataset):
+    """The environment that the dataset names, its seed and its actions give what was observed."""
+    env = dataset.recover_environment()
+    assert env.spec.id == "SurgSim/Palpate-v0" and type(env.unwrapped).__name__ == "PalpateEnv"
+    assert dataset.total_episodes == 2 and dataset.spec.env_spec.max_episode_steps == 80
+    episode, metadata = dataset[1], next(iter(dataset.storage.get_episode_metadata([1])))
+    assert metadata["seed"] == 4
+    observation, info = env.reset(seed=metadata["seed"])
+    np.testing.assert_array_equal(observation, episode.observations[0])
+    for index, action in enumerate(episode.actions):
+        observation, reward, terminated, truncated, info = env.step(action)
+        np.testing.assert_array_equal(observation, episode.observations[index + 1])
+        assert (reward, terminated, truncated) == (
+            episode.rewards[index],
+            episode.terminations[index],
+            episode.truncations[index],
+        )
+        assert info["force_peak"] == episode.infos["force_peak"][index + 1]
+    assert info["success"] and terminated and index == len(episode.actions) - 1
+
+
+def test_a_policy_is_cloned_in_one_script(dataset, tmp_path, capsys):
+    from agents.behaviour_cloning import main
+    from agents.training.policy_files import load_policy
+
+    main([NAME, "--out", str(tmp_path / "clone.zip"), "--epochs", "3", "--episodes", "1", "--width", "32"])
+    said = capsys.readouterr().out
+    assert f"{NAME}: 2 episodes, {dataset.total_steps} steps" in said and "of 1 episodes, mean return" in said
+    policy = load_policy(tmp_path / "clone.zip")
+    assert policy.description.env_id == "SurgSim/Palpate-v0" and policy.description.algorithm == "PPO"
+
+
+def test_a_clone_does_what_was_recorded(dataset):
+    from agents.behaviour_cloning import clone_dataset
+    from agents.cloning import CloningOptions
+
+    options = CloningOptions(epochs=300, patience=300, batch_size=32, learning_rate=3e-3)
+    policy, curve = clone_dataset(dataset, width=32, options=options)
+    seen = np.concatenate([episode.observations[:-1] for episode in dataset.iterate_episodes()])
+    taken = np.concatenate([episode.actions for episode in dataset.iterate_episodes()])
+    policy.reset(len(seen))
+    missed = policy.act(seen, np.ones(len(seen), dtype=np.bool_)) - taken
+    # Ninety steps can be learned by heart; stopped where held-out ones are met best, it knows more than their mean.
+    assert curve.training[-1] < 0.05 * curve.training[0]
+    assert np.sqrt(np.square(missed).mean()) < 0.5 * np.sqrt(np.square(taken - taken.mean(axis=0)).mean())
+
+
+def test_a_policy_with_a_memory_is_cloned(dataset, tmp_path):
+    from agents.behaviour_cloning import clone_dataset
+    from agents.cloning import CloningOptions
+
+    options = CloningOptions(epochs=30, batch_size=1, learning_rate=3e-3)
+    policy, curve = clone_dataset(dataset, recurrent=True, width=16, options=options)
+    assert type(policy.model).__name__ == "RecurrentPPO"
+    assert curve.training[-1] < 0.5 * curve.training[0]
+    policy.reset(1)
+    first = policy.act(dataset[0].observations[:1], np.array([True]))
+    again = policy.act(dataset[0].observations[:1], np.array([False]))
+    assert np.abs(first - again).max() > 1e-6, "it remembers"
+    np.testing.assert_array_equal(policy.act(dataset[0].observations[:1], np.array([True])), first)
+
+
+def test_any_agent_is_recorded_and_failures_are_kept_if_asked(folder):
+    from agents.record_demonstrations import Recorder, play_agent, record, write_dataset
+
+    class Idle:
+        def reset(self):
+            pass
+
+        def act(self, observation):
+            return np.zeros(4, dtype=np.float32)
+
+    env = gym.make("SurgSim/Palpate-v0", max_episode_steps=5)
+
+    def play(env, seed):
+        play_agent(env, seed, Idle())
+
+    assert record(env, play, range(2)) == []
+    episodes = record(env, play, range(2), keep_failures=True)
+    assert [episode.seed for episode in episodes] == [0, 1] and len(episodes[0].actions) == 5
+    written = write_dataset(episodes, env, "surgsim/palpate/idle-v0", algorithm_name="nobody")
+    assert list(written[0].truncations) == [False] * 4 + [True] and not written[0].terminations.any()
+    assert written.recover_environment().spec.max_episode_steps == 5
+    # An episode that is left is cut short; a reset alone is none.
+    recorder = Recorder(env)
+    recorder.reset(seed=0)
+    recorder.reset(seed=1)
+    recorder.step(np.zeros(4, dtype=np.float32))
+    (left,) = recorder.episodes
+    buffer = left.buffer(0)
+    assert left.seed == 1 and buffer.truncations == [True] and len(buffer.observations) == 2
+
+
+def test_what_cannot_be_recorded_is_refused(folder):
+    from agents.record_demonstrations import player, record, write_dataset
+
+    env = gym.make("SurgSim/Palpate-v0")
+    with pytest.raises(ValueError, match="seed 1000000 is kept for scores"):
+        record(env, lambda env, seed: None, [1_000_000])
+    with pytest.raises(ValueError, match="there is no episode to write"):
+        write_dataset([], env, "surgsim/palpate/none-v0", algorithm_name="nobody")
+    with pytest.raises(ValueError, match="--by is 'raster'; the rule is"):
+        player("raster", env)

@@ -1,0 +1,241 @@
+"""A stand-in for SurgSim/Palpate-v0 on blocks that costs microseconds: forces from a formula instead of an organ.
+
+Learning begins here and ends on the full physics, where alone agents are scored. The force of a press at x, y and
+depth d is
+
+    F = c (d / 1 m)^p  b (1 + A exp(-r^2 / (2 s^2)))  e(x, y)
+
+with b the background's factor, r the distance from the lesion's place, and e the fall towards the block's edges. The
+numbers are fitted to presses of the full physics (`TOUCH_MODELS`); sensor, limits, rewards, memory and episode are the
+environment's own. It stands behind the interface of stable-baselines3 and steps all environments in one go.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.rewards import PALPATE_WEIGHTS
+from surgsim_env.tasks.palpate import (
+    DECLARE_STEPS,
+    DECLARE_VALUE,
+    EPISODE_STEPS,
+    SPEED_FULL_SCALE,
+    START_GAP,
+    SUCCESS_DISTANCE,
+)
+
+
+@dataclass(frozen=True)
+class TouchModel:
+    """What a scene feels like at level "standard", fitted to the full physics.
+
+    Args:
+        stiffness: c [N], the force of healthy tissue in the middle, extrapolated to a depth of 1 m.
+        exponent: p.
+        edge: e = 1 - edge (x/a)^edge_power - edge (y/a)^edge_power, x and y from the middle, a half the block's side.
+        edge_power: likewise.
+        excess: range of A.
+        width: range of s [m].
+        friction: tangential over normal force of a sliding tip.
+    """
+
+    stiffness: float
+    exponent: float
+    edge: float
+    edge_power: float
+    excess: tuple[float, float]
+    width: tuple[float, float]
+    friction: float
+
+
+TOUCH_MODELS = {
+    "phantom": TouchModel(2046.0, 1.65, 0.21, 4.0, (0.22, 0.85), (0.0058, 0.0075), 0.15),
+}
+
+
+class PalpateSurrogate(VecEnv):
+    """Many palpations of a block's flat top, by formula."""
+
+    def __init__(self, count: int, scene: str = "phantom", *, memory: bool = True) -> None:
+        """Take spaces, limits, sensor and memory from the environment itself.
+
+        Raises:
+            ValueError: a scene that no touch model was fitted to.
+        """
+        if scene not in TOUCH_MODELS:
+            raise ValueError(f"scene {scene!r} has no touch model; there are: {', '.join(TOUCH_MODELS)}")
+        env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level="standard", memory=True).unwrapped
+        self.touch, self.scene, self.task = TOUCH_MODELS[scene], env.scene, env.task
+        self.chart, self.indenter = env.task.memory.chart, env.task.memory.indenter
+        self.least_depth = env.task.memory.least_depth
+        self.memory = memory
+        instrument = env.simulation.instrument
+        self.low, self.high = instrument.lower, instrument.upper
+        self.block = np.array(env.scene.mesh.block.size)
+        self.surface = self.block[2] + env.scene.instrument.tip_radius
+        space = env.observation_space if memory else gym.make("SurgSim/Palpate-v0", scene=scene).observation_space
+        super().__init__(count, space, env.action_space)
+        self.rng = np.random.default_rng(0)
+        sites = self.chart.side_count**2
+        self.tip, self.velocity, self.bias = np.zeros((3, count, 3))
+        self.lesion = np.zeros((count, 2))
+        self.excess, self.width, self.background = np.zeros((3, count))
+        self.steps, self.declared = np.zeros((2, count), dtype=np.int64)
+        self.product, self.square = np.zeros((2, count, sites))
+        self.render_mode = None
+
+    # ---- the interface of stable-baselines3 ---------------------------------------------------------------------
+
+    def reset(self) -> VecEnvObs:
+        """Draw an episode everywhere."""
+        if self._seeds[0] is not None:
+            self.rng = np.random.default_rng(self._seeds[0])
+        self._reset_seeds()
+        self._draw(np.ones(self.num_envs, dtype=np.bool_))
+        return self._observe(np.ones(self.num_envs, dtype=np.bool_))
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions (n_env, 4)."""
+        self._actions = np.asarray(actions, dtype=np.float64)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One control step of all; a finished environment begins its next episode."""
+        before = self.tip.copy()
+        self.tip = np.clip(self.tip + self._actions[:, :3] * SPEED_FULL_SCALE * 0.05, self.low, self.high)
+        self.velocity = (self.tip - before) / 0.05
+        self.steps += 1
+        force = self.normal_force()
+        pressing = (self._actions[:, 3] > DECLARE_VALUE) & (force > 0.0)
+        self.declared = np.where(pressing, self.declared + 1, 0)
+        observation = self._observe(np.ones(self.num_envs, dtype=np.bool_))
+        rewards, over, infos = self._judge(force)
+        if over.any():
+            for index in np.flatnonzero(over):
+                infos[index]["terminal_observation"] = observation[index].copy()
+            self._draw(over)
+            observation[over] = self._observe(over)[over]
+        return observation, rewards.astype(np.float32), over, infos
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute, the same for all."""
+        value = self if attr_name == "unwrapped" else getattr(self, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of all."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args, indices: VecEnvIndices = None, **method_kwargs) -> list[Any]:
+        """None has methods of its own."""
+        raise NotImplementedError(f"{method_name}: environments by formula have no methods of their own")
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """None is."""
+        return [False for _ in self._get_indices(indices)]
+
+    # ---- the palpation -------------------------------------------------------------------------------------------
+
+    def normal_force(self) -> NDArray[np.float64]:
+        """Force along the normal [N] (n_env,): the formula above."""
+        touch, depth = self.touch, np.maximum(self.surface - self.tip[:, 2], 0.0)
+        off = np.abs(self.tip[:, :2] / (0.5 * self.block[:2]) - 1.0)
+        edge = np.maximum(1.0 - touch.edge * (off**touch.edge_power).sum(axis=1), 0.3)
+        gap = ((self.tip[:, :2] - self.lesion) ** 2).sum(axis=1)
+        bump = 1.0 + self.excess * np.exp(-0.5 * gap / self.width**2)
+        return touch.stiffness * depth**touch.exponent * self.background * bump * edge
+
+    def _draw(self, which: NDArray[np.bool_]) -> None:
+        """New episodes: a lesion, a background, a sensor's bias, a start."""
+        count, rng, scene = int(which.sum()), self.rng, self.scene
+        rim, margin = scene.lesion.rim_distance, scene.palpation.face_margin
+        self.lesion[which] = rng.uniform(rim, self.block[:2] - rim, (count, 2))
+        self.excess[which] = rng.uniform(*self.touch.excess, count)
+        self.width[which] = rng.uniform(*self.touch.width, count)
+        self.background[which] = rng.uniform(0.7, 1.35, count)
+        self.bias[which] = rng.uniform(-scene.sensor.bias, scene.sensor.bias, (count, 3))
+        place = rng.uniform(margin, self.block[:2] - margin, (count, 2))
+        height = self.surface + rng.uniform(*START_GAP, count)
+        self.tip[which] = np.column_stack([place, height])
+        self.velocity[which] = 0.0
+        self.steps[which] = self.declared[which] = 0
+        self.product[which] = self.square[which] = 0.0
+
+    def _observe(self, which: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """What the environments observe (n_env, n); the memory of `which` takes the reading in."""
+        normal = self.normal_force()
+        speed = np.linalg.norm(self.velocity[:, :2], axis=1, keepdims=True)
+        way = self.velocity[:, :2] / np.maximum(speed, 1e-9)
+        force = np.column_stack([-self.touch.friction * normal[:, None] * way, normal]) + self.bias
+        reach = self.scene.sensor.range
+        reading = np.clip(force + self.rng.normal(0.0, self.scene.sensor.noise, force.shape), -reach, reach)
+        left = 1.0 - self.steps / EPISODE_STEPS
+        seen = [self.tip, self.velocity, reading, left[:, None]]
+        if self.memory:
+            self._remember(which, reading[:, 2])
+            seen += list(self._recalled())
+        return np.concatenate(seen, axis=1).astype(np.float32)
+
+    def _remember(self, which: NDArray[np.bool_], force: NDArray[np.float64]) -> None:
+        """`TouchMemory.feel` of all at once."""
+        side, depth = self.chart.side_count, self.surface - self.tip[:, 2]
+        cell = np.floor(0.5 * (self.chart.place(self.tip) + 1.0) * (side - 1) + 0.5).astype(np.int64)
+        felt = which & (depth >= self.least_depth) & ((cell >= 0) & (cell < side)).all(axis=1)
+        rows, sites = np.flatnonzero(felt), cell[felt, 1] * side + cell[felt, 0]
+        healthy = self.indenter.force(1.0) * depth[felt] ** 1.5
+        self.product[rows, sites] += force[felt] * healthy
+        self.square[rows, sites] += healthy**2
+
+    def _recalled(self) -> tuple[NDArray[np.float64], ...]:
+        """Contrasts, visited marks and the stiffest place, as `TouchMemory` gives them."""
+        side = self.chart.side_count
+        visited = self.square > 0.0
+        contrast = np.divide(self.product, self.square, out=np.zeros_like(self.product), where=visited)
+        sums = []
+        for values in (self.product, self.square):
+            padded = np.pad(values.reshape(-1, side, side), ((0, 0), (1, 1), (1, 1)))
+            rows = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+            sums.append((rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]).reshape(len(values), -1))
+        around = np.divide(sums[0], sums[1], out=np.zeros_like(sums[0]), where=sums[1] > 0.0)
+        best = np.argmax(np.where(visited, around, -np.inf), axis=1)
+        stiffest = np.column_stack([self.chart.sites[best], around[np.arange(len(best)), best]])
+        stiffest[~visited.any(axis=1)] = 0.0
+        return contrast, visited.astype(np.float64), stiffest
+
+    def _judge(self, force: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Rewards, ends and infos, as `PalpateTask.judge` has them."""
+        limits = self.scene.limits
+        hard = force > limits.hard_force
+        declared = ~hard & (self.declared >= DECLARE_STEPS)
+        error = np.linalg.norm(self.tip[:, :2] - self.lesion, axis=1)
+        found = declared & (error <= SUCCESS_DISTANCE)
+        terminated, left = hard | declared, EPISODE_STEPS - self.steps
+        over = terminated | (left <= 0)
+        share = np.clip((force - limits.soft_force) / (limits.hard_force - limits.soft_force), 0.0, 1.0)
+        weights = PALPATE_WEIGHTS
+        rewards = (
+            weights["time"]
+            + weights["soft_force"] * share
+            + weights["found"] * found
+            + weights["wrong"] * (declared & ~found)
+            + weights["hard_force"] * hard
+            + weights["forgone"] * (terminated & ~found) * left
+        )
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for index in np.flatnonzero(over):
+            infos[index] = {
+                "success": bool(found[index]),
+                "declared": bool(declared[index]),
+                "hard_limit": bool(hard[index]),
+                "error_mm": float(error[index]) * 1000.0 if declared[index] else -1.0,
+                "TimeLimit.truncated": bool(not terminated[index]),
+            }
+        return rewards, over, infos

@@ -3,21 +3,22 @@
 Learning begins here and ends on the full physics, where alone agents are scored. The force of a press at x, y and
 depth d is
 
-    F = c (d / 1 m)^p  b (1 + A exp(-r^2 / (2 s^2)))  e(x, y)
+    F = c (d / 1 m)^p b (1 + A exp(-r^2 / (2 s^2))) e(x, y)
 
 with b the background's factor, r the distance from the lesion's place, and e the fall towards the block's edges. The
 numbers are fitted to presses of the full physics (`TOUCH_MODELS`); sensor, limits, rewards, memory and episode are the
-environment's own. It stands behind the interface of stable-baselines3 and steps all environments in one go.
+environment's own. All environments are stepped in one go.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.rewards import PALPATE_WEIGHTS
@@ -28,6 +29,7 @@ from surgsim_env.tasks.palpate import (
     SPEED_FULL_SCALE,
     START_GAP,
     SUCCESS_DISTANCE,
+    touch_memory,
 )
 
 
@@ -55,12 +57,18 @@ class TouchModel:
 
 
 TOUCH_MODELS = {
-    "phantom": TouchModel(2046.0, 1.65, 0.21, 4.0, (0.22, 0.85), (0.0058, 0.0075), 0.15),
+    "phantom": TouchModel(425.0, 1.37, 0.437, 4.14, (0.25, 0.85), (0.0055, 0.0078), 0.21),
+    "phantom_small": TouchModel(587.0, 1.42, 0.315, 3.06, (0.13, 0.50), (0.0045, 0.0066), 0.2),
 }
 
+# The range of b: that of the level's moduli, and what a drawn capsule adds.
+BACKGROUND = (0.7, 1.4)
 
-class PalpateSurrogate(VecEnv):
-    """Many palpations of a block's flat top, by formula."""
+
+class PalpateSurrogate(VectorEnv):
+    """Many palpations of a block's flat top, by formula; an environment that ends is reset in the same step."""
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
     def __init__(self, count: int, scene: str = "phantom", *, memory: bool = True) -> None:
         """Take spaces, limits, sensor and memory from the environment itself.
@@ -70,17 +78,23 @@ class PalpateSurrogate(VecEnv):
         """
         if scene not in TOUCH_MODELS:
             raise ValueError(f"scene {scene!r} has no touch model; there are: {', '.join(TOUCH_MODELS)}")
-        env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level="standard", memory=True).unwrapped
+        env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level="standard", memory=memory).unwrapped
         self.touch, self.scene, self.task = TOUCH_MODELS[scene], env.scene, env.task
-        self.chart, self.indenter = env.task.memory.chart, env.task.memory.indenter
-        self.least_depth = env.task.memory.least_depth
+        remembered = touch_memory(env.simulation.anatomy)
+        self.chart, self.indenter, self.least_depth = remembered.chart, remembered.indenter, remembered.least_depth
         self.memory = memory
+        timing = env.scene.timing
+        self.control_step = timing.haptic_step * timing.haptic_steps_per_control
         instrument = env.simulation.instrument
         self.low, self.high = instrument.lower, instrument.upper
         self.block = np.array(env.scene.mesh.block.size)
         self.surface = self.block[2] + env.scene.instrument.tip_radius
-        space = env.observation_space if memory else gym.make("SurgSim/Palpate-v0", scene=scene).observation_space
-        super().__init__(count, space, env.action_space)
+        self.num_envs = count
+        self.single_observation_space, self.single_action_space = env.observation_space, env.action_space
+        self.observation_space = batch_space(self.single_observation_space, count)
+        self.action_space = batch_space(self.single_action_space, count)
+        # Who asks an environment for its scene or task gets the true one's.
+        self.envs = [env] * count
         self.rng = np.random.default_rng(0)
         sites = self.chart.side_count**2
         self.tip, self.velocity, self.bias = np.zeros((3, count, 3))
@@ -88,59 +102,37 @@ class PalpateSurrogate(VecEnv):
         self.excess, self.width, self.background = np.zeros((3, count))
         self.steps, self.declared = np.zeros((2, count), dtype=np.int64)
         self.product, self.square = np.zeros((2, count, sites))
-        self.render_mode = None
 
-    # ---- the interface of stable-baselines3 ---------------------------------------------------------------------
-
-    def reset(self) -> VecEnvObs:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[NDArray[np.float32], dict]:
         """Draw an episode everywhere."""
-        if self._seeds[0] is not None:
-            self.rng = np.random.default_rng(self._seeds[0])
-        self._reset_seeds()
-        self._draw(np.ones(self.num_envs, dtype=np.bool_))
-        return self._observe(np.ones(self.num_envs, dtype=np.bool_))
+        if isinstance(seed, list):
+            seed = seed[0]
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        everywhere = np.ones(self.num_envs, dtype=np.bool_)
+        self._draw(everywhere)
+        return self._observe(everywhere), {}
 
-    def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions (n_env, 4)."""
-        self._actions = np.asarray(actions, dtype=np.float64)
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """One control step of all; a finished environment begins its next episode."""
-        before = self.tip.copy()
-        self.tip = np.clip(self.tip + self._actions[:, :3] * SPEED_FULL_SCALE * 0.05, self.low, self.high)
-        self.velocity = (self.tip - before) / 0.05
+    def step(self, actions: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray, NDArray, NDArray, dict]:
+        """One control step of all; a finished environment begins its next episode in the same step."""
+        actions, before = np.asarray(actions, dtype=np.float64), self.tip
+        self.tip = np.clip(before + actions[:, :3] * SPEED_FULL_SCALE * self.control_step, self.low, self.high)
+        self.velocity = (self.tip - before) / self.control_step
         self.steps += 1
         force = self.normal_force()
-        pressing = (self._actions[:, 3] > DECLARE_VALUE) & (force > 0.0)
+        pressing = (actions[:, 3] > DECLARE_VALUE) & (force > 0.0)
         self.declared = np.where(pressing, self.declared + 1, 0)
         observation = self._observe(np.ones(self.num_envs, dtype=np.bool_))
-        rewards, over, infos = self._judge(force)
+        rewards, terminated, truncated, endings = self._judge(force)
+        infos: dict[str, Any] = {}
+        over = terminated | truncated
         if over.any():
             for index in np.flatnonzero(over):
-                infos[index]["terminal_observation"] = observation[index].copy()
+                ended = {"final_obs": observation[index].copy(), "final_info": endings(index)}
+                infos = self._add_info(infos, ended, int(index))
             self._draw(over)
             observation[over] = self._observe(over)[over]
-        return observation, rewards.astype(np.float32), over, infos
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute, the same for all."""
-        value = self if attr_name == "unwrapped" else getattr(self, attr_name)
-        return [value for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all."""
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *method_args, indices: VecEnvIndices = None, **method_kwargs) -> list[Any]:
-        """None has methods of its own."""
-        raise NotImplementedError(f"{method_name}: environments by formula have no methods of their own")
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """None is."""
-        return [False for _ in self._get_indices(indices)]
+        return observation, rewards, terminated, truncated, infos
 
     # ---- the palpation -------------------------------------------------------------------------------------------
 
@@ -160,7 +152,7 @@ class PalpateSurrogate(VecEnv):
         self.lesion[which] = rng.uniform(rim, self.block[:2] - rim, (count, 2))
         self.excess[which] = rng.uniform(*self.touch.excess, count)
         self.width[which] = rng.uniform(*self.touch.width, count)
-        self.background[which] = rng.uniform(0.7, 1.35, count)
+        self.background[which] = rng.uniform(*BACKGROUND, count)
         self.bias[which] = rng.uniform(-scene.sensor.bias, scene.sensor.bias, (count, 3))
         place = rng.uniform(margin, self.block[:2] - margin, (count, 2))
         height = self.surface + rng.uniform(*START_GAP, count)
@@ -210,17 +202,17 @@ class PalpateSurrogate(VecEnv):
         stiffest[~visited.any(axis=1)] = 0.0
         return contrast, visited.astype(np.float64), stiffest
 
-    def _judge(self, force: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
+    def _judge(
+        self, force: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Callable[[int], dict[str, Any]]]:
         """Rewards, ends and infos, as `PalpateTask.judge` has them."""
-        limits = self.scene.limits
+        limits, weights = self.scene.limits, PALPATE_WEIGHTS
         hard = force > limits.hard_force
         declared = ~hard & (self.declared >= DECLARE_STEPS)
         error = np.linalg.norm(self.tip[:, :2] - self.lesion, axis=1)
         found = declared & (error <= SUCCESS_DISTANCE)
         terminated, left = hard | declared, EPISODE_STEPS - self.steps
-        over = terminated | (left <= 0)
         share = np.clip((force - limits.soft_force) / (limits.hard_force - limits.soft_force), 0.0, 1.0)
-        weights = PALPATE_WEIGHTS
         rewards = (
             weights["time"]
             + weights["soft_force"] * share
@@ -229,13 +221,13 @@ class PalpateSurrogate(VecEnv):
             + weights["hard_force"] * hard
             + weights["forgone"] * (terminated & ~found) * left
         )
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for index in np.flatnonzero(over):
-            infos[index] = {
+
+        def ending(index: int) -> dict[str, Any]:
+            return {
                 "success": bool(found[index]),
                 "declared": bool(declared[index]),
                 "hard_limit": bool(hard[index]),
                 "error_mm": float(error[index]) * 1000.0 if declared[index] else -1.0,
-                "TimeLimit.truncated": bool(not terminated[index]),
             }
-        return rewards, over, infos
+
+        return rewards, terminated, ~terminated & (left <= 0), ending

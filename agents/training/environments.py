@@ -87,4 +87,9 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
         from agents.press_library import PressLibraryEnv
 
         return DummyVecEnv([lambda: PressLibraryEnv(settings.library, **settings.kwargs)] * count)
+    if settings.kind == "surrogate":
+        from agents.palpate_surrogate import PalpateSurrogate
+
+        chosen = {name: value for name, value in settings.kwargs.items() if name != "level"}
+        return VectorEnvForStableBaselines(PalpateSurrogate(count, **chosen))
     return DummyVecEnv([lambda: gym.make(settings.id, **settings.kwargs)] * count)

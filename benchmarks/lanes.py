@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel
-from msdm_core.lanes import advance_lanes, rest_lanes, stack_organs, stack_shapes
+from msdm_core.lane_organs import stack_organs
+from msdm_core.lanes import advance_lanes, rest_lanes, stack_shapes
 from msdm_core.organ import rest_state
 from msdm_core.shapes import round_shapes
 from msdm_core.stepping import advance_organ

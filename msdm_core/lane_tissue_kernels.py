@@ -18,7 +18,7 @@ from msdm_core.element_kernels import (
     tet_shape,
     volume_ratio,
 )
-from msdm_core.vector import any_below, keep_lower, load_lanes, spread_lanes, store_lanes
+from msdm_core.vector import any_below, keep_lower, load_lanes, load_or_spread, store_lanes
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -108,7 +108,7 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
     for spring in range(begin, nodes.shape[0]):
         x, y, z = _difference(lanes, position, nodes, spring, 1)
         scale = spring_scale(
-            x, y, z, load_lanes(lanes, stiffness, spring), spread_lanes(lanes, position, rest_length[spring])
+            x, y, z, load_lanes(lanes, stiffness, spring), load_or_spread(lanes, position, rest_length, spring)
         )
         x, y, z = x * scale, y * scale, z * scale
         _add(lanes, force, nodes[spring, 0], x, y, z)
@@ -149,7 +149,7 @@ def average_volumes(lanes, position, velocity, tension, tets, node_inverse_volum
             gradients, _ = tet_shape(*_three_edges(lanes, position, tets, tet))
             _share(lanes, tension, tets, tet, beta * six_rates(*_three_edges(lanes, velocity, tets, tet), gradients))
     for node in range(tension.shape[0]):
-        inverse = spread_lanes(lanes, position, node_inverse_volume[node])
+        inverse = load_or_spread(lanes, position, node_inverse_volume, node)
         store_lanes(
             tension, node, node_tension(load_lanes(lanes, tension, node), inverse, load_lanes(lanes, node_bulk, node))
         )
@@ -178,7 +178,7 @@ def add_tet_forces(
     for tet in range(tets.shape[0]):
         edge, third, fourth = _three_edges(lanes, position, tets, tet)
         gradients, six = tet_shape(edge, third, fourth)
-        ratio = volume_ratio(six, spread_lanes(lanes, position, inverse_volume[tet]))
+        ratio = volume_ratio(six, load_or_spread(lanes, position, inverse_volume, tet))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         if any_below(ratio, SQUEEZED_RATIO):
             squeezed[count] = tet
@@ -189,7 +189,7 @@ def add_tet_forces(
         )  # fmt: skip
         own, shared = load_lanes(lanes, bulk, tet), load_lanes(lanes, averaged_bulk, tet)
         scale = tet_scale(ratio, own, shared, averaged)
-        length = spread_lanes(lanes, position, rest_length[tet])
+        length = load_or_spread(lanes, position, rest_length, tet)
         pull = spring_scale(edge[0], edge[1], edge[2], load_lanes(lanes, stiffness, tet), length)
         _push(lanes, force, tets, tet, scale, gradients, pull, edge)
     store_lanes(low, 0, _where_moving(load_lanes(lanes, moving, 0), lowest, load_lanes(lanes, low, 0)))
@@ -202,7 +202,7 @@ def add_volume_damping(lanes, position, velocity, force, tets, inverse_volume, b
     for tet in range(tets.shape[0]):
         gradients, _ = tet_shape(*_three_edges(lanes, position, tets, tet))
         six_rate = six_rates(*_three_edges(lanes, velocity, tets, tet), gradients)
-        rate = beta * volume_ratio(six_rate, spread_lanes(lanes, position, inverse_volume[tet]))
+        rate = beta * volume_ratio(six_rate, load_or_spread(lanes, position, inverse_volume, tet))
         _push(
             lanes,
             force,

@@ -1,8 +1,9 @@
 """Organs of one mesh side by side: eight float64 or sixteen float32 advance at once, each as it would alone.
 
 Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, supports,
-damping and gravity are shared. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its
-neighbours.
+damping and gravity are shared. With `own_rest` organs of the same tets may also differ in their rest shape and in what
+is anchored, for a few hundredths of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves
+it, whoever its neighbours.
 """
 
 import math
@@ -15,102 +16,50 @@ from numpy.typing import NDArray
 from msdm_core.contact_kernels import QUADRATURE_COUNT
 from msdm_core.errors import OrganError
 from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState, ToolResponse
-from msdm_core.lane_kernels import LANE_EMPTY, LaneModel, LaneState, advance_lane_substeps
+from msdm_core.lane_kernels import advance_lane_substeps
+from msdm_core.lane_organs import check_lane, has_own_rest, lane_count, surface_rooms
+from msdm_core.lane_view_kernels import LANE_EMPTY, LaneModel, LaneState
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import rest_state, support_shape
 from msdm_core.stepping import unyielding
-from msdm_core.vector import aligned_zeros, lane_counts
+from msdm_core.vector import aligned_zeros
 
-# Of an organ's arrays, those that each lane has of its own; all others are shared.
-OWN_FIELDS = ("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk")
-OWN_NUMBERS = ("averages_volume", "stable_step")
-SHARED_FIELDS = tuple(name for name in LaneModel._fields if name not in (*OWN_FIELDS, *OWN_NUMBERS, "lanes"))
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
 CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch")
 
 
-def stack_organs(organs: Sequence[OrganModel], *, dtype: Any = np.float64, lanes: int | None = None) -> LaneModel:
-    """Organs of one mesh side by side, in the given order; lanes that are left over have copies of the last one.
-
-    Args:
-        organs: at most as many as there are lanes.
-        dtype: np.float64 or np.float32.
-        lanes: 8 in float64; 16 (the default) or 8 in float32, where two groups on two cores may be worth more.
-
-    Raises:
-        OrganError: no organ or too many, another dtype or number of lanes, or an organ that differs from the first in
-            what they share: its mesh, anchors, supports, damping or gravity. Names the lane and the field.
-    """
-    count = _lane_count(dtype, lanes)
-    if not 1 <= len(organs) <= count:
-        raise OrganError(
-            f"{len(organs)} organs for the {count} lanes of {np.dtype(dtype)}: stack them in several groups"
-        )
-    first = organs[0]
-    own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in OWN_FIELDS}
-    numbers = {"averages_volume": np.zeros(count, dtype=np.bool_), "stable_step": np.zeros(count)}
-    shared = {name: getattr(first, name) for name in SHARED_FIELDS}
-    model = LaneModel(lanes=(0,) * count, **own, **numbers, **shared)
-    for lane in range(count):
-        organ = organs[min(lane, len(organs) - 1)]
-        _check_shared(model, lane, organ, first.node_inverse_mass == 0.0)
-        _write_lane(model, lane, organ)
-    return model
-
-
-def _lane_count(dtype: Any, lanes: int | None) -> int:
-    if np.dtype(dtype) not in (np.float64, np.float32):
-        raise OrganError(f"dtype is {np.dtype(dtype)}; lanes are float64 (8 organs) or float32 (16 or 8 organs)")
-    known = lane_counts(dtype)
-    if lanes is not None and lanes not in known:
-        raise OrganError(f"lanes is {lanes}; in {np.dtype(dtype)} there are {' or '.join(map(str, known))}")
-    return known[0] if lanes is None else lanes
-
-
-def set_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
-    """Put another organ of the same mesh into a lane, as with another lesion; its state is left as it is (`put_lane`).
-
-    Raises:
-        OrganError: no such lane, or an organ that differs in what the lanes share.
-    """
-    _check_lane(lane, len(model.stable_step))
-    _check_shared(model, lane, organ, model.node_inverse_mass[:, lane] == 0.0)
-    _write_lane(model, lane, organ)
-
-
-def _check_shared(model: LaneModel, lane: int, organ: OrganModel, anchored: NDArray[np.bool_]) -> None:
-    differing = [name for name in SHARED_FIELDS if not _equal(getattr(model, name), getattr(organ, name))]
-    if not differing and not np.array_equal(organ.node_inverse_mass == 0.0, anchored):
-        differing = ["anchors"]
-    if differing:
-        raise OrganError(
-            f"the organ for lane {lane} has another {differing[0]} than its neighbours: organs side by side share "
-            "mesh, anchors, supports, damping and gravity; put it into a group of its own"
-        )
-
-
-def _equal(a: Any, b: Any) -> bool:
-    return a is b or np.array_equal(a, b)
-
-
-def _write_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
-    # Read-only but for this moment: a kernel that writes to the model does not compile.
-    for name in OWN_FIELDS + OWN_NUMBERS:
-        array = getattr(model, name)
-        array.setflags(write=True)
-        array[..., lane] = getattr(organ, name)
-        array.setflags(write=False)
-
-
 def rest_lanes(
-    organs: Sequence[OrganModel], *, shape_count: int = 0, dtype: Any = np.float64, lanes: int | None = None
+    organs: Sequence[OrganModel],
+    *,
+    shape_count: int = 0,
+    dtype: Any = np.float64,
+    lanes: int | None = None,
+    own_rest: bool = False,
 ) -> LaneState:
     """The state at rest of organs side by side, with contact memory for `shape_count` shapes each.
 
     Lanes that are left over stand still (LANE_EMPTY). Under gravity each organ is settled, as `rest_state` does.
     """
-    first, count = organs[0], _lane_count(dtype, lanes)
+    resting = [rest_state(organ, shape_count=shape_count) for organ in organs]
+    return lanes_of(resting, organs[0], dtype=dtype, lanes=lanes, own_rest=own_rest)
+
+
+def lanes_of(
+    states: Sequence[OrganState],
+    first: OrganModel,
+    *,
+    dtype: Any = np.float64,
+    lanes: int | None = None,
+    own_rest: bool = False,
+) -> LaneState:
+    """Lanes that go on from the states of organs, the first of which is given; those left over stand still."""
+    shape_count = len(states[0].contact_engaged)
+    count = lane_count(dtype, lanes)
     nodes, surface = len(first.node_mass), len(first.surface_triangles)
+    support_nodes, supports, _ = support_shape(first)
+    if own_rest:
+        rooms = surface_rooms(first)
+        surface, support_nodes = rooms["surface_triangles"], rooms["support_nodes"]
     vectors = {name: aligned_zeros((nodes, 3, count), dtype) for name in (*NODE_FIELDS, "kept_force")}
     state = LaneState(
         **vectors,
@@ -120,18 +69,19 @@ def rest_lanes(
         contact_stretch=np.zeros((count, shape_count, surface * QUADRATURE_COUNT, 3)),
         contact_candidates=np.zeros((count, shape_count, surface), dtype=np.int32),
         contact_passed=np.zeros((count, 2), dtype=np.int32),
-        support_stretch=np.zeros((count, *support_shape(first))),
+        support_stretch=np.zeros((count, support_nodes, supports, 3)),
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
         moving=aligned_zeros((1, count), dtype),
         finite_sum=aligned_zeros((1, count), dtype),
         candidate_count=np.zeros(count, dtype=np.int32),
         contact_kept=np.ones(count, dtype=np.uint8),
+        surface_count=np.full(count, surface, dtype=np.int32),
+        support_count=np.full(count, support_nodes, dtype=np.int32),
     )
-    resting = [rest_state(organ, shape_count=shape_count) for organ in organs]
     for lane in range(count):
-        put_lane(state, lane, resting[min(lane, len(organs) - 1)])
-    state.lane_fault[len(organs) :] = LANE_EMPTY
+        put_lane(state, lane, states[min(lane, len(states) - 1)])
+    state.lane_fault[len(states) :] = LANE_EMPTY
     return state
 
 
@@ -141,10 +91,14 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
     Raises:
         OrganError: no such lane, or a state of another mesh or of another number of contact shapes.
     """
-    _check_lane(lane, len(state.lane_fault))
+    check_lane(lane, len(state.lane_fault))
     memory = tuple(getattr(organ, name).shape for name in ("contact_engaged", "support_stretch"))
     lane_memory = tuple(getattr(state, name).shape[1:] for name in ("contact_engaged", "support_stretch"))
-    if organ.node_position.shape != state.node_position.shape[:2] or memory != lane_memory:
+    # Lanes with rest shapes of their own have room for the organ with the largest surface.
+    shapes, points = memory[0]
+    has_room = shapes == lane_memory[0][0] and points <= lane_memory[0][1]
+    has_room &= memory[1][0] <= lane_memory[1][0] and memory[1][1:] == lane_memory[1][1:]
+    if organ.node_position.shape != state.node_position.shape[:2] or not has_room:
         raise OrganError(
             f"the state has {len(organ.node_position)} nodes and memory of contact and supports {memory}, lane {lane} "
             f"{len(state.node_position)} and {lane_memory}: make it with rest_state(model, shape_count=...)"
@@ -152,7 +106,9 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
     for name in NODE_FIELDS:
         getattr(state, name)[:, :, lane] = getattr(organ, name)
     for name in CONTACT_FIELDS:
-        getattr(state, name)[lane] = getattr(organ, name)
+        values = getattr(organ, name)
+        getattr(state, name)[lane][tuple(slice(length) for length in values.shape)] = values
+    state.surface_count[lane], state.support_count[lane] = points // QUADRATURE_COUNT, len(organ.support_stretch)
     state.volume_ratio_smallest[0, lane] = organ.volume_ratio_smallest[0]
     state.lane_fault[lane] = FAULT_NONE
 
@@ -163,23 +119,22 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
     Raises:
         OrganError: no such lane.
     """
-    _check_lane(lane, len(state.lane_fault))
-    nodes = len(state.node_position)
+    check_lane(lane, len(state.lane_fault))
+    nodes, surface, supports = len(state.node_position), state.surface_count[lane], state.support_count[lane]
     rows = {name: aligned_zeros((nodes, 4)) for name in ("row_position", "row_velocity", "row_force")}
+    points = np.s_[:, : surface * QUADRATURE_COUNT]
     return OrganState(
         **{name: np.array(getattr(state, name)[:, :, lane], dtype=np.float64, order="C") for name in NODE_FIELDS},
-        **{name: getattr(state, name)[lane].copy() for name in CONTACT_FIELDS},
+        contact_engaged=state.contact_engaged[lane][points].copy(),
+        contact_stretch=state.contact_stretch[lane][points].copy(),
+        contact_passed=state.contact_passed[lane].copy(),
+        support_stretch=state.support_stretch[lane, :supports].copy(),
         **rows,
         node_tension=np.zeros(nodes),
         squeezed_tets=np.zeros_like(state.squeezed_tets),
-        contact_candidates=state.contact_candidates[lane].copy(),
+        contact_candidates=state.contact_candidates[lane, :, :surface].copy(),
         volume_ratio_smallest=state.volume_ratio_smallest[:, lane].astype(np.float64),
     )
-
-
-def _check_lane(lane: int, count: int) -> None:
-    if not 0 <= lane < count:
-        raise OrganError(f"lane {lane} does not exist; there are lanes 0 to {count - 1}")
 
 
 def stack_shapes(shapes: Sequence[ContactShapes], lanes: int = 8) -> ContactShapes:
@@ -252,11 +207,12 @@ def _check_fit(
     """Registers are loaded without looking at an array's bounds: what does not fit must not get there."""
     lanes, count = shapes.shape_radius.shape
     tools = shapes.tool_centre.shape[1]
-    nodes, surface = len(model.node_mass), len(model.surface_triangles)
+    nodes, own = len(model.node_mass), int(has_own_rest(model))
+    surface, support_nodes = model.surface_triangles.shape[own], model.support_nodes.shape[own]
     fits = {
         "node_position": (state.node_position, (nodes, 3, len(model.lanes))),
         "contact_engaged": (state.contact_engaged, (lanes, count, surface * QUADRATURE_COUNT)),
-        "support_stretch": (state.support_stretch, (lanes, len(model.support_nodes), len(model.support_kind), 3)),
+        "support_stretch": (state.support_stretch, (lanes, support_nodes, len(model.support_kind), 3)),
         "shape_ends": (shapes.shape_ends, (len(state.lane_fault), count, 2, 3)),
         "shape_span": (shapes.shape_span, (lanes, count, 3)),
         "shape_friction": (shapes.shape_friction, (lanes, count)),
@@ -267,5 +223,8 @@ def _check_fit(
     for name, (array, shape) in fits.items():
         if array.shape != shape:
             raise OrganError(f"{name} has shape {array.shape}; with these organs, shapes and tools it is {shape}")
+    for name in ("surface_count", "support_count"):
+        if not np.array_equal(getattr(model, name), getattr(state, name)):
+            raise OrganError(f"{name} of the lanes' organs and of their states differ: put_lane goes with set_lane")
     if model.node_mass.dtype != state.node_position.dtype:
         raise OrganError(f"the organs are {model.node_mass.dtype}, their states {state.node_position.dtype}")

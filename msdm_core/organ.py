@@ -12,7 +12,7 @@ from msdm_core.contact_kernels import QUADRATURE_COUNT
 from msdm_core.damping import Damping
 from msdm_core.errors import OrganError
 from msdm_core.kernels import OrganModel, OrganState
-from msdm_core.lane_kernels import LaneModel
+from msdm_core.lane_view_kernels import LaneModel
 from msdm_core.length_unit import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.lumping import MassScheme, lump_mass
 from msdm_core.mesh import FloatArray, TetMesh

@@ -255,14 +255,22 @@ def spread_like(_typing: Any, array: Any, value: Any) -> Any:
 
 
 @intrinsic
-def spread_lanes(_typing: Any, lanes: Any, array: Any, value: Any) -> Any:
-    """A number in every lane of a vector of an array's type, as wide as the tuple `lanes` is long."""
-    vector = VectorType(array.dtype, len(lanes))
+def load_or_spread(_typing: Any, lanes: Any, like: Any, array: Any, index: Any) -> Any:
+    """What each lane has of its own in an array (n, n_lane), or what an array (n,) has for all, of type `like`."""
+    own = array.ndim == 2
+    vector = VectorType(array.dtype if own else like.dtype, len(lanes))
 
-    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
-        return _operand(context, builder, values[2], value, vector)
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
+        kind = signature.args[2]
+        if own:
+            place = builder.mul(values[3], ir.Constant(values[3].type, vector.width))
+            loaded = builder.load(_pointer(context, builder, kind, values[2], place, vector))
+            loaded.align = array.dtype.bitwidth // 8
+            return loaded
+        data = context.make_array(kind)(context, builder, values[2]).data
+        return _operand(context, builder, builder.load(builder.gep(data, [values[3]])), array.dtype, vector)
 
-    return vector(lanes, array, value), generate
+    return vector(lanes, like, array, types.intp), generate
 
 
 # ---- shuffles -----------------------------------------------------------------------------------------------------

@@ -286,7 +286,10 @@ def register() -> None:
         max_episode_steps=palpate.EPISODE_STEPS,
     )
     gym.register(
-        id="SurgSim/Retract-v0", entry_point="surgsim_env.env:RetractEnv", max_episode_steps=retract.EPISODE_STEPS
+        id="SurgSim/Retract-v0",
+        entry_point="surgsim_env.env:RetractEnv",
+        vector_entry_point="surgsim_env.vector_env:RetractVectorEnv",
+        max_episode_steps=retract.EPISODE_STEPS,
     )
     gym.register(
         id="SurgSim/BimanualRetract-v0",

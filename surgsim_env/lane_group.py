@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.kernels import FAULT_NONE, OrganModel
-from msdm_core.lane_kernels import LANE_EMPTY
-from msdm_core.lanes import get_lane, lane_responses, put_lane, rest_lanes, set_lane, stack_organs, stack_shapes
+from msdm_core.lane_organs import same_rest, set_lane, stack_organs
+from msdm_core.lane_view_kernels import LANE_EMPTY
+from msdm_core.lanes import get_lane, lane_responses, lane_shapes, lanes_of, put_lane, stack_shapes
 from surgsim_env.exchange import StepsTaken, describe
 from surgsim_env.lane_haptic_kernels import advance_lane_haptic_steps
 from surgsim_env.simulation import Simulation
@@ -16,6 +18,9 @@ from surgsim_env.simulation import Simulation
 
 class LaneGroup:
     """As many simulations as there are lanes: 8 in float64, 16 or 8 in float32.
+
+    Their organs have the same tets; rest shapes and anchors are shared till a simulation comes with others, and each
+    lane's own from then on.
 
     Between control steps every simulation holds its own state, so that tasks, saving and loading see no difference; a
     control step copies them into the lanes and back, which costs a hundredth of it.
@@ -25,11 +30,9 @@ class LaneGroup:
         """Take simulations of one scene, at most as many as there are lanes."""
         self.simulations = list(simulations)
         first = self.simulations[0]
-        self._organs: list[OrganModel] = [one.organ_model for one in self.simulations]
-        self._model = stack_organs(self._organs, dtype=dtype, lanes=lanes)
+        self._dtype, self._lanes = dtype, lanes
+        self._stack()
         count = len(self._model.lanes)
-        shapes = first.instrument.shapes
-        self._state = rest_lanes(self._organs, shape_count=len(shapes.shape_radius), dtype=dtype, lanes=count)
         self._shapes = stack_shapes([one.instrument.shapes for one in self.simulations], count)
         tools = first.instrument.tool_count
         self._response = lane_responses(tools, count)
@@ -45,6 +48,11 @@ class LaneGroup:
 
         Called from several threads for several groups: the compiled call does not hold the interpreter's lock.
         """
+        if not self._own_rest and not all(
+            one.organ_model is known or same_rest(one.organ_model, self._organs[0])
+            for one, known in zip(self.simulations, self._organs, strict=True)
+        ):
+            self._stack()
         for lane, simulation in enumerate(self.simulations):
             self._load(lane, simulation, bool(active[lane]))
         first = self.simulations[0]
@@ -59,6 +67,14 @@ class LaneGroup:
         )  # fmt: skip
         for lane in np.flatnonzero(active):
             self._unload(int(lane))
+
+    def _stack(self) -> None:
+        """Make lanes for the simulations as they are now."""
+        self._organs: list[OrganModel] = [one.organ_model for one in self.simulations]
+        self._own_rest = not all(same_rest(self._organs[0], organ) for organ in self._organs)
+        settings: dict[str, Any] = {"dtype": self._dtype, "lanes": self._lanes, "own_rest": self._own_rest}
+        self._model = stack_organs(self._organs, **settings)
+        self._state = lanes_of([one.organ_state for one in self.simulations], self._organs[0], **settings)
 
     def _load(self, lane: int, simulation: Simulation, active: bool) -> None:
         if not active:
@@ -77,4 +93,7 @@ class LaneGroup:
         if code != FAULT_NONE:
             message = describe(simulation.organ_model, organ_state, self._mean[lane], code)
         taken = StepsTaken(int(self._taken[lane]), float(self._peak[lane]), message, float(self._pull_peak[lane]))
+        # Tasks read where the shapes are: torques are about their tools' centres.
+        for own, moved in zip(simulation.instrument.shapes, lane_shapes(self._shapes, lane), strict=True):
+            own[...] = moved
         simulation.take_over(organ_state, self._wrench[lane], taken)

@@ -3,7 +3,8 @@
 from numba import njit
 
 from msdm_core.kernels import FAULT_NONE
-from msdm_core.lane_kernels import LANE_EMPTY, advance_lane_substeps, response_of, shapes_of
+from msdm_core.lane_kernels import advance_lane_substeps
+from msdm_core.lane_view_kernels import LANE_EMPTY, response_of, shapes_of
 from surgsim_env.haptic_kernels import begin_step, end_step, pull_force, total_force
 
 

@@ -1,9 +1,9 @@
-"""SurgSim/Palpate-v0 many times over: environments whose organs advance side by side in vector registers."""
+"""Environments of one id many times over: their organs advance side by side in vector registers."""
 
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -11,12 +11,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
 from msdm_core.vector import lane_counts
-from surgsim_env.env import PalpateEnv
+from surgsim_env.env import PalpateEnv, RetractEnv
 from surgsim_env.lane_group import LaneGroup
-from surgsim_env.tasks.palpate import EPISODE_STEPS
+from surgsim_env.surgical_env import SurgicalEnv
+from surgsim_env.tasks import palpate, retract
 
 
-class PalpateVectorEnv(SyncVectorEnv):
+class LaneVectorEnv(SyncVectorEnv):
     """Environments of one scene, stepped together; each gives what it would give alone.
 
     Everything but the control step itself is `SyncVectorEnv`'s: resets, autoreset modes, infos, spaces. In float64 each
@@ -27,47 +28,45 @@ class PalpateVectorEnv(SyncVectorEnv):
     Args:
         num_envs: how many; multiples of 8 (float64) or 16 (float32) leave no lane empty. In float32 groups are of 8
             where groups of 16 would leave a thread idle.
-        scene: a scene's name or the path of a scene file.
-        instrument: "probe", an arm's name or the path of its TOML file; the scene's own by default.
-        level: "easy", "standard" or "hard"; the scene's ranges by default.
         autoreset_mode: "NextStep", "SameStep" or "Disabled" (reset with `options={"reset_mask": ...}`).
         dtype: "float64", or "float32" for up to half the speed more, with forces within 0.5 %.
         threads: groups of organs that advance at the same time; as many as there are cores by default.
         max_episode_steps: truncate after so many control steps, at most the environment's own number.
-        memory: as for a single environment.
         render_mode: None, or "rgb_array": `render()` gives a tuple of pictures, drawn with shared graphics.
-        pictures: what the pictures show, as for a single environment.
+        settings: what a single environment takes, such as scene, instrument and level, by name.
     """
+
+    # What a subclass says: the environment that it has many of, and how long its episodes are at most.
+    single: ClassVar[type[SurgicalEnv]]
+    episode_steps: ClassVar[int]
 
     def __init__(
         self,
         num_envs: int = 1,
-        scene: str = "phantom",
-        instrument: str | None = None,
-        level: str | None = None,
+        *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         dtype: Literal["float64", "float32"] = "float64",
         threads: int | None = None,
         max_episode_steps: int | None = None,
-        memory: bool = False,
         render_mode: str | None = None,
-        **pictures: Any,
+        **settings: Any,
     ) -> None:
         if render_mode == "human" and num_envs != 1:
             raise ValueError(f'render_mode "human" shows one environment, not {num_envs}: use "rgb_array"')
 
         def make() -> gym.Env:
-            env = PalpateEnv(scene, instrument, level, render_mode, memory, **pictures)
-            steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
-            return gym.wrappers.TimeLimit(env, steps) if steps < EPISODE_STEPS else env
+            env: gym.Env = self.single(render_mode=render_mode, **settings)  # type: ignore[call-arg]
+            longest = self.episode_steps
+            steps = longest if max_episode_steps is None else max_episode_steps
+            return gym.wrappers.TimeLimit(env, steps) if steps < longest else env
 
         super().__init__([make] * num_envs, autoreset_mode=autoreset_mode)
-        self._palpations: list[PalpateEnv] = [env.unwrapped for env in self.envs]  # type: ignore[misc]
+        self._singles: list[SurgicalEnv] = [env.unwrapped for env in self.envs]  # type: ignore[misc]
         threads = threads if threads is not None else os.cpu_count() or 1
         width = group_width(num_envs, np.dtype(dtype), threads)
         self._members = [range(first, min(first + width, num_envs)) for first in range(0, num_envs, width)]
         self._groups = [
-            LaneGroup([self._palpations[index].simulation for index in members], np.dtype(dtype).type, width)
+            LaneGroup([self._singles[index].simulation for index in members], np.dtype(dtype).type, width)
             for members in self._members
         ]
         self._pool = ThreadPoolExecutor(max_workers=min(len(self._groups), threads))
@@ -77,13 +76,14 @@ class PalpateVectorEnv(SyncVectorEnv):
         active = np.zeros(self.num_envs, dtype=np.bool_)
         for index, action in enumerate(iterate(self.action_space, actions)):
             if not (self._autoreset_envs[index] and self.autoreset_mode is AutoresetMode.NEXT_STEP):
-                self._palpations[index].command(action)
+                self._singles[index].command(action)
                 active[index] = True
-        first = self._palpations[0]
-        count, limit = first.scene.timing.haptic_steps_per_control, first.task.force_limit
+        first = self._singles[0]
+        count = first.scene.timing.haptic_steps_per_control
+        limits = first.task.force_limit, first.task.pull_limit
         list(
             self._pool.map(
-                lambda group, members: group.control_step(active[members.start : members.stop], count, limit),
+                lambda group, members: group.control_step(active[members.start : members.stop], count, *limits),
                 self._groups,
                 self._members,
             )
@@ -94,6 +94,20 @@ class PalpateVectorEnv(SyncVectorEnv):
         """Stop the threads and close the environments."""
         self._pool.shutdown()
         super().close_extras(**kwargs)
+
+
+class PalpateVectorEnv(LaneVectorEnv):
+    """SurgSim/Palpate-v0 many times over."""
+
+    single = PalpateEnv
+    episode_steps = palpate.EPISODE_STEPS
+
+
+class RetractVectorEnv(LaneVectorEnv):
+    """SurgSim/Retract-v0 many times over; each lane has a lobe of its own size, held as it was drawn."""
+
+    single = RetractEnv
+    episode_steps = retract.EPISODE_STEPS
 
 
 def group_width(num_envs: int, dtype: np.dtype, threads: int) -> int:

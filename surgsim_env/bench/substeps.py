@@ -7,7 +7,8 @@ import numpy as np
 
 from msdm_core.damping import Damping
 from msdm_core.kernels import FAULT_NONE, OrganModel
-from msdm_core.lanes import advance_lanes, rest_lanes, stack_organs, stack_shapes
+from msdm_core.lane_organs import stack_organs
+from msdm_core.lanes import advance_lanes, rest_lanes, stack_shapes
 from msdm_core.meshing import box_mesh
 from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.regions import Material

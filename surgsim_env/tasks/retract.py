@@ -157,9 +157,15 @@ class RetractTask:
             [np.asarray(velocity, dtype=np.float64) / SPEED_FULL_SCALE, turn, [self.jaw_target if jaw is None else jaw]]
         )
 
+    @property
+    def force_entries(self) -> tuple[int, ...]:
+        """The entries of the observation that are forces: the jaw's wrench, its grip and its pull."""
+        first = self._first_force
+        return tuple(range(first, first + 8))
+
     def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
         """The force sensor's reading in an observation [N], shape (3,)."""
-        first = 7 + (6 if self.turning_size else 0)
+        first = self._first_force
         return np.asarray(observation[first : first + 3], dtype=np.float64)
 
     # An episode ------------------------------------------------------------------------------------------------------
@@ -312,6 +318,10 @@ class RetractTask:
             np.array(drawn.eye), target.points(), nodes, triangles, instrument.model, instrument.data, hiding
         )
         return float(seen.mean())
+
+    @property
+    def _first_force(self) -> int:
+        return 7 + (6 if self.turning_size else 0)
 
     def _grasp(self, simulation: Simulation) -> Grasp:
         grasp = simulation.grasp

@@ -13,8 +13,9 @@ from msdm_core.kernels import (
     OrganState,
     ToolResponse,
 )
-from msdm_core.lane_kernels import LANE_EMPTY
-from msdm_core.lanes import advance_lanes, get_lane, lane_shapes, put_lane, set_lane
+from msdm_core.lane_organs import set_lane
+from msdm_core.lane_view_kernels import LANE_EMPTY
+from msdm_core.lanes import advance_lanes, get_lane, lane_shapes, put_lane
 from msdm_core.organ import rest_state
 from msdm_core.stepping import advance_organ, describe_fault, unyielding
 from tests.core.test_lanes import LAW, SUBSTEP, SUBSTEPS, pressed_organs, pressing, same, tool, varied, yielding

@@ -22,7 +22,9 @@ from msdm_core.kernels import (
     ToolResponse,
     evaluate_forces,
 )
-from msdm_core.lane_kernels import LANE_EMPTY, LaneModel, LaneState, advance_lane_substeps, evaluate_lane_forces
+from msdm_core.lane_kernels import advance_lane_substeps, evaluate_lane_forces
+from msdm_core.lane_organs import set_lane, stack_organs
+from msdm_core.lane_view_kernels import LANE_EMPTY, LaneModel, LaneState
 from msdm_core.lanes import (
     advance_lanes,
     get_lane,
@@ -30,8 +32,6 @@ from msdm_core.lanes import (
     lane_shapes,
     put_lane,
     rest_lanes,
-    set_lane,
-    stack_organs,
     stack_shapes,
 )
 from msdm_core.organ import rest_state

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from msdm_core import settling
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
-from msdm_core.lanes import advance_lanes, get_lane, rest_lanes, stack_organs, stack_shapes
+from msdm_core.lane_organs import stack_organs
+from msdm_core.lanes import advance_lanes, get_lane, rest_lanes, stack_shapes
 from msdm_core.measure import kinetic_energy, momentum, potential_energy, support_forces
 from msdm_core.organ import rest_state
 from msdm_core.stability import stable_dt

@@ -1,0 +1,140 @@
+"""A scripted expert for SurgSim/Retract-v0 that remembers nothing: each action follows from the observation alone.
+
+What `surgsim_env.scripting.retract_oracle` does as a script, it reads off where things are, so that it knows what to do
+in any state that a learning agent gets into: that is what DAgger asks of an expert (Ross et al. 2011). It is made for
+the scene `lobe` with its own grasper, whose wrist turns about one hinge. Run it from a checkout:
+
+    python agents/expert_retract.py --episodes 20
+"""
+
+import argparse
+import math
+from collections.abc import Iterable
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+import surgsim_env  # noqa: F401  (registers the ids)
+
+SPEED = 0.02  # [m/s] full scale of an action's velocity
+TURNING = 0.5  # [rad/s] full scale of the wrist
+CONTROL_STEP = 0.05  # [s]
+
+# Where the observation has what (docs of `RetractEnv`, instrument with one hinge).
+TIP, POINTS_ALONG, GAP = slice(0, 3), slice(9, 12), 12
+GRIP, HOLDS, EDGE, MIDDLE, VISIBLE, TARGET = 19, 21, slice(22, 37), slice(37, 52), 52, slice(53, 55)
+
+# Before the free edge, where the jaw waits; how deep its middle goes in over the edge [m].
+WAITING_GAP, GRASP_DEPTH = 0.016, 0.0065
+# Nearer than this to the bed's end the pads do not go [m].
+NEAREST = 0.0475
+# From the lobe's top to the middle of its thickness [m]; of a free edge that hangs down a little.
+HALF_THICKNESS = 0.006
+# The approach may begin this far off its line; the jaw closes this near its goal [m].
+ALIGNED, ARRIVED = 0.0015, 0.0008
+# The jaw is told to be closed where it is this near the grasp and has begun to close, or holds.
+OPEN_GAP, NEAR_GRASP = 0.0195, 0.004
+GRIP_FORCE = 0.22  # [N] it lifts from here on
+# Ways of the tip: up first, then over [m]; how far the edge turns on each of them [rad].
+RISEN, FOLDED = (0.0465, 0.031), (0.024, 0.050)
+TURNS = (math.radians(35.0), math.radians(75.0))
+SEEN_ENOUGH = 0.9
+CARRYING_SPEED, APPROACH_SPEED = 0.015, 0.015
+
+
+class RetractExpert:
+    """Goes before the edge over the target, around it, closes, lifts, folds, and keeps still where enough is seen."""
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The action (5,) for an observation (56,)."""
+        now = np.asarray(observation, dtype=np.float64)
+        velocity, turning, jaw = self._carry(now) if self._grasped(now) else self._approach(now)
+        return np.concatenate([velocity / SPEED, [turning / TURNING, jaw]]).clip(-1.0, 1.0).astype(np.float32)
+
+    def _grasped(self, now: NDArray[np.float64]) -> bool:
+        return bool(now[HOLDS] > 0.5 and now[GRIP] > 0.0)
+
+    def _carry(self, now: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
+        tip, still = now[TIP], np.zeros(3)
+        if now[GRIP] < GRIP_FORCE and now[GAP] > 0.0045 and tip[2] < 0.012:
+            return still, 0.0, -1.0
+        if now[VISIBLE] >= SEEN_ENOUGH:
+            return still, 0.0, -1.0
+        goal = RISEN if tip[2] < RISEN[1] - 0.002 and tip[1] > 0.040 else FOLDED
+        velocity = towards(np.array([tip[0], *goal]) - tip, CARRYING_SPEED)
+        return velocity, _turning(now, _wanted_pitch(tip[2])), -1.0
+
+    def _approach(self, now: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
+        tip, grasp = now[TIP], grasp_place(now)
+        off = grasp - tip
+        waiting = np.array([grasp[0], grasp[1] + GRASP_DEPTH + WAITING_GAP, grasp[2]])
+        across = math.hypot(off[0], off[2])
+        turning = _turning(now, 0.0)
+        closing = now[GAP] < OPEN_GAP and np.linalg.norm(off) < NEAR_GRASP
+        if np.linalg.norm(off) < ARRIVED or closing:
+            return 0.2 * off / CONTROL_STEP, turning, -1.0
+        if across < ALIGNED or (across < 2.0 * ALIGNED and tip[1] < waiting[1] - 0.002):
+            return towards(off, APPROACH_SPEED), turning, 1.0
+        if tip[1] < waiting[1] - 0.004:
+            # Beside its line: out first, straight away from the edge.
+            return np.array([0.0, SPEED, 0.0]), turning, 1.0
+        return towards(waiting - tip, SPEED), turning, 1.0
+
+
+def grasp_place(now: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where the tip grasps the free edge over the target [m] (3,), from the points of the edge that are seen."""
+    edge = now[EDGE].reshape(5, 3)
+    along = float(now[TARGET][0])
+    border = float(np.interp(along, edge[:, 0], edge[:, 1]))
+    top = float(np.interp(along, edge[:, 0], edge[:, 2]))
+    return np.array([along, max(border - GRASP_DEPTH, NEAREST), top - HALF_THICKNESS])
+
+
+def towards(gap: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
+    """A velocity along a way left [m], slower on its last millimetre: the tip lags behind what is asked."""
+    distance = float(np.linalg.norm(gap))
+    return gap * (min(speed, 0.6 * distance / CONTROL_STEP) / max(distance, 1e-9))
+
+
+def _wanted_pitch(height: float) -> float:
+    """How far the jaw has turned down where the tip is so high [rad]."""
+    heights = (0.004, RISEN[1], FOLDED[1])
+    return float(np.interp(height, heights, (0.0, *TURNS)))
+
+
+def _turning(now: NDArray[np.float64], wanted: float) -> float:
+    """The wrist's speed [rad/s] towards an angle below the level; a hinge lifts the jaw's tip above 0."""
+    _, y, z = now[POINTS_ALONG]
+    return -0.6 * (wanted - math.atan2(-z, -y)) / CONTROL_STEP
+
+
+def run_episode(env: gym.Env, expert: RetractExpert, seed: int) -> dict[str, float | bool | str]:
+    """One episode's outcome: success, harm, steps, return, largest pull [N]."""
+    observation, info = env.reset(seed=seed)
+    total, steps, done = 0.0, 0, False
+    while not done:
+        observation, reward, terminated, truncated, info = env.step(expert.act(observation))
+        total, steps, done = total + float(reward), steps + 1, terminated or truncated
+    names = ("success", "torn", "hard_limit", "sim_fault", "pull_force_peak", "slips", "visible")
+    return {"seed": seed, "steps": steps, "return": total, **{name: info[name] for name in names}}
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """Run episodes and print them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(None if arguments is None else list(arguments))
+    env = gym.make("SurgSim/Retract-v0")
+    records = []
+    for seed in range(given.seed, given.seed + given.episodes):
+        records.append(run_episode(env, RetractExpert(), seed))
+        print(" ".join(f"{name}={value}" for name, value in records[-1].items()), flush=True)
+    share = np.mean([bool(record["success"]) for record in records])
+    steps = np.mean([float(record["steps"]) for record in records])
+    print(f"success {share:.0%} of {len(records)} episodes, {steps:.0f} control steps each")
+
+
+if __name__ == "__main__":
+    main()

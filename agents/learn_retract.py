@@ -1,0 +1,128 @@
+"""Learn SurgSim/Retract-v0 from the scripted expert with DAgger: the policy plays, the expert says what it would do.
+
+    python -m agents.learn_retract --out agents/policies/retract_dagger.zip
+    python -m agents.learn_retract --without-force --out agents/policies/retract_dagger_without_force.zip
+
+With `--without-force` the policy sees 0 in place of the jaw's wrench, its grip and its pull; the expert still sees all.
+What it comes to is a policy of stable-baselines3's PPO, which `agents.train` can go on from (`warm_start`).
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv, VectorObservationWrapper
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from agents.cloning import CloningOptions
+from agents.dagger import dagger
+from agents.expert_retract import RetractExpert
+from agents.training.policy_files import PolicyDescription, save_policy
+from agents.training.wrappers import blinded
+from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+
+ID = "SurgSim/Retract-v0"
+# As in the configurations of `agents.train` that go on from here.
+NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh}
+# Seeds of training's own; those of the evaluation are from 1,000,000 on, those of periodic evaluations from 500,000 on.
+FIRST_SEED = 2_000_000
+
+
+def make_envs(count: int, dtype: str, threads: int) -> VectorEnv:
+    """Environments side by side, as DAgger wants them."""
+    return gym.make_vec(
+        ID,
+        num_envs=count,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode="SameStep",
+        dtype=dtype,
+        threads=threads,
+    )
+
+
+class SeeingExpert:
+    """The expert in each of some environments: it sees what the environments know, whatever the policy is shown."""
+
+    def __init__(self, envs: VectorEnv) -> None:
+        self._singles = [env.unwrapped for env in envs.unwrapped.envs]  # type: ignore[attr-defined]
+        self._expert = RetractExpert()
+
+    def __call__(self, observations: NDArray, begun: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Actions (n_env, 5); both arguments are the policy's."""
+        return np.array([self._expert.act(one.task_observation) for one in self._singles])
+
+
+class Blind(VectorObservationWrapper):
+    """Environments some entries of whose observations are 0."""
+
+    def __init__(self, envs: VectorEnv, entries: Sequence[int]) -> None:
+        super().__init__(envs)
+        self._entries = list(entries)
+
+    def observations(self, observations: NDArray) -> NDArray:
+        """What is shown of observations (n_env, n_observation)."""
+        return blinded(observations, self._entries)
+
+
+def learn(arguments: argparse.Namespace) -> None:
+    """Rounds of DAgger, the policy saved after each, a line of figures for each."""
+    torch.set_num_threads(1)
+    envs = make_envs(arguments.envs, arguments.dtype, arguments.threads)
+    expert = SeeingExpert(envs)
+    entries = list(envs.unwrapped.envs[0].unwrapped.task.force_entries) if arguments.without_force else []  # type: ignore[attr-defined]
+    normalisation = VecNormalize(VectorEnvForStableBaselines(envs), norm_reward=False)
+    model = PPO("MlpPolicy", normalisation, policy_kwargs=NETWORK, seed=arguments.seed, device="cpu")
+    options = CloningOptions(epochs=arguments.epochs, patience=15, std=0.05, seed=arguments.seed)
+    began, rounds = time.time(), []
+    for done in dagger(
+        Blind(envs, entries) if entries else envs,
+        expert,
+        model,
+        rounds=arguments.rounds,
+        steps=arguments.steps,
+        expert_share=lambda index: 1.0 if index == 0 else 0.3 if index == 1 else 0.0,
+        normalisation=normalisation,
+        options=options,
+        seed=FIRST_SEED + 10_000 * arguments.seed,
+    ):
+        rounds.append({**vars(done), "seconds": round(time.time() - began)})
+        print(json.dumps(rounds[-1]), flush=True)
+        description = PolicyDescription(
+            algorithm="PPO",
+            env_id=ID,
+            force_entries=entries,
+            observation_mean=normalisation.obs_rms.mean.tolist(),  # type: ignore[union-attr]
+            observation_variance=normalisation.obs_rms.var.tolist(),  # type: ignore[union-attr]
+            trained_steps=done.sample_count,
+            seed=arguments.seed,
+        )
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        save_policy(model, description, arguments.out)
+    envs.close()
+
+
+def main() -> None:
+    """Learn as the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="the policy's file, NAME.zip")
+    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=170, help="control steps of each environment in a round")
+    parser.add_argument("--envs", type=int, default=16)
+    parser.add_argument("--epochs", type=int, default=200, help="of each fit, at most")
+    parser.add_argument("--dtype", choices=("float64", "float32"), default="float32")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--without-force", action="store_true")
+    learn(parser.parse_args())
+
+
+if __name__ == "__main__":
+    main()

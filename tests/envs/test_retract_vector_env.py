@@ -1,0 +1,132 @@
+"""SurgSim/Retract-v0 side by side: lobes of different sizes, held differently, each as it is alone, to the bit."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+from surgsim_env.vector_env import LaneVectorEnv, PalpateVectorEnv, RetractVectorEnv
+from tests.envs.test_vector_env import assert_equal
+
+ID = "SurgSim/Retract-v0"
+COUNT = 3  # five lanes stay empty
+# Draws whose lobes are held on different shares of their edge: their surfaces differ by some triangles.
+SEED = 5
+
+
+def side_by_side(**settings) -> gym.vector.VectorEnv:
+    return gym.make_vec(ID, num_envs=COUNT, vectorization_mode="vector_entry_point", **settings)
+
+
+def one_after_the_other(mode: str, **settings) -> gym.vector.VectorEnv:
+    return gym.make_vec(
+        ID, num_envs=COUNT, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **settings
+    )
+
+
+def goals(envs: gym.vector.VectorEnv) -> np.ndarray:
+    """Where each jaw grasps: over the target, deep enough over the edge [m] (n_env, 3)."""
+    targets = np.array([env.unwrapped.task.target.centre for env in envs.envs])  # type: ignore[attr-defined]
+    return np.column_stack([targets[:, 0], np.full(len(targets), 0.048), np.full(len(targets), 0.005)])
+
+
+def action(observation: np.ndarray, goal: np.ndarray, *, grasp: bool, size: int) -> np.ndarray:
+    """To the goal with the jaw open; then closed, up and out, which folds, slips or tears."""
+    moves = np.zeros((len(observation), size), dtype=np.float32)
+    away = np.array([0.0, 0.6, 0.8])
+    moves[:, :3] = away if grasp else np.clip((goal - observation[:, :3]) / 0.001, -1.0, 1.0)
+    moves[:, -1] = -1.0 if grasp else 1.0
+    return moves
+
+
+@pytest.mark.parametrize(
+    ("mode", "instrument"), [("NextStep", None), ("SameStep", None), ("SameStep", "psm_retractor")]
+)
+def test_equals_environments_one_after_the_other(mode: str, instrument: str | None):
+    """Approach, grasp and pull, over an episode's end: observations, rewards, ends, infos, and all that is saved."""
+    steps, closes = (75, 45) if instrument is None else (24, 8)
+    settings = {"instrument": instrument, "max_episode_steps": steps - 5}
+    together, apart = side_by_side(autoreset_mode=mode, **settings), one_after_the_other(mode, **settings)
+    assert isinstance(together, RetractVectorEnv)
+    assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
+    first = together.reset(seed=SEED)
+    assert_equal(first, apart.reset(seed=SEED))
+    observation, goal = first[0], goals(together)
+    size, held, ends = together.single_action_space.shape[0], 0, 0  # type: ignore[index]
+    for step in range(steps):
+        told = action(observation, goal, grasp=step >= closes, size=size)
+        found, expected = together.step(told), apart.step(told)
+        assert_equal(found[:4], expected[:4])
+        assert_equal(found[4], expected[4])
+        observation = found[0]
+        held += int(found[4]["holds"].sum()) if "holds" in found[4] else 0
+        ends += int((found[2] | found[3]).sum())
+    assert ends >= COUNT
+    assert held > 0 or instrument is not None, "the grasper grasps"
+    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
+        assert one.unwrapped.save_state() == other.unwrapped.save_state()  # type: ignore[attr-defined]
+    models = [env.unwrapped.simulation.organ_model for env in together.envs]  # type: ignore[attr-defined]
+    assert len({float(model.node_rest_position.max()) for model in models}) == COUNT, "sizes differ"
+    together.close()
+    apart.close()
+
+
+def test_a_fault_leaves_the_neighbours_untouched():
+    spoilt, whole = side_by_side(autoreset_mode="SameStep"), side_by_side(autoreset_mode="SameStep")
+    still = np.zeros((COUNT, 5), dtype=np.float32)
+    for envs in (spoilt, whole):
+        envs.reset(seed=SEED)
+        envs.step(still)
+    spoilt.envs[1].unwrapped.simulation.organ_state.node_velocity[700, 1] = np.nan  # type: ignore[attr-defined]
+    found, expected = spoilt.step(still), whole.step(still)
+    assert found[2].tolist() == [False, True, False]
+    assert "no longer finite" in found[4]["final_info"]["sim_fault"][1]
+    for _ in range(2):
+        for lane in (0, 2):
+            np.testing.assert_array_equal(found[0][lane], expected[0][lane])
+            assert found[1][lane] == expected[1][lane]
+        found, expected = spoilt.step(still), whole.step(still)
+
+
+def test_single_precision_feels_the_same_force():
+    """Over an approach and a grasp: within 0.5 % of the largest force on a finger."""
+    exact, fast = side_by_side(), side_by_side(dtype="float32")
+    felt = []
+    for envs in (exact, fast):
+        observation, _ = envs.reset(seed=SEED)
+        goal, rows = goals(envs), []
+        for step in range(56):
+            observation = envs.step(action(observation, goal, grasp=step >= 45, size=5))[0]
+            rows.append([env.unwrapped.simulation.contact_wrench[:, :3] for env in envs.envs])  # type: ignore[attr-defined]
+        felt.append(np.array(rows))
+    largest, error = np.abs(felt[0]).max(), np.abs(felt[1] - felt[0]).max()
+    print(f"\nlargest force {largest:.3f} N, float32 off by {error:.2e} N, {100.0 * error / largest:.3f} %")
+    assert largest > 0.1
+    assert 0.0 < error < 0.005 * largest
+
+
+def test_lanes_have_rest_shapes_of_their_own_only_where_they_differ():
+    """Lesions leave the phantom's rest shape alone: its lanes share it, which is faster."""
+    lobes, phantoms = side_by_side(), PalpateVectorEnv(2, scene="phantom")
+    for envs in (lobes, phantoms):
+        assert isinstance(envs, LaneVectorEnv)
+        envs.reset(seed=SEED)
+        envs.step(np.zeros(envs.action_space.shape, dtype=np.float32))  # type: ignore[arg-type]
+    assert lobes._groups[0]._own_rest and not phantoms._groups[0]._own_rest  # type: ignore[attr-defined]
+
+
+def test_a_state_saved_alone_goes_on_in_a_lane():
+    envs, single = side_by_side(), gym.make(ID)
+    observation, _ = envs.reset(seed=SEED)
+    goal = goals(envs)
+    single.reset(seed=SEED + 1)
+    for _ in range(3):
+        told = action(observation, goal, grasp=False, size=5)
+        observation = envs.step(told)[0]
+        single.step(told[1])
+    state = envs.envs[1].unwrapped.save_state()  # type: ignore[attr-defined]
+    assert state == single.unwrapped.save_state()  # type: ignore[attr-defined]
+    told = action(observation, goal, grasp=False, size=5)
+    ahead = envs.step(told)[0][1]
+    envs.envs[2].unwrapped.load_state(state)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(envs.step(np.tile(told[1], (COUNT, 1)))[0][2], ahead)

@@ -1,0 +1,81 @@
+"""A Gaussian process on the sites of a chart, by scikit-learn: what the agents gp_*.py expect and how unsure they are.
+
+Kernel and numbers are those of the benchmark's own estimator, so that an agent models what it is scored by:
+log contrast = background + excess + noise.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+from agents.site_agent import SiteFacts
+from surgsim_env.palpation.lesion_estimator import (
+    BACKGROUND_SPREAD,
+    EXCESS_LENGTH,
+    EXCESS_SPREAD,
+    MODEL_SPREAD,
+    REFERENCE_TIP_RADIUS,
+)
+
+# Sites nearer to the chart's border than this share of the tip's radius are not pressed: half of what a press there
+# would tell lies where no lesion can be.
+BORDER = 0.4
+# The first two presses, as shares of the chart: on its diagonal. Two say what is background more surely than one does,
+# and a process that knows nothing would take any two.
+FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75))
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """At the candidate sites: expected log contrast (n,), its standard deviation (n,); and what is background."""
+
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    background: float
+
+
+class SiteProcess:
+    """The process of one chart and the sites that an agent chooses among."""
+
+    def __init__(self, facts: SiteFacts) -> None:
+        self.facts = facts
+        self.candidates = np.flatnonzero(_off_border(facts))
+        self.places = facts.sites[self.candidates]
+        excess = ConstantKernel(EXCESS_SPREAD**2) * RBF(EXCESS_LENGTH * facts.tip_radius / REFERENCE_TIP_RADIUS)
+        self._kernel = ConstantKernel(BACKGROUND_SPREAD**2) + excess
+
+    def belief(self, observation: NDArray[np.floating]) -> Belief:
+        """Posterior given all presses that an observation remembers."""
+        process = GaussianProcessRegressor(self._kernel, alpha=self.facts.noise**2 + MODEL_SPREAD**2, optimizer=None)
+        pressed, values = self.facts.remembered(observation)
+        background = 0.0
+        if pressed.size:
+            process.fit(self.facts.sites[pressed], values)
+            background = BACKGROUND_SPREAD**2 * float(process.alpha_.sum())
+        mean, spread = process.predict(self.places, return_std=True)
+        return Belief(mean, spread, background)
+
+    def best(
+        self, worth: NDArray[np.float64], observation: NDArray[np.floating], rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """The action for the candidate of most worth that was not pressed yet; equals are drawn among."""
+        pressed, _ = self.facts.remembered(observation)
+        worth = np.where(np.isin(self.candidates, pressed), -np.inf, worth)
+        return self.facts.action(self.places[rng.choice(np.flatnonzero(worth >= worth.max() - 1e-9))])
+
+    def first(self, number: int) -> NDArray[np.float32] | None:
+        """The action of the press of this number (from 0) where it is one of the first, on the site nearest to it."""
+        if number >= len(FIRST_SHARES):
+            return None
+        wanted = np.array(FIRST_SHARES[number]) * self.facts.extent
+        return self.facts.action(self.places[np.argmin(((self.places - wanted) ** 2).sum(axis=1))])
+
+
+@lru_cache(maxsize=8)
+def _off_border(facts: SiteFacts) -> NDArray[np.bool_]:
+    from_border = np.minimum(facts.sites, np.array(facts.extent) - facts.sites).min(axis=1)
+    return from_border >= BORDER * facts.tip_radius

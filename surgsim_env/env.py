@@ -286,6 +286,11 @@ def register() -> None:
         max_episode_steps=palpate.EPISODE_STEPS,
     )
     gym.register(
+        id="SurgSim/PalpateSites-v0",
+        entry_point="surgsim_env.palpate_sites_env:PalpateSitesEnv",
+        vector_entry_point="surgsim_env.palpate_sites_env:PalpateSitesVectorEnv",
+    )
+    gym.register(
         id="SurgSim/Retract-v0",
         entry_point="surgsim_env.env:RetractEnv",
         vector_entry_point="surgsim_env.vector_env:RetractVectorEnv",

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -77,24 +78,42 @@ class PalpableFace:
             "widen palpation.face_angle_deg"
         )
 
+    @cached_property
+    def _plane(self) -> tuple[FloatArray, FloatArray]:
+        """The triangles' corners across the approach (n_face, 3, 2) and against it (n_face, 3) [m]."""
+        across, along = tangent_axes(self.approach)
+        corners = self.points[self.triangles]
+        return np.stack([corners @ across, corners @ along], axis=2), corners @ -self.approach
+
+    def drop(self, u: float, v: float) -> tuple[FloatArray, FloatArray] | None:
+        """The uppermost point of the face over a point of the plane of `tangent_axes` [m], and its normal, each (3,).
+
+        None beyond the face.
+        """
+        hit = _drop(*self._plane, u, v)
+        return None if hit is None else self._at(*hit)
+
+    def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
+        """`drop`, but None also nearer to the border than the face's margin less a slack [m], or over thin organ."""
+        hit = _drop(*self._plane, u, v)
+        if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
+            return None
+        point, normal = self._at(*hit)
+        return (point, normal) if self.rim_distance(point) >= self.margin - slack else None
+
     def raster(self, spacing: float) -> tuple[FloatArray, FloatArray]:
         """Points on a square grid seen along the approach, dropped onto the face, and their normals, each (n_site, 3).
 
         Points nearer to the border than the face's margin, or where the organ is too thin, are left out.
         """
-        across, along = tangent_axes(self.approach)
-        corners = self.points[self.triangles]
-        plane = np.stack([corners @ across, corners @ along], axis=2)
+        plane = self._plane[0]
         lower, upper = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
         points, normals = [], []
         for u, v in _grid(lower, upper, spacing):
-            hit = _drop(plane, corners @ -self.approach, u, v)
-            if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
-                continue
-            point, normal = self._at(*hit)
-            if self.rim_distance(point) >= self.margin:
-                points.append(point)
-                normals.append(normal)
+            site = self.site(u, v)
+            if site is not None:
+                points.append(site[0])
+                normals.append(site[1])
         return np.array(points).reshape(-1, 3), np.array(normals).reshape(-1, 3)
 
 

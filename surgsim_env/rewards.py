@@ -13,6 +13,24 @@ PALPATE_WEIGHTS: Mapping[str, float] = {
     "forgone": -0.015,  # each step left when it ends without finding: the dearest step, so that ending pays less
 }
 
+# Weights of SurgSim/PalpateSites-v0. `error`, `soft_force` and `forgone` are in [0, 1] per press and count as shares of
+# the budget of n presses: 0.04, 0.01 and 0.05 a press for n = 25.
+#
+# `found` is the CHANGE of a number in [0, 1] and sums to what it ends with less what it begins with (1 where there is
+# nothing to find and nothing is claimed, else 0): it cannot be farmed. The worst full episode returns at least
+# error + soft_force - f, one that fails after k presses at most (1 - f) found + failure + (n - k) / n forgone, where
+# f is what `found` begins with. As forgone = error + soft_force, the first is larger by
+#   -f + k / n (error + soft_force) - (1 - f) - failure  >=  -1 - 1.25 + 2.5  =  0.25  at least:
+# a failed, faulted or aborted episode never returns more than the worst full one.
+PALPATE_SITES_WEIGHTS: Mapping[str, float] = {
+    "error": -1.0,  # distance of estimates from the truth (OSPA) after a press, over its cutoff and the budget
+    "found": 1.0,  # change of the share of lesions that an estimate is near to
+    "soft_force": -0.25,  # share of the way from the soft to the hard limit, largest of the press, over the budget
+    "hard_force": -2.5,  # the hard limit was passed: a safety stop
+    "fault": -2.5,  # the simulation could not go on
+    "forgone": -1.25,  # share of the budget that is left when it ends early
+}
+
 # Weights of SurgSim/Retract-v0.
 #
 # `visible` and `grasped` are CHANGES of numbers in [0, 1]: over an episode they sum to what is reached at its end less

@@ -114,8 +114,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self.command(action)
         self.last_action = self._checked(action)
         self.task.begin(self.last_action)
-        count = self.scene.timing.haptic_steps_per_control
-        force_peak = self.simulation.control_step(count, self.task.force_limit, self.task.pull_limit)
+        force_peak = self._advance()
         fault = self.simulation.fault
         saturated = False
         if not fault:
@@ -235,6 +234,11 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             "narrow the ranges of the scene's draw"
         )
 
+    def _advance(self) -> float:
+        """Advance the simulation by what a step lasts; returns the largest contact force [N]."""
+        count = self.scene.timing.haptic_steps_per_control
+        return self.simulation.control_step(count, self.task.force_limit, self.task.pull_limit)
+
     def _take(self, values: NDArray[np.floating]) -> None:
         """Take the task's numbers as the last observation; its picture is of this moment too."""
         self._observation, self._picture = values.astype(np.float32), None
@@ -266,7 +270,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             f"{timing.substep_count} substeps in {timing.haptic_step:g} s, digest {digest:08x})"
         )
 
-    def _checked(self, action: Action) -> FloatArray:
+    def _checked(self, action: Action | FloatArray) -> FloatArray:
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape:
             raise ValueError(f"action has shape {values.shape}; the rule is {self.action_space.shape}")

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
+from numpy.typing import NDArray
 
 from msdm_core.vector import lane_counts
 from surgsim_env.env import PalpateEnv, RetractEnv
@@ -38,7 +39,7 @@ class LaneVectorEnv(SyncVectorEnv):
 
     # What a subclass says: the environment that it has many of, and how long its episodes are at most.
     single: ClassVar[type[SurgicalEnv]]
-    episode_steps: ClassVar[int]
+    episode_steps: ClassVar[float]
 
     def __init__(
         self,
@@ -76,19 +77,26 @@ class LaneVectorEnv(SyncVectorEnv):
         active = np.zeros(self.num_envs, dtype=np.bool_)
         for index, action in enumerate(iterate(self.action_space, actions)):
             if not (self._autoreset_envs[index] and self.autoreset_mode is AutoresetMode.NEXT_STEP):
-                self._singles[index].command(action)
+                self._command(index, action)
                 active[index] = True
-        first = self._singles[0]
-        count = first.scene.timing.haptic_steps_per_control
-        limits = first.task.force_limit, first.task.pull_limit
         list(
             self._pool.map(
-                lambda group, members: group.control_step(active[members.start : members.stop], count, *limits),
+                lambda group, members: self._advance(group, members, active[members.start : members.stop]),
                 self._groups,
                 self._members,
             )
         )
         return super().step(actions)
+
+    def _command(self, index: int, action: Any) -> None:
+        """Give an environment's instrument the commands of an action."""
+        self._singles[index].command(action)
+
+    def _advance(self, group: LaneGroup, members: range, active: NDArray[np.bool_]) -> None:
+        """Advance the active of a group's environments (n,) by what a step lasts."""
+        first = self._singles[members.start]
+        count = first.scene.timing.haptic_steps_per_control
+        group.control_step(active, count, first.task.force_limit, first.task.pull_limit)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads and close the environments."""

@@ -1,0 +1,123 @@
+"""What presses at sites told so far: force, depth and contrast of each, maps over the chart's grid, time and way."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.palpation.charted_face import ChartedFace, Site
+from surgsim_env.palpation.healthy_map import HealthyMap
+from surgsim_env.palpation.site_press import PressResult
+from surgsim_env.scenes import Palpation
+
+# How fast the tip travels from site to site, which is counted and not simulated [m/s].
+TRAVEL_SPEED = 0.02
+# Log contrast is cut to +- this, and the touch says so.
+LOG_CONTRAST_BOUND = 2.0
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What the agent knows of a press.
+
+    Args:
+        place: on the chart, each -1 to 1.
+        moved: how far that is from the place that was asked for [m].
+        force: along the inward normal, through the sensor model [N].
+        depth: of the tip [m].
+        log_contrast: log of stiffness over healthy stiffness there.
+        cut: that it was cut to its bound.
+        stopped: that force ended the way in before depth did.
+    """
+
+    place: tuple[float, float]
+    moved: float = 0.0
+    force: float = 0.0
+    depth: float = 0.0
+    log_contrast: float = 0.0
+    cut: bool = False
+    stopped: bool = False
+
+    @property
+    def stiffness(self) -> float:
+        """Force over depth [N/m]; 0 where the tip did not get below the surface."""
+        return self.force / self.depth if self.depth > 0.0 else 0.0
+
+
+class SiteTouches:
+    """The touches of an episode.
+
+    Fields:
+        touches: one a press, in their order
+        seconds, path_length: of the tip so far, with the way to and off the sites, which is not simulated [s], [m]
+    """
+
+    def __init__(self, charted: ChartedFace, healthy: HealthyMap, palpation: Palpation) -> None:
+        self.charted, self.healthy, self.palpation = charted, healthy, palpation
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin an episode."""
+        self.touches: list[Touch] = []
+        self.seconds = self.path_length = 0.0
+        self._last_start: FloatArray | None = None
+
+    @property
+    def last(self) -> Touch:
+        """The last touch; before the first one that says nothing."""
+        return self.touches[-1] if self.touches else Touch((0.0, 0.0))
+
+    def add(self, site: Site, result: PressResult, force: float) -> None:
+        """Note a press at a site, of which the sensor told a force along the normal [N]."""
+        healthy = float(self.healthy.stiffness(site.place))
+        # A force that bias and noise turn round, or a tip that an arm did not get below the surface: softest there is.
+        contrast = force / (result.depth * healthy) if result.depth > 0.0 else 0.0
+        log_contrast = math.log(contrast) if contrast > 0.0 else -math.inf
+        bounded = min(max(log_contrast, -LOG_CONTRAST_BOUND), LOG_CONTRAST_BOUND)
+        u, v = site.place.tolist()
+        cut = bounded != log_contrast
+        self.touches.append(Touch((u, v), site.moved, force, result.depth, bounded, cut, result.stopped))
+        start = site.point + site.normal * self.palpation.clearance
+        way = 0.0 if self._last_start is None else math.dist(start, self._last_start)
+        stroke = self.palpation.clearance + result.depth
+        self.path_length += way + 2.0 * stroke
+        self.seconds += result.duration + (way + stroke) / TRAVEL_SPEED
+        self._last_start = start
+
+    @property
+    def places(self) -> FloatArray:
+        """Where was pressed, lengths along the chart's sides [m], shape (n, 2)."""
+        places = np.array([touch.place for touch in self.touches]).reshape(-1, 2)
+        return 0.5 * (places + 1.0) * self.charted.chart.extent
+
+    @property
+    def log_contrasts(self) -> FloatArray:
+        """What was felt there, shape (n,)."""
+        return np.array([touch.log_contrast for touch in self.touches])
+
+    def maps(self) -> FloatArray:
+        """Log contrast and whether it was touched for each site of the chart's grid, shape (2 n_site,).
+
+        The latest counts where one was pressed again.
+        """
+        values = np.zeros((2, self.charted.chart.side_count**2))
+        for touch in self.touches:
+            site = self.charted.chart.site(np.array(touch.place))
+            values[0, site], values[1, site] = touch.log_contrast, 1.0
+        return values.ravel()
+
+    def get_state(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        return {
+            "touches": [asdict(touch) for touch in self.touches],
+            "way": [self.seconds, self.path_length],
+            "last_start": None if self._last_start is None else self._last_start.tolist(),
+        }
+
+    def set_state(self, table: dict[str, Any]) -> None:
+        """Restore what `get_state` gave."""
+        self.touches = [Touch(**{**touch, "place": tuple(touch["place"])}) for touch in table["touches"]]
+        self.seconds, self.path_length = table["way"]
+        self._last_start = None if table["last_start"] is None else np.array(table["last_start"])

@@ -57,9 +57,9 @@ class LaneVectorEnv(SyncVectorEnv):
 
         def make() -> gym.Env:
             env: gym.Env = self.single(render_mode=render_mode, **settings)  # type: ignore[call-arg]
-            longest = self.episode_steps
-            steps = longest if max_episode_steps is None else max_episode_steps
-            return gym.wrappers.TimeLimit(env, steps) if steps < longest else env
+            if max_episode_steps is None or max_episode_steps >= self.episode_steps:
+                return env
+            return gym.wrappers.TimeLimit(env, max_episode_steps)
 
         super().__init__([make] * num_envs, autoreset_mode=autoreset_mode)
         self._singles: list[SurgicalEnv] = [env.unwrapped for env in self.envs]  # type: ignore[misc]

@@ -1,8 +1,8 @@
 """A scripted expert for SurgSim/Palpate-v0 with memory=True: slide over the face, go back to the stiffest, declare.
 
 It has no state: each action follows from one observation, so that a network can be taught to do the same
-(`agents/dagger.py`). The tip slides along rows at a steady depth, less where the force nears the soft limit; what it
-felt is in the observation. When the rows are done it feels around the stiffest place, goes there and declares it.
+(`agents/learn_palpate.py`). The tip slides along rows at a steady depth, less where the force nears the soft limit;
+what it felt is in the observation. When the rows are done it goes back to the stiffest place and declares it.
 
     python -m agents.expert_palpate --scene phantom --episodes 48
 """
@@ -15,101 +15,83 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 
-SPEED = 0.02  # [m/s] full scale of the action
-CONTROL_STEP = 0.05  # [s]
+ROWS_FEWEST = 5
+NEAR = 0.003  # [m] gaps below this are closed the more slowly the smaller they are; a row's end reaches as far
+GOAL_NEAR = 0.006  # [m] likewise on the way to the first row and to the stiffest place
+ABOVE = 0.004  # [m] the tip comes down within this of the rows' begin
+TRAVEL_GAP = 0.001  # [m] between tip and surface on the way there
+CLOSE_ENOUGH = 0.0015  # [m] a row is reached
+DECLARE_NEAR = 0.003  # [m] to the stiffest place
+FORCE_GAIN = 20.0  # [1/N] full speed upwards at 50 mN too much
 
 
 class PalpateExpert:
-    """Actions (n, 4) for observations (n, n_observation) of a block's flat top."""
+    """Actions (n, 4) for observations (n, n_observation) of a block's flat top.
+
+    While it slides along the rows, where to go follows from the place alone: row by row in alternating directions. That
+    this has begun, and that it is over, is told by the marks of the rows' first and last site.
+    """
 
     def __init__(
-        self,
-        env: gym.Env,
-        *,
-        depth: float = 0.003,
-        row_spacing: float = 0.010,
-        refine_radius: float = 0.006,
-        blur: float = 0.005,
-        force_share: float = 0.75,
+        self, env: gym.Env, *, depth: float = 0.003, row_spacing: float = 0.010, force_share: float = 0.75
     ) -> None:
         """Read the chart, the block's height and the soft limit from an environment.
 
         Args:
             env: with memory=True.
             depth: that it slides at [m].
-            row_spacing: at most so far apart are the rows [m].
-            refine_radius: around the stiffest place, all sites are felt before it is declared [m].
-            blur: the stiffest place is sought in the map blurred by a Gaussian of this width [m].
+            row_spacing: at most so far apart are the rows [m], of which there are five or more.
             force_share: it lifts where the force is above this share of the soft limit.
+
+        Raises:
+            ValueError: a scene that is no block, or an environment without memory.
         """
         scene, task = env.unwrapped.scene, env.unwrapped.task
         if scene.mesh.block is None:
-            raise ValueError(
-                f"this expert slides on the flat top of a block; scene {scene.name!r} is none: use phantom"
-            )
+            raise ValueError(f"this expert slides on a block's flat top; scene {scene.name!r} is none: use phantom")
         if task.memory is None:
             raise ValueError("this expert has no memory of its own: make the environment with memory=True")
-        self.chart = task.memory.chart
-        self.radius, self.top = scene.instrument.tip_radius, scene.mesh.block.size[2]
+        self.chart, side = task.memory.chart, task.memory.chart.side_count
+        self.surface = scene.mesh.block.size[2] + scene.instrument.tip_radius
         self.force_most = force_share * scene.limits.soft_force
-        self.depth, self.refine_radius = depth, refine_radius
-        self.places = self.chart.plane_point(self.chart.sites)
-        side = self.chart.side_count
-        self.way = self._way(side, row_spacing)
-        gaps = np.linalg.norm(self.places[:, None] - self.places[None], axis=2)
-        self.blur = np.exp(-0.5 * (gaps / blur) ** 2)
-        self.gaps = gaps
+        self.depth = depth
+        # Rows lie on rows of sites, whose marks tell that they were felt.
+        row_count = max(int(np.ceil(self.chart.extent[1] / row_spacing - 1e-6)) + 1, ROWS_FEWEST)
+        rows = np.unique(np.round(np.linspace(0, side - 1, row_count)).astype(int))
+        self.rows = self.chart.lower[1] + rows * self.chart.extent[1] / (side - 1)
+        self.first = 10 + side**2 + rows[0] * side
+        self.last = 10 + side**2 + rows[-1] * side + (side - 1 if len(rows) % 2 else 0)
+        self.start = np.array([self.chart.lower[0], self.rows[0]])
 
     def act(self, observations: NDArray) -> NDArray[np.float32]:
         """The next actions."""
-        return np.array([self._one(row) for row in np.asarray(observations, dtype=np.float64)], dtype=np.float32)
+        seen = np.asarray(observations, dtype=np.float64)
+        tip, height, force = seen[:, :2], seen[:, 2], seen[:, 8]
+        begun, over = seen[:, self.first] > 0.5, seen[:, self.last] > 0.5
+        stiffest = self.chart.plane_point(seen[:, -3:-1])
+        goal = np.where(over[:, None], stiffest, self.start)
+        gap = goal - tip
+        distance = np.linalg.norm(gap, axis=1)
+        sliding = begun & ~over
+        across = np.where(sliding[:, None], self._along_rows(tip), gap / GOAL_NEAR)
+        # In the air on the way to the first row.
+        wanted = np.where(begun | (distance < ABOVE), self.depth, -TRAVEL_GAP)
+        depth = self.surface - height
+        rise = np.maximum((depth - wanted) / NEAR, FORCE_GAIN * (force - self.force_most))
+        declare = over & (distance < DECLARE_NEAR)
+        return np.clip(np.column_stack([across, rise, declare]), -1.0, 1.0).astype(np.float32)
 
-    def _way(self, side: int, row_spacing: float) -> NDArray[np.int64]:
-        """Numbers of the sites along the rows, in alternating directions."""
-        row_count = int(np.ceil(self.chart.extent[1] / row_spacing)) + 1
-        rows = np.unique(np.round(np.linspace(0, side - 1, row_count)).astype(int))
-        numbers = np.arange(side * side).reshape(side, side)
-        return np.concatenate([numbers[row, :: 1 if index % 2 == 0 else -1] for index, row in enumerate(rows)])
-
-    def _one(self, observation: NDArray[np.float64]) -> NDArray[np.float64]:
-        tip, force = observation[:3], observation[8]
-        count = len(self.places)
-        contrast, visited = observation[10 : 10 + count], observation[10 + count : 10 + 2 * count] > 0.5
-        target, declares = self._target(tip[:2], contrast, visited)
-        gap = target - tip[:2]
-        distance = float(np.linalg.norm(gap))
-        depth = self.radius + self.top - tip[2]
-        far = distance > 0.012
-        wanted = -0.001 if far else self.depth
-        rise = (depth - wanted) / CONTROL_STEP / SPEED
-        # The nearer the force comes to the limit, the less deep; above it, up.
-        rise = max(rise, 20.0 * (force - self.force_most))
-        ready = depth > 0.75 * self.depth or force > 0.8 * self.force_most or (far and depth < 0.0005)
-        across = gap / CONTROL_STEP / SPEED if ready else np.zeros(2)
-        declare = float(declares and distance < 0.0025)
-        return np.clip([*across, 0.5 * rise, declare], -1.0, 1.0)
-
-    def _target(self, tip: NDArray, contrast: NDArray, visited: NDArray) -> tuple[NDArray, bool]:
-        """Where to go in the plane [m] (2,), and whether it is what to declare."""
-        left = self.way[~visited[self.way]]
-        if len(left):
-            return self.places[left[0]], False
-        peak = self._peak(contrast, visited)
-        near = np.linalg.norm(self.places - peak, axis=1) < self.refine_radius
-        left = np.flatnonzero(near & ~visited)
-        if len(left):
-            return self.places[left[np.argmin(np.linalg.norm(self.places[left] - tip, axis=1))]], False
-        return peak, True
-
-    def _peak(self, contrast: NDArray, visited: NDArray) -> NDArray:
-        """The centre of the excess contrast around the stiffest place [m] (2,)."""
-        weight = self.blur * visited
-        smooth = (weight @ contrast) / np.maximum(weight.sum(axis=1), 1e-9)
-        best = int(np.argmax(np.where(visited, smooth, -np.inf)))
-        excess = np.maximum(smooth - np.median(smooth[visited]), 0.0) * visited * (self.gaps[best] < 0.008)
-        if excess.sum() <= 0.0:
-            return self.places[best]
-        return excess @ self.places / excess.sum()
+    def _along_rows(self, tip: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Directions (n, 2) at places (n, 2) [m]: along the row that was reached, at its end on to the next."""
+        spacing = self.rows[1] - self.rows[0]
+        row = np.clip(np.floor((tip[:, 1] - self.rows[0] + CLOSE_ENOUGH) / spacing), 0, len(self.rows) - 1).astype(int)
+        way = np.where(row % 2 == 0, 1.0, -1.0)
+        end = np.where(way > 0.0, self.chart.upper[0], self.chart.lower[0])
+        short = way * (end - tip[:, 0])
+        at_end = (short < NEAR) & (row < len(self.rows) - 1)
+        x = way * np.clip(short / NEAR, -1.0, 1.0)
+        y = np.where(at_end, 1.0, (self.rows[row] - tip[:, 1]) / NEAR)
+        return np.column_stack([x, y])
 
 
 def play(envs: gym.vector.VectorEnv, expert, episodes: int, seed: int) -> list[dict]:

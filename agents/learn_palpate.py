@@ -65,7 +65,7 @@ def main() -> None:
         steps=arguments.steps,
         expert_share=lambda index: 0.5**index if index < 3 else 0.0,
         normalisation=scaled,
-        options=CloningOptions(epochs=12, patience=4, batch_size=512, std=0.05),
+        options=CloningOptions(epochs=15, patience=5, batch_size=256, std=0.05),
         seed=arguments.seed,
     ):
         print(f"{time.time() - begin:6.0f} s {stage}", flush=True)

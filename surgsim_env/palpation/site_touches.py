@@ -63,6 +63,7 @@ class SiteTouches:
         self.touches: list[Touch] = []
         self.seconds = self.path_length = 0.0
         self._last_start: FloatArray | None = None
+        self._maps = np.zeros((2, self.charted.chart.side_count**2))
 
     @property
     def last(self) -> Touch:
@@ -79,6 +80,7 @@ class SiteTouches:
         u, v = site.place.tolist()
         cut = bounded != log_contrast
         self.touches.append(Touch((u, v), site.moved, force, result.depth, bounded, cut, result.stopped))
+        self._mark(self.touches[-1])
         start = site.point + site.normal * self.palpation.clearance
         way = 0.0 if self._last_start is None else math.dist(start, self._last_start)
         stroke = self.palpation.clearance + result.depth
@@ -102,11 +104,11 @@ class SiteTouches:
 
         The latest counts where one was pressed again.
         """
-        values = np.zeros((2, self.charted.chart.side_count**2))
-        for touch in self.touches:
-            site = self.charted.chart.site(np.array(touch.place))
-            values[0, site], values[1, site] = touch.log_contrast, 1.0
-        return values.ravel()
+        return self._maps.ravel()
+
+    def _mark(self, touch: Touch) -> None:
+        site = self.charted.chart.site(np.array(touch.place))
+        self._maps[:, site] = touch.log_contrast, 1.0
 
     def get_state(self) -> dict[str, Any]:
         """All of it, for JSON."""
@@ -121,3 +123,6 @@ class SiteTouches:
         self.touches = [Touch(**{**touch, "place": tuple(touch["place"])}) for touch in table["touches"]]
         self.seconds, self.path_length = table["way"]
         self._last_start = None if table["last_start"] is None else np.array(table["last_start"])
+        self._maps = np.zeros_like(self._maps)
+        for touch in self.touches:
+            self._mark(touch)

@@ -9,7 +9,7 @@ import torch
 
 from agents.site_belief import BeliefSettings, SiteBelief
 from agents.site_policy import CURIOSITY, SHARPNESS, SitePolicy
-from surgsim_env.palpation.lesion_estimator import EXCESS_SPREAD, LesionEstimator
+from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_LENGTH, EXCESS_SPREAD, LesionEstimator
 
 pytestmark = pytest.mark.agents
 SETTINGS = BeliefSettings(extent=(0.04, 0.03), site_count=7, tip_radius=0.008, noise=0.04)
@@ -39,21 +39,20 @@ def test_expected_excess_is_the_estimators():
     np.testing.assert_allclose(features[:SITES] * EXCESS_SPREAD, excess.ravel(), atol=1e-6)
 
 
-def test_doubt_is_that_of_scikit_learns_process():
-    process = pytest.importorskip("sklearn.gaussian_process")
-    kernels = pytest.importorskip("sklearn.gaussian_process.kernels")
-    belief = SiteBelief(SETTINGS)
-    contrast = {3: 0.1, 17: 0.5, 24: -0.2}
-    # A press where the background is known for sure tells of the excess alone: far from all others nothing is known.
-    doubt = belief.features(observed(contrast)[None])[0][SITES : 2 * SITES]
+def test_doubt_is_that_of_the_joint_normal_distribution():
+    belief, visited = SiteBelief(SETTINGS), [3, 17, 24]
     assert belief.features(observed({})[None])[0][SITES : 2 * SITES].tolist() == [1.0] * SITES
-    assert doubt[[3, 17, 24]].max() < 0.75 < 0.95 < doubt[48]
-    kernel = kernels.ConstantKernel(EXCESS_SPREAD**2) * kernels.RBF(0.007)
-    known = process.GaussianProcessRegressor(kernel, alpha=belief.noise_variance, optimizer=None)
-    known.fit([place(site) for site in contrast], list(contrast.values()))
-    _, least = known.predict([place(site) for site in range(SITES)], return_std=True)
-    # Not knowing the background can only add to the doubt.
-    assert (doubt * EXCESS_SPREAD > least - 1e-6).all()
+    doubt = belief.features(observed(dict.fromkeys(visited, 0.1))[None])[0][SITES : 2 * SITES] * EXCESS_SPREAD
+    # Bayes' rule in terms of precisions: excess at every site and the background, then the presses.
+    places = np.array([place(site) for site in range(SITES)])
+    squared = ((places[:, None] - places) ** 2).sum(axis=2)
+    prior = np.zeros((SITES + 1, SITES + 1))
+    prior[:-1, :-1] = EXCESS_SPREAD**2 * np.exp(-0.5 * squared / EXCESS_LENGTH**2) + 1e-8 * np.eye(SITES)
+    prior[-1, -1] = BACKGROUND_SPREAD**2
+    seen = np.eye(SITES + 1)[visited]
+    seen[:, -1] = 1.0
+    posterior = np.linalg.inv(np.linalg.inv(prior) + seen.T @ seen / belief.noise_variance)
+    np.testing.assert_allclose(doubt, np.sqrt(np.diag(posterior)[:-1]), atol=1e-4)
 
 
 def test_sites_and_actions_are_the_grids():

@@ -13,7 +13,7 @@ WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
 
 PYTEST_ARGS ?= -n 2
 
-.PHONY: help demo test test-all test-agents test-distributed bench lint clean distclean
+.PHONY: help demo test test-all test-agents test-distributed with-ray bench lint clean distclean
 .NOTPARALLEL:
 
 help:
@@ -21,7 +21,7 @@ help:
 	@echo "make test         the tests (PYTEST_ARGS='-n 2' is the default)"
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
-	@echo "make test-distributed  those that need Ray (installs it: 0.6 GB)"
+	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 1.5 GB)"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
 	@echo "make lint         ruff and pyright"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
@@ -39,7 +39,11 @@ test-all: $(VENV)/.ready-dev
 test-agents: $(VENV)/.ready-agents
 	$(PY) -m pytest $(PYTEST_ARGS) -m "agents and not slow"
 
-test-distributed: $(VENV)/.ready-distributed
+# Ray in an environment of its own: what agents need is tested without it, it without what they need.
+test-distributed:
+	@$(MAKE) --no-print-directory VENV=$(VENV)-distributed with-ray
+
+with-ray: $(VENV)/.ready-distributed
 	$(PY) -m pytest -m "distributed and not slow"
 
 bench: $(VENV)/.ready-bench
@@ -55,7 +59,7 @@ clean:
 	find msdm_core surgsim_env agents benchmarks scenes tests -name __pycache__ -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf $(VENV) $(VENV)-virtualenv
+	rm -rf $(VENV) $(VENV)-virtualenv $(VENV)-distributed $(VENV)-distributed-virtualenv
 
 # ---- set-up -------------------------------------------------------------------------------------------------------
 # Stamp files, not the folder, say what is done. `.made` holds the folder that .venv was made for; `.installing` lies
@@ -81,8 +85,7 @@ $(VENV)/.ready-agents: pyproject.toml $(VENV)/.made
 	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
 
 $(VENV)/.ready-distributed: pyproject.toml $(VENV)/.made
-	$(call install,$(TORCH) $(WITH_AGENTS) --editable=.[distributed])
-	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev $(VENV)/.ready-agents
+	$(call install,$(TORCH) --editable=.[dev,distributed])
 
 $(VENV)/.ready-bench: pyproject.toml $(VENV)/.made
 	$(call install,--editable=.[bench])

@@ -36,9 +36,8 @@ ALIGNED, ARRIVED = 0.0015, 0.0008
 # The jaw is told to be closed where it is this near the grasp and has begun to close, or holds.
 OPEN_GAP, NEAR_GRASP = 0.0195, 0.004
 GRIP_FORCE = 0.22  # [N] it lifts from here on
-# Ways of the tip: up first, then over [m]; how far the edge turns on each of them [rad].
+# Where the tip takes the edge: up first, then over; y and z [m].
 RISEN, FOLDED = (0.0465, 0.031), (0.024, 0.050)
-TURNS = (math.radians(35.0), math.radians(75.0))
 SEEN_ENOUGH = 0.9
 CARRYING_SPEED, APPROACH_SPEED = 0.015, 0.015
 
@@ -63,14 +62,14 @@ class RetractExpert:
             return still, 0.0, -1.0
         goal = RISEN if tip[2] < RISEN[1] - 0.002 and tip[1] > 0.040 else FOLDED
         velocity = towards(np.array([tip[0], *goal]) - tip, CARRYING_SPEED)
-        return velocity, _turning(now, _wanted_pitch(tip[2])), -1.0
+        return velocity, _levelling(now), -1.0
 
     def _approach(self, now: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
         tip, grasp = now[TIP], grasp_place(now)
         off = grasp - tip
         waiting = np.array([grasp[0], grasp[1] + GRASP_DEPTH + WAITING_GAP, grasp[2]])
         across = math.hypot(off[0], off[2])
-        turning = _turning(now, 0.0)
+        turning = _levelling(now)
         closing = now[GAP] < OPEN_GAP and np.linalg.norm(off) < NEAR_GRASP
         if np.linalg.norm(off) < ARRIVED or closing:
             return 0.2 * off / CONTROL_STEP, turning, -1.0
@@ -97,16 +96,10 @@ def towards(gap: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
     return gap * (min(speed, 0.6 * distance / CONTROL_STEP) / max(distance, 1e-9))
 
 
-def _wanted_pitch(height: float) -> float:
-    """How far the jaw has turned down where the tip is so high [rad]."""
-    heights = (0.004, RISEN[1], FOLDED[1])
-    return float(np.interp(height, heights, (0.0, *TURNS)))
-
-
-def _turning(now: NDArray[np.float64], wanted: float) -> float:
-    """The wrist's speed [rad/s] towards an angle below the level; a hinge lifts the jaw's tip above 0."""
+def _levelling(now: NDArray[np.float64]) -> float:
+    """The wrist's speed that keeps the jaw level [rad/s]; above 0 its pads sink."""
     _, y, z = now[POINTS_ALONG]
-    return -0.6 * (wanted - math.atan2(-z, -y)) / CONTROL_STEP
+    return -0.6 * math.atan2(-z, -y) / CONTROL_STEP
 
 
 def run_episode(env: gym.Env, expert: RetractExpert, seed: int) -> dict[str, float | bool | str]:

@@ -19,10 +19,11 @@ from agents.cloning import CloningOptions
 from agents.dagger import dagger
 from agents.expert_palpate import PalpateExpert
 from agents.palpate_surrogate import PalpateSurrogate
+from agents.training.extractors import MemorySummary
 from agents.training.policy_files import PolicyDescription, save_policy
 from surgsim_env.stable_baselines import VectorEnvForStableBaselines
 
-NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh}
+NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
 
 
 def organs(scene: str, count: int) -> VectorEnv:
@@ -65,7 +66,7 @@ def main() -> None:
         steps=arguments.steps,
         expert_share=lambda index: 0.5**index if index < 3 else 0.0,
         normalisation=scaled,
-        options=CloningOptions(epochs=15, patience=5, batch_size=256, std=0.05),
+        options=CloningOptions(epochs=8, patience=3, batch_size=256, std=0.05),
         seed=arguments.seed,
     ):
         print(f"{time.time() - begin:6.0f} s {stage}", flush=True)

@@ -10,8 +10,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 from agents.site_policy import SitePolicy
+from agents.training.extractors import MemorySummary
 from surgsim_env.toml_tables import nearest
 
+EXTRACTORS = {"MemorySummary": MemorySummary}
 ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU}
 
 
@@ -44,21 +46,21 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 
 def keywords(hyperparameters: dict[str, Any]) -> dict[str, Any]:
-    """Hyperparameters as the algorithm takes them: `{linear: x}` is a schedule, activation functions are classes.
+    """Hyperparameters as the algorithm takes them: `{linear: x}` is a schedule, some names are classes.
 
     Raises:
-        ValueError: an activation function that is unknown.
+        ValueError: an activation function or a features extractor that is unknown.
     """
     made = dict(hyperparameters)
     for name, value in hyperparameters.items():
         if isinstance(value, dict) and set(value) == {"linear"}:
             made[name] = LinearSchedule(float(value["linear"]), 0.0, 1.0)
-    policy = made.get("policy_kwargs")
-    if policy and "activation_fn" in policy:
-        name = policy["activation_fn"]
-        if name not in ACTIVATIONS:
-            raise ValueError(
-                f"hyperparameters.policy_kwargs.activation_fn is {name!r}; known are {', '.join(ACTIVATIONS)}"
-            )
-        made["policy_kwargs"] = {**policy, "activation_fn": ACTIVATIONS[name]}
-    return made
+    policy = dict(made.get("policy_kwargs") or {})
+    for entry, known in (("activation_fn", ACTIVATIONS), ("features_extractor_class", EXTRACTORS)):
+        if entry in policy:
+            if policy[entry] not in known:
+                raise ValueError(
+                    f"hyperparameters.policy_kwargs.{entry} is {policy[entry]!r}; known are {', '.join(known)}"
+                )
+            policy[entry] = known[policy[entry]]
+    return made | {"policy_kwargs": policy} if policy else made

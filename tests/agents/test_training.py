@@ -214,7 +214,7 @@ def test_warm_starts_that_do_not_fit_are_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="its networks are not those of this run"):
         Run(config(warm_start=file, hyperparameters=wider), tmp_path / "second")
     bare = {**table()["environment"], "normalize_observation": False}
-    with pytest.raises(ValueError, match="set environment.normalize_observation: true"):
+    with pytest.raises(ValueError, match=r"set environment\.normalize_observation: true"):
         Run(config(warm_start=file, environment=bare), tmp_path / "third")
 
 

@@ -132,8 +132,20 @@ def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Genera
         return found
 
     whole = figures(np.arange(len(records)))
-    draws = [figures(rng.integers(len(records), size=len(records))) for _ in range(RESAMPLES)]
+    draws = [figures(_resampled(len(records), rng)) for _ in range(RESAMPLES)]
     return {name: _figure(value, np.array([draw[name] for draw in draws])) for name, value in whole.items()}
+
+
+def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) -> dict[str, Figure]:
+    """Means over episodes of numbers an episode (n,), NaN where it does not define them, and their intervals."""
+    table = np.array(list(columns.values()))
+    draws = np.array([_means(table[:, _resampled(table.shape[1], rng)]) for _ in range(RESAMPLES)])
+    means = _means(table).tolist()
+    return {name: _figure(mean, draw) for name, mean, draw in zip(columns, means, draws.T, strict=True)}
+
+
+def _resampled(count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    return rng.integers(count, size=count)
 
 
 def _matched(record: PalpationRecord) -> FloatArray:

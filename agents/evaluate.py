@@ -1,0 +1,243 @@
+"""Score methods on the evaluation seeds, write the leaderboard, film a policy; run from a checkout.
+
+    python -m agents.evaluate --agent gp_ucb --scene phantom --level standard
+    python -m agents.evaluate --all --scene phantom --level standard     # every baseline and every policy for it
+    python -m agents.evaluate --policy agents/policies/NAME.zip --episodes 20 --video out.mp4
+    python -m agents.evaluate --reach --scene phantom --level hard       # lesions below the sensor's reach
+    python -m agents.evaluate --leaderboard
+
+Results go to agents/results/, one file a method and place; the leaderboard is written from all of them. A policy is a
+zip of pickles: load only those that you trust.
+"""
+
+import argparse
+import datetime
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from agents.leaderboard import SITES, write_leaderboard
+from agents.results_files import RESULTS, Result
+from agents.roster import AGENTS, POLICIES, RASTER_SIDES, find_agent
+from agents.site_episodes import AgentChooser, PolicyChooser, SiteChooser, play
+from agents.task_episodes import play_tasks, task_figures
+from surgsim_env.evaluation.palpation import EVALUATION_SEEDS, press_errors, score
+
+# Of the bootstrap.
+BOOTSTRAP_SEED = 0
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read the command line and do what it asks."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--all", action="store_true", help="every baseline, and every policy for this place")
+    what.add_argument("--agent", help=f"one of {', '.join(AGENTS)}")
+    what.add_argument("--policy", type=Path, help="NAME.zip, with NAME.json beside it")
+    what.add_argument("--reach", action="store_true", help="which lesions the sensor can feel at all")
+    what.add_argument("--leaderboard", action="store_true", help="write it and do nothing else")
+    parser.add_argument("--scene", default="phantom")
+    parser.add_argument("--level", default="standard")
+    parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
+    parser.add_argument("--envs", type=int, default=16, help="organs side by side")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--dtype", default="float64", choices=("float64", "float32"))
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the result files")
+    parser.add_argument("--video", type=Path, help="film the first episodes into this mp4 file")
+    parser.add_argument("--video-episodes", type=int, default=3)
+    options = parser.parse_args(arguments)
+    if not 1 <= options.episodes <= len(EVALUATION_SEEDS):
+        parser.error(f"--episodes is {options.episodes}; there are 1 to {len(EVALUATION_SEEDS)} evaluation seeds")
+    if options.video is not None and options.policy is None:
+        parser.error("--video films a policy: give --policy as well")
+    run(options)
+
+
+def run(options: argparse.Namespace) -> None:
+    """What the options ask for."""
+    if options.reach:
+        write_reach(options)
+    elif options.agent is not None:
+        evaluate_agent(options.agent, options)
+    elif options.policy is not None:
+        evaluate_policy(options.policy, options)
+    elif options.all:
+        evaluate_all(options)
+    if options.results == RESULTS:
+        write_leaderboard()
+
+
+def evaluate_all(options: argparse.Namespace) -> None:
+    """Every baseline on the place that the options name, then every policy made for it."""
+    widest = 7 if "wide" in options.scene else 5
+    skipped = {f"raster_{side}" for side in RASTER_SIDES if not widest - 3 <= side <= widest}
+    for name in AGENTS:
+        if name not in skipped:
+            evaluate_agent(name, options)
+    for path in sorted(POLICIES.glob("*.json")):
+        kwargs = json.loads(path.read_text(encoding="utf-8"))["env_kwargs"]
+        if kwargs.get("scene", "phantom") == options.scene:
+            evaluate_policy(path.with_suffix(".zip"), options)
+
+
+def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
+    """A baseline of SurgSim/PalpateSites-v0."""
+    kwargs = {"scene": options.scene, "level": options.level}
+    command = f"python -m agents.evaluate --agent {name} --scene {options.scene} --level {options.level}"
+    return _evaluate_sites(name, AgentChooser(find_agent(name)), kwargs, command, options)
+
+
+def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
+    """A trained policy on what it was trained for; `--level` sets the level where its environment has one."""
+    from agents.training.policy_files import load_policy
+
+    policy = load_policy(path)
+    kwargs = dict(policy.description.env_kwargs)
+    command = f"python -m agents.evaluate --policy {_from_here(path)}"
+    if "level" in kwargs or policy.description.env_id == SITES:
+        kwargs["level"] = options.level
+        command += f" --level {options.level}"
+    if options.video is not None:
+        from agents.policy_video import film
+
+        film(policy, kwargs, EVALUATION_SEEDS[: options.video_episodes], options.video)
+    if policy.description.env_id == SITES:
+        kwargs = {"scene": "phantom", **kwargs}
+        return _evaluate_sites(path.stem, PolicyChooser(policy), kwargs, command, options)
+    return _evaluate_task(path.stem, policy, kwargs, command, options)
+
+
+def _evaluate_sites(
+    name: str, chooser: SiteChooser, kwargs: dict[str, Any], command: str, options: argparse.Namespace
+) -> Result:
+    seeds = EVALUATION_SEEDS[: options.episodes]
+    envs = _environments(SITES, kwargs, options)
+    budget = envs.unwrapped.envs[0].unwrapped.task.budget  # type: ignore[attr-defined]
+    start = time.perf_counter()
+    records = play(chooser, envs, seeds, progress=_Progress(name))
+    taken = time.perf_counter() - start
+    envs.close()
+    result = Result(
+        method=name,
+        env_id=SITES,
+        env_kwargs=kwargs,
+        seeds=(seeds[0], seeds[-1]),
+        budget=budget,
+        figures=score(records, budget, np.random.default_rng(BOOTSTRAP_SEED)),
+        command=_with_options(command, options),
+        wall_time=round(taken, 1),
+        date=_today(),
+        errors_mm=[np.round(1000.0 * press_errors(record, budget), 2).tolist() for record in records],
+        lesion_counts=[len(record.truth) for record in records],
+    )
+    return _saved(result, options)
+
+
+def _evaluate_task(name: str, policy: Any, kwargs: dict[str, Any], command: str, options: argparse.Namespace) -> Result:
+    seeds = EVALUATION_SEEDS[: options.episodes]
+    envs = _environments(policy.description.env_id, kwargs, options)
+    policy.reset(envs.num_envs)
+    first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
+    start = time.perf_counter()
+    records = play_tasks(policy.act, envs, seeds, progress=_Progress(name))
+    taken = time.perf_counter() - start
+    control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
+    envs.close()
+    result = Result(
+        method=name,
+        env_id=policy.description.env_id,
+        env_kwargs=kwargs,
+        seeds=(seeds[0], seeds[-1]),
+        budget=600,
+        figures=task_figures(records, control_step, soft_force, np.random.default_rng(BOOTSTRAP_SEED)),
+        command=_with_options(command, options),
+        wall_time=round(taken, 1),
+        date=_today(),
+    )
+    return _saved(result, options)
+
+
+def write_reach(options: argparse.Namespace) -> None:
+    """Press over each lesion of the evaluation seeds, with it and without it, and count those that stay hidden."""
+    from surgsim_env.palpation.lesion_reach import lesion_reaches
+
+    kwargs = {"scene": options.scene, "level": options.level}
+    env = gym.make(SITES, **kwargs).unwrapped
+    reaches, progress = [], _Progress("reach")
+    for seed in EVALUATION_SEEDS[: options.episodes]:
+        env.reset(seed=seed)
+        reaches += lesion_reaches(env.task.anatomy, env.task.drawn)  # type: ignore[attr-defined]
+        progress()
+    table = {
+        **kwargs,
+        "lesions": len(reaches),
+        "below": sum(reach.below for reach in reaches),
+        "noise": reaches[0].noise,
+        "differences": [round(reach.force - reach.force_without, 5) for reach in reaches],
+    }
+    options.results.mkdir(parents=True, exist_ok=True)
+    path = options.results / f"reach_PalpateSites_{options.scene}_{options.level}.json"
+    path.write_text(json.dumps(table) + "\n", encoding="utf-8")
+    print(f"{table['below']} of {table['lesions']} lesions below reach -> {path}")
+
+
+def _environments(env_id: str, kwargs: dict[str, Any], options: argparse.Namespace) -> gym.vector.VectorEnv:
+    """Environments side by side."""
+    return gym.make_vec(
+        env_id,
+        num_envs=min(options.envs, options.episodes),
+        vectorization_mode="vector_entry_point",
+        dtype=options.dtype,
+        threads=options.threads,
+        **kwargs,
+    )
+
+
+def _saved(result: Result, options: argparse.Namespace) -> Result:
+    path = result.save(options.results)
+    shown = {name: figure.value for name, figure in result.figures.items()}
+    told = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
+    figures = ", ".join(f"{name} {shown[name]:.3g}" for name in told if shown.get(name) is not None)
+    print(f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s -> {path}", flush=True)
+    return result
+
+
+class _Progress:
+    """Says from time to time that something moves."""
+
+    def __init__(self, name: str, every: float = 60.0) -> None:
+        self.name, self.every, self.count = name, every, 0
+        self.start = self.last = time.perf_counter()
+
+    def __call__(self) -> None:
+        self.count += 1
+        now = time.perf_counter()
+        if now - self.last > self.every:
+            self.last = now
+            print(f"{self.name}: {self.count} steps in {now - self.start:.0f} s", file=sys.stderr, flush=True)
+
+
+def _with_options(command: str, options: argparse.Namespace) -> str:
+    command += "" if options.episodes == len(EVALUATION_SEEDS) else f" --episodes {options.episodes}"
+    return command + ("" if options.dtype == "float64" else f" --dtype {options.dtype}")
+
+
+def _from_here(path: Path) -> str:
+    """The path as seen from the checkout, so that no machine's folders are written."""
+    absolute, checkout = path.resolve(), POLICIES.parent.parent
+    return absolute.relative_to(checkout).as_posix() if absolute.is_relative_to(checkout) else path.name
+
+
+def _today() -> str:
+    return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+
+
+if __name__ == "__main__":
+    main()

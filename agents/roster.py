@@ -1,0 +1,41 @@
+"""The methods that `agents.evaluate` knows by name."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from agents.gp_level_set import GpLevelSet
+from agents.gp_ucb import GpUcb
+from agents.gp_variance import GpVariance
+from agents.random_sites import RandomSites
+from agents.raster_sites import RasterSites
+from agents.site_agent import SiteAgent
+from agents.sobol_sites import SobolSites
+from agents.words import Middle, Truth
+
+# Rasters of so many places a side are tried on each scene; the leaderboard shows the best of them.
+RASTER_SIDES = (2, 3, 4, 5, 6, 7)
+
+AGENTS: dict[str, Callable[[], SiteAgent]] = {
+    "random": RandomSites,
+    **{f"raster_{side}": lambda side=side: RasterSites(side) for side in RASTER_SIDES},
+    "sobol": SobolSites,
+    "gp_variance": GpVariance,
+    "gp_ucb": GpUcb,
+    "gp_level_set": GpLevelSet,
+    # What the scores are at best, and by guessing: neither presses with a purpose.
+    "truth": Truth,
+    "middle": Middle,
+}
+
+POLICIES = Path(__file__).resolve().parent / "policies"
+
+
+def find_agent(name: str) -> Callable[[], SiteAgent]:
+    """How to make the agent of a name.
+
+    Raises:
+        ValueError: an unknown name; lists the known.
+    """
+    if name not in AGENTS:
+        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join(AGENTS)}")
+    return AGENTS[name]

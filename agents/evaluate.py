@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
     parser.add_argument("--envs", type=int, default=16, help="organs side by side")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--dtype", default="float64", choices=("float64", "float32"))
+    parser.add_argument("--dtype", default="float32", choices=("float64", "float32"), help="of the lanes")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the result files")
     parser.add_argument("--video", type=Path, help="film the first episodes into this mp4 file")
     parser.add_argument("--video-episodes", type=int, default=3)
@@ -226,7 +226,7 @@ class _Progress:
 
 def _with_options(command: str, options: argparse.Namespace) -> str:
     command += "" if options.episodes == len(EVALUATION_SEEDS) else f" --episodes {options.episodes}"
-    return command + ("" if options.dtype == "float64" else f" --dtype {options.dtype}")
+    return command + ("" if options.dtype == "float32" else f" --dtype {options.dtype}")
 
 
 def _from_here(path: Path) -> str:

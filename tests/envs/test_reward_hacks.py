@@ -3,6 +3,8 @@
 First by the tables of weights alone, for whatever an episode holds; then played, one cheat after the other.
 """
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,9 +14,11 @@ from surgsim_env import rewards
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.scripting import oracle_script, run_script
 from surgsim_env.tasks.palpate import EPISODE_STEPS, SUCCESS_DISTANCE
+from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE
 
-# What each table's terms are. Per step: at most so often, each in [0, 1]. Won: changes of a number in [0, 1], which
-# telescope. Reached: paid once, at a good end. Failures: paid once, at a bad one.
+# What each table's terms are. Per step: each in [0, 1], so often at most; where `shared`, a share of that number of
+# steps, as `forgone` is. Won: changes of a number in [0, 1], which telescope. Reached: paid once, at a good end.
+# Failures: paid once, at a bad one.
 TABLES = {
     "SurgSim/Palpate-v0": {
         "weights": rewards.PALPATE_WEIGHTS,
@@ -41,7 +45,22 @@ TABLES = {
         "failures": ("torn", "hard_force", "collided", "fault"),
     },
 }
+for _name, _budget in (("phantom", BUDGET), ("phantom_wide", BUDGET_WIDE)):
+    TABLES[f"SurgSim/PalpateSites-v0 {_name}"] = {
+        "weights": rewards.PALPATE_SITES_WEIGHTS,
+        "steps": _budget,
+        "shared": True,
+        "per_step": ("error", "soft_force"),
+        "won": ("found",),
+        "reached": (),
+        "failures": ("hard_force", "fault"),
+    }
 IDS = sorted(TABLES)
+
+
+def of_a_step(table, *terms):
+    """What terms pay in one step at most."""
+    return sum(table["weights"][term] for term in terms) / (table["steps"] if "shared" in table else 1)
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -63,19 +82,19 @@ def test_at_no_moment_does_a_bad_end_pay_more_than_going_on(name):
     """
     table = TABLES[name]
     weights = table["weights"]
-    dearest_step = sum(weights[term] for term in table["per_step"])
+    dearest, forgone = of_a_step(table, *table["per_step"]), of_a_step(table, "forgone")
     won = sum(weights[term] for term in table["won"])
     for failure in table["failures"]:
         for left in range(table["steps"]):
-            assert weights[failure] + left * weights["forgone"] + won < (left + 1) * dearest_step, (failure, left)
+            assert weights[failure] + left * forgone + won < (left + 1) * dearest, (failure, left)
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", [name for name in IDS if TABLES[name]["reached"]])
 def test_a_good_end_pays_more_than_standing_still(name):
     """Even the dearest way to success, in the last step, beats doing nothing at all, which pays time alone."""
     weights = TABLES[name]["weights"]
     reached = sum(weights[term] for term in TABLES[name]["reached"])
-    dearest = TABLES[name]["steps"] * sum(weights[term] for term in TABLES[name]["per_step"])
+    dearest = TABLES[name]["steps"] * of_a_step(TABLES[name], *TABLES[name]["per_step"])
     assert reached + dearest > TABLES[name]["steps"] * weights["time"]
 
 
@@ -190,3 +209,51 @@ def test_a_search_by_touch_is_paid_more_than_any_cheat():
 
     env = gym.make("SurgSim/Palpate-v0")
     assert run_episode(env, RasterAgent(env), SEED)["return"] > 7.0
+
+
+# ---- press by press ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def presses():
+    return gym.make("SurgSim/PalpateSites-v0")
+
+
+def returns_of_places(places):
+    """Mean return of eight organs on which every episode presses the same places (n, 2)."""
+    envs = gym.make_vec("SurgSim/PalpateSites-v0", 8, "vector_entry_point", threads=1, budget=len(places))
+    envs.reset(seed=0)
+    total = np.zeros(8)
+    for place in places:
+        _, reward, terminated, _, infos = envs.step(np.tile(place, (8, 1)).astype(np.float32))
+        total += reward
+    assert terminated.all() and not infos["hard_limit"].any()
+    envs.close()
+    return total.mean()
+
+
+def test_a_search_is_paid_more_than_pressing_one_place_again_and_again():
+    """An even raster against the middle of the chart, 16 presses each, level "standard"."""
+    side = np.linspace(-0.75, 0.75, 4)
+    raster = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    searched, stayed = returns_of_places(raster), returns_of_places(np.zeros((16, 2)))
+    assert searched > stayed + 0.1
+
+
+def test_a_press_that_ends_in_harm_is_paid_less_than_the_worst_episode(presses, monkeypatch):
+    weights = rewards.PALPATE_SITES_WEIGHTS
+    # What `found` begins with is lost at most.
+    worst = weights["error"] + weights["soft_force"] - weights["found"]
+    presses.reset(seed=SEED)
+    inner = presses.unwrapped
+    limits = inner.task.limits
+    monkeypatch.setattr(inner.task, "limits", dataclasses.replace(limits, soft_force=0.1, hard_force=0.2))
+    _, reward, over, _, info = presses.step(np.zeros(2, dtype=np.float32))
+    assert over and info["hard_limit"] and reward < worst
+    monkeypatch.setattr(inner.task, "limits", limits)
+    presses.reset(seed=SEED)
+    total = presses.step(np.zeros(2, dtype=np.float32))[1]
+    # A press begins from rest: what has to be wrong is the contact.
+    monkeypatch.setattr(inner.simulation, "contact", inner.simulation.contact._replace(stiffness=1e12))
+    _, reward, over, _, info = presses.step(np.zeros(2, dtype=np.float32))
+    assert over and info["sim_fault"] and total + reward < worst

@@ -31,6 +31,8 @@ class BeliefSettings:
 class SiteBelief:
     """Belief maps at the n x n sites of a chart's grid, row by row along its second axis."""
 
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
     def __init__(self, settings: BeliefSettings) -> None:
         self.settings, self.site_count = settings, settings.site_count
         estimator = LesionEstimator(settings.extent, tip_radius=settings.tip_radius, noise=settings.noise)

@@ -59,8 +59,8 @@ class BetweenRollouts(BaseCallback):
         if self._envs is None:
             count = min(self.run.config.environment.count, settings.episodes)
             self._envs = make_environments(self.run.config.environment, count)
-        # These environments repeat actions and blind by themselves.
-        seen = replace(self.run.description(), action_repeat=1, force_entries=[])
+        # These environments repeat actions, blind and believe by themselves.
+        seen = replace(self.run.description(), action_repeat=1, force_entries=[], belief=None)
         figures = mean_figures(play_episodes(TrainedPolicy(model, seen), self._envs, settings.episodes))
         self.evaluated_at = model.num_timesteps
         if settings.score not in figures:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -66,11 +67,12 @@ class TrainedPolicy:
         """Begin episodes in so many environments."""
         self._state: Any = None
         self._since = np.zeros(count, dtype=np.int64)
-        self._actions = np.zeros((count, *self._action_shape), dtype=np.float32)
+        self._actions = np.zeros((count, *self._actions_of.shape), dtype=self._actions_of.dtype)
 
     @property
-    def _action_shape(self) -> tuple[int, ...]:
-        return (2,) if self.belief is not None else self.model.action_space.shape  # type: ignore[return-value]
+    def _actions_of(self) -> gym.spaces.Space:
+        """The space that actions are given in: the model's own, but for a site's number."""
+        return self.model.action_space if self.belief is None else self.belief.action_space
 
     def act(self, observations: NDArray[Any], begins: NDArray[np.bool_], *, deterministic: bool = True) -> NDArray:
         """Actions (n, n_action) for raw observations (n, n_observation); `begins` (n,): a new episode begins there."""

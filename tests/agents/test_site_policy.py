@@ -1,14 +1,18 @@
 """The learned acquisition function: what it sees is the estimator's belief, and what it names is the site pressed."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
 pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 import gymnasium as gym
 import torch
+from stable_baselines3 import PPO
 
 from agents.site_belief import BeliefSettings, SiteBelief
 from agents.site_policy import CURIOSITY, SHARPNESS, SitePolicy
+from agents.training.policy_files import PolicyDescription, load_policy, save_policy
 from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_LENGTH, EXCESS_SPREAD, LesionEstimator
 
 pytestmark = pytest.mark.agents
@@ -70,3 +74,23 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
     np.testing.assert_allclose(difference, np.broadcast_to(difference[:, :1], difference.shape), atol=1e-4)
     chosen, _ = policy.predict(features, deterministic=True)
     assert chosen.tolist() == bound.argmax(axis=1).tolist()
+
+
+def test_a_saved_policy_presses_what_its_scores_say(tmp_path):
+    class Sites(gym.Env):
+        """Just spaces: the policy is never asked to step."""
+
+        observation_space = SiteBelief(SETTINGS).space
+        action_space = gym.spaces.Discrete(SITES)
+
+    model = PPO(SitePolicy, Sites(), n_steps=8, batch_size=8)
+    save_policy(model, PolicyDescription("PPO", "SurgSim/PalpateSites-v0", belief=asdict(SETTINGS)), tmp_path / "p.zip")
+    policy = load_policy(tmp_path / "p.zip")
+    policy.reset(2)
+    observations = np.stack([observed({3: 0.1, 17: 0.5}), observed({40: 0.3})])
+    actions = policy.act(observations, np.ones(2, dtype=bool))
+    belief = SiteBelief(SETTINGS)
+    features = belief.features(observations)
+    bound = features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES]
+    np.testing.assert_array_equal(actions, belief.action(bound.argmax(axis=1)))
+    assert actions.dtype == np.float32

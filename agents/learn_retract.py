@@ -12,11 +12,12 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv, VectorObservationWrapper
+from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
@@ -60,16 +61,22 @@ class SeeingExpert:
         return np.array([self._expert.act(one.task_observation) for one in self._singles])
 
 
-class Blind(VectorObservationWrapper):
-    """Environments some entries of whose observations are 0."""
+class Blind(VectorWrapper):
+    """Environments some entries of whose observations are 0; what `final_obs` holds is left as it is."""
 
     def __init__(self, envs: VectorEnv, entries: Sequence[int]) -> None:
         super().__init__(envs)
         self._entries = list(entries)
 
-    def observations(self, observations: NDArray) -> NDArray:
-        """What is shown of observations (n_env, n_observation)."""
-        return blinded(observations, self._entries)
+    def reset(self, **kwargs: Any) -> tuple[NDArray, dict[str, Any]]:
+        """Start an episode everywhere."""
+        observations, info = self.env.reset(**kwargs)
+        return blinded(observations, self._entries), info
+
+    def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
+        """One control step of all."""
+        observations, *rest = self.env.step(actions)
+        return (blinded(observations, self._entries), *rest)  # type: ignore[return-value]
 
 
 def learn(arguments: argparse.Namespace) -> None:

@@ -1,0 +1,121 @@
+"""The scripted expert of SurgSim/Retract-v0, how agents are scored on it, and a few steps of DAgger."""
+
+import json
+from argparse import Namespace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+
+pytestmark = pytest.mark.agents
+pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
+
+ID = "SurgSim/Retract-v0"
+
+
+def envs(count: int, mode: str = "Disabled", **settings) -> gym.vector.VectorEnv:
+    return gym.make_vec(
+        ID, num_envs=count, vectorization_mode="vector_entry_point", autoreset_mode=mode, threads=1, **settings
+    )
+
+
+def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
+    """Three seeds on two environments: each record is that of a single environment, to the bit; all succeed."""
+    from agents.expert_retract import RetractExpert, run_episode
+    from agents.play_retract import Expert, play, summary
+
+    seeds = [21, 22, 23]
+    records = play(Expert(), envs(2), seeds)
+    assert [record["seed"] for record in records] == seeds
+    single = gym.make(ID)
+    for record in records:
+        alone = run_episode(single, RetractExpert(), record["seed"])
+        assert {name: record[name] for name in alone} == alone
+        assert record["success"] and not record["torn"] and record["visible"] >= 0.8
+    figures = summary(records)
+    assert figures["success"] == 1.0 and figures["torn"] == figures["faults"] == 0.0
+    assert figures["pull_force_peak_largest"] == max(record["pull_force_peak"] for record in records)
+
+
+def test_the_expert_follows_from_the_observation_alone():
+    """Asked in another order, or again, it says the same; and it keeps still where enough is seen."""
+    from agents.expert_retract import GRIP, HOLDS, TIP, VISIBLE, RetractExpert
+
+    random = np.random.default_rng(0)
+    box = gym.make(ID).observation_space
+    places = random.uniform(box.low, box.high, (20, *box.shape))  # type: ignore[attr-defined, misc]
+    expert = RetractExpert()
+    first = np.array([expert.act(place) for place in places])
+    np.testing.assert_array_equal(first[::-1], [expert.act(place) for place in places[::-1]])
+    assert (np.abs(first) <= 1.0).all()
+    held = places[0].copy()
+    held[TIP], held[GRIP], held[HOLDS], held[VISIBLE] = [0.04, 0.045, 0.03], 0.45, 1.0, 0.95
+    np.testing.assert_array_equal(expert.act(held), [0.0, 0.0, 0.0, 0.0, -1.0])
+
+
+def test_intervals_of_shares_are_wilsons():
+    """Against the worked values of Newcombe (1998), table I: 81 of 263 is 0.2553 to 0.3662, 0 of 20 is 0 to 0.1611."""
+    from agents.play_retract import wilson
+
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+
+
+def test_forces_are_those_entries_of_the_observation():
+    """Where the jaw presses tissue, they alone tell the wrench, grip and pull."""
+    env = gym.make(ID)
+    observation, _ = env.reset(seed=3)
+    task = env.unwrapped.task  # type: ignore[attr-defined]
+    assert task.force_entries == tuple(range(13, 21))
+    np.testing.assert_array_equal(observation[13:16], task.sensed_force(observation).astype(np.float32))
+    assert observation[19] == observation[20] == 0.0 and observation[21] == 0.0
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypatch, capsys):
+    """Two rounds of a few steps; without force the policy sees zeros there, the expert does not."""
+    from agents import learn_retract
+    from agents.play_retract import play
+    from agents.training.policy_files import load_policy
+
+    asked = []
+    act = learn_retract.RetractExpert.act
+    monkeypatch.setattr(learn_retract.RetractExpert, "act", lambda self, seen: (asked.append(seen), act(self, seen))[1])
+    out = tmp_path / "policy.zip"
+    settings = {"envs": 2, "dtype": "float64", "threads": 1, "rounds": 2, "steps": 4, "epochs": 2, "seed": 0}
+    learn_retract.learn(Namespace(out=out, without_force=blind, **settings))
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
+    assert [line["sample_count"] for line in lines] == [8, 16]
+    assert np.array(asked)[:, 13:19].any(), "the expert sees the sensor's noise"
+    policy = load_policy(out)
+    assert policy.description.force_entries == (list(range(13, 21)) if blind else [])
+    assert policy.description.env_id == ID and len(policy.description.observation_mean or []) == 56
+    shown = policy.seen(np.ones((1, 56), dtype=np.float32))
+    other = np.ones((1, 56), dtype=np.float32)
+    other[:, 13:21] = 2.0
+    assert (policy.seen(other) == shown).all() == blind
+    (record,) = play(policy, envs(1, max_episode_steps=3), [5])
+    assert record["steps"] == 3 and not record["success"]
+
+
+def test_figures_are_those_of_the_episodes():
+    from agents.play_retract import KEPT, summary
+
+    blank = dict.fromkeys(KEPT, 0.0)
+    won = {**blank, "seed": 0, "steps": 80, "return": 14.0, "success": True, "sim_fault": "", "force_peak": 0.5}
+    lost = {
+        **won,
+        "seed": 1,
+        "steps": 40,
+        "return": -20.0,
+        "success": False,
+        "sim_fault": "inverted",
+        "force_peak": 1.5,
+    }
+    figures = summary([won, won, lost])
+    assert figures["success"] == pytest.approx(2 / 3) and figures["faults"] == pytest.approx(1 / 3)
+    assert figures["seconds_to_success"] == pytest.approx(4.0)
+    assert (figures["force_peak_largest"], figures["return"]) == (1.5, pytest.approx(8.0 / 3.0))

@@ -25,7 +25,7 @@ import numpy as np
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.leaderboard import SITES, write_leaderboard
 from agents.results_files import RESULTS, Result
-from agents.roster import AGENTS, POLICIES, RASTER_SIDES, find_agent
+from agents.roster import AGENTS, POLICIES, RASTER_SIDES, WORDS, find_agent
 from agents.site_episodes import AgentChooser, PolicyChooser, SiteChooser, play
 from agents.task_episodes import play_tasks, task_figures
 from surgsim_env.evaluation.palpation import EVALUATION_SEEDS, press_errors, score
@@ -46,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--level", default="standard")
     parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
+    parser.add_argument("--budget", type=int, help="presses of an episode, in place of the environment's own")
     parser.add_argument("--envs", type=int, default=16, help="organs side by side")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--dtype", default="float32", choices=("float64", "float32"), help="of the lanes")
@@ -89,7 +90,10 @@ def evaluate_all(options: argparse.Namespace) -> None:
 
 def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
     """A baseline of SurgSim/PalpateSites-v0."""
-    kwargs = {"scene": options.scene, "level": options.level}
+    kwargs: dict[str, Any] = {"scene": options.scene, "level": options.level}
+    if name in WORDS:
+        # What these say does not change with what is felt.
+        kwargs["budget"] = 1
     command = f"python -m agents.evaluate --agent {name} --scene {options.scene} --level {options.level}"
     return _evaluate_sites(name, AgentChooser(find_agent(name)), kwargs, command, options)
 
@@ -118,6 +122,8 @@ def _evaluate_sites(
     name: str, chooser: SiteChooser, kwargs: dict[str, Any], command: str, options: argparse.Namespace
 ) -> Result:
     seeds = EVALUATION_SEEDS[: options.episodes]
+    if options.budget is not None:
+        kwargs = {**kwargs, "budget": options.budget}
     envs = _environments(SITES, kwargs, options)
     budget = envs.unwrapped.envs[0].unwrapped.task.budget  # type: ignore[attr-defined]
     start = time.perf_counter()
@@ -226,6 +232,7 @@ class _Progress:
 
 def _with_options(command: str, options: argparse.Namespace) -> str:
     command += "" if options.episodes == len(EVALUATION_SEEDS) else f" --episodes {options.episodes}"
+    command += "" if options.budget is None else f" --budget {options.budget}"
     return command + ("" if options.dtype == "float32" else f" --dtype {options.dtype}")
 
 

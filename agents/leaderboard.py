@@ -78,7 +78,7 @@ def _order(place: str) -> tuple[int, str]:
 
 def _sites(place: str, rows: list[Result], folder: Path) -> str:
     rows = sorted(best_raster_alone(rows), key=_merit)
-    first = rows[0]
+    first = max(rows, key=lambda row: row.budget)
     said = [f"\n## {_title(first)}\n"]
     lesions = first.lesion_counts
     said.append(

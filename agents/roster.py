@@ -22,10 +22,13 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "gp_variance": GpVariance,
     "gp_ucb": GpUcb,
     "gp_level_set": GpLevelSet,
-    # What the scores are at best, and by guessing: neither presses with a purpose.
+    # What the scores are at best, and by guessing.
     "truth": Truth,
     "middle": Middle,
 }
+
+# Those that say where lesions are without feeling for them.
+WORDS = ("truth", "middle")
 
 POLICIES = Path(__file__).resolve().parent / "policies"
 

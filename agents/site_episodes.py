@@ -6,12 +6,12 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.site_agent import SiteAgent, site_facts
 from surgsim_env.evaluation.palpation import MapScore, PalpationRecord
 from surgsim_env.palpation.scan import HOLD_TIME, PRESS_SPEED
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 ENV_ID = "SurgSim/PalpateSites-v0"
 

@@ -1,0 +1,99 @@
+"""The baselines of SurgSim/PalpateSites-v0, on maps made of bell curves: what they press, and that they find."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn", reason="needs the `agents` extra")
+from agents.roster import AGENTS, WORDS, find_agent
+from agents.site_agent import SiteFacts
+from surgsim_env.palpation.lesion_estimator import LesionEstimator
+
+pytestmark = pytest.mark.agents
+FACTS = SiteFacts(extent=(0.04, 0.04), site_count=13, tip_radius=0.008, noise=0.05, budget=25)
+NAMES = [name for name in AGENTS if name not in WORDS]
+
+
+class Chart:
+    """An environment without physics: log contrast is a bell curve of 7 mm at each centre [m]."""
+
+    def __init__(self, centres: list[tuple[float, float]], noise: float = 0.0, seed: int = 0) -> None:
+        self.centres, self.noise, self.rng = np.array(centres).reshape(-1, 2), noise, np.random.default_rng(seed)
+        self.places: list[np.ndarray] = []
+        self.values: list[float] = []
+
+    def observation(self) -> np.ndarray:
+        count = FACTS.site_count
+        memory = np.zeros((2, count**2))
+        for place, value in zip(self.places, self.values, strict=True):
+            column, row = np.round(place / FACTS.extent * (count - 1)).astype(int)
+            memory[:, row * count + column] = value, 1.0
+        left = 1.0 - len(self.places) / FACTS.budget
+        return np.concatenate([memory.ravel(), np.zeros(5), [left]]).astype(np.float32)
+
+    def press(self, action: np.ndarray) -> None:
+        assert action.shape == (2,) and action.dtype == np.float32 and (np.abs(action) <= 1.0).all()
+        place = 0.5 * (action.astype(np.float64) + 1.0) * FACTS.extent
+        squared = ((self.centres - place) ** 2).sum(axis=1)
+        self.places.append(place)
+        self.values.append(0.4 * np.exp(-0.5 * squared / 0.007**2).sum() + self.noise * self.rng.normal())
+
+
+def played(name: str, chart: Chart, presses: int = 25, seed: int = 0) -> np.ndarray:
+    agent = find_agent(name)()
+    agent.reset(np.random.default_rng(seed), FACTS)
+    for _ in range(presses):
+        chart.press(agent.act(chart.observation()))
+    return np.array(chart.places)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_agent_presses_its_budget(name: str) -> None:
+    places = played(name, Chart([(0.012, 0.030)]))
+    assert len(np.unique(places.round(6), axis=0)) >= min(25, {"raster_2": 13}.get(name, 25))
+    again = played(name, Chart([(0.012, 0.030)]))
+    np.testing.assert_array_equal(places, again)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_agent_finds_one_lesion(name: str) -> None:
+    """On a map without noise the common estimator says where the lesion is to 3 mm, and that it is one."""
+    chart = Chart([(0.0125, 0.0285)])
+    # A raster that is not done has left out a part of the chart.
+    played(name, chart, presses=max(25, int(name[-1]) ** 2 if name.startswith("raster") else 0))
+    estimator = LesionEstimator(FACTS.extent, tip_radius=FACTS.tip_radius, noise=FACTS.noise)
+    said = estimator.estimate(np.array(chart.places), np.array(chart.values)).points
+    assert said.shape == (1, 2)
+    assert np.linalg.norm(said[0] - chart.centres[0]) < 0.003
+
+
+def test_a_raster_presses_the_middles_of_its_fields() -> None:
+    places = played("raster_3", Chart([]), presses=9)
+    middles = (np.arange(3) + 0.5) / 3 * 0.04
+    expected = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
+    np.testing.assert_allclose(places[np.lexsort(places.T)], expected[np.lexsort(expected.T)], atol=1e-8)
+    # There and back: no way is longer than a field.
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() == pytest.approx(0.04 / 3, abs=1e-8)
+
+
+@pytest.mark.parametrize(("name", "inner", "outer"), [("gp_ucb", 0.0, 0.009), ("gp_level_set", 0.005, 0.012)])
+def test_what_is_felt_draws_presses(name: str, inner: float, outer: float) -> None:
+    """GP-UCB presses on a lesion, the level set around it; what only fills the chart presses there less."""
+    centre = np.array([0.027, 0.013])
+
+    def between(name: str) -> int:
+        distance = np.linalg.norm(played(name, Chart([tuple(centre)], noise=0.05)) - centre, axis=1)
+        return int(((distance > inner) & (distance < outer)).sum())
+
+    assert between(name) >= between("gp_variance") + 2
+
+
+def test_variance_reduction_fills_the_chart() -> None:
+    """No candidate is farther from a press than one correlation length after 25 presses."""
+    places = played("gp_variance", Chart([(0.027, 0.013)]))
+    gaps = np.linalg.norm(FACTS.sites[:, None] - places, axis=2).min(axis=1)
+    assert gaps.max() < 0.010
+
+
+def test_unknown_agents_are_refused() -> None:
+    with pytest.raises(ValueError, match="agent 'gp_ubc' is unknown"):
+        find_agent("gp_ubc")

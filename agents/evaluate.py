@@ -25,9 +25,9 @@ import numpy as np
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.leaderboard import SITES, write_leaderboard
 from agents.results_files import RESULTS, Result
-from agents.roster import AGENTS, POLICIES, RASTER_SIDES, WORDS, find_agent
+from agents.roster import AGENTS, POLICIES, RASTER_SIDES, TASK_AGENTS, WORDS, find_agent
 from agents.site_episodes import AgentChooser, PolicyChooser, SiteChooser, play
-from agents.task_episodes import play_tasks, task_figures
+from agents.task_episodes import Actor, play_tasks, task_figures
 from surgsim_env.evaluation.palpation import EVALUATION_SEEDS, press_errors, score
 
 # Of the bootstrap.
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--all", action="store_true", help="every baseline, and every policy for this place")
-    what.add_argument("--agent", help=f"one of {', '.join(AGENTS)}")
+    what.add_argument("--agent", help=f"one of {', '.join([*AGENTS, *TASK_AGENTS])}")
     what.add_argument("--policy", type=Path, help="NAME.zip, with NAME.json beside it")
     what.add_argument("--reach", action="store_true", help="which lesions the sensor can feel at all")
     what.add_argument("--leaderboard", action="store_true", help="write it and do nothing else")
@@ -89,7 +89,10 @@ def evaluate_all(options: argparse.Namespace) -> None:
 
 
 def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
-    """A baseline of SurgSim/PalpateSites-v0."""
+    """A baseline of SurgSim/PalpateSites-v0, or the script of another environment on that one's own scene."""
+    if name in TASK_AGENTS:
+        script = TASK_AGENTS[name]
+        return _evaluate_task(name, script.act, script.env_id, {}, f"python -m agents.evaluate --agent {name}", options)
     kwargs: dict[str, Any] = {"scene": options.scene, "level": options.level}
     if name in WORDS:
         # What these say does not change with what is felt.
@@ -115,7 +118,8 @@ def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
     if policy.description.env_id == SITES:
         kwargs = {"scene": "phantom", **kwargs}
         return _evaluate_sites(path.stem, PolicyChooser(policy), kwargs, command, options)
-    return _evaluate_task(path.stem, policy, kwargs, command, options)
+    policy.reset(min(options.envs, options.episodes))
+    return _evaluate_task(path.stem, policy.act, policy.description.env_id, kwargs, command, options)
 
 
 def _evaluate_sites(
@@ -146,19 +150,20 @@ def _evaluate_sites(
     return _saved(result, options)
 
 
-def _evaluate_task(name: str, policy: Any, kwargs: dict[str, Any], command: str, options: argparse.Namespace) -> Result:
+def _evaluate_task(
+    name: str, actor: Actor, env_id: str, kwargs: dict[str, Any], command: str, options: argparse.Namespace
+) -> Result:
     seeds = EVALUATION_SEEDS[: options.episodes]
-    envs = _environments(policy.description.env_id, kwargs, options)
-    policy.reset(envs.num_envs)
+    envs = _environments(env_id, kwargs, options, autoreset_mode="Disabled")
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
     start = time.perf_counter()
-    records = play_tasks(policy.act, envs, seeds, progress=_Progress(name))
+    records = play_tasks(actor, envs, seeds, progress=_Progress(name))
     taken = time.perf_counter() - start
     control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
     envs.close()
     result = Result(
         method=name,
-        env_id=policy.description.env_id,
+        env_id=env_id,
         env_kwargs=kwargs,
         seeds=(seeds[0], seeds[-1]),
         budget=600,
@@ -194,7 +199,9 @@ def write_reach(options: argparse.Namespace) -> None:
     print(f"{table['below']} of {table['lesions']} lesions below reach -> {path}")
 
 
-def _environments(env_id: str, kwargs: dict[str, Any], options: argparse.Namespace) -> gym.vector.VectorEnv:
+def _environments(
+    env_id: str, kwargs: dict[str, Any], options: argparse.Namespace, autoreset_mode: str = "NextStep"
+) -> gym.vector.VectorEnv:
     """Environments side by side."""
     return gym.make_vec(
         env_id,
@@ -202,6 +209,7 @@ def _environments(env_id: str, kwargs: dict[str, Any], options: argparse.Namespa
         vectorization_mode="vector_entry_point",
         dtype=options.dtype,
         threads=options.threads,
+        autoreset_mode=autoreset_mode,
         **kwargs,
     )
 

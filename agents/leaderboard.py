@@ -43,6 +43,9 @@ TASKS: tuple[Column, ...] = (
     ("peak force [N]", "force_peak", 2, 1.0),
     ("under soft limit [%]", "under_soft_force", 0, 100.0),
     ("torn [%]", "torn", 0, 100.0),
+    ("peak grip [N]", "grip_force_peak", 2, 1.0),
+    ("peak pull [N]", "pull_force_peak", 2, 1.0),
+    ("slips", "slips", 1, 1.0),
     ("hard limit, faults [%]", "violations", 0, 100.0),
     ("return", "return", 2, 1.0),
 )

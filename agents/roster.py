@@ -1,8 +1,10 @@
 """The methods that `agents.evaluate` knows by name."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
+from agents.expert_retract import RetractExpert
 from agents.gp_level_set import GpLevelSet
 from agents.gp_ucb import GpUcb
 from agents.gp_variance import GpVariance
@@ -10,6 +12,7 @@ from agents.random_sites import RandomSites
 from agents.raster_sites import RasterSites
 from agents.site_agent import SiteAgent
 from agents.sobol_sites import SobolSites
+from agents.task_episodes import Actor
 from agents.words import Middle, Truth
 
 # Rasters of so many places a side are tried on each scene; the leaderboard shows the best of them.
@@ -30,6 +33,17 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
 # Those that say where lesions are without feeling for them.
 WORDS = ("truth", "middle")
 
+
+@dataclass(frozen=True)
+class TaskAgent:
+    """A script for another environment than SurgSim/PalpateSites-v0."""
+
+    env_id: str
+    act: Actor
+
+
+TASK_AGENTS = {"expert_retract": TaskAgent("SurgSim/Retract-v0", RetractExpert().act_all)}
+
 POLICIES = Path(__file__).resolve().parent / "policies"
 
 
@@ -40,5 +54,5 @@ def find_agent(name: str) -> Callable[[], SiteAgent]:
         ValueError: an unknown name; lists the known.
     """
     if name not in AGENTS:
-        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join(AGENTS)}")
+        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS])}")
     return AGENTS[name]

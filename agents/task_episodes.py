@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
@@ -29,32 +30,41 @@ class TaskRecord:
 def play_tasks(
     actor: Actor, envs: gym.vector.VectorEnv, seeds: Sequence[int], *, progress: Callable[[], None] = lambda: None
 ) -> list[TaskRecord]:
-    """Play an episode of each seed, as many at once as there are environments; `progress` is called each step."""
-    starts = range(0, len(seeds), envs.num_envs)
-    rounds = [_round(actor, envs, seeds[start : start + envs.num_envs], progress) for start in starts]
-    return [record for records in rounds for record in records]
+    """Play an episode of each seed; where one ends the next seed begins, and `progress` is called each step.
 
-
-def _round(
-    actor: Actor, envs: gym.vector.VectorEnv, seeds: Sequence[int], progress: Callable[[], None]
-) -> list[TaskRecord]:
-    filled = [int(seed) for seed in [*seeds, *[seeds[-1]] * (envs.num_envs - len(seeds))]]
-    observations, _ = envs.reset(seed=filled)
-    records = [TaskRecord(0, 0.0, [], {}) for _ in filled]
-    running, begins = np.ones(len(filled), dtype=bool), np.ones(len(filled), dtype=bool)
-    while running[: len(seeds)].any():
+    The environments are made with autoreset_mode="Disabled", so that each can be given its seed.
+    """
+    mode = AutoresetMode(envs.metadata["autoreset_mode"])
+    if mode is not AutoresetMode.DISABLED:
+        raise ValueError(f'autoreset_mode is {mode.value!r}; episodes of given seeds need "Disabled"')
+    records = [TaskRecord(0, 0.0, [], {}) for _ in seeds]
+    waiting = list(range(len(seeds)))
+    # Who plays which seed; an environment that is left over plays the first one again, for nobody.
+    playing = [waiting.pop(0) if waiting else None for _ in range(envs.num_envs)]
+    observations, _ = envs.reset(seed=[int(seeds[index or 0]) for index in playing])  # type: ignore[arg-type]
+    begins = np.ones(envs.num_envs, dtype=np.bool_)
+    while any(index is not None for index in playing):
         observations, rewards, terminated, truncated, infos = envs.step(actor(observations, begins))
-        for index in np.flatnonzero(running):
-            record = records[index]
-            record.steps += 1
-            record.total += float(rewards[index])
-            record.force_peaks.append(float(infos["force_peak"][index]))
-            if terminated[index] or truncated[index]:
-                record.last = {name: values[index] for name, values in infos.items() if not name.startswith("_")}
         begins = terminated | truncated
-        running &= ~begins
+        for env, index in enumerate(playing):
+            if index is not None:
+                _note(records[index], env, float(rewards[env]), infos, over=bool(begins[env]))
+        for env in np.flatnonzero(begins):
+            playing[env] = waiting.pop(0) if waiting else None
+        if begins.any():
+            following = [int(seeds[index or 0]) for index in playing]
+            observations, _ = envs.reset(seed=following, options={"reset_mask": begins.copy()})  # type: ignore[arg-type]
         progress()
-    return records[: len(seeds)]
+    return records
+
+
+def _note(record: TaskRecord, env: int, reward: float, infos: dict[str, Any], *, over: bool) -> None:
+    """Add one environment's step to its episode."""
+    record.steps += 1
+    record.total += reward
+    record.force_peaks.append(float(infos["force_peak"][env]))
+    if over:
+        record.last = {name: values[env] for name, values in infos.items() if not name.startswith("_")}
 
 
 def task_figures(
@@ -81,7 +91,7 @@ def task_figures(
         "hard_limit_share": [bool(record.last["hard_limit"]) for record in records],
         "fault_share": [bool(record.last["sim_fault"]) for record in records],
     }
-    for name in ("torn", "visible"):
+    for name in ("torn", "visible", "grip_force_peak", "pull_force_peak", "pull_force_mean", "slips", "path_length"):
         if name in records[0].last:
             columns[name] = [float(record.last[name]) for record in records]
     if "error_mm" in records[0].last:

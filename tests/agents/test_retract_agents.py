@@ -25,19 +25,22 @@ def envs(count: int, mode: str = "Disabled", **settings) -> gym.vector.VectorEnv
 def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
     """Three seeds on two environments: each record is that of a single environment, to the bit; all succeed."""
     from agents.expert_retract import RetractExpert, run_episode
-    from agents.play_retract import Expert, play, summary
+    from agents.task_episodes import play_tasks, task_figures
 
     seeds = [21, 22, 23]
-    records = play(Expert(), envs(2), seeds)
-    assert [record["seed"] for record in records] == seeds
+    records = play_tasks(RetractExpert().act_all, envs(2), seeds)
     single = gym.make(ID)
-    for record in records:
-        alone = run_episode(single, RetractExpert(), record["seed"])
-        assert {name: record[name] for name in alone} == alone
-        assert record["success"] and not record["torn"] and record["visible"] >= 0.8
-    figures = summary(records)
-    assert figures["success"] == 1.0 and figures["torn"] == figures["faults"] == 0.0
-    assert figures["pull_force_peak_largest"] == max(record["pull_force_peak"] for record in records)
+    for seed, record in zip(seeds, records, strict=True):
+        alone = run_episode(single, RetractExpert(), seed)
+        assert (alone.pop("seed"), alone.pop("steps"), alone.pop("return")) == (seed, record.steps, record.total)
+        assert {name: record.last[name] for name in alone} == alone
+        assert record.last["success"] and not record.last["torn"] and record.last["visible"] >= 0.8
+    figures = task_figures(records, 0.05, 1.0, np.random.default_rng(0))
+    assert figures["success"].value == 1.0 and figures["torn"].value == figures["fault_share"].value == 0.0
+    pulls = [record.last["pull_force_peak"] for record in records]
+    assert figures["pull_force_peak"].value == pytest.approx(np.mean(pulls))
+    with pytest.raises(ValueError, match=r'autoreset_mode is .*; episodes of given seeds need "Disabled"'):
+        play_tasks(RetractExpert().act_all, envs(1, "NextStep"), seeds)
 
 
 def test_the_expert_follows_from_the_observation_alone():
@@ -56,14 +59,6 @@ def test_the_expert_follows_from_the_observation_alone():
     np.testing.assert_array_equal(expert.act(held), [0.0, 0.0, 0.0, 0.0, -1.0])
 
 
-def test_intervals_of_shares_are_wilsons():
-    """Against the worked values of Newcombe (1998), table I: 81 of 263 is 0.2553 to 0.3662, 0 of 20 is 0 to 0.1611."""
-    from agents.play_retract import wilson
-
-    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
-    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
-
-
 def test_forces_are_those_entries_of_the_observation():
     """Where the jaw presses tissue, they alone tell the wrench, grip and pull."""
     env = gym.make(ID)
@@ -78,7 +73,7 @@ def test_forces_are_those_entries_of_the_observation():
 def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypatch, capsys):
     """Two rounds of a few steps; without force the policy sees zeros there, the expert does not."""
     from agents import learn_retract
-    from agents.play_retract import play
+    from agents.task_episodes import play_tasks
     from agents.training.policy_files import load_policy
 
     asked = []
@@ -97,25 +92,6 @@ def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypa
     other = np.ones((1, 56), dtype=np.float32)
     other[:, 13:21] = 2.0
     assert (policy.seen(other) == shown).all() == blind
-    (record,) = play(policy, envs(1, max_episode_steps=3), [5])
-    assert record["steps"] == 3 and not record["success"]
-
-
-def test_figures_are_those_of_the_episodes():
-    from agents.play_retract import KEPT, summary
-
-    blank = dict.fromkeys(KEPT, 0.0)
-    won = {**blank, "seed": 0, "steps": 80, "return": 14.0, "success": True, "sim_fault": "", "force_peak": 0.5}
-    lost = {
-        **won,
-        "seed": 1,
-        "steps": 40,
-        "return": -20.0,
-        "success": False,
-        "sim_fault": "inverted",
-        "force_peak": 1.5,
-    }
-    figures = summary([won, won, lost])
-    assert figures["success"] == pytest.approx(2 / 3) and figures["faults"] == pytest.approx(1 / 3)
-    assert figures["seconds_to_success"] == pytest.approx(4.0)
-    assert (figures["force_peak_largest"], figures["return"]) == (1.5, pytest.approx(8.0 / 3.0))
+    policy.reset(1)
+    (record,) = play_tasks(policy.act, envs(1, max_episode_steps=3), [5])
+    assert record.steps == 3 and not record.last["success"]

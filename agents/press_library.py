@@ -180,9 +180,9 @@ class PressLibraryEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Look a press up."""
-        action = np.asarray(action, dtype=np.float64)
-        self.task.begin(action)
-        site = self.task.site(action)
+        values = np.asarray(action, dtype=np.float64)
+        self.task.begin(values)
+        site = self.task.site(values)
         result = self.press(site)
         self.task.take(site, result)
         values, saturated = self.task.observe(None, self.np_random)

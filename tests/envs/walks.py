@@ -11,7 +11,7 @@ def walk(env, rng):
             action[1] = 0.4 * action[1] - 0.8  # towards the free edge
             # The jaw nearly closed, so that it does not pass above and below the lobe.
             action[env.unwrapped.task.jaw_place] -= 0.5
-        else:
+        elif "Sites" not in env.spec.id:
             action[2] -= 0.3  # press
         yield action.astype(np.float32)
 

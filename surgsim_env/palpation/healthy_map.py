@@ -106,8 +106,9 @@ def _digest(anatomy: Anatomy) -> str:
         *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports, scene.support_law),
     )
     digest.update(repr(parts).encode())
-    core, own = Path(msdm_core.__file__).parent, Path(__file__).parent
-    for path in (*sorted(core.glob("*.py")), *sorted(own.parent.glob("*kernels.py")), *sorted(own.glob("*.py"))):
+    core, here = Path(msdm_core.__file__).parent, Path(__file__)
+    press = [here.with_name(f"{name}.py") for name in ("chart", "charted_face", "scan", "site_press")]
+    for path in (*sorted(core.glob("*.py")), *sorted(here.parents[1].glob("*kernels.py")), *press, here):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -10,6 +10,7 @@ SUITABLE := $(if $(PYTHON),sys.version_info >= (3, 11),(3, 11) <= sys.version_in
 # Asked for before the `agents` extra, so that a CPU build of just this version is taken where pip is shown one.
 TORCH := torch==2.13.0
 WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
+WITH_RAY := --editable=.[dev,distributed]
 
 PYTEST_ARGS ?= -n 2
 
@@ -85,7 +86,7 @@ $(VENV)/.ready-agents: pyproject.toml $(VENV)/.made
 	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
 
 $(VENV)/.ready-distributed: pyproject.toml $(VENV)/.made
-	$(call install,$(TORCH) --editable=.[dev,distributed])
+	$(call install,$(TORCH) $(WITH_RAY))
 
 $(VENV)/.ready-bench: pyproject.toml $(VENV)/.made
 	$(call install,--editable=.[bench])

@@ -122,12 +122,13 @@ def main() -> None:
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--level", default=None)
     parser.add_argument("--episodes", type=int, default=16)
+    parser.add_argument("--envs", type=int, default=16, help="organs side by side")
     parser.add_argument("--seed", type=int, default=700_000)
     arguments = parser.parse_args()
     level = {} if arguments.level is None else {"level": arguments.level}
     envs = gym.make_vec(
         "SurgSim/Palpate-v0",
-        num_envs=16,
+        num_envs=arguments.envs,
         vectorization_mode="vector_entry_point",
         autoreset_mode="SameStep",
         dtype="float32",

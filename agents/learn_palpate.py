@@ -1,44 +1,90 @@
-"""Teach a network what the scripted expert of SurgSim/Palpate-v0 does (DAgger), by formula first, then on the organ.
+"""Teach a network what the scripted expert of SurgSim/Palpate-v0 does, where a force costs microseconds.
 
-    python -m agents.learn_palpate --scene phantom --out runs/palpate_phantom_dagger.zip
+    python -m agents.learn_palpate --scene phantom --out runs/palpate_phantom_cloned.zip
 
-PPO goes on from what comes out (`warm_start` in agents/configs/palpate_*.yaml).
+It is shown what the expert does all over the face (`imagined`), and in the places that it comes to itself (DAgger,
+Ross, Gordon & Bagnell 2011). PPO goes on from what comes out: `warm_start` in agents/configs/palpate_*.yaml.
 """
 
 import argparse
 import time
 from pathlib import Path
 
-import gymnasium as gym
+import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.cloning import CloningOptions
-from agents.dagger import dagger
+from agents.cloning import CloningOptions, clone, normalise_by
 from agents.expert_palpate import PalpateExpert
 from agents.palpate_surrogate import PalpateSurrogate
 from agents.training.extractors import MemorySummary
-from agents.training.policy_files import PolicyDescription, save_policy
+from agents.training.policy_files import PolicyDescription, TrainedPolicy, save_policy
 from surgsim_env.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
+# Rounds that the expert plays, with random errors so that it shows how to make up for them.
+EXPERT_ROUNDS = 2
+ERROR, ERROR_KEPT = 0.3, 0.9
 
 
-def organs(scene: str, count: int) -> VectorEnv:
-    """The environments themselves, side by side."""
-    return gym.make_vec(
-        "SurgSim/Palpate-v0",
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        autoreset_mode="SameStep",
-        dtype="float32",
-        threads=1,
-        scene=scene,
-        level="standard",
-        memory=True,
-    )
+def play_round(
+    envs: PalpateSurrogate,
+    expert: PalpateExpert,
+    policy: TrainedPolicy | None,
+    steps: int,
+    rng: np.random.Generator,
+    begun: tuple[NDArray, NDArray[np.bool_]],
+) -> tuple[list[NDArray], list[NDArray], list[float], tuple[NDArray, NDArray[np.bool_]]]:
+    """Observations, the expert's actions there, successes, and where the round was left; the expert plays if no policy.
+
+    Errors are a first-order autoregressive noise on the action.
+    """
+    observation, begins = begun
+    seen, told, won = [], [], []
+    error = np.zeros((envs.num_envs, 3))
+    for _ in range(steps):
+        wanted = expert.act(observation)
+        seen.append(observation)
+        told.append(wanted)
+        action = wanted.copy() if policy is None else policy.act(observation, begins)
+        error = ERROR_KEPT * error + ERROR * rng.normal(size=error.shape) * [1.0, 1.0, 0.5]
+        erring = 0.5 * error * (np.arange(envs.num_envs) % 2 == 0)[:, None]
+        action[:, :3] = np.clip(action[:, :3] + erring, -1.0, 1.0)
+        observation, _, terminated, truncated, info = envs.step(action)
+        begins = terminated | truncated
+        won += [float(info["final_info"]["success"][index]) for index in np.flatnonzero(begins)]
+    return seen, told, won, (observation, begins)
+
+
+def imagined(
+    observations: NDArray[np.float32], envs: PalpateSurrogate, expert: PalpateExpert, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """The same observations with the tip anywhere over the face, and the search begun, under way or over."""
+    made, count = observations.copy(), len(observations)
+    low, high = envs.chart.lower - 0.005, envs.chart.upper + 0.005
+    made[:, :2] = rng.uniform(low, high, (count, 2))
+    near = rng.random(count) < 0.7
+    depth = np.where(near, rng.normal(expert.depth, 0.0005, count), rng.uniform(-0.008, 0.0045, count))
+    made[:, 2] = envs.surface - depth
+    stiffness = envs.touch.stiffness * rng.uniform(0.6, 2.2, count)
+    made[:, 8] = stiffness * np.maximum(depth, 0.0) ** envs.touch.exponent + rng.normal(0.0, 0.015, count)
+    # Not begun, under way, over.
+    stage = rng.choice(3, count, p=[0.1, 0.5, 0.4])
+    marks = 10 + envs.chart.side_count**2
+    corners = np.array([0, envs.chart.side_count - 1])
+    for row in corners * envs.chart.side_count:
+        for column in corners:
+            made[:, marks + row + column] = np.where(stage == 2, 1.0, (stage == 1) & (rng.random(count) < 0.5))
+    made[:, expert.first] = stage >= 1
+    made[:, expert.last] = stage == 2
+    made[:, -3:-1] = rng.uniform(-1.0, 1.0, (count, 2))
+    # Some close to the stiffest place, where it must be declared.
+    close = (stage == 2) & (rng.random(count) < 0.4)
+    spot = envs.chart.plane_point(made[:, -3:-1]) + rng.normal(0.0, 0.003, (count, 2))
+    made[close, :2] = spot[close]
+    return made
 
 
 def main() -> None:
@@ -46,39 +92,56 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--rounds", type=int, default=16, help="by formula")
-    parser.add_argument("--organ-rounds", type=int, default=0, help="on the full physics")
-    parser.add_argument("--steps", type=int, default=400, help="of each environment in a round")
-    parser.add_argument("--envs", type=int, default=64)
+    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=200, help="of each environment in a round")
+    parser.add_argument("--envs", type=int, default=128)
+    parser.add_argument("--epochs", type=int, default=12, help="of each round")
     parser.add_argument("--seed", type=int, default=2_000_000)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    rng = np.random.default_rng(arguments.seed)
     envs = PalpateSurrogate(arguments.envs, arguments.scene)
+    expert = PalpateExpert(envs.envs[0])
     scaled = VecNormalize(VectorEnvForStableBaselines(envs), norm_reward=False)
     model = PPO("MlpPolicy", scaled, policy_kwargs=NETWORK, device="cpu", seed=0)
-    expert = PalpateExpert(envs.envs[0])
-    begin = time.time()
-    for stage in dagger(
-        envs,
-        lambda observations, _: expert.act(observations),
-        model,
-        rounds=arguments.rounds,
-        steps=arguments.steps,
-        expert_share=lambda index: 0.5**index if index < 3 else 0.0,
-        normalisation=scaled,
-        options=CloningOptions(epochs=8, patience=3, batch_size=256, std=0.05),
-        seed=arguments.seed,
-    ):
-        print(f"{time.time() - begin:6.0f} s {stage}", flush=True)
+    begun = (envs.reset(seed=arguments.seed)[0], np.ones(envs.num_envs, dtype=np.bool_))
+    seen: list[NDArray] = []
+    told: list[NDArray] = []
+    begin, policy = time.time(), None
+    for index in range(arguments.rounds):
+        played = policy if index >= EXPERT_ROUNDS else None
+        new_seen, new_told, won, begun = play_round(envs, expert, played, arguments.steps, rng, begun)
+        seen += new_seen
+        told += new_told
+        real = np.concatenate(seen)
+        if index < EXPERT_ROUNDS:
+            normalise_by(scaled, real)
+        made = imagined(real[rng.integers(len(real), size=100_000)], envs, expert, rng)
+        options = CloningOptions(epochs=arguments.epochs, patience=4, batch_size=512, std=0.05, seed=index)
+        curve = clone(
+            model,
+            np.concatenate([real, made]),
+            np.concatenate([*told, expert.act(made)]),
+            normalisation=scaled,
+            options=options,
+        )
+        success = np.mean(won) if won else float("nan")
+        loss = curve.validation[curve.best]
+        print(
+            f"{time.time() - begin:6.0f} s round {index}: {len(won)} episodes, success {success:.2f}, loss {loss:.5f}",
+            flush=True,
+        )
         description = PolicyDescription(
             algorithm="PPO",
             env_id="SurgSim/Palpate-v0",
             env_kwargs={"scene": arguments.scene, "level": "standard", "memory": True},
-            observation_mean=scaled.obs_rms.mean.tolist(),
-            observation_variance=scaled.obs_rms.var.tolist(),
-            trained_steps=stage.sample_count,
+            observation_mean=scaled.obs_rms.mean.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
+            observation_variance=scaled.obs_rms.var.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
+            trained_steps=len(real),
         )
         save_policy(model, description, arguments.out)
+        policy = TrainedPolicy(model, description)
+        policy.reset(envs.num_envs)
 
 
 if __name__ == "__main__":

@@ -92,7 +92,11 @@ def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
     """A baseline of SurgSim/PalpateSites-v0, or the script of another environment on that one's own scene."""
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
-        return _evaluate_task(name, script.act, script.env_id, {}, f"python -m agents.evaluate --agent {name}", options)
+        command, kwargs = f"python -m agents.evaluate --agent {name}", dict(script.kwargs)
+        if script.has_places:
+            kwargs = {"scene": options.scene, "level": options.level, **kwargs}
+            command += f" --scene {options.scene} --level {options.level}"
+        return _evaluate_task(name, script.make(kwargs), script.env_id, kwargs, command, options)
     kwargs: dict[str, Any] = {"scene": options.scene, "level": options.level}
     if name in WORDS:
         # What these say does not change with what is felt.

@@ -1,9 +1,13 @@
 """The methods that `agents.evaluate` knows by name."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
+
+from agents.expert_palpate import PalpateExpert
 from agents.expert_retract import RetractExpert
 from agents.gp_level_set import GpLevelSet
 from agents.gp_ucb import GpUcb
@@ -36,13 +40,30 @@ WORDS = ("truth", "middle")
 
 @dataclass(frozen=True)
 class TaskAgent:
-    """A script for another environment than SurgSim/PalpateSites-v0."""
+    """A script for another environment than SurgSim/PalpateSites-v0.
+
+    Args:
+        env_id: the environment's.
+        make: the script, for the environment's arguments.
+        kwargs: arguments of its own that the environment needs.
+        has_places: whether the environment takes `scene` and `level`.
+    """
 
     env_id: str
-    act: Actor
+    make: Callable[[dict[str, Any]], Actor]
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    has_places: bool = False
 
 
-TASK_AGENTS = {"expert_retract": TaskAgent("SurgSim/Retract-v0", RetractExpert().act_all)}
+def _palpate_expert(kwargs: dict[str, Any]) -> Actor:
+    expert = PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs))
+    return lambda observations, begins: expert.act(observations)
+
+
+TASK_AGENTS = {
+    "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all),
+    "expert_palpate": TaskAgent("SurgSim/Palpate-v0", _palpate_expert, {"memory": True}, has_places=True),
+}
 
 POLICIES = Path(__file__).resolve().parent / "policies"
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgsim_env import levels
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.levels import LEVELS, DrawnOrgan, Level, find_level
 from surgsim_env.scenes import make_scene
@@ -105,7 +106,7 @@ def test_unknown_levels_are_refused(name: object):
         find_level(name)  # type: ignore[arg-type]
 
 
-def test_scenes_that_a_level_cannot_draw_from_are_refused():
+def test_scenes_that_a_level_cannot_draw_from_are_refused(monkeypatch):
     with pytest.raises(ValueError, match=r"scene 'lobe' has no \[lesion\] table"):
         LEVELS["easy"].scene(make_scene("lobe"))
     scene = make_scene("phantom")
@@ -113,6 +114,7 @@ def test_scenes_that_a_level_cannot_draw_from_are_refused():
     LEVELS["standard"].scene(weak)
     with pytest.raises(ValueError, match=r"level 'hard' of scene 'phantom' draws lesion\.modulus_ratio from \[-2, 6"):
         LEVELS["hard"].scene(weak)
+    monkeypatch.setattr(levels, "TRIES_MOST", 3)
     crowded = load_anatomy(LEVELS["standard"].scene(make_scene("phantom_small")))
     with pytest.raises(ValueError, match=r"9 lesions of level 'standard' found no room beside each other"):
         LEVELS["standard"].draw(crowded, np.random.default_rng(0), lesion_count=9)

@@ -1,0 +1,313 @@
+"""SurgSim/PalpateSites-v0: its press, its chart, what is felt and believed, what it pays, and many side by side."""
+
+import json
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.levels import LEVELS, DrawnOrgan
+from surgsim_env.palpation import healthy_map as healthy_module
+from surgsim_env.palpation.chart import make_chart
+from surgsim_env.palpation.charted_face import ChartedFace, interpolated
+from surgsim_env.palpation.healthy_map import charted_face, healthy_map
+from surgsim_env.palpation.scan import press
+from surgsim_env.palpation.site_press import SitePress, press_alone, press_phases, stop_force
+from surgsim_env.rewards import PALPATE_SITES_WEIGHTS
+from surgsim_env.scenes import make_scene
+from surgsim_env.simulation import Simulation
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from tests.envs.test_vector_env import assert_equal
+
+ID = "SurgSim/PalpateSites-v0"
+SMALL = {"scene": "phantom_small"}
+MIDDLE = np.zeros(2, dtype=np.float32)
+
+
+def small_anatomy(level: str = "standard"):
+    return load_anatomy(LEVELS[level].scene(make_scene("phantom_small")))
+
+
+def raster(side: int) -> np.ndarray:
+    axis = (2.0 * np.arange(side) + 1.0) / side - 1.0
+    return np.array([[u, v] for v in axis for u in axis], dtype=np.float32)
+
+
+def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
+    env.reset(seed=seed)
+    return [env.step(action) for action in actions]
+
+
+# ---- the press ------------------------------------------------------------------------------------------------------
+
+
+def test_a_press_feels_what_the_scan_feels():
+    """The same way in and hold; the mean is over four readings in 40 ms instead of forty."""
+    simulation = Simulation(small_anatomy())
+    site = charted_face(simulation.anatomy).site([0.2, -0.3])
+    simulation.reset(simulation.anatomy.organ(), simulation.instrument.parked)
+    found = press_alone(SitePress(simulation, site.point, site.normal), press_phases(simulation.anatomy.scene))
+    expected = press(simulation, site.point, site.normal)
+    assert not found.stopped and not found.fault and not expected.end
+    assert found.force @ site.normal == pytest.approx(expected.force, rel=2e-3)
+    assert found.depth == pytest.approx(expected.depth, rel=1e-3)
+    assert found.force_peak == pytest.approx(expected.force_peak, rel=1e-12)
+    assert found.duration == pytest.approx(expected.duration)
+
+
+def test_the_organ_is_at_rest_again_before_the_next_press():
+    """What a press leaves when the tip has left at 20 mm/s for the nearest site: below 0.1 % of the press depth."""
+    simulation = Simulation(small_anatomy())
+    scene = simulation.anatomy.scene
+    simulation.reset(simulation.anatomy.organ(), simulation.instrument.parked)
+    rest = simulation.organ_state.node_position.copy()
+    site = charted_face(simulation.anatomy).site(MIDDLE)
+    press_alone(SitePress(simulation, site.point, site.normal), press_phases(scene))
+    assert np.abs(simulation.organ_state.node_position - rest).max() > 0.8 * scene.palpation.press_depth
+    # Up by press depth and clearance, and over to the next site, half a tip radius on: 9 mm.
+    simulation.instrument.command_velocity(0.02 * site.normal)
+    simulation.control_step(round(0.009 / 0.02 / scene.timing.haptic_step))
+    left = np.linalg.norm(simulation.organ_state.node_position - rest, axis=1).max()
+    print(f"\nleft of the press: {left * 1e6:.2f} um of {scene.palpation.press_depth * 1e3:g} mm")
+    assert left < 0.001 * scene.palpation.press_depth
+
+
+def test_force_stops_a_press_before_the_hard_limit_does():
+    """On an organ four times as stiff: the tip stops above the stop force, below the hard limit, and not as deep."""
+    anatomy = small_anatomy()
+    simulation = Simulation(anatomy)
+    simulation.reset(anatomy.organ(modulus_factor=4.0), simulation.instrument.parked)
+    site = charted_face(anatomy).site(MIDDLE)
+    found = press_alone(SitePress(simulation, site.point, site.normal), press_phases(anatomy.scene))
+    limits = anatomy.scene.limits
+    assert found.stopped and not found.fault
+    assert stop_force(limits) < found.force_peak < limits.hard_force
+    assert found.depth < 0.9 * anatomy.scene.palpation.press_depth
+    # Its stiffness still tells: not quite four times the healthy one, as it rises with depth and contact stays as soft.
+    healthy = float(healthy_map(make_scene("phantom_small")).stiffness(MIDDLE))
+    assert 3.0 * healthy < found.force @ site.normal / found.depth < 4.0 * healthy
+
+
+# ---- the chart ------------------------------------------------------------------------------------------------------
+
+
+def test_charts_hold_the_sites_that_keep_the_margin():
+    for name, extent, side in (("phantom", 0.04, 13), ("phantom_small", 0.03, 13), ("phantom_wide", 0.1, 25)):
+        scene = make_scene(name)
+        anatomy = load_anatomy(scene)
+        chart = make_chart(anatomy.face, scene.instrument.tip_radius)
+        np.testing.assert_allclose(chart.extent, extent, rtol=1e-12)
+        assert chart.side_count == side
+        charted = ChartedFace(anatomy.face, chart)
+        for place in ([-1.0, -1.0], [1.0, 1.0], [0.3, -0.7]):
+            site = charted.site(place)
+            assert site.moved == 0.0
+            top, margin = scene.mesh.block.size[2], scene.palpation.face_margin
+            expected = [*(margin + 0.5 * (np.array(place) + 1.0) * extent), top]
+            np.testing.assert_allclose(site.point, expected, atol=1e-12)
+            np.testing.assert_allclose(charted.surface(place), expected, atol=1e-12)
+
+
+def test_a_place_beyond_the_liver_is_moved_to_its_nearest_site():
+    anatomy = load_anatomy(make_scene("liver"))
+    charted = charted_face(anatomy)
+    corner = charted.site([-1.0, -1.0])
+    assert corner.moved > 0.005
+    way = 0.5 * (corner.place - [-1.0, -1.0]) * charted.chart.extent
+    assert corner.moved == pytest.approx(float(np.linalg.norm(way)))
+    for site in (corner, charted.site([0.1, 0.2])):
+        assert anatomy.face.rim_distance(site.point) >= anatomy.scene.palpation.face_margin - 1e-9
+        np.testing.assert_allclose(charted.chart.place(site.point), site.place, atol=1e-9)
+    # Between points that were dropped onto it the surface is a little off, far less than an estimate.
+    inside = charted.site([0.1, 0.2])
+    assert np.linalg.norm(charted.surface(inside.place) - inside.point) < 1e-3
+
+
+def test_interpolation_is_exact_for_bilinear_values():
+    axis = np.linspace(-1.0, 1.0, 4)
+    columns, rows = np.meshgrid(axis, axis)
+    values = 2.0 + 3.0 * columns - rows + 0.5 * columns * rows
+    places = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 2))
+    u, v = places.T
+    np.testing.assert_allclose(interpolated(values, places), 2.0 + 3.0 * u - v + 0.5 * u * v, rtol=1e-12)
+    assert interpolated(values, [5.0, -1.0]) == values[0, -1], "beyond the chart its border counts"
+
+
+# ---- the healthy map ------------------------------------------------------------------------------------------------
+
+
+def test_healthy_tissue_of_nominal_modulus_has_contrast_one(monkeypatch):
+    """Without lesions, noise and bias, between the map's points too: within the mesh's 3 %."""
+    env = gym.make(ID, **SMALL).unwrapped
+    env.reset(seed=0)
+    task = env.task
+    healthy = DrawnOrgan((), 1.0, 0.0)
+    monkeypatch.setattr(type(task.level), "draw", lambda *_: healthy)
+    task.reading.sensor = replace(task.reading.sensor, noise=0.0, bias=0.0)
+    records = play(env, 1, np.random.default_rng(2).uniform(-1.0, 1.0, (6, 2)).astype(np.float32))
+    np.testing.assert_allclose([np.log(record[-1]["contrast"]) for record in records], 0.0, atol=0.03)
+    assert records[-1][-1]["lesion_count_estimated"] == 0.0 and records[-1][-1]["found"] == 1.0
+
+
+def test_the_map_is_made_once_and_anew_where_its_file_is_broken(tmp_path, monkeypatch):
+    monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
+    made = []
+
+    def pressed(anatomy):
+        made.append(anatomy.scene.name)
+        return np.full((13, 13), 50.0)
+
+    monkeypatch.setattr(healthy_module, "_pressed", pressed)
+    scene = make_scene("phantom_small")
+    for times in (1, 1):
+        healthy_module._healthy_map.cache_clear()
+        assert healthy_module.healthy_map(scene).stiffness(MIDDLE) == 50.0
+        assert len(made) == times
+    (file,) = (tmp_path / "cache").iterdir()
+    file.write_bytes(b"broken")
+    healthy_module._healthy_map.cache_clear()
+    healthy_module.healthy_map(scene)
+    assert len(made) == 2
+    healthy_module._healthy_map.cache_clear()
+    healthy_module.healthy_map(replace(scene, material=replace(scene.material, youngs_modulus=6000.0)))
+    assert len(made) == 3, "another organ has another map"
+    monkeypatch.setenv("SURGSIM_CACHE", "/proc/nowhere")
+    healthy_module._healthy_map.cache_clear()
+    assert healthy_module.healthy_map(scene).stiffness(MIDDLE) == 50.0, (
+        "a folder that cannot be written costs time alone"
+    )
+    healthy_module._healthy_map.cache_clear()
+
+
+# ---- episodes -------------------------------------------------------------------------------------------------------
+
+
+def test_presses_are_felt_remembered_and_believed():
+    env = gym.make(ID, level="easy", budget=16, **SMALL).unwrapped
+    records = play(env, 2, raster(4))
+    task = env.task
+    sites = task.site_count**2
+    for count, (observation, _, terminated, truncated, info) in enumerate(records, start=1):
+        assert observation[sites : 2 * sites].sum() == count
+        assert observation[-1] == pytest.approx(1.0 - count / 16.0)
+        assert (terminated, truncated) == (count == 16, False)
+        site = task.charted.chart.site(observation[-6:-4])
+        assert observation[site] == observation[-2] == pytest.approx(np.log(info["contrast"]), abs=1e-6)
+        assert info["stiffness"] == info["force"] / info["depth"]
+        assert 0.9 * 0.004 < info["depth"] < 0.004
+        assert not info["sim_fault"] and not info["hard_limit"] and info["moved_mm"] == 0.0
+    last = records[-1][-1]
+    assert last["error_mm"] < 5.0 and last["found"] == 1.0 and last["success"]
+    assert last["lesion_count_estimated"] == 1.0
+    # Steps of 7.5 mm in four rows and three ways back at 20 mm/s; presses of 225 ms and the way off.
+    way = 12 * 0.0075 + 3 * np.hypot(0.0075, 0.0225)
+    assert last["path_length"] == pytest.approx(way + 32 * 0.005, rel=0.01)
+    assert last["seconds"] == pytest.approx(16 * 0.225 + (way + 16 * 0.005) / 0.02, rel=0.01)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(MIDDLE)
+
+
+def test_without_memory_the_last_press_alone_is_observed():
+    actions = raster(2)
+    with_memory = play(gym.make(ID, **SMALL), 4, actions)
+    without = play(gym.make(ID, memory=False, **SMALL), 4, actions)
+    for one, other in zip(with_memory, without, strict=True):
+        np.testing.assert_array_equal(one[0][-6:], other[0])
+        assert one[1:] == other[1:]
+
+
+def test_what_is_found_pays_by_its_change():
+    """However often it is found and lost: the terms sum to what it ends with less what it began with."""
+    for seed in (0, 1, 5):
+        env = gym.make(ID, budget=9, **SMALL).unwrapped
+        _, info = env.reset(seed=seed)
+        began = info["found"]
+        records = [env.step(action) for action in raster(3)]
+        assert sum(record[-1]["reward_found"] for record in records) == pytest.approx(records[-1][-1]["found"] - began)
+        errors = [record[-1]["error_mm"] / 20.0 / 9 for record in records]
+        assert [-record[-1]["reward_error"] for record in records] == pytest.approx(errors)
+
+
+def test_harm_never_pays():
+    """The reckoning that stands beside the weights, for every number of presses made of the budget."""
+    weights = PALPATE_SITES_WEIGHTS
+    for done in np.linspace(0.0, 1.0, 11):
+        for found_first in (0.0, 1.0):
+            full = weights["error"] + weights["soft_force"] - found_first
+            for harm in ("hard_force", "fault"):
+                failed = (1.0 - found_first) * weights["found"] + weights[harm] + (1.0 - done) * weights["forgone"]
+                assert full >= failed + 0.25 - 1e-12
+
+
+def test_a_fault_ends_the_episode_with_the_last_finite_observation():
+    env = gym.make(ID, **SMALL).unwrapped
+    env.reset(seed=3)
+    before = env.step(MIDDLE)[0]
+    env.simulation._rest_position[40] = np.nan
+    observation, reward, terminated, truncated, info = env.step(np.array([0.5, 0.5], dtype=np.float32))
+    assert terminated and not truncated and info["sim_fault"]
+    np.testing.assert_array_equal(observation, before)
+    assert info["reward_fault"] == -2.5 and info["reward_forgone"] == pytest.approx(-1.25 * 23 / 25)
+    assert reward < -3.0
+
+
+@pytest.mark.parametrize("budget", [0, -3, 2.5, True, "25"])
+def test_budgets_that_are_none_are_refused(budget):
+    with pytest.raises(ValueError, match=r"budget is .*; it must be a whole number of presses, at least 1"):
+        gym.make(ID, budget=budget, **SMALL)
+
+
+def test_the_budget_of_a_wide_scene_is_larger():
+    level, scene = LEVELS["standard"], make_scene("phantom_wide")
+    flat = healthy_module.HealthyMap(np.full((25, 25), 55.0))
+    task = PalpateSitesTask(load_anatomy(level.scene(scene)), level, flat)
+    assert (task.budget, task.site_count) == (60, 25)
+    assert PalpateSitesTask(load_anatomy(level.scene(scene)), level, flat, budget=7).budget == 7
+
+
+def test_an_unknown_level_is_refused():
+    with pytest.raises(ValueError, match="did you mean 'standard'"):
+        gym.make(ID, level="standart")
+
+
+# ---- many side by side ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_equals_environments_one_after_the_other(mode: str):
+    """Observations, rewards, ends and infos of several episodes, organs with capsules and added mass among them."""
+    count, settings = 3, {"budget": 3, **SMALL}
+    together = gym.make_vec(
+        ID, num_envs=count, vectorization_mode="vector_entry_point", autoreset_mode=mode, **settings
+    )
+    apart = gym.make_vec(
+        ID, num_envs=count, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **settings
+    )
+    assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
+    # Some of these draws have a capsule, some get mass.
+    assert_equal(together.reset(seed=[4, 5, 6]), apart.reset(seed=[4, 5, 6]))
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(7):
+        actions = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
+        found, expected = together.step(actions), apart.step(actions)
+        assert_equal(found[:4], expected[:4])
+        assert_equal(found[4], expected[4])
+        singles = [env.unwrapped for env in together.envs]  # type: ignore[attr-defined]
+        drawn += [(one.task.drawn.capsule_stiffness, one.simulation.organ_model.added_mass) for one in singles]
+    assert {value > 0.0 for value, _ in drawn} == {True, False}, "the seeds must have capsules among them"
+    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
+        assert one.unwrapped.save_state() == other.unwrapped.save_state()
+    together.close()
+    apart.close()
+
+
+def test_a_saved_state_says_what_was_drawn():
+    env = gym.make(ID, **SMALL).unwrapped
+    env.reset(seed=9)
+    env.step(MIDDLE)
+    table = json.loads(env.task.get_state())
+    assert set(table) == {"drawn", "bias", "felt", "step_count", "found_before"}
+    assert len(table["felt"]["touches"]) == table["step_count"] == 1

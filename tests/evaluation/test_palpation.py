@@ -113,14 +113,16 @@ def test_an_episode_that_ended_early_keeps_its_last_error() -> None:
 
 
 def test_missed_and_imagined_lesions_count() -> None:
-    """Of two lesions one is found 4 mm off; a second estimate is nowhere near."""
+    """Of two lesions one is found 4 mm off; of three estimates two are nowhere near."""
     truth = np.array([[0.01, 0.01, 0.0], [0.03, 0.03, 0.0]])
-    said = np.array([[0.014, 0.01, 0.0], [0.01, 0.035, 0.0]])
+    said = np.array([[0.014, 0.01, 0.0], [0.01, 0.035, 0.0], [0.0, 0.04, 0.0]])
     figures = score([record(truth, [said])], 1, np.random.default_rng(0))
-    assert figures["recall"].value == figures["precision"].value == 0.5
+    assert figures["recall"].value == pytest.approx(1.0 / 2.0)
+    assert figures["precision"].value == pytest.approx(1.0 / 3.0)
     assert figures["centroid_error_mm"].value == pytest.approx(4.0)
-    assert figures["error_mm"].value == pytest.approx((4.0 + 1000.0 * math.hypot(0.02, 0.005)) / 2.0)
-    assert figures["count_right"].value == 1.0
+    matched = 4.0 + 1000.0 * math.hypot(0.02, 0.005)
+    assert figures["error_mm"].value == pytest.approx((matched + 1000.0 * CUTOFF) / 3.0)
+    assert figures["count_right"].value == 0.0
     # Nothing hidden, nothing said: no recall, no precision, no line, but no error either.
     nothing = score([record(NONE, [NONE])], 1, np.random.default_rng(0))
     assert nothing["recall"].value is nothing["precision"].value is nothing["presses_to_median"].value is None

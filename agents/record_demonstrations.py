@@ -6,14 +6,15 @@
 
 Datasets lie in the folder that MINARI_DATASETS_PATH names, by default ~/.minari/datasets. Each episode is kept with its
 seed: `dataset.recover_environment()` reset with it and given the actions again gives the same observations to the bit.
-Anything else that steps an environment, a person too, is recorded by `Recorder`:
+A person plays with `agents/keyboard.py`. Anything else that steps an environment is recorded by `Recorder`:
 
-    env = Recorder(gym.make("SurgSim/Palpate-v0", render_mode="human"))
-    ...  # reset and step it, from a joystick say
-    write_dataset(env.episodes, env.env, "surgsim/palpate/human-v0", algorithm_name="a person")
+    env = Recorder(gym.make("SurgSim/Palpate-v0"))
+    ...  # reset and step it
+    write_dataset(env.episodes, env.env, "surgsim/palpate/mine-v0", algorithm_name="mine")
 """
 
 import argparse
+import copy
 import importlib
 import json
 import warnings
@@ -199,17 +200,20 @@ def write_dataset(
         raise ValueError("there is no episode to write: none was played, or none succeeded (--keep-failures)")
     if env.spec is None:
         raise ValueError("the environment does not know how it was made, so that nobody could make it again: gym.make")
+    # Who wants to see it asks for that anew, maybe where there is no display.
+    spec = copy.deepcopy(env.spec)
+    spec.kwargs.pop("render_mode", None)
     with warnings.catch_warnings():
         # That neither an email nor another environment for evaluation is given.
         warnings.filterwarnings("ignore", message=".*is set to None")
         return minari.create_dataset_from_buffers(
             name,
             [episode.buffer(index) for index, episode in enumerate(episodes)],
-            env=env,
+            env=spec,
             algorithm_name=algorithm_name,
             author=author,
             code_permalink=CODE,
-            description=f"{len(episodes)} episodes of {env.spec.id} by {algorithm_name}",
+            description=f"{len(episodes)} episodes of {spec.id} by {algorithm_name}",
             requirements=["surgsim"],
             jpeg_encoding=False,
         )

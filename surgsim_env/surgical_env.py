@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from msdm_core.mesh import FloatArray
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown
 from surgsim_env.rendering.renderer import OrganRenderer
+from surgsim_env.rendering.window import Window
 from surgsim_env.simulation import Simulation
 from surgsim_env.tasks.task import Task
 
@@ -165,6 +166,11 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def task_observation(self) -> NDArray[np.float32]:
         """The task's own numbers of that moment, whatever obs_mode observes."""
         return self._observation.copy()
+
+    @property
+    def window(self) -> Window | None:
+        """The window of render_mode "human", once the first reset has opened it; else None."""
+        return self._view.window
 
     def close(self) -> None:
         """Close the window and give back the graphics; more than once is no harm."""

@@ -87,6 +87,11 @@ class EpisodeView:
         self.renderer(shown)
         self._window.show()
 
+    @property
+    def window(self) -> Window | None:
+        """The live window, once it is open."""
+        return self._window
+
     def close(self) -> None:
         """Close what is open; more than once is no harm."""
         if self._window is not None:

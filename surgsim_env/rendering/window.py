@@ -18,6 +18,8 @@ from surgsim_env.rendering.renderer import OrganRenderer
 TURN, ZOOM = 0.008, 0.9
 # The view stays this far from straight up and down [rad].
 POLE = 0.05
+# Those that a person may play with; GLFW names a key by its letter's number.
+PLAYING_KEYS = "ADEFQRSW "
 KEYS = "drag: turn, wheel: zoom, C: next camera, Esc: close"
 
 
@@ -94,6 +96,13 @@ class Window:
             glfw.swap_buffers(handle)
         time.sleep(max(0.0, self._next - time.monotonic()))
         self._next = max(self._next, time.monotonic() - self._period) + self._period
+
+    def held_keys(self) -> str:
+        """Letters (capital) and the space whose keys are held down, as of the last picture; none in a closed window."""
+        glfw, handle = self._context._glfw, self._context.handle
+        if self.closed:
+            return ""
+        return "".join(key for key in PLAYING_KEYS if glfw.get_key(handle, ord(key)) == glfw.PRESS)
 
     def close(self) -> None:
         """Close the window; more than once is no harm."""

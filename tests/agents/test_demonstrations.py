@@ -134,3 +134,43 @@ def test_what_cannot_be_recorded_is_refused(folder):
         write_dataset([], env, "surgsim/palpate/none-v0", algorithm_name="nobody")
     with pytest.raises(ValueError, match="--by is 'raster'; the rule is"):
         player("raster", env)
+
+
+class Shown(gym.Env):
+    """As much of an environment in a window as the keyboard asks for."""
+
+    render_mode = "human"
+
+    class task:
+        pass
+
+    class window:
+        closed = False
+
+        @classmethod
+        def held_keys(cls):
+            return "F"
+
+    def __init__(self, size, jaw=False):
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (size,), dtype=np.float32)
+        if jaw:
+            self.task = type("task", (), {"jaw_place": size - 1})
+
+
+def test_a_person_plays_with_the_keys_that_are_held():
+    from agents.keyboard import Keyboard
+
+    env = Shown(4)
+    keyboard = Keyboard(env)
+    np.testing.assert_array_equal(keyboard.act(None), [0.0, 0.0, -0.5, 0.0])
+    np.testing.assert_array_equal(keyboard.action("DWE "), [0.5, 0.5, 0.0, 1.0], "no wrist to turn; declared")
+    retracting = Keyboard(Shown(5, jaw=True))
+    np.testing.assert_array_equal(retracting.action("AQ"), [-0.5, 0.0, 0.0, -0.5, 1.0], "the jaw is open")
+    np.testing.assert_array_equal(retracting.action("RF "), [0.0, 0.0, 0.0, 0.0, -1.0])
+    env.window.closed = True
+    with pytest.raises(KeyboardInterrupt, match="the window was closed"):
+        keyboard.act(None)
+    with pytest.raises(ValueError, match="render_mode is None; a person needs the window"):
+        Keyboard(gym.make("SurgSim/Palpate-v0"))
+    with pytest.raises(ValueError, match="the keys move one tip"):
+        Keyboard(Shown(13, jaw=True))

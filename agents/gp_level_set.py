@@ -33,7 +33,7 @@ class GpLevelSet:
         if first is not None:
             return first
         belief = self.process.belief(observation)
-        excess = belief.mean - belief.background
+        excess, doubt = belief.excess, BETA * belief.spread
         level = max(self.least, LEVEL_SHARE * float(excess.max()))
-        ambiguity = np.minimum(excess + BETA * belief.spread - level, level - excess + BETA * belief.spread)
+        ambiguity = np.minimum(excess + doubt - level, level - excess + doubt)
         return self.process.best(ambiguity, observation, self.rng)

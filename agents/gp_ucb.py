@@ -1,6 +1,7 @@
 """GP-UCB for SurgSim/PalpateSites-v0 (Srinivas et al. 2010): press where tissue may be stiffest.
 
-argmax of mean + BETA x standard deviation of a Gaussian process on log contrast, over the grid's sites.
+argmax of mean + BETA x standard deviation of what a Gaussian process on log contrast takes for excess, over the
+grid's sites.
 """
 
 import numpy as np
@@ -27,4 +28,4 @@ class GpUcb:
         if first is not None:
             return first
         belief = self.process.belief(observation)
-        return self.process.best(belief.mean + BETA * belief.spread, observation, self.rng)
+        return self.process.best(belief.excess + BETA * belief.spread, observation, self.rng)

@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
@@ -31,11 +32,10 @@ FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75))
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """At the candidate sites: expected log contrast (n,), its standard deviation (n,); and what is background."""
+    """At the candidate sites: what lesions are expected to add to the log contrast, and its standard deviation (n,)."""
 
-    mean: NDArray[np.float64]
+    excess: NDArray[np.float64]
     spread: NDArray[np.float64]
-    background: float
 
 
 class SiteProcess:
@@ -45,19 +45,27 @@ class SiteProcess:
         self.facts = facts
         self.candidates = np.flatnonzero(_off_border(facts))
         self.places = facts.sites[self.candidates]
-        excess = ConstantKernel(EXCESS_SPREAD**2) * RBF(EXCESS_LENGTH * facts.tip_radius / REFERENCE_TIP_RADIUS)
-        self._kernel = ConstantKernel(BACKGROUND_SPREAD**2) + excess
+        rbf = RBF(EXCESS_LENGTH * facts.tip_radius / REFERENCE_TIP_RADIUS)
+        self._excess = ConstantKernel(EXCESS_SPREAD**2) * rbf
+        self._kernel = ConstantKernel(BACKGROUND_SPREAD**2) + self._excess
 
     def belief(self, observation: NDArray[np.floating]) -> Belief:
-        """Posterior given all presses that an observation remembers."""
-        process = GaussianProcessRegressor(self._kernel, alpha=self.facts.noise**2 + MODEL_SPREAD**2, optimizer=None)
+        """The excess given all presses that an observation remembers.
+
+        The process predicts the sum of background and excess. Of the excess alone mean and variance follow from the
+        fitted process by its own covariance with the presses: Rasmussen & Williams 2006, eq. 2.25 and 2.26. How unsure
+        the background is should draw no press: it is the same everywhere.
+        """
         pressed, values = self.facts.remembered(observation)
-        background = 0.0
-        if pressed.size:
-            process.fit(self.facts.sites[pressed], values)
-            background = BACKGROUND_SPREAD**2 * float(process.alpha_.sum())
-        mean, spread = process.predict(self.places, return_std=True)
-        return Belief(mean, spread, background)
+        if not pressed.size:
+            return Belief(np.zeros(len(self.places)), np.full(len(self.places), EXCESS_SPREAD))
+        noise = self.facts.noise**2 + MODEL_SPREAD**2
+        process = GaussianProcessRegressor(self._kernel, alpha=noise, optimizer=None)
+        process.fit(self.facts.sites[pressed], values)
+        covariance = self._excess(self.places, process.X_train_)
+        explained = solve_triangular(process.L_, covariance.T, lower=True)
+        variance = EXCESS_SPREAD**2 - (explained**2).sum(axis=0)
+        return Belief(covariance @ process.alpha_, np.sqrt(np.maximum(variance, 0.0)))
 
     def best(
         self, worth: NDArray[np.float64], observation: NDArray[np.floating], rng: np.random.Generator

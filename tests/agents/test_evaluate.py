@@ -94,3 +94,40 @@ def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture
         with pytest.raises(SystemExit):
             evaluate.main(arguments)
         assert message in capsys.readouterr().err
+
+
+class MiddleOfAll:
+    """A policy that presses the middle, in place of a trained one."""
+
+    class description:
+        env_id = leaderboard.SITES
+
+    def reset(self, count: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observations: np.ndarray, begins: np.ndarray) -> np.ndarray:
+        return np.zeros((len(observations), 2), dtype=np.float32)
+
+
+def test_a_policy_is_filmed(tmp_path: Path) -> None:
+    """Organ and probe on the left, forces and belief on the right; four pictures a press, the last for a second."""
+    pytest.importorskip("moviepy", reason="needs the `video` extra")
+    from surgsim_env.rendering import gl
+
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    from moviepy import VideoFileClip
+
+    from agents.policy_video import PICTURE_SIZE, PRESS_PICTURES, RATE, film
+
+    film(MiddleOfAll(), {"scene": "phantom", "budget": 2}, [5], tmp_path / "out.mp4")
+    clip = VideoFileClip(str(tmp_path / "out.mp4"))
+    assert clip.size == [2 * PICTURE_SIZE, PICTURE_SIZE]
+    assert clip.duration == pytest.approx((2 * PRESS_PICTURES + RATE) / RATE, abs=0.11)
+    first, last = clip.get_frame(0.0), clip.get_frame(clip.duration - 0.1)
+    left, right = slice(0, PICTURE_SIZE), slice(PICTURE_SIZE, None)
+    assert first[:, left].std() > 10.0, "an organ is seen"
+    assert np.abs(first[:, right].astype(float) - last[:, right]).max() > 100.0, "the second press was drawn"
+    clip.close()

@@ -10,10 +10,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 from agents.site_policy import SitePolicy
-from agents.training.extractors import MemorySummary
+from agents.training.extractors import MemorySummary, PlaceAndForce
 from surgsim_env.toml_tables import nearest
 
-EXTRACTORS = {"MemorySummary": MemorySummary}
+EXTRACTORS = {"MemorySummary": MemorySummary, "PlaceAndForce": PlaceAndForce}
 ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU}
 
 

@@ -44,3 +44,25 @@ class MemorySummary(BaseFeaturesExtractor):
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """The chosen entries of normalised observations (n, n_observation)."""
         return observations[:, self.entries]
+
+
+class PlaceAndForce(BaseFeaturesExtractor):
+    """Of Palpate-v0 without memory: the tip's place and the force along z, as `MemorySummary` says why."""
+
+    def __init__(self, observation_space: gym.Space) -> None:
+        """Choose the entries.
+
+        Raises:
+            ValueError: an observation that is not Palpate-v0's without memory.
+        """
+        if observation_space.shape != (BEFORE,):
+            raise ValueError(
+                f"an observation of shape {observation_space.shape} is not that of Palpate-v0 with memory=False "
+                f"({BEFORE},): leave the features extractor out"
+            )
+        super().__init__(observation_space, len(SEEN))
+        self.register_buffer("entries", torch.tensor(SEEN))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """The chosen entries of normalised observations (n, 10)."""
+        return observations[:, self.entries]

@@ -1,0 +1,132 @@
+"""Teach a network with a memory of its own what the expert of SurgSim/Palpate-v0 does; it sees no memory=True.
+
+    python -m agents.learn_palpate_recurrent --scene phantom --out runs/palpate_phantom_recurrent_cloned.zip
+
+The expert reads what was felt from the observation, the network sees place and force alone and must keep in mind what
+it needs: whole episodes are cloned. First the expert plays, with errors to make up for; then the network does, and the
+expert says what it would have done there.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents.cloning import CloningOptions, clone, normalise_by, pad
+from agents.expert_palpate import PalpateExpert
+from agents.learn_palpate import ERROR, ERROR_KEPT
+from agents.palpate_surrogate import PalpateSurrogate
+from agents.training.extractors import BEFORE, PlaceAndForce
+from agents.training.policy_files import PolicyDescription, TrainedPolicy, save_policy
+from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+
+NETWORK = {
+    "lstm_hidden_size": 96,
+    "net_arch": [64],
+    "activation_fn": torch.nn.Tanh,
+    "features_extractor_class": PlaceAndForce,
+}
+# The way back to the stiffest place is a tenth of an episode: its steps count so much more.
+BACK_WEIGHT = 4.0
+
+
+def play_episodes(
+    envs: PalpateSurrogate,
+    expert: PalpateExpert,
+    policy: TrainedPolicy | None,
+    steps: int,
+    rng: np.random.Generator,
+) -> tuple[list[NDArray], list[NDArray], list[NDArray], list[bool]]:
+    """First episode of each environment: its short observations, the expert's actions, weights, success."""
+    observation, _ = envs.reset(seed=int(rng.integers(2**31)))
+    begins, running = np.ones(envs.num_envs, dtype=np.bool_), np.ones(envs.num_envs, dtype=np.bool_)
+    length, won = np.zeros(envs.num_envs, dtype=np.int64), [False] * envs.num_envs
+    error = np.zeros((envs.num_envs, 3))
+    if policy is not None:
+        policy.reset(envs.num_envs)
+    seen, told, weight = [], [], []
+    for _ in range(steps):
+        wanted = expert.act(observation)
+        seen.append(observation[:, :BEFORE])
+        told.append(wanted)
+        weight.append(np.where(observation[:, expert.last] > 0.5, BACK_WEIGHT, 1.0))
+        action = wanted.copy() if policy is None else policy.act(observation[:, :BEFORE], begins)
+        error = ERROR_KEPT * error + ERROR * rng.normal(size=error.shape) * [1.0, 1.0, 0.5]
+        erring = 0.4 * error * (np.arange(envs.num_envs) % 2 == 0)[:, None]
+        action[:, :3] = np.clip(action[:, :3] + erring, -1.0, 1.0)
+        length += running
+        observation, _, terminated, truncated, info = envs.step(action)
+        begins = terminated | truncated
+        for index in np.flatnonzero(begins & running):
+            won[index] = bool(info["final_info"]["success"][index])
+        running &= ~begins
+        if not running.any():
+            break
+    columns = [np.stack(rows, axis=1) for rows in (seen, told, weight)]
+    parts = [[column[index, : length[index]] for index in range(envs.num_envs)] for column in columns]
+    return parts[0], parts[1], parts[2], won
+
+
+def main() -> None:
+    """Teach, printing a line a round, and write the policy after each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="phantom")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--rounds", type=int, default=8)
+    parser.add_argument("--envs", type=int, default=192, help="episodes of a round")
+    parser.add_argument("--steps", type=int, default=420, help="of an episode at most")
+    parser.add_argument("--epochs", type=int, default=25, help="of each round")
+    parser.add_argument("--seed", type=int, default=2_000_000)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(arguments.seed)
+    envs = PalpateSurrogate(arguments.envs, arguments.scene)
+    expert = PalpateExpert(envs.envs[0])
+    blind = PalpateSurrogate(2, arguments.scene, memory=False)
+    scaled = VecNormalize(VectorEnvForStableBaselines(blind), norm_reward=False)
+    model = RecurrentPPO("MlpLstmPolicy", scaled, policy_kwargs=NETWORK, device="cpu", seed=0)
+    episodes: list[list[NDArray]] = [[], [], []]
+    begin, policy = time.time(), None
+    for index in range(arguments.rounds):
+        *parts, won = play_episodes(envs, expert, policy, arguments.steps, rng)
+        for kept, new in zip(episodes, parts, strict=True):
+            kept += new
+        observations, inside = pad(episodes[0], arguments.steps)
+        actions, _ = pad(episodes[1], arguments.steps)
+        weights, _ = pad([one[:, None] for one in episodes[2]], arguments.steps)
+        if index == 0:
+            normalise_by(scaled, np.concatenate(episodes[0]))
+        curve = clone(
+            model,
+            observations,
+            actions,
+            sample_weight=inside * weights[:, :, 0],
+            normalisation=scaled,
+            options=CloningOptions(
+                epochs=arguments.epochs, patience=8, batch_size=16, learning_rate=2e-3, std=0.05, seed=index
+            ),
+        )
+        print(
+            f"{time.time() - begin:6.0f} s round {index}: success {np.mean(won):.2f} of {len(won)} episodes, "
+            f"loss {curve.validation[curve.best]:.5f}",
+            flush=True,
+        )
+        description = PolicyDescription(
+            algorithm="RecurrentPPO",
+            env_id="SurgSim/Palpate-v0",
+            env_kwargs={"scene": arguments.scene, "level": "standard", "memory": False},
+            observation_mean=scaled.obs_rms.mean.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
+            observation_variance=scaled.obs_rms.var.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
+            trained_steps=int(sum(len(one) for one in episodes[0])),
+        )
+        save_policy(model, description, arguments.out)
+        policy = TrainedPolicy(model, description)
+
+
+if __name__ == "__main__":
+    main()

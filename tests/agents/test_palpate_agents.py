@@ -1,0 +1,197 @@
+"""Agents for Palpate-v0: the expert, the stand-in that it is learned on, what learners see, the committed policies."""
+
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401
+
+pytestmark = pytest.mark.agents
+pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
+
+POLICIES = Path(__file__).parents[2] / "agents" / "policies"
+ID = "SurgSim/Palpate-v0"
+
+
+def surrogate(count: int, **settings):
+    from agents.palpate_surrogate import PalpateSurrogate
+
+    return PalpateSurrogate(count, **settings)
+
+
+# ---- the stand-in ---------------------------------------------------------------------------------------------------
+
+
+def test_the_formula_presses_as_the_organ_does():
+    """Down to 3.5 mm, away from the lesion: within 15 % or 15 mN, where the sensor's noise is 10 mN (standard)."""
+    env = gym.make(ID).unwrapped
+    made = surrogate(1)
+    compared = 0
+    for seed in range(30):
+        observation, _ = env.reset(seed=seed)
+        task = env.task
+        if np.linalg.norm(observation[:2] - task.lesion.centre[:2]) < 0.022 or compared == 2:
+            continue
+        while observation[2] > made.surface - 0.0035:
+            observation, *_ = env.step(np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32))
+        made.tip[0], made.background[0], made.excess[0] = observation[:3], task.drawn.background, 0.0
+        felt, formula = env.simulation.contact_force[2], made.normal_force()[0]
+        assert abs(felt - formula) < max(0.15 * felt, 0.015), (seed, felt, formula)
+        compared += 1
+    assert compared == 2
+
+
+def test_its_memory_is_the_environments():
+    """The observation's memory, recomputed from its first ten entries by `TouchMemory` itself."""
+    from agents.expert_palpate import PalpateExpert
+
+    envs = surrogate(2)
+    env = envs.envs[0]
+    memory, expert = env.task.memory, PalpateExpert(env)
+    memory.forget()
+    observation, _ = envs.reset(seed=4)
+    for _ in range(200):
+        observation, _, terminated, truncated, _ = envs.step(expert.act(observation))
+        assert not (terminated | truncated)[0]
+        tip = envs.tip[0]
+        surface, normal = env.task.anatomy.face.project(tip)
+        depth = memory.indenter.radius - (tip - surface) @ normal
+        memory.feel(memory.chart.place(surface), depth, float(observation[0, 8]))
+    assert memory.visited.sum() > 30
+    np.testing.assert_allclose(observation[0, 10:179], memory.contrast, rtol=1e-5)
+    np.testing.assert_array_equal(observation[0, 179:348], memory.visited)
+    np.testing.assert_allclose(observation[0, 348:], memory.stiffest(), rtol=1e-5)
+
+
+def test_its_spaces_rewards_and_ends_are_the_environments():
+    from agents.expert_palpate import PalpateExpert
+
+    envs = surrogate(16)
+    assert envs.single_observation_space == gym.make(ID, level="standard", memory=True).observation_space
+    assert surrogate(1, memory=False).single_observation_space == gym.make(ID).observation_space
+    expert = PalpateExpert(envs.envs[0])
+    observation, _ = envs.reset(seed=0)
+    total, steps, ends = np.zeros(16), np.zeros(16), []
+    for _ in range(400):
+        assert envs.single_observation_space.contains(observation[3])
+        observation, reward, terminated, truncated, info = envs.step(expert.act(observation))
+        total, steps = total + reward, steps + 1
+        for index in np.flatnonzero(terminated | truncated):
+            ends.append((info["final_info"]["success"][index], total[index], steps[index]))
+            total[index] = steps[index] = 0.0
+    assert len(ends) >= 16 and all(success for success, _, _ in ends)
+    for _, value, length in ends:
+        assert value == pytest.approx(10.0 - 0.005 * length)
+
+
+def test_pressing_on_is_a_safety_stop_that_pays_least():
+    envs = surrogate(4)
+    envs.reset(seed=0)
+    down = np.tile(np.array([0.0, 0.0, -1.0, 0.0], dtype=np.float32), (4, 1))
+    step, terminated = 0, np.zeros(4, dtype=bool)
+    while not terminated.any():
+        _, reward, terminated, _, info = envs.step(down)
+        step += 1
+    index = int(np.flatnonzero(terminated)[0])
+    assert info["final_info"]["hard_limit"][index] and not info["final_info"]["success"][index]
+    # -5, the forgone steps, this step and its force beyond the soft limit.
+    assert reward[index] == pytest.approx(-5.0 - 0.015 * (600 - step) - 0.005 - 0.010)
+
+
+def test_scenes_without_a_touch_model_are_refused():
+    with pytest.raises(ValueError, match=r"scene 'liver' has no touch model; there are: phantom, phantom_small"):
+        surrogate(1, scene="liver")
+
+
+# ---- the expert -----------------------------------------------------------------------------------------------------
+
+
+def test_the_expert_finds_the_lesion_gently_on_the_organ():
+    from agents.expert_palpate import PalpateExpert
+
+    env = gym.make(ID, scene="phantom_small", level="standard", memory=True)
+    expert = PalpateExpert(env)
+    observation, _ = env.reset(seed=3)
+    forces, over = [], False
+    while not over:
+        observation, _, terminated, truncated, info = env.step(expert.act(observation[None])[0])
+        forces.append(info["force_peak"])
+        over = terminated or truncated
+    assert info["success"] and len(forces) < 300
+    assert max(forces) < env.unwrapped.scene.limits.soft_force
+
+
+def test_the_expert_refuses_what_it_cannot_do():
+    from agents.expert_palpate import PalpateExpert
+
+    with pytest.raises(ValueError, match="make the environment with memory=True"):
+        PalpateExpert(gym.make(ID))
+    with pytest.raises(ValueError, match="scene 'liver' is none: use phantom"):
+        PalpateExpert(gym.make(ID, scene="liver", memory=True))
+
+
+# ---- learners -------------------------------------------------------------------------------------------------------
+
+
+def test_extractors_choose_what_they_say():
+    import torch
+
+    from agents.training.extractors import MemorySummary, PlaceAndForce
+
+    space = gym.make(ID, memory=True).observation_space
+    row = torch.arange(351.0)[None]
+    marks = [10 + 169 + corner for corner in (0, 12, 156, 168)]
+    assert MemorySummary(space)(row)[0].tolist() == [0, 1, 2, 8, *marks, 348, 349, 350]
+    short = gym.make(ID).observation_space
+    assert PlaceAndForce(short)(row[:, :10])[0].tolist() == [0, 1, 2, 8]
+    with pytest.raises(ValueError, match="an observation of 10 numbers is not that of Palpate-v0 with memory=True"):
+        MemorySummary(short)
+    with pytest.raises(ValueError, match="is not that of Palpate-v0 with memory=False"):
+        PlaceAndForce(space)
+
+
+@pytest.mark.parametrize(
+    ("script", "memory"), [("learn_palpate", True), ("learn_palpate_recurrent", False)], ids=["feed-forward", "lstm"]
+)
+def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script: str, memory: bool):
+    from importlib import import_module
+
+    from agents.training.policy_files import load_policy
+
+    file = tmp_path / "taught.zip"
+    sizes = ["--rounds", "3", "--envs", "4", "--steps", "30", "--epochs", "1"]
+    monkeypatch.setattr(sys, "argv", [script, "--out", str(file), *sizes])
+    import_module(f"agents.{script}").main()
+    policy = load_policy(file)
+    assert policy.description.env_kwargs == {"scene": "phantom", "level": "standard", "memory": memory}
+    envs = surrogate(3, memory=memory)
+    policy.reset(3)
+    observation, _ = envs.reset(seed=1)
+    action = policy.act(observation, np.ones(3, dtype=bool))
+    assert action.shape == (3, 4) and np.isfinite(action).all()
+
+
+@pytest.mark.parametrize("path", sorted(POLICIES.glob("palpate_*.json")), ids=lambda path: path.stem)
+def test_committed_policies_search_as_they_were_taught(path: Path):
+    """By formula, which is quick: four of five find their lesion. On the organ: agents/results."""
+    from agents.training.policy_files import load_policy
+
+    policy = load_policy(path)
+    kwargs = dict(policy.description.env_kwargs)
+    assert kwargs.pop("level") == "standard" and policy.description.env_id == ID
+    assert path.with_suffix(".zip").stat().st_size < 2e6
+    envs = surrogate(32, **kwargs)
+    observation, _ = envs.reset(seed=11)
+    begins, first = np.ones(32, dtype=bool), np.full(32, np.nan)
+    policy.reset(32)
+    for _ in range(600):
+        observation, _, terminated, truncated, info = envs.step(policy.act(observation, begins))
+        begins = terminated | truncated
+        for index in np.flatnonzero(begins & np.isnan(first)):
+            first[index] = info["final_info"]["success"][index]
+        if not np.isnan(first).any():
+            break
+    assert first.mean() >= 0.8

@@ -112,15 +112,22 @@ def draw_belief(axes: Any, task: Any) -> None:
 
 
 def _draw_way(axes: Any, env: Any, tips: Sequence[NDArray[np.float64]]) -> None:
-    """The tip's way seen from above."""
+    """The tip's way seen from above, over the contrast that the observation remembers where it remembers any."""
+    memory = getattr(env.task, "memory", None)
+    if memory is not None:
+        chart = memory.chart
+        contrast = np.where(memory.visited > 0.0, memory.contrast, np.nan).reshape(chart.side_count, -1)
+        edges = [1000.0 * np.linspace(chart.lower[i], chart.upper[i], chart.side_count) for i in range(2)]
+        shown = axes.pcolormesh(*edges, contrast, shading="nearest", cmap="viridis", vmin=0.5, vmax=2.5)
+        axes.figure.colorbar(shown, ax=axes, label="contrast felt")
     way = 1000.0 * np.array(tips)
     axes.plot(way[:, 0], way[:, 1], "-", color="tab:gray", linewidth=1)
     axes.plot(*way[-1, :2], "o", color="tab:blue")
     for lesion in env.task.lesions:
         axes.plot(1000.0 * lesion.centre[0], 1000.0 * lesion.centre[1], "x", color="red")
-    box = 1000.0 * env.simulation.anatomy.mesh.points
-    axes.set_xlim(box[:, 0].min() - 5.0, box[:, 0].max() + 5.0)
-    axes.set_ylim(box[:, 1].min() - 5.0, box[:, 1].max() + 5.0)
+    seen = np.concatenate([1000.0 * env.simulation.anatomy.mesh.points[:, :2], way[:, :2]])
+    axes.set_xlim(seen[:, 0].min() - 5.0, seen[:, 0].max() + 5.0)
+    axes.set_ylim(seen[:, 1].min() - 5.0, seen[:, 1].max() + 5.0)
     axes.set_aspect("equal")
     axes.set_xlabel("the tip's way, from above [mm]", fontsize=8)
     axes.tick_params(labelsize=7)

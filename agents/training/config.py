@@ -103,6 +103,7 @@ class TrainingConfig:
         seed: of everything
         hyperparameters: handed to the algorithm; `{linear: x}` falls from x to 0, activation functions go by name
         warm_start: a policy file that the run begins with, its normalisation included
+        warm_spread: standard deviation of the actions that a warm start begins to explore with; its own by default
         critic_first: so many steps train the value alone, which a cloned policy has not learned
         torch_threads: cores that the networks may use
     """
@@ -115,6 +116,7 @@ class TrainingConfig:
     seed: int = 0
     hyperparameters: dict[str, Any] = field(default_factory=dict)
     warm_start: str | None = None
+    warm_spread: float | None = None
     critic_first: int = 0
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     checkpoint: CheckpointSettings = field(default_factory=CheckpointSettings)
@@ -123,6 +125,11 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         for name, least in (("total_steps", 1), ("seed", 0), ("critic_first", 0), ("torch_threads", 1)):
             _at_least(name, getattr(self, name), least)
+        if self.warm_spread is not None and (self.warm_start is None or not self.warm_spread > 0.0):
+            raise ValueError(
+                f"warm_spread is {self.warm_spread} and warm_start {self.warm_start}: it is the positive standard "
+                "deviation of a warm start's actions"
+            )
         _refuse_texts_of_numbers(self.hyperparameters, "hyperparameters")
         _refuse_texts_of_numbers(self.environment.kwargs, "environment.kwargs")
 

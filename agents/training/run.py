@@ -1,6 +1,7 @@
 """One training run in its folder: begun, or gone on with from its last whole checkpoint."""
 
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -132,6 +133,9 @@ class Run:
                 f"warm_start {path}: its networks are not those of this run; set policy and policy_kwargs alike: "
                 f"{error}"
             ) from None
+        if self.config.warm_spread is not None:
+            with torch.no_grad():
+                model.policy.log_std.fill_(math.log(self.config.warm_spread))
         mean, scaled = warm.description.observation_mean, model.get_vec_normalize_env()
         here = scaled is not None and scaled.norm_obs
         if (mean is not None) != here:

@@ -57,6 +57,7 @@ def config(algorithm: str = "PPO", **changes):
         ({"environment": {"id": "x", "knd": "lanes"}}, "did you mean 'kind'"),
         ({"environment": {"id": "x", "kind": "library"}}, "a library file goes with kind"),
         ({"environment": {"id": "x", "count": 0}}, "environment.count is 0; it must be at least 1"),
+        ({"warm_spread": 0.1}, "warm_spread is 0.1 and warm_start None"),
         ({"total_steps": "1e6"}, "'1e6' is not a whole number"),
         ({"hyperparameters": {"learning_rate": "3e-4"}}, r"hyperparameters.learning_rate is the text '3e-4'"),
     ],
@@ -187,8 +188,9 @@ def test_a_warm_start_takes_weights_and_normalisation_and_the_value_learns_first
 
     train(config(evaluation={"every": 0}), tmp_path / "first")
     file = next((tmp_path / "first" / "final").iterdir()) / "policy.zip"
-    warm = config(evaluation={"every": 0}, warm_start=str(file), critic_first=10_000)
+    warm = config(evaluation={"every": 0}, warm_start=str(file), critic_first=10_000, warm_spread=0.25)
     run = Run(warm, tmp_path / "second")
+    np.testing.assert_allclose(run.model.policy.log_std.detach().exp(), 0.25, rtol=1e-6)
     before = load_policy(file)
     np.testing.assert_array_equal(run.normalization.obs_rms.mean, before.description.observation_mean)
     observation = np.random.default_rng(0).normal(size=(5, 10)).astype(np.float32)
@@ -201,7 +203,7 @@ def test_a_warm_start_takes_weights_and_normalisation_and_the_value_learns_first
     np.testing.assert_allclose(after.act(observation, begins), expected, atol=1e-4)
     old, new = before.model.policy.state_dict(), after.model.policy.state_dict()
     changed = {name for name in old if (old[name] != new[name]).any()}
-    assert changed and all("value" in name for name in changed)
+    assert changed > {"log_std"} and all("value" in name for name in changed - {"log_std"})
 
 
 def test_warm_starts_that_do_not_fit_are_refused(tmp_path: Path):

@@ -53,7 +53,8 @@ class PalpateSitesEnv(SurgicalEnv):
     | -2 | its log contrast | +-2 |
     | -1 | share of the presses left | 0 to 1 |
 
-    Contrast is stiffness (force over depth) over that of the scene's healthy organ of nominal modulus at this place.
+    Contrast is stiffness (force over depth) over that of the scene's healthy organ of nominal modulus at this place, a
+    map that is made once for each scene and kept on disk (`surgsim_env.palpation.healthy_map`).
 
     ## Rewards
     Named terms, weighted in `surgsim_env.rewards.PALPATE_SITES_WEIGHTS`; `info["reward_<term>"]` shows each. Each press

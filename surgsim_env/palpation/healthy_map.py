@@ -44,10 +44,10 @@ def charted_face(anatomy: Anatomy) -> ChartedFace:
 
 
 def healthy_map(scene: Scene) -> HealthyMap:
-    """The map of a scene, from its cache on disk or by pressing its healthy organ (seconds).
+    """The map of a scene, from its cache on disk or by pressing its healthy organ at every site of the chart's grid.
 
-    The cache lies in the folder that SURGSIM_CACHE names, else in the user's cache folder; where that cannot be written
-    the map is made anew by each process.
+    That takes `phantom` some 5 s of processor time and `phantom_wide` 90 s, once: the map is kept in the folder that
+    SURGSIM_CACHE names, else in the user's cache folder; where that cannot be written each process makes it anew.
 
     Raises:
         ValueError: a press on healthy tissue that came to a fault or felt nothing (says where).
@@ -57,10 +57,13 @@ def healthy_map(scene: Scene) -> HealthyMap:
 
 @lru_cache(maxsize=8)
 def _healthy_map(anatomy: Anatomy) -> HealthyMap:
-    path = _folder() / f"healthy-{_digest(anatomy)}.npy"
+    folder = _folder()
+    if folder is None:
+        return HealthyMap(_pressed(anatomy))
+    path = folder / f"healthy-{_digest(anatomy)}.npy"
     try:
         grid = np.load(path, allow_pickle=False)
-    except (OSError, ValueError):
+    except (OSError, ValueError, EOFError):
         grid = _pressed(anatomy)
         _keep(path, grid)
     return HealthyMap(grid)
@@ -113,11 +116,15 @@ def _digest(anatomy: Anatomy) -> str:
     return digest.hexdigest()
 
 
-def _folder() -> Path:
+def _folder() -> Path | None:
+    """Where maps are kept; None for an account without a home."""
     named = os.environ.get(FOLDER_VARIABLE)
     if named:
         return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "surgsim"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "surgsim"
+    except RuntimeError:
+        return None
 
 
 def _keep(path: Path, grid: FloatArray) -> None:

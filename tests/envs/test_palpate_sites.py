@@ -234,6 +234,7 @@ def test_what_is_found_pays_by_its_change():
 def test_harm_never_pays():
     """The reckoning that stands beside the weights, for every number of presses made of the budget."""
     weights = PALPATE_SITES_WEIGHTS
+    assert weights["forgone"] == weights["error"] + weights["soft_force"]
     for done in np.linspace(0.0, 1.0, 11):
         for found_first in (0.0, 1.0):
             full = weights["error"] + weights["soft_force"] - found_first

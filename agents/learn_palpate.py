@@ -96,6 +96,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200, help="of each environment in a round")
     parser.add_argument("--envs", type=int, default=128)
     parser.add_argument("--epochs", type=int, default=12, help="of each round")
+    parser.add_argument("--imagined", type=int, default=100_000, help="observations of a round that are made up")
     parser.add_argument("--seed", type=int, default=2_000_000)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -116,7 +117,7 @@ def main() -> None:
         real = np.concatenate(seen)
         if index < EXPERT_ROUNDS:
             normalise_by(scaled, real)
-        made = imagined(real[rng.integers(len(real), size=100_000)], envs, expert, rng)
+        made = imagined(real[rng.integers(len(real), size=arguments.imagined)], envs, expert, rng)
         options = CloningOptions(epochs=arguments.epochs, patience=4, batch_size=512, std=0.05, seed=index)
         curve = clone(
             model,

@@ -154,16 +154,18 @@ def test_extractors_choose_what_they_say():
 
 
 @pytest.mark.parametrize(
-    ("script", "memory"), [("learn_palpate", True), ("learn_palpate_recurrent", False)], ids=["feed-forward", "lstm"]
+    ("script", "memory", "more"),
+    [("learn_palpate", True, ["--imagined", "200"]), ("learn_palpate_recurrent", False, [])],
+    ids=["feed-forward", "lstm"],
 )
-def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script: str, memory: bool):
+def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script: str, memory: bool, more: list):
     from importlib import import_module
 
     from agents.training.policy_files import load_policy
 
     file = tmp_path / "taught.zip"
     sizes = ["--rounds", "3", "--envs", "4", "--steps", "30", "--epochs", "1"]
-    monkeypatch.setattr(sys, "argv", [script, "--out", str(file), *sizes])
+    monkeypatch.setattr(sys, "argv", [script, "--out", str(file), *sizes, *more])
     import_module(f"agents.{script}").main()
     policy = load_policy(file)
     assert policy.description.env_kwargs == {"scene": "phantom", "level": "standard", "memory": memory}

@@ -22,7 +22,7 @@ help:
 	@echo "make test         the tests (PYTEST_ARGS='-n 2' is the default)"
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
-	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 1.5 GB)"
+	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
 	@echo "make lint         ruff and pyright"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
@@ -45,7 +45,7 @@ test-distributed:
 	@$(MAKE) --no-print-directory VENV=$(VENV)-distributed with-ray
 
 with-ray: $(VENV)/.ready-distributed
-	$(PY) -m pytest -m "distributed and not slow"
+	$(PY) -m pytest tests/agents -m "distributed and not slow"
 
 bench: $(VENV)/.ready-bench
 	$(VENV)/bin/surgsim bench --out docs

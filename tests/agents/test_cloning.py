@@ -154,7 +154,9 @@ def test_recurrent_policy_remembers():
         episodes.append(episode)
     observations, weight = pad(episodes)
     actions = np.repeat(observations[:, :1, :2], observations.shape[1], axis=1)
-    actions[weight == 0.0] = 1.0  # not to be learned
+    for index, episode in enumerate(episodes):
+        actions[index, len(episode) :] = 1.0  # not to be learned
+        assert weight[index].sum() == len(episode)
     options = CloningOptions(epochs=60, batch_size=32, learning_rate=3e-3)
     clone(model, observations, actions, sample_weight=weight, options=options)
     memory, began = None, np.array([True])

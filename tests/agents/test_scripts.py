@@ -13,21 +13,19 @@ pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
 ROOT = Path(__file__).resolve().parents[2]
 AGENTS = ROOT / "agents"
 
-# Arguments that make a run short, and what it has said or written by then; "OUT" is a folder.
+# Arguments that make a run short, and what it has said by then.
 SMALL: dict[str, tuple[list[str], str]] = {
     "expert_palpate": (["--envs", "1", "--episodes", "1"], r"1 episodes: success"),
-    "learn_palpate": (
-        ["--scene", "phantom_small", "--rounds", "2", "--steps", "40", "--envs", "8", "--out", "OUT/a.zip"],
-        r"sample_count=640",
-    ),
-    "press_library": (["--scene", "phantom_small", "--organs", "1", "--out", "OUT/library.npz"], ""),
 }
 # Scripts that other tests run.
 ELSEWHERE = {
     "behaviour_cloning": "test_demonstrations.py",
     "evaluate": "test_evaluate.py",
     "expert_retract": "test_retract_agents.py",
+    "learn_palpate": "test_palpate_agents.py",
+    "learn_palpate_recurrent": "test_palpate_agents.py",
     "learn_retract": "test_retract_agents.py",
+    "press_library": "test_press_library.py",
     "raster": "test_agents.py",
     "record_demonstrations": "test_demonstrations.py",
     "train": "test_training.py",
@@ -40,24 +38,26 @@ def scripts() -> set[str]:
 
 
 def test_every_script_is_run_somewhere():
-    assert scripts() == set(SMALL) | set(ELSEWHERE)
+    assert scripts() == {*SMALL, *ELSEWHERE, "palpation_figures"}
     for name, where in ELSEWHERE.items():
-        imported = rf"(agents\.|import ){name}\b|from agents import .*\b{name}\b"
-        assert re.search(imported, (Path(__file__).parent / where).read_text(encoding="utf-8")), name
+        named = rf"(agents\.|import |\"){name}\b|from agents import .*\b{name}\b"
+        assert re.search(named, (Path(__file__).parent / where).read_text(encoding="utf-8")), name
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
-def test_it_runs(name, tmp_path, monkeypatch, capsys):
+def test_it_runs(name, monkeypatch, capsys):
     arguments, said = SMALL[name]
-    monkeypatch.setattr(sys, "argv", [name, *(part.replace("OUT", str(tmp_path)) for part in arguments)])
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_module(f"agents.{name}", run_name="__main__")
     assert re.search(said, capsys.readouterr().out)
-    if name == "press_library":
-        assert (tmp_path / "library.npz").is_file()
-    if "OUT/a.zip" in arguments:
-        from agents.training.policy_files import load_policy
 
-        assert load_policy(tmp_path / "a.zip").description.algorithm == "PPO"
+
+def test_the_picture_of_a_search_is_drawn(tmp_path, monkeypatch):
+    from agents import palpation_figures
+
+    monkeypatch.setattr(palpation_figures, "SHOWN_PRESSES", (1, 2))
+    palpation_figures.draw_search(tmp_path / "search.png")
+    assert (tmp_path / "search.png").stat().st_size > 10_000
 
 
 def test_what_the_readme_names_is_there():

@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--envs", type=int, default=192, help="episodes of a round")
     parser.add_argument("--steps", type=int, default=420, help="of an episode at most")
-    parser.add_argument("--epochs", type=int, default=25, help="of each round")
+    parser.add_argument("--epochs", type=int, default=50, help="of each round")
     parser.add_argument("--seed", type=int, default=2_000_000)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -108,7 +108,7 @@ def main() -> None:
             sample_weight=inside * weights[:, :, 0],
             normalisation=scaled,
             options=CloningOptions(
-                epochs=arguments.epochs, patience=8, batch_size=16, learning_rate=2e-3, std=0.05, seed=index
+                epochs=arguments.epochs, patience=10, batch_size=8, learning_rate=2e-3, std=0.05, seed=index
             ),
         )
         print(

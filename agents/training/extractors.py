@@ -39,6 +39,7 @@ class MemorySummary(BaseFeaturesExtractor):
         marks = [BEFORE + site_count + corner for corner in corners]
         entries = [*SEEN, *marks, *range(length - BEHIND, length)]
         super().__init__(observation_space, len(entries))
+        self.entries: torch.Tensor
         self.register_buffer("entries", torch.tensor(entries))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
@@ -61,6 +62,7 @@ class PlaceAndForce(BaseFeaturesExtractor):
                 f"({BEFORE},): leave the features extractor out"
             )
         super().__init__(observation_space, len(SEEN))
+        self.entries: torch.Tensor
         self.register_buffer("entries", torch.tensor(SEEN))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -55,7 +56,8 @@ class Run:
         settings, scaled = self.config.environment, self.normalization
         mean = variance = None
         if scaled is not None and scaled.norm_obs:
-            mean, variance = scaled.obs_rms.mean.tolist(), scaled.obs_rms.var.tolist()
+            statistics: Any = scaled.obs_rms
+            mean, variance = statistics.mean.tolist(), statistics.var.tolist()
         return PolicyDescription(
             algorithm=self.config.algorithm,
             env_id=settings.id,
@@ -134,8 +136,9 @@ class Run:
                 f"{error}"
             ) from None
         if self.config.warm_spread is not None:
+            policy: Any = model.policy
             with torch.no_grad():
-                model.policy.log_std.fill_(math.log(self.config.warm_spread))
+                policy.log_std.fill_(math.log(self.config.warm_spread))
         mean, scaled = warm.description.observation_mean, model.get_vec_normalize_env()
         here = scaled is not None and scaled.norm_obs
         if (mean is not None) != here:
@@ -144,9 +147,10 @@ class Run:
                 f"observation: set environment.normalize_observation: {str(mean is not None).lower()}"
             )
         if scaled is not None and mean is not None:
-            scaled.obs_rms.mean[:] = mean
-            scaled.obs_rms.var[:] = warm.description.observation_variance
-            scaled.obs_rms.count = WARM_COUNT
+            statistics: Any = scaled.obs_rms
+            statistics.mean[:] = mean
+            statistics.var[:] = warm.description.observation_variance
+            statistics.count = WARM_COUNT
 
     def _resume(self, saved: Path) -> BaseAlgorithm:
         envs: VecEnv = self.bare

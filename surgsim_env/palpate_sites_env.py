@@ -75,7 +75,7 @@ class PalpateSitesEnv(SurgicalEnv):
     `moved_mm`, `cost` (force over the soft limit, 1 at the hard one: a constraint for safe learning),
     `trocar_error_mm`, `added_mass` [kg], one `reward_<term>` each. Of the episode so far: `seconds`, `path_length` [m],
     `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm under a tip of 8 mm),
-    `found` (share of lesions with an estimate within 10 mm; without lesions 1 where none is claimed),
+    `found` (share of lesions with an estimate within 10 mm, likewise; without lesions 1 where none is claimed),
     `lesion_count_estimated`, `success`.
 
     ## Arguments
@@ -109,6 +109,15 @@ class PalpateSitesEnv(SurgicalEnv):
         self.phases: tuple[PressPhase, ...] = press_phases(self.scene)
         # A press that was made among others, for the next `step` to take.
         self._made: tuple[Site, SitePress] | None = None
+
+    def load_state(self, state: bytes) -> None:
+        """As `SurgicalEnv.load_state`; a press that was begun is forgotten."""
+        super().load_state(state)
+        self._made = None
+
+    def _draw(self) -> None:
+        self._made = None
+        super()._draw()
 
     def begin_press(self, action: Action | FloatArray) -> SitePress:
         """Put the organ at rest and the tip over the site that an action names; the next `step` takes the press."""

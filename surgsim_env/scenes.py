@@ -139,6 +139,10 @@ class Limits:
         if not self.tear_force > 0.0:
             raise ValueError(f"limits.tear_force is {self.tear_force:g} N; it must be above 0")
 
+    def excess(self, force: float) -> float:
+        """How far a force [N] is on its way from the soft limit (0) to the hard one (1); below 0 and above 1 beyond."""
+        return (force - self.soft_force) / (self.hard_force - self.soft_force)
+
 
 @dataclass(frozen=True)
 class ForceSensor:

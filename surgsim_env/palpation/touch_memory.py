@@ -32,8 +32,8 @@ class TouchMemory:
     """Contrast felt at each site of a chart: force over Hertz's for nominal tissue, fitted to all readings there.
 
     Readings f_i at depths with Hertz's forces h_i give the least-squares contrast sum(f_i h_i) / sum(h_i^2), so that
-    deep presses, which noise spoils least, count most. Readings of less than half the scene's press depth are left
-    out: so |contrast| is at most the sensor's range over Hertz's force there (`bound`).
+    deep presses, which noise spoils least, count most. Readings beyond the chart, and of less than half the scene's
+    press depth, are left out: so |contrast| is at most the sensor's range over Hertz's force there (`bound`).
     """
 
     def __init__(self, chart: Chart, indenter: Indenter, *, press_depth: float, force_range: float) -> None:

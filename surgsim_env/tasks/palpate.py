@@ -192,7 +192,7 @@ class PalpateTask:
         error = self.declared_error(simulation) if declared else None
         found = error is not None and error <= SUCCESS_DISTANCE
         terminated = bool(fault) or hard or declared
-        excess = (force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force)
+        excess = self.limits.excess(force_peak)
         terms = {
             "time": 1.0,
             "soft_force": min(max(excess, 0.0), 1.0),

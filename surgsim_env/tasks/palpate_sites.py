@@ -196,7 +196,7 @@ class PalpateSitesTask:
         """End a press: say what it was worth and whether it was the last; `simulation` is not looked at."""
         hard = not fault and force_peak > self.limits.hard_force
         done, failed = self.step_count >= self.budget, bool(fault) or hard
-        over = max((force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force), 0.0)
+        over = max(self.limits.excess(force_peak), 0.0)
         terms = {
             "error": self.error / self.cutoff / self.budget,
             "found": self.found - self._found_before,
@@ -246,13 +246,23 @@ class PalpateSitesTask:
                 "bias": self.reading.bias.tolist(),
                 "felt": self.felt.get_state(),
                 "step_count": self.step_count,
+                "budget": self.budget,
                 "found_before": self._found_before,
             }
         )
 
     def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the organ of that episode."""
+        """Restore what `get_state` gave; returns the organ of that episode.
+
+        Raises:
+            ValueError: the episode has another budget, which what is observed and paid goes with.
+        """
         table = json.loads(text)
+        if table["budget"] != self.budget:
+            raise ValueError(
+                f"the state is of an episode of {table['budget']} presses, this environment's have {self.budget}: make "
+                f"it with budget={table['budget']}"
+            )
         self.drawn = DrawnOrgan.from_json(table["drawn"], self.anatomy)
         self.truth = self.drawn.places(self.anatomy)
         self.reading.bias = np.array(table["bias"])

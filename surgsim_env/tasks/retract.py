@@ -243,7 +243,7 @@ class RetractTask:
         self.goal_count = self.goal_count + 1 if at_goal else 0
         success = self.goal_count >= round(SUCCESS_TIME / self.anatomy.scene.timing.control_step)
         terminated = bool(harm) or success
-        excess = (force_peak - self.limits.soft_force) / (self.limits.hard_force - self.limits.soft_force)
+        excess = self.limits.excess(force_peak)
         terms = {
             "time": 1.0,
             "soft_force": min(max(excess, 0.0), 1.0),

@@ -310,5 +310,29 @@ def test_a_saved_state_says_what_was_drawn():
     env.reset(seed=9)
     env.step(MIDDLE)
     table = json.loads(env.task.get_state())
-    assert set(table) == {"drawn", "bias", "felt", "step_count", "found_before"}
+    assert set(table) == {"drawn", "bias", "felt", "step_count", "budget", "found_before"}
     assert len(table["felt"]["touches"]) == table["step_count"] == 1
+
+
+def test_a_saved_state_of_another_budget_is_refused():
+    env, short = (gym.make(ID, budget=budget, **SMALL).unwrapped for budget in (5, 3))
+    for one in (env, short):
+        one.reset(seed=9)
+        one.step(MIDDLE)
+    before = short.save_state()
+    with pytest.raises(ValueError, match=r"episode of 5 presses, this environment's have 3: make it with budget=5"):
+        short.load_state(env.save_state())
+    assert short.save_state() == before, "what is refused changes nothing"
+
+
+def test_a_press_that_was_begun_is_forgotten_with_its_episode():
+    env = gym.make(ID, **SMALL).unwrapped
+    env.reset(seed=9)
+    saved = env.save_state()
+    expected = env.step(MIDDLE)
+    for forget in (lambda: env.reset(seed=9), lambda: env.load_state(saved)):
+        env.begin_press(np.ones(2, dtype=np.float32))
+        forget()
+        found = env.step(MIDDLE)
+        np.testing.assert_array_equal(found[0], expected[0])
+        assert found[1:] == expected[1:]

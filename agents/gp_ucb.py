@@ -11,7 +11,7 @@ from agents.site_agent import SiteFacts
 from agents.site_process import SiteProcess
 
 # Chosen on organs that no evaluation uses, as all numbers of these agents (docs/palpation.md).
-BETA = 3.5
+BETA = 3.0
 
 
 class GpUcb:

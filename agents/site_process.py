@@ -1,7 +1,7 @@
 """A Gaussian process on the sites of a chart, by scikit-learn: what the agents gp_*.py expect and how unsure they are.
 
-Kernel and numbers are those of the benchmark's own estimator, so that an agent models what it is scored by:
-log contrast = background + excess + noise.
+Kernel and numbers are those of the benchmark's own estimator, log contrast = background + excess + noise, but that a
+press tells of fewer neighbours (LENGTH_SHARE).
 """
 
 from dataclasses import dataclass
@@ -25,9 +25,12 @@ from surgsim_env.palpation.lesion_estimator import (
 # Sites nearer to the chart's border than this share of the tip's radius are not pressed: half of what a press there
 # would tell lies where no lesion can be.
 BORDER = 0.4
-# The first two presses, as shares of the chart: on its diagonal. Two say what is background more surely than one does,
-# and a process that knows nothing would take any two.
+# Share of the estimator's correlation length: with the whole of it, weak lesions between two presses are overlooked.
+LENGTH_SHARE = 0.8
+# On a chart of so few correlation lengths the first two presses lie on its diagonal, at these shares of its sides: two
+# say what is background more surely than one does, and a process that knows nothing would take any two.
 FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75))
+FIRST_LENGTHS = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +48,8 @@ class SiteProcess:
         self.facts = facts
         self.candidates = np.flatnonzero(_off_border(facts))
         self.places = facts.sites[self.candidates]
-        rbf = RBF(EXCESS_LENGTH * facts.tip_radius / REFERENCE_TIP_RADIUS)
-        self._excess = ConstantKernel(EXCESS_SPREAD**2) * rbf
+        self.length = LENGTH_SHARE * EXCESS_LENGTH * facts.tip_radius / REFERENCE_TIP_RADIUS
+        self._excess = ConstantKernel(EXCESS_SPREAD**2) * RBF(self.length)
         self._kernel = ConstantKernel(BACKGROUND_SPREAD**2) + self._excess
 
     def belief(self, observation: NDArray[np.floating]) -> Belief:
@@ -77,7 +80,7 @@ class SiteProcess:
 
     def first(self, number: int) -> NDArray[np.float32] | None:
         """The action of the press of this number (from 0) where it is one of the first, on the site nearest to it."""
-        if number >= len(FIRST_SHARES):
+        if number >= len(FIRST_SHARES) or max(self.facts.extent) > FIRST_LENGTHS * self.length:
             return None
         wanted = np.array(FIRST_SHARES[number]) * self.facts.extent
         return self.facts.action(self.places[np.argmin(((self.places - wanted) ** 2).sum(axis=1))])

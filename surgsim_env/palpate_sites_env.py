@@ -15,7 +15,7 @@ from surgsim_env.palpation.healthy_map import healthy_map
 from surgsim_env.palpation.site_press import PressPhase, SitePress, press_alone, press_in_lanes, press_phases
 from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
-from surgsim_env.surgical_env import Action, SurgicalEnv
+from surgsim_env.surgical_env import Action, Info, SurgicalEnv
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.vector_env import LaneVectorEnv
 
@@ -109,6 +109,7 @@ class PalpateSitesEnv(SurgicalEnv):
         self.phases: tuple[PressPhase, ...] = press_phases(self.scene)
         # A press that was made among others, for the next `step` to take.
         self._made: tuple[Site, SitePress] | None = None
+        self._limited = False
 
     def load_state(self, state: bytes) -> None:
         """As `SurgicalEnv.load_state`; a press that was begun is forgotten."""
@@ -116,7 +117,7 @@ class PalpateSitesEnv(SurgicalEnv):
         self._made = None
 
     def _draw(self) -> None:
-        self._made = None
+        self._made, self._limited = None, False
         super()._draw()
 
     def begin_press(self, action: Action | FloatArray) -> SitePress:
@@ -134,7 +135,13 @@ class PalpateSitesEnv(SurgicalEnv):
         (site, press), self._made = self._made, None
         result = press.result()
         self.task.take(site, result)
+        self._limited = result.workspace_limited
         return result.force_peak
+
+    def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
+        """Of the whole press, where a simulation says only whether the instrument is limited at its end."""
+        info = super()._info(fault, saturated, task_info, rewards)
+        return {**info, "workspace_limited": self._limited}
 
 
 class PalpateSitesVectorEnv(LaneVectorEnv):

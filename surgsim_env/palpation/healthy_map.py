@@ -17,6 +17,7 @@ from surgsim_env.lane_group import LaneGroup
 from surgsim_env.palpation.chart import make_chart
 from surgsim_env.palpation.charted_face import ChartedFace, interpolated
 from surgsim_env.palpation.site_press import SitePress, press_in_lanes, press_phases
+from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import Scene, with_instrument
 from surgsim_env.simulation import Simulation
 
@@ -111,6 +112,8 @@ def _digest(anatomy: Anatomy) -> str:
     digest.update(repr(parts).encode())
     core, here = Path(msdm_core.__file__).parent, Path(__file__)
     press = [here.with_name(f"{name}.py") for name in ("chart", "charted_face", "scan", "site_press")]
+    press += [here.parents[1] / f"{name}.py" for name in ("instrument", "palpable_face")]
+    press += [scenes_folder() / "instruments" / scene.instrument.model]
     for path in (*sorted(core.glob("*.py")), *sorted(here.parents[1].glob("*kernels.py")), *press, here):
         digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -131,8 +134,9 @@ def _keep(path: Path, grid: FloatArray) -> None:
     """Write the map whole or not at all; a folder that cannot be written costs time, nothing else."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as stream:
-            np.save(stream, grid, allow_pickle=False)
-        os.replace(stream.name, path)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix="part-") as folder:
+            part = Path(folder, path.name)
+            np.save(part, grid, allow_pickle=False)
+            os.replace(part, path)
     except OSError:
         return

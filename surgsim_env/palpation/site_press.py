@@ -43,6 +43,7 @@ class PressResult:
         stopped: the way in ended by force before it ended by depth
         fault: what the simulation came to, or an empty string
         duration: simulated time [s]
+        workspace_limited: the instrument could not go where it was told, in any part of the press
     """
 
     force: FloatArray
@@ -51,6 +52,7 @@ class PressResult:
     stopped: bool
     fault: str
     duration: float
+    workspace_limited: bool = False
 
 
 def stop_force(limits: Limits) -> float:
@@ -90,7 +92,7 @@ class SitePress:
         self._hard_force = scene.limits.hard_force
         self._readings: list[tuple[FloatArray, float]] = []
         self._force_peak = 0.0
-        self._stopped = self._over = False
+        self._stopped = self._over = self._limited = False
         simulation.restart(point + normal * (self._radius + scene.palpation.clearance))
 
     def begin(self, phase: PressPhase) -> bool:
@@ -105,6 +107,7 @@ class SitePress:
     def end(self, phase: PressPhase, force_peak: float) -> None:
         """Note what a phase came to, whose largest contact force was `force_peak` [N]."""
         self._force_peak = max(self._force_peak, force_peak)
+        self._limited |= self.simulation.instrument.workspace_limited
         if self.simulation.fault or not self.simulation.end_control_step():
             self._over = True
             return
@@ -125,6 +128,7 @@ class SitePress:
             stopped=self._stopped,
             fault=fault,
             duration=self.simulation.time,
+            workspace_limited=self._limited,
         )
 
 

@@ -17,6 +17,7 @@ from surgsim_env.palpation.healthy_map import charted_face, healthy_map
 from surgsim_env.palpation.scan import press
 from surgsim_env.palpation.site_press import SitePress, press_alone, press_phases, stop_force
 from surgsim_env.rewards import PALPATE_SITES_WEIGHTS
+from surgsim_env.scene_files import scenes_folder
 from surgsim_env.scenes import make_scene
 from surgsim_env.simulation import Simulation
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
@@ -89,6 +90,17 @@ def test_force_stops_a_press_before_the_hard_limit_does():
     # Its stiffness still tells: not quite four times the healthy one, as it rises with depth and contact stays as soft.
     healthy = float(healthy_map(make_scene("phantom_small")).stiffness(MIDDLE))
     assert 3.0 * healthy < found.force @ site.normal / found.depth < 4.0 * healthy
+
+
+def test_a_press_tells_where_the_instrument_was_held_back(monkeypatch):
+    """On the way in alone: at the end of the hold nothing is asked of it any more."""
+    env = gym.make(ID, **SMALL).unwrapped
+    env.reset(seed=9)
+    assert not env.step(MIDDLE)[-1]["workspace_limited"]
+    phases = iter(range(len(env.phases)))
+    held = property(lambda _: next(phases, 1) == 0)
+    monkeypatch.setattr(type(env.simulation.instrument), "workspace_limited", held)
+    assert env.step(MIDDLE)[-1]["workspace_limited"]
 
 
 # ---- the chart ------------------------------------------------------------------------------------------------------
@@ -174,6 +186,13 @@ def test_the_map_is_made_once_and_anew_where_its_file_is_broken(tmp_path, monkey
     healthy_module._healthy_map.cache_clear()
     healthy_module.healthy_map(replace(scene, material=replace(scene.material, youngs_modulus=6000.0)))
     assert len(made) == 3, "another organ has another map"
+    plain = healthy_module._digest(load_anatomy(scene))
+    probe = (scenes_folder() / "instruments" / "probe.xml").read_text(encoding="utf-8")
+    (tmp_path / "instruments").mkdir()
+    (tmp_path / "instruments" / "probe.xml").write_text(probe + "<!-- heavier -->", encoding="utf-8")
+    monkeypatch.setattr(healthy_module, "scenes_folder", lambda: tmp_path)
+    assert healthy_module._digest(load_anatomy(scene)) != plain, "another probe has another map"
+    monkeypatch.setattr(healthy_module, "scenes_folder", scenes_folder)
     monkeypatch.setenv("SURGSIM_CACHE", "/proc/nowhere")
     healthy_module._healthy_map.cache_clear()
     assert healthy_module.healthy_map(scene).stiffness(MIDDLE) == 50.0, (

@@ -45,10 +45,10 @@ class SiteBelief:
     @property
     def space(self) -> gym.spaces.Box:
         """Of the features."""
-        return gym.spaces.Box(-FEATURE_BOUND, FEATURE_BOUND, (2 * self.site_count**2 + 1,), dtype=np.float32)
+        return gym.spaces.Box(-FEATURE_BOUND, FEATURE_BOUND, (3 * self.site_count**2 + 1,), dtype=np.float32)
 
     def features(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Expected excess and its doubt in units of the prior's, and the share of presses left, (m, 2 n n + 1).
+        """Expected excess and its doubt in units of the prior's, what was touched, the presses left, (m, 3 n n + 1).
 
         Args:
             observations: of SurgSim/PalpateSites-v0 with memory, shape (m, n_observation).
@@ -68,7 +68,7 @@ class SiteBelief:
         doubt = np.sqrt(np.maximum(variance, 0.0))
         maps = np.concatenate([mean, doubt]) / EXCESS_SPREAD
         bounded = np.clip(maps, -FEATURE_BOUND, FEATURE_BOUND)
-        return np.append(bounded, observation[-1]).astype(np.float32)
+        return np.concatenate([bounded, observation[sites : 2 * sites], observation[-1:]]).astype(np.float32)
 
     def action(self, site: int | NDArray[np.integer]) -> NDArray[np.float32]:
         """The environment's action that presses a site, shape (..., 2)."""

@@ -1,6 +1,6 @@
 """A learned acquisition function: a small picture network that gives every site of the chart a score.
 
-Bayesian optimisation presses where a formula of expected excess and doubt is largest; here a network of 7 000 numbers,
+Bayesian optimisation presses where a formula of expected excess and doubt is largest; here a network of 3 600 numbers,
 the same at every site, is that formula and reinforcement learning finds it (after Volpp et al. 2020, "Meta-learning
 acquisition functions for transfer learning in Bayesian optimization"). It begins as an upper confidence bound.
 """
@@ -15,13 +15,15 @@ from torch import nn
 SHARPNESS = 4.0
 CURIOSITY = 2.0
 WIDTH = 16
+# Of a site that was touched: a chance of nothing, and finite, as the entropy needs it.
+TOUCHED_SCORE = -1e4
 
 
 class SiteScores(nn.Module):
     """Scores of all sites, and what the value is estimated from; convolutions, so of any size of grid.
 
-    Channels: expected excess, doubt, the share of presses left, and where a site lies on the chart (x^2, y^2, and the
-    distance from its middle).
+    Channels: expected excess, doubt, what was touched, the share of presses left, and where a site lies on the chart
+    (x^2, y^2, and the distance from its middle). A site that was touched is not chosen again.
     """
 
     def __init__(self, site_count: int) -> None:
@@ -31,7 +33,7 @@ class SiteScores(nn.Module):
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         self.register_buffer("place", torch.stack([x * x, y * y, x.abs().maximum(y.abs())]), persistent=False)
         self.body = nn.Sequential(
-            nn.Conv2d(6, WIDTH, 3, padding=1),
+            nn.Conv2d(7, WIDTH, 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(WIDTH, WIDTH, 3, padding=2, dilation=2),
             nn.ReLU(),
@@ -46,13 +48,13 @@ class SiteScores(nn.Module):
         self.latent_dim_vf = 2 * WIDTH + 1
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Scores (m, n n) and summary (m, latent_dim_vf) of features (m, 2 n n + 1)."""
+        """Scores (m, n n) and summary (m, latent_dim_vf) of features (m, 3 n n + 1)."""
         count, n = len(features), self.site_count
-        maps, left = features[:, :-1].reshape(count, 2, n, n), features[:, -1:]
+        maps, left = features[:, :-1].reshape(count, 3, n, n), features[:, -1:]
         place = self.place.expand(count, 3, n, n)
         seen = self.body(torch.cat([maps, left[:, :, None, None].expand(count, 1, n, n), place], dim=1))
         bound = SHARPNESS * (maps[:, 0] + CURIOSITY * maps[:, 1])
-        scores = (self.score(seen)[:, 0] + bound).flatten(1)
+        scores = (self.score(seen)[:, 0] + bound).masked_fill(maps[:, 2] > 0.5, TOUCHED_SCORE).flatten(1)
         return scores, torch.cat([seen.mean(dim=(2, 3)), seen.amax(dim=(2, 3)), left], dim=1)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:

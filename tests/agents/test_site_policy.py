@@ -70,10 +70,14 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
     features = belief.features(np.stack([observed({3: 0.1, 17: 0.5}), observed({40: 0.3})]))
     logits = policy.get_distribution(torch.as_tensor(features)).distribution.logits
     bound = SHARPNESS * (features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES])
+    touched = features[:, 2 * SITES : 3 * SITES] > 0.5
+    assert touched.sum(axis=1).tolist() == [2, 1]
+    assert (logits.exp().detach().numpy()[touched] == 0.0).all()
     difference = logits.detach().numpy() - bound
-    np.testing.assert_allclose(difference, np.broadcast_to(difference[:, :1], difference.shape), atol=1e-4)
+    for one, hidden in zip(difference, touched, strict=True):
+        np.testing.assert_allclose(one[~hidden], one[~hidden][0], atol=1e-4)
     chosen, _ = policy.predict(features, deterministic=True)
-    assert chosen.tolist() == bound.argmax(axis=1).tolist()
+    assert chosen.tolist() == np.where(touched, -np.inf, bound).argmax(axis=1).tolist()
 
 
 def test_a_saved_policy_presses_what_its_scores_say(tmp_path):
@@ -92,5 +96,6 @@ def test_a_saved_policy_presses_what_its_scores_say(tmp_path):
     belief = SiteBelief(SETTINGS)
     features = belief.features(observations)
     bound = features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES]
+    bound[features[:, 2 * SITES : 3 * SITES] > 0.5] = -np.inf
     np.testing.assert_array_equal(actions, belief.action(bound.argmax(axis=1)))
     assert actions.dtype == np.float32

@@ -1,4 +1,4 @@
-"""The figures of docs/palpation.md, from the result files and one organ pressed by two methods.
+"""The figures of docs/palpation.md and the picture of a trained agent, from result files and one organ pressed.
 
 python -m agents.palpation_figures
 """
@@ -12,9 +12,9 @@ import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.leaderboard import SITES, best_raster_alone
-from agents.policy_video import draw_belief
+from agents.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
 from agents.results_files import Result, load_results
-from agents.roster import WORDS, find_agent
+from agents.roster import POLICIES, WORDS, find_agent
 from agents.site_agent import site_facts
 from surgsim_env.evaluation.palpation import ERROR_LINE
 
@@ -24,6 +24,8 @@ from matplotlib.figure import Figure
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 # An organ that no evaluation uses, with two lesions, and when it is shown.
 SHOWN_SEED, SHOWN_PRESSES = 3_000_003, (4, 9, 16)
+# The trained agent that is shown, an organ with two lesions that neither its training nor an evaluation uses, and when.
+SHOWN_POLICY, AGENT_SEED, AGENT_PRESSES = "sites_ppo_seed0.zip", 4_000_009, (4, 12)
 
 
 def draw_errors(results: list[Result], path: Path) -> None:
@@ -63,8 +65,22 @@ def draw_search(path: Path) -> None:
     figure.savefig(path)
 
 
+def draw_agent(path: Path) -> None:
+    """Two frames of a trained policy's film: early, and when it has found what there is."""
+    from PIL import Image
+
+    from agents.training.policy_files import load_policy
+
+    size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_lesion": True}
+    env = gym.make(SITES, scene="phantom", level="standard", render_mode="rgb_array", **size)
+    frames = episode_frames(load_policy(POLICIES / SHOWN_POLICY), env, AGENT_SEED)
+    env.close()
+    Image.fromarray(np.concatenate([frames[(press - 1) * PRESS_PICTURES] for press in AGENT_PRESSES])).save(path)
+
+
 def main() -> None:
-    """Draw both."""
+    """Draw them."""
+    draw_agent(IMAGES / "agent_at_work.png")
     draw_search(IMAGES / "palpation_search.png")
     draw_errors(load_results(), IMAGES / "palpation_errors.png")
 

@@ -170,7 +170,7 @@ def _evaluate_task(
         env_id=env_id,
         env_kwargs=kwargs,
         seeds=(seeds[0], seeds[-1]),
-        budget=600,
+        budget=gym.spec(env_id).max_episode_steps or 0,
         figures=task_figures(records, control_step, soft_force, np.random.default_rng(BOOTSTRAP_SEED)),
         command=_with_options(command, options),
         wall_time=round(taken, 1),

@@ -97,6 +97,11 @@ class Simulation:
         return read_grasp(self.instrument, self._wrench, self.contact.friction)
 
     @property
+    def rest_position(self) -> FloatArray:
+        """Where the organ's nodes rest [m], (n_node, 3): as scanned, or settled under gravity."""
+        return self._rest_position.copy()
+
+    @property
     def contact_centre(self) -> FloatArray | None:
         """Centre of the touched patch on the RESTING surface, by area [m], shape (3,); None without contact."""
         model = self.organ_model

@@ -1,0 +1,133 @@
+"""The spring and damper between a device and the instrument's tip, and how stiff they may be."""
+
+import math
+from dataclasses import dataclass
+
+from surgsim_env.haptics.device import DeviceDynamics, require_positive
+
+# What a coupling chosen for a device takes of the largest stiffness, and its damping of the device's.
+STIFFNESS_SHARE = 0.8
+DAMPING_SHARE = 0.25
+# The stiffness chosen where no device's damping limits it [N/m]: soft enough to let a probe lag by a millimetre or two.
+STIFFNESS_FREE = 500.0
+
+
+@dataclass(frozen=True)
+class VirtualCoupling:
+    """F = K e + B de/dt, e from the tip to the device: on the tip as it is, on the device turned round.
+
+    (Virtual coupling: Colgate, Stanley & Brown 1995, "Issues in the haptic display of tool use".) de/dt is the
+    difference of two haptic steps.
+
+    Args:
+        stiffness: K [N/m].
+        damping: B [N s/m], along the spring.
+
+    Raises:
+        ValueError: names the entry, its value and the rule.
+    """
+
+    stiffness: float
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_positive("coupling stiffness", self.stiffness, "N/m")
+        if not (math.isfinite(self.damping) and self.damping >= 0.0):
+            raise ValueError(f"coupling damping is {self.damping!r} N s/m; it must be finite and not negative")
+
+
+@dataclass(frozen=True)
+class TipDynamics:
+    """What a coupling pulls at: mass of the instrument's tip where it is lightest [kg], its damping [N s/m]."""
+
+    mass: float
+    damping: float
+
+
+def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, haptic_step: float) -> float:
+    """The stiffest coupling that takes energy and gives none, whatever hand and organ do [N/m]; 0 if there is none.
+
+    A force held for T while device and tip move by T v_d and T v_t (velocities of one step) differs from the spring's
+    own; what that adds in a step is at most T (K T / 2 + |B|) (|v_d| + |v_t|)^2, and a lag of L between pose and force
+    on the device's side adds T K L (|v_d| + |v_t|) |v_d|. Device and tip take b_d T v_d^2 and b_t T v_t^2, which is
+    never less where, with S = K T / 2 + |B| and D = K L,
+
+        (b_d - S - D) (b_t - S) >= (S + D / 2)^2,    S <= b_t.
+
+    With a tip that stands still (b_t to infinity) that is K <= 2 (b_d - |B|) / (T + 2 L): Colgate & Schenkel 1997,
+    "Passivity of a class of sampled-data systems", and each sample of lag costs K T of damping.
+
+    Args:
+        device: damping b_d, lag L.
+        tip: damping b_t.
+        damping: B of the coupling [N s/m].
+        haptic_step: T [s].
+    """
+    lag, mine, other = device.lag(haptic_step), device.damping, tip.damping
+    # (b_d - S - D)(b_t - S) - (S + D/2)^2 = b_d b_t - S (b_d + b_t) - D b_t - D^2 / 4, a quadratic in K.
+    rest = mine * other - abs(damping) * (mine + other)
+    if rest <= 0.0:
+        return 0.0
+    slope = 0.5 * haptic_step * (mine + other) + lag * other
+    bend = 0.25 * lag * lag
+    # The root in the form that holds for bend = 0.
+    return 2.0 * rest / (slope + math.sqrt(slope * slope + 4.0 * bend * rest))
+
+
+def coupling_for(device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float) -> VirtualCoupling:
+    """A coupling for a device: 0.8 of its limit, with a quarter of its damping in the coupling; else 500 N/m.
+
+    Where no device's damping limits it the damper is critical for the tip's mass, within what its step bears.
+
+    Raises:
+        ValueError: a device whose damping allows no coupling.
+    """
+    if device is None:
+        stiffness = min(STIFFNESS_FREE, 0.5 * tip.mass / haptic_step**2)
+        return VirtualCoupling(stiffness, min(2.0 * math.sqrt(stiffness * tip.mass), 0.5 * tip.mass / haptic_step))
+    damping = DAMPING_SHARE * min(device.damping, tip.damping)
+    stiffness = STIFFNESS_SHARE * stiffness_limit(device, tip, damping, haptic_step)
+    if stiffness <= 0.0:
+        raise ValueError(
+            f"device damping {device.damping:g} N s/m and tip damping {tip.damping:g} N s/m allow no coupling at steps "
+            f"of {haptic_step * 1e3:g} ms: use a device with more damping"
+        )
+    return VirtualCoupling(stiffness, damping)
+
+
+def check_coupling(
+    coupling: VirtualCoupling, device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float, scale: float = 1.0
+) -> None:
+    """Refuse a coupling that the device or the tip cannot bear.
+
+    Args:
+        coupling: between device and tip, in the scene's metres and newtons.
+        device: None where it does not push.
+        tip: what the coupling pulls at.
+        haptic_step: T [s].
+        scale: of the coupling as the device feels it: metres of the scene a metre of the device, squared.
+
+    Raises:
+        ValueError: says the stiffness, the limit, what it was computed from, and the way out.
+    """
+    # Explicit steps of a mass on this spring and damper leave the unit circle at K T^2 + 2 B T = 4 m: half of it.
+    load = coupling.stiffness * haptic_step**2 + 2.0 * coupling.damping * haptic_step
+    if load > 2.0 * tip.mass:
+        raise ValueError(
+            f"a coupling of {coupling.stiffness:g} N/m and {coupling.damping:g} N s/m is too stiff for a tip of "
+            f"{tip.mass * 1e3:.3g} g at steps of {haptic_step * 1e3:g} ms: K T^2 + 2 B T must be at most 2 m, "
+            f"{2.0 * tip.mass:.3g} kg, and is {load:.3g} kg; lower the stiffness or the damping"
+        )
+    if device is None:
+        return
+    # What the device feels is scale times as stiff; the same energies in the device's metres.
+    felt = TipDynamics(tip.mass * scale, tip.damping * scale)
+    limit = stiffness_limit(device, felt, coupling.damping * scale, haptic_step)
+    if coupling.stiffness * scale > limit:
+        raise ValueError(
+            f"a coupling of {coupling.stiffness * scale:g} N/m at the device's handle is stiffer than {limit:.4g} N/m, "
+            f"the most that takes energy and gives none with device damping {device.damping:g} N s/m, tip damping "
+            f"{felt.damping:g} N s/m, coupling damping {coupling.damping * scale:g} N s/m, a haptic step of "
+            f"{haptic_step * 1e3:g} ms and a lag of {device.lag(haptic_step) * 1e3:g} ms: lower the stiffness or the "
+            "coupling's damping, or use a device with more damping or less delay"
+        )

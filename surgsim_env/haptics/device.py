@@ -1,0 +1,85 @@
+"""What a haptic device is to a simulation: a pose in, a force out, and the dynamics that say how stiff it may feel."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from msdm_core.mesh import FloatArray
+
+
+class DevicePose(NamedTuple):
+    """Where a device is held.
+
+    Fields:
+        position: in the device's own frame [m], shape (3,)
+        time: when it was read, on a clock that never goes back [s]
+        buttons: one bit each, the first is 1
+        rotation: unit quaternion (w, x, y, z) from the handle's axes to the device's frame; None where not measured
+    """
+
+    position: FloatArray
+    time: float
+    buttons: int = 0
+    rotation: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class DeviceDynamics:
+    """What a device that pushes back is made of, as its hand's end feels it.
+
+    Args:
+        damping: viscous damping b that is there whoever holds it [N s/m]; more of it allows a stiffer coupling.
+        mass: apparent mass m at the handle [kg].
+        delay: of pose and force together beyond the haptic step for which a force is held [s]: transport, filters.
+        pose_interval: time between two of its poses [s]; None: a pose each haptic step.
+        force_largest: what it can push with [N].
+
+    Raises:
+        ValueError: names the entry, its value and the rule.
+    """
+
+    damping: float
+    mass: float
+    delay: float = 0.0
+    pose_interval: float | None = None
+    force_largest: float = math.inf
+
+    def __post_init__(self) -> None:
+        require_positive("device damping", self.damping, "N s/m")
+        require_positive("device mass", self.mass, "kg")
+        require_positive("device force_largest", self.force_largest, "N", finite=False)
+        if not (math.isfinite(self.delay) and self.delay >= 0.0):
+            raise ValueError(f"device delay is {self.delay!r} s; it must be finite and not negative")
+        if self.pose_interval is not None:
+            require_positive("device pose_interval", self.pose_interval, "s")
+
+    def lag(self, haptic_step: float) -> float:
+        """Delay beyond the holding of one haptic step [s]: the device's own, and that of its rarer poses."""
+        return self.delay + max(0.0, (self.pose_interval or haptic_step) - haptic_step)
+
+
+class HapticDevice(Protocol):
+    """A device that a `HapticLoop` reads and writes once a haptic step; neither call may ever wait."""
+
+    @property
+    def dynamics(self) -> DeviceDynamics | None:
+        """What it is made of; None where it shows forces or drops them, but does not push."""
+        ...
+
+    def read(self) -> DevicePose | None:
+        """The newest pose that was not read before; None where there is none."""
+        ...
+
+    def write(self, force: FloatArray) -> None:
+        """Push the hand with a force in the device's frame [N], shape (3,), until the next one."""
+        ...
+
+
+def require_positive(name: str, value: float, unit: str, *, finite: bool = True) -> None:
+    """Refuse a number that is not above zero.
+
+    Raises:
+        ValueError: names the number, its value and the rule.
+    """
+    if not value > 0.0 or (finite and not math.isfinite(value)):
+        raise ValueError(f"{name} is {value!r} {unit}; it must be {'finite and ' if finite else ''}above 0")

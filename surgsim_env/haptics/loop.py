@@ -1,0 +1,115 @@
+"""The haptic loop: devices that hold the tips of a simulation's instrument, one haptic step at a time."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from msdm_core.kernels import OrganModel
+from msdm_core.mesh import FloatArray, IntArray
+from surgsim_env.arms.pair import SIDES, Pair
+from surgsim_env.haptics.device import HapticDevice
+from surgsim_env.haptics.held_tip import HeldTip
+from surgsim_env.haptics.press_depth import PressDepth
+from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.telemetry import HapticTelemetry
+from surgsim_env.haptics.tip_drive import tip_drives
+from surgsim_env.simulation import Simulation
+
+
+class HapticLoop:
+    """Steps a simulation whose instrument is held by devices; `step` never raises for what organ or device do.
+
+    In each step the devices' poses are read, the couplings' forces written to them and put on the tips, and organ and
+    instrument advance by one haptic step: a force answers the pose of its own step, and nothing stands in between.
+
+    Once the organ or MuJoCo came to grief (`fault` says why) forces are zero and the simulation stands still, until
+    `reset`.
+
+    Fields:
+        simulation: what is held
+        held: one for each device, with its coupling
+        fault: why the simulation stands still, or ""
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        devices: HapticDevice | Sequence[HapticDevice],
+        settings: HapticSettings | Sequence[HapticSettings] | None = None,
+    ) -> None:
+        """Couple devices to the tips of an instrument where they are now.
+
+        Args:
+            simulation: a scene's, reset; nobody else advances it meanwhile.
+            devices: one, or one for each tip, the left arm's first.
+            settings: for all, or one for each.
+
+        Raises:
+            ValueError: as many devices as there are not tips; a coupling that a device or tip cannot bear (says the
+                limit); a force beyond what device or servo can push with.
+            TypeError: an instrument that cannot be held so.
+        """
+        self.simulation = simulation
+        scene, dt = simulation.anatomy.scene, simulation.haptic_dt
+        many = list(devices) if isinstance(devices, Sequence) else [devices]
+        drives = tip_drives(simulation.instrument, dt)
+        each = list(settings) if isinstance(settings, Sequence) else [settings or HapticSettings()] * len(many)
+        if len(many) != len(drives) or len(each) != len(many):
+            raise ValueError(
+                f"{len(many)} devices and {len(each)} settings for the {len(drives)} tips of scene {scene.name!r}: "
+                "give one device for each tip, and settings for all or one for each"
+            )
+        radius = 0.0 if simulation.instrument.jaw is not None else scene.instrument.tip_radius
+        depth = PressDepth(simulation, radius)
+        self.held = [HeldTip(*parts, depth, dt) for parts in zip(many, drives, each, strict=True)]
+        self.fault = simulation.fault
+        self._tools = _tools_of_tips(simulation)
+
+    def step(self) -> HapticTelemetry:
+        """Advance by one haptic step, or let go of everything after a fault."""
+        if not self.fault:
+            simulation = self.simulation
+            for held, contact in zip(self.held, self._contact_forces(), strict=True):
+                held.step(contact)
+            simulation.control_step(1)
+            simulation.instrument.refresh()
+            self.fault = simulation.fault or simulation.instrument.warning()
+        if self.fault:
+            for held in self.held:
+                held.release()
+        contacts = self._contact_forces()
+        tips = tuple(held.telemetry(contact) for held, contact in zip(self.held, contacts, strict=True))
+        return HapticTelemetry(self.simulation.time, self.fault, tips)
+
+    def reset(self, organ_model: OrganModel | None = None, tip_position: FloatArray | None = None) -> None:
+        """Start anew: forces are zero, and devices are approached slowly from where the tip is put.
+
+        Args:
+            organ_model: another organ of the same scene; the same one by default.
+            tip_position: [m], (3,), or (2, 3) for a pair; where the instrument parks by default.
+
+        Raises:
+            OrganError: the scene's number of substeps is too small for this organ.
+            ValueError: an arm does not reach that place.
+        """
+        simulation = self.simulation
+        place = simulation.instrument.parked if tip_position is None else np.asarray(tip_position, dtype=np.float64)
+        if organ_model is None:
+            simulation.restart(place)
+        else:
+            simulation.reset(organ_model, place)
+        self.fault = simulation.fault
+        for held in self.held:
+            held.restart()
+
+    def _contact_forces(self) -> list[FloatArray]:
+        wrench = self.simulation.contact_wrench
+        return [wrench[tools, :3].sum(axis=0) for tools in self._tools]
+
+
+def _tools_of_tips(simulation: Simulation) -> list[IntArray]:
+    """Which tools of the instrument each tip carries."""
+    instrument = simulation.instrument
+    if isinstance(instrument, Pair):
+        return [instrument.tools_of(side) for side in SIDES]
+    return [np.arange(instrument.tool_count, dtype=np.int32)]

@@ -1,0 +1,41 @@
+"""How deep a tip is in the organ, measured from the organ's surface at rest."""
+
+import numpy as np
+
+from msdm_core.contact_kernels import QUADRATURE_COUNT
+from msdm_core.kernels import OrganModel
+from msdm_core.mesh import FloatArray
+from surgsim_env.simulation import Simulation
+
+
+class PressDepth:
+    """Depth of a ball below the resting surface: r - n . (tip - c) [m].
+
+    n and c are normal and centre of that touched triangle of the surface at rest whose centre is nearest to the tip:
+    exact over a flat face, and on a curved one to within what a triangle is flat. 0 without contact.
+    """
+
+    def __init__(self, simulation: Simulation, radius: float) -> None:
+        """Measure for a tip of a radius [m]; 0 measures the point between the pads of a jaw."""
+        self._simulation, self._radius = simulation, radius
+        self._model: OrganModel | None = None
+        self._centres = self._normals = np.zeros((0, 3))
+
+    def of(self, tip: FloatArray) -> float:
+        """Depth of a tip at a place [m], (3,)."""
+        simulation = self._simulation
+        if simulation.organ_model is not self._model:
+            self._look_at(simulation.organ_model)
+        touched = np.flatnonzero(simulation.organ_state.contact_engaged.max(axis=0)) // QUADRATURE_COUNT
+        if not len(touched):
+            return 0.0
+        across = tip - self._centres[touched]
+        nearest = int((across * across).sum(axis=1).argmin())
+        return self._radius - float(self._normals[touched[nearest]] @ across[nearest])
+
+    def _look_at(self, model: OrganModel) -> None:
+        self._model = model
+        corners = self._simulation.rest_position[model.surface_triangles]
+        self._centres = corners.mean(axis=1)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)

@@ -13,8 +13,8 @@ from agents.site_agent import SiteFacts
 from agents.site_process import SiteProcess
 from surgsim_env.palpation.lesion_estimator import EXCESS_LEAST, EXCESS_LEAST_NOISE
 
-BETA = 2.5
-LEVEL_SHARE = 0.35
+BETA = 2.0
+LEVEL_SHARE = 0.55
 
 
 class GpLevelSet:

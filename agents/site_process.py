@@ -27,9 +27,9 @@ from surgsim_env.palpation.lesion_estimator import (
 BORDER = 0.4
 # Share of the estimator's correlation length: with the whole of it, weak lesions between two presses are overlooked.
 LENGTH_SHARE = 0.8
-# On a chart of so few correlation lengths the first two presses lie on its diagonal, at these shares of its sides: two
-# say what is background more surely than one does, and a process that knows nothing would take any two.
-FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75))
+# On a chart of so few correlation lengths the first four presses are a raster of 2 x 2, at these shares of its sides:
+# together they say what is background and leave no quarter unfelt, where a process that knows nothing takes any place.
+FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75), (0.75, 0.25), (0.25, 0.75))
 FIRST_LENGTHS = 6.0
 
 

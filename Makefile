@@ -14,7 +14,7 @@ WITH_RAY := --editable=.[dev,distributed]
 
 PYTEST_ARGS ?= -n 2
 
-.PHONY: help demo test test-all test-agents test-distributed with-ray bench lint clean distclean
+.PHONY: help demo test test-all test-agents test-distributed with-ray bench docs lint clean distclean
 .NOTPARALLEL:
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
 	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
+	@echo "make docs         the documentation site, in site/; warnings are errors"
 	@echo "make lint         ruff and pyright"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
 	@echo "PYTHON=/path/to/python picks the interpreter (3.11 or newer) that $(VENV) is made from"
@@ -50,14 +51,19 @@ with-ray: $(VENV)/.ready-distributed
 bench: $(VENV)/.ready-bench
 	$(VENV)/bin/surgsim bench --out docs
 
+# Material for MkDocs advertises its successor at each build.
+docs: $(VENV)/.ready-dev
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
+	@echo "surgsim: the site is in site/; open site/index.html (searching needs a server: $(PY) -m http.server -d site)"
+
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pyright --pythonpath $(PY)
 
 clean:
-	rm -rf runs build dist .pytest_cache .ruff_cache .hypothesis .numba_cache
-	find msdm_core surgsim_env agents benchmarks scenes tests -name __pycache__ -prune -exec rm -rf {} +
+	rm -rf runs build dist site .pytest_cache .ruff_cache .hypothesis .numba_cache
+	find msdm_core surgsim_env agents benchmarks docs scenes tests -name __pycache__ -prune -exec rm -rf {} +
 
 distclean: clean
 	rm -rf $(VENV) $(VENV)-virtualenv $(VENV)-distributed $(VENV)-distributed-virtualenv

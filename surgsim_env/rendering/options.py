@@ -18,7 +18,8 @@ class RenderOptions:
     Args:
         camera: "overview" (organ and instrument), "endoscope" (the palpable face, near and oblique), "side" (level) or
             "above" (from straight above).
-        width, height: of the picture [pixels].
+        width: of the picture [pixels], up to 4096.
+        height: likewise.
         show_force: draw the tissue's force on each tool as an arrow with its size in newtons; none where it is 0.
         force_mm_per_newton: length of that arrow in the scene [mm/N].
         show_lesion: the organ is translucent and its lesions are solid inside.

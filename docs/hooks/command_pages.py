@@ -1,0 +1,73 @@
+"""`<!-- commands -->` in a page becomes what `surgsim --help` says of itself and of each command."""
+
+import contextlib
+import html
+import io
+import os
+import re
+from unittest import mock
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import Files
+from mkdocs.structure.pages import Page
+
+MARK = "<!-- commands -->"
+# Wide enough for each option to stand on one line.
+COLUMNS = {"COLUMNS": "4000"}
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Fill the mark in."""
+    return markdown.replace(MARK, command_list()) if MARK in markdown else markdown
+
+
+def command_list() -> str:
+    """A table of all commands, then a section each, as Markdown."""
+    (names,) = re.findall(r"^usage: surgsim .*\{([\w,]+)\}", said("--help"), flags=re.MULTILINE)
+    told = {name: said(name, "--help") for name in names.split(",")}
+    rows = [f"| [`{name}`](#surgsim-{name}) | {_first_sentence(text)} |" for name, text in told.items()]
+    return "\n".join(["| command | |", "|---|---|", *rows, "", *(_section(name, text) for name, text in told.items())])
+
+
+def said(*arguments: str) -> str:
+    """What the command line prints, in one line for each option."""
+    from surgsim_env.cli import main
+
+    printed = io.StringIO()
+    with mock.patch.dict(os.environ, COLUMNS), contextlib.redirect_stdout(printed):
+        status = main(arguments)
+    assert status == 0, (arguments, status)
+    return printed.getvalue()
+
+
+def _section(name: str, text: str) -> str:
+    usage, description, tables = _parts(text)
+    lines = [f"## surgsim {name}\n", f"```text\n{usage}\n```\n", description, ""]
+    for title, rows in tables:
+        if rows:
+            lines += [f"| {title} | |", "|---|---|", *(f"| {_code(what)} | {_cell(told)} |" for what, told in rows), ""]
+    return "\n".join(lines)
+
+
+def _parts(text: str) -> tuple[str, str, list[tuple[str, list[tuple[str, str]]]]]:
+    """Usage, description, and for each box its title and rows of two."""
+    head, *boxes = re.split(r"^[╭ ]─?\s?([a-z][a-z ]*?)\s*─*╮?\s*$", text, flags=re.MULTILINE)
+    usage, _, description = head.strip().partition("\n\n")
+    tables = []
+    for title, body in zip(boxes[::2], boxes[1::2]):
+        rows = re.findall(r"^[│ ] {1,2}(\S.*?)(?: {2,}(\S.*?))?\s*│?$", body, flags=re.MULTILINE)
+        tables.append((title, [row for row in rows if set(row[0]) - set("-─╰╯") and row[0] != "-h, --help"]))
+    return usage.removeprefix("usage: "), description.strip(), tables
+
+
+def _first_sentence(text: str) -> str:
+    return _cell(re.split(r"(?<=[.;:])\s", _parts(text)[1], maxsplit=1)[0].rstrip(".;:"))
+
+
+def _code(text: str) -> str:
+    return f"<code>{html.escape(text)}</code>".replace("|", "&#124;")
+
+
+def _cell(text: str) -> str:
+    """Text for a table's cell: no bar ends it, no option's two dashes become one."""
+    return re.sub(r"(?<![\w`-])(--[\w-]+)", r"`\1`", text.replace("|", "&#124;"))

@@ -1,0 +1,94 @@
+"""Make the moving pictures of the pages on environments: python docs/make_environment_pictures.py (some minutes)."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from PIL import Image
+
+import surgsim_env  # noqa: F401  (registers the environments)
+from surgsim_env.scripting import oracle_script, run_script
+from surgsim_env.surgical_env import SurgicalEnv
+
+IMAGES = Path(__file__).parent / "images"
+SIZE = (480, 360)
+STEP_MS = 50
+PRESSES, PRESS_SHOWN_MS = 16, 600
+BOTH = ("overview", "endoscope")
+
+
+class Filmed(gym.Wrapper):
+    """Keeps a picture of every so many steps, one camera beside the other."""
+
+    def __init__(self, env: gym.Env, cameras: tuple[str, ...], every: int) -> None:
+        super().__init__(env)
+        self.cameras, self.every = cameras, every
+        self.frames: list[Image.Image] = []
+        self.count = 0
+
+    def step(self, action: Any) -> Any:
+        stepped = self.env.step(action)
+        if self.count % self.every == 0:
+            self.frames.append(frame(self.env, self.cameras))
+        self.count += 1
+        return stepped
+
+
+def frame(env: gym.Env, cameras: tuple[str, ...] = ("overview",)) -> Image.Image:
+    """The environment as it stands, drawn at twice the size and made smaller."""
+    inner = env.unwrapped
+    assert isinstance(inner, SurgicalEnv)
+    drawn = [Image.fromarray(inner.renderer.rgb(camera)) for camera in cameras]
+    return Image.fromarray(np.concatenate([np.asarray(one.resize(SIZE, Image.Resampling.LANCZOS)) for one in drawn], 1))
+
+
+def make(id: str, **arguments: Any) -> gym.Env:
+    return gym.make(id, render_mode="rgb_array", width=2 * SIZE[0], height=2 * SIZE[1], **arguments)
+
+
+def write(frames: list[Image.Image], path: Path, milliseconds: int) -> None:
+    """A WebP that moves, its last picture shown for a second longer."""
+    times = [milliseconds] * (len(frames) - 1) + [milliseconds + 1000]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=times, loop=0, quality=70, method=6)
+    print(f"{path.name}: {len(frames)} pictures, {path.stat().st_size / 1000:.0f} kB")
+
+
+def film_oracle(id: str, path: Path, *cameras: str, seed: int, every: int = 2, **arguments: Any) -> None:
+    """The script that knows the truth, doing the task."""
+    env = Filmed(make(id, **arguments), cameras, every)
+    env.reset(seed=seed)
+    run_script(env, oracle_script(env))
+    write(env.frames, path, every * STEP_MS)
+
+
+def film_presses(path: Path, *, seed: int) -> None:
+    """A raster of presses, each as it stands at its deepest."""
+    env = make("SurgSim/PalpateSites-v0", show_lesion=True)
+    env.reset(seed=seed)
+    side = round(PRESSES**0.5)
+    places = (2.0 * np.arange(side) + 1.0) / side - 1.0
+    frames = []
+    for row, y in enumerate(places):
+        for x in places[:: 1 if row % 2 == 0 else -1]:
+            env.step(np.array([x, y], dtype=np.float32))
+            frames.append(frame(env))
+    write(frames, path, PRESS_SHOWN_MS)
+
+
+def main(names: list[str]) -> None:
+    films = {
+        "palpate": lambda path: film_oracle("SurgSim/Palpate-v0", path, "overview", seed=3, show_lesion=True),
+        "palpate_sites": lambda path: film_presses(path, seed=4),
+        "retract": lambda path: film_oracle("SurgSim/Retract-v0", path, "overview", "endoscope", seed=4),
+        "bimanual_retract": lambda path: film_oracle(
+            "SurgSim/BimanualRetract-v0", path, "overview", "endoscope", seed=4
+        ),
+    }
+    for name in names or films:
+        films[name](IMAGES / f"env_{name}.webp")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,149 @@
+"""What the pages say of the project is so: files and modules that they name exist, what is generated tells all."""
+
+import importlib
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+import msdm_core
+import surgsim_env.scripting
+from surgsim_env import rewards
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+HOOKS = ROOT / "docs" / "hooks"
+
+
+def hook(name: str):
+    """A hook as mkdocs loads it."""
+    pytest.importorskip("mkdocs", reason="needs the `docs` extra")
+    specification = importlib.util.spec_from_file_location(name, HOOKS / f"{name}.py")
+    assert specification is not None and specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.path.insert(0, str(HOOKS))
+    try:
+        specification.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(HOOKS))
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT / "docs").as_posix())
+def test_files_and_modules_that_are_named_exist(page):
+    text = page.read_text(encoding="utf-8")
+    for place in re.findall(r"`((?:scenes|msdm_core|surgsim_env|agents|docs|tests|benchmarks)/[\w/.]*)`", text):
+        assert (ROOT / place).exists(), place
+    for name in re.findall(r"`((?:msdm_core|surgsim_env)(?:\.\w+)+)(?:\([^`]*)?`|^::: (\S+)", text, flags=re.MULTILINE):
+        assert resolved(name[0] or name[1]) is not None, name
+
+
+def resolved(name: str) -> object:
+    """A module, or what a module has by a dotted name; None if there is none."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for attribute in parts[count:]:
+            # A dataclass's field without a default is no attribute of the class.
+            if not hasattr(found, attribute) and attribute not in getattr(found, "__annotations__", {}):
+                return None
+            found = getattr(found, attribute, name)
+        return found
+    return None
+
+
+def test_names_are_resolved_or_not():
+    assert resolved("surgsim_env.levels.find_level") and resolved("msdm_core.OrganSpec.mesh")
+    assert resolved("surgsim_env.levels.nothing") is None and resolved("surgsim_env.nowhere.at_all") is None
+
+
+def test_pictures_are_small():
+    pictures = [path for path in (ROOT / "docs" / "images").rglob("*") if path.is_file()]
+    assert pictures and all(path.stat().st_size < 500_000 for path in pictures)
+
+
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [("msdm_core", msdm_core.__all__), ("scripting", surgsim_env.scripting.__all__)],
+)
+def test_the_reference_has_every_public_name(page, names):
+    text = (ROOT / "docs" / "reference" / f"{page}.md").read_text(encoding="utf-8")
+    told = re.findall(r"^::: [\w.]+\.(\w+)$", text, flags=re.MULTILINE)
+    # Protocols and exceptions that only name a type are told with what takes them.
+    assert set(told) - set(names) == set()
+    assert set(names) - set(told) <= {"Script", "Step", "StepFailed"}
+
+
+IDS = sorted(id for id in gym.registry if id.startswith("SurgSim/"))
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_every_environment_has_a_page_with_gymnasiums_headings(id):
+    (page,) = (page for page in PAGES if f"<!-- environment {id} -->" in page.read_text(encoding="utf-8"))
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith(f"# {id}\n")
+    assert re.search(r"!\[[^]]{20,}\]\(\.\./images/\w+\.webp\)", text)
+    _, told = hook("environment_pages").sections(hook("environment_pages").environment_class(id).__doc__)
+    assert set(told) >= {"Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End"}
+    assert "Arguments" in told and all(told.values())
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_reward_tables_are_the_codes(id):
+    module = hook("environment_pages")
+    _, told = module.sections(module.environment_class(id).__doc__)
+    table = module.reward_table(told["Rewards"])
+    (name,) = re.findall(r"rewards\.(\w+)", told["Rewards"])
+    rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (.+) \|$", table, flags=re.MULTILINE)
+    assert {term: float(weight) for term, weight, _ in rows} == dict(getattr(rewards, name))
+    assert all(len(meaning) > 10 for *_, meaning in rows)
+
+
+def test_a_docstring_without_a_heading_is_refused(monkeypatch):
+    module = hook("environment_pages")
+    bad = type("Env", (), {"__doc__": "One.\n\n## Description\nx"})
+    monkeypatch.setattr(module, "environment_class", lambda id: bad)
+    with pytest.raises(module.PluginError, match="has the headings Description; it must have Description, Action"):
+        module.environment_text("SurgSim/Palpate-v0")
+
+
+def test_every_command_and_every_option_is_on_the_page():
+    module = hook("command_pages")
+    text = module.command_list()
+    (names,) = re.findall(r"\{([\w,]+)\}", module.said("--help"))
+    assert {"palpate", "organ", "arms", "validate"} <= set(names.split(","))
+    for name in names.split(","):
+        _, _, section = text.partition(f"## surgsim {name}\n")
+        section = section.partition("\n## ")[0]
+        options = set(re.findall(r"^\W*(--[a-z][\w-]*)", module.said(name, "--help"), flags=re.MULTILINE)) - {"--help"}
+        assert options == set(re.findall(r"^\| <code>(?:-\w, )?(--[\w-]+)", section, flags=re.MULTILINE)), name
+
+
+def test_paths_of_pages_become_links_outside_of_code():
+    module = hook("named_pages")
+
+    class One:
+        def __init__(self, place: str, text: str) -> None:
+            self.src_uri, self.content_string = place, text
+            self.inclusion = self
+
+        def is_included(self) -> bool:
+            return True
+
+    class All(dict):
+        get_file_from_path = dict.get
+
+    files = All({"arms.md": One("arms.md", "# Arms of all kinds\n"), "agents.md": One("agents.md", "# Agents\n")})
+    page = type("Page", (), {"file": One("tutorials/robot.md", "")})
+    text = "See `docs/arms.md`, agents/README.md (docs/arms.md)."
+    code = "\n\n```sh\ncat docs/arms.md\n```\n\n`cat docs/arms.md` `x docs/arms.md y` [x](docs/arms.md)"
+    link = "[Arms of all kinds](../arms.md)"
+    turned = module.on_page_markdown(text + code, page, None, files)
+    assert turned == f"See {link}, [Agents](../agents.md) ({link})." + code
+    assert module.on_page_markdown("`docs/nowhere.md`", page, None, files) == "`docs/nowhere.md`"

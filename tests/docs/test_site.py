@@ -1,0 +1,145 @@
+"""The documentation site builds without a warning, asks nothing of the network, and its links lead somewhere."""
+
+import html.parser
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+pytest.importorskip("material", reason="needs the `docs` extra")
+pytest.importorskip("mkdocstrings", reason="needs the `docs` extra")
+ROOT = Path(__file__).resolve().parents[2]
+# What a browser fetches by itself; links are fetched when somebody follows them.
+FETCHED = {"img": "src", "script": "src", "link": "href", "source": "src", "iframe": "src", "video": "src"}
+
+
+class Html(html.parser.HTMLParser):
+    """What a page holds: ids, links, and what it makes a browser fetch."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: set[str] = set()
+        self.links: list[str] = []
+        self.fetched: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attrs}
+        self.ids.update(given[name] for name in ("id", "name") if name in given)
+        if tag == "a" and "href" in given:
+            self.links.append(given["href"])
+        if tag in FETCHED and FETCHED[tag] in given and given.get("rel") != "canonical":
+            self.fetched.append(given[FETCHED[tag]])
+
+
+def build(folder: Path, *options: str, configuration: Path = ROOT / "mkdocs.yml") -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder), *options]
+    settings = {**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1", "NO_COLOR": "1"}
+    command += ["--config-file", str(configuration)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, env=settings)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> dict[str, Html]:
+    """Every page of the built site, by its path."""
+    folder = tmp_path_factory.mktemp("site")
+    done = build(folder)
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    return {
+        path.relative_to(folder).as_posix(): Html(path.read_text(encoding="utf-8")) for path in folder.rglob("*.html")
+    } | {"": Html(f'<a name="{folder}">')}
+
+
+@pytest.fixture(scope="module")
+def folder(site) -> Path:
+    return Path(*site[""].ids)
+
+
+def pages(site: dict[str, Html]) -> dict[str, Html]:
+    return {path: page for path, page in site.items() if path not in ("", "404.html")}
+
+
+def test_every_page_of_docs_is_on_the_site(site):
+    written = {
+        path.relative_to(ROOT / "docs").with_suffix(".html").as_posix()
+        for path in (ROOT / "docs").rglob("*.md")
+        if path.name != "benchmarks_notes.md"
+    }
+    assert written | {"agents.html", "contributing.html", "changelog.html"} <= set(site)
+
+
+def test_every_page_is_in_the_navigation(site):
+    """From the home page, by links alone, to all."""
+    reached, waiting = set(), ["index.html"]
+    while waiting:
+        path = waiting.pop()
+        if path in reached:
+            continue
+        reached.add(path)
+        found = [os.path.normpath(os.path.join(os.path.dirname(path), link.split("#")[0])) for link in site[path].links]
+        waiting += [link for link in found if link in pages(site)]
+    assert set(pages(site)) - reached == set()
+
+
+def test_links_lead_somewhere(site, folder):
+    """mkdocs looks at links of Markdown; this one also at those of generated and of HTML parts."""
+    lost = []
+    for path, page in pages(site).items():
+        for link in page.links + page.fetched:
+            if re.match(r"[a-z]+:", link):
+                continue
+            target, _, anchor = unquote(link).partition("#")
+            place = os.path.normpath(os.path.join(os.path.dirname(path), target)) if target else path
+            if not (folder / place).is_file():
+                lost.append(f"{path}: {link}")
+            elif anchor and place in site and anchor not in site[place].ids:
+                lost.append(f"{path}: {link}")
+    assert lost == []
+
+
+def test_nothing_is_fetched_from_elsewhere(site, folder):
+    fetched = {link for page in pages(site).values() for link in page.fetched}
+    assert fetched, "no page fetches its own style sheet?"
+    assert [link for link in fetched if re.match(r"(?:[a-z]+:)?//", link)] == []
+    styles = [path.read_text(encoding="utf-8") for path in folder.rglob("*.css")]
+    assert styles and not any(re.search(r"(?:url\(|@import\s+)[\"']?(?:https?:)?//", style) for style in styles)
+
+
+def test_equations_became_mathml(folder):
+    for path in folder.rglob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        assert "arithmatex" not in text, path
+        for drawn in re.findall(r"<math.*?</math>", text, flags=re.DOTALL):
+            assert "\\" not in drawn and "merror" not in drawn, (path, drawn)
+    assert (folder / "concepts.html").read_text(encoding="utf-8").count("equation-number") >= 6
+
+
+@pytest.mark.parametrize(
+    "fault",
+    ["[lost](nowhere.md)", "[lost](arms.md#nowhere)", "![lost](images/nowhere.png)", r"$\nocommand{x}$"],
+)
+def test_a_fault_ends_the_build(tmp_path, fault):
+    """That warnings are errors, and that each of these is noticed: a site of two pages with our configuration."""
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    (docs / "arms.md").write_text("# Arms\n", encoding="utf-8")
+    (docs / "index.md").write_text(f"# Home\n\n[there](arms.md#arms) {fault}\n", encoding="utf-8")
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    text = re.sub(r"^nav:\n(?:[ #].*\n|\n)*?(?=\S)", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^  (logo|favicon):.*\n", "", text, flags=re.MULTILINE).replace(
+        "  - docs/hooks/outside_pages.py\n", ""
+    )
+    text = text.replace("docs/hooks/", f"{ROOT}/docs/hooks/").replace("extra_css: [stylesheets/site.css]\n", "")
+    configuration = tmp_path / "mkdocs.yml"
+    configuration.write_text(text, encoding="utf-8")
+    done = build(tmp_path / "site", configuration=configuration)
+    assert done.returncode != 0
+    assert "nowhere" in done.stderr + done.stdout or "nocommand" in done.stderr + done.stdout
+    (docs / "index.md").write_text("# Home\n\n[there](arms.md#arms) $\\alpha$\n", encoding="utf-8")
+    done = build(tmp_path / "site", configuration=configuration)
+    assert done.returncode == 0, done.stderr

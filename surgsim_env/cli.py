@@ -1,4 +1,4 @@
-"""The command line: `surgsim palpate`, `retract`, `arms`, `organ`, `scenes`, `validate`, `bench`."""
+"""The command line: `surgsim palpate`, `retract`, `arms`, `organ`, `scenes`, `validate`, `bench`, `haptics`."""
 
 import contextlib
 import io
@@ -17,6 +17,7 @@ from rich.table import Table
 from msdm_core.length_unit import LengthUnit
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.haptics.options import Haptics
 from surgsim_env.out_folder import writable_folder
 from surgsim_env.scenes import Ball, Scene, list_scenes, load_scene, make_scene
 
@@ -178,6 +179,7 @@ Command = (
     | Annotated[Arms, tyro.conf.subcommand("arms")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Haptics, tyro.conf.subcommand("haptics")]
 )
 
 
@@ -207,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench) -> int:
+def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench | Haptics) -> int:
     console = Console()
     if isinstance(command, Palpate):
         _palpate(command, console)
@@ -228,6 +230,10 @@ def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench) 
         from surgsim_env.bench.command import bench
 
         return bench(quick=command.quick, folder=command.out, console=console)
+    elif isinstance(command, Haptics):
+        from surgsim_env.haptics.command import run_haptics
+
+        run_haptics(command, console)
     elif isinstance(command, Organ):
         from surgsim_env.organ_report import report_organ
 

@@ -74,7 +74,9 @@ def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, ha
     return 2.0 * rest / (slope + math.sqrt(slope * slope + 4.0 * bend * rest))
 
 
-def coupling_for(device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float) -> VirtualCoupling:
+def coupling_for(
+    device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float, scale: float = 1.0
+) -> VirtualCoupling:
     """A coupling for a device: 0.8 of its limit, with a quarter of its damping in the coupling; else 500 N/m.
 
     Where no device's damping limits it the damper is critical for the tip's mass, within what its step bears.
@@ -85,14 +87,17 @@ def coupling_for(device: DeviceDynamics | None, tip: TipDynamics, haptic_step: f
     if device is None:
         stiffness = min(STIFFNESS_FREE, 0.5 * tip.mass / haptic_step**2)
         return VirtualCoupling(stiffness, min(2.0 * math.sqrt(stiffness * tip.mass), 0.5 * tip.mass / haptic_step))
-    damping = DAMPING_SHARE * min(device.damping, tip.damping)
-    stiffness = STIFFNESS_SHARE * stiffness_limit(device, tip, damping, haptic_step)
+    felt = TipDynamics(tip.mass * scale, tip.damping * scale)
+    damping = DAMPING_SHARE * min(device.damping, felt.damping)
+    # What the tip bears, see `check_coupling`, with its margin.
+    bearable = (2.0 * felt.mass - 2.0 * damping * haptic_step) / haptic_step**2
+    stiffness = STIFFNESS_SHARE * min(stiffness_limit(device, felt, damping, haptic_step), bearable)
     if stiffness <= 0.0:
         raise ValueError(
-            f"device damping {device.damping:g} N s/m and tip damping {tip.damping:g} N s/m allow no coupling at steps "
-            f"of {haptic_step * 1e3:g} ms: use a device with more damping"
+            f"device damping {device.damping:g} N s/m and tip damping {felt.damping:g} N s/m allow no coupling at "
+            f"steps of {haptic_step * 1e3:g} ms: use a device with more damping"
         )
-    return VirtualCoupling(stiffness, damping)
+    return VirtualCoupling(stiffness / scale, damping / scale)
 
 
 def check_coupling(

@@ -67,7 +67,10 @@ class HapticDevice(Protocol):
         ...
 
     def read(self) -> DevicePose | None:
-        """The newest pose that was not read before; None where there is none."""
+        """The newest pose that was not read before; None where there is none.
+
+        A device at rest still gives poses: one that gives none for 50 ms counts as lost, and its force fades.
+        """
         ...
 
     def write(self, force: FloatArray) -> None:

@@ -47,22 +47,27 @@ class Follower:
     tip into an organ.
     """
 
-    def __init__(self, place: FloatArray, approach_speed: float, speed_largest: float, haptic_step: float) -> None:
-        """Wait at a place [m]; speeds in [m/s], steps of `haptic_step` [s]."""
+    def __init__(
+        self, place: FloatArray, approach_speed: float, speed_largest: float, smoothing: float, haptic_step: float
+    ) -> None:
+        """Wait at a place [m]; speeds in [m/s], smoothing with a time constant [s], steps of `haptic_step` [s]."""
         self.place = place.copy()
         self.approaching = True
         self.limited = False
+        self._share = haptic_step / (haptic_step + smoothing)
         self._approach, self._largest = approach_speed * haptic_step, speed_largest * haptic_step
 
     def follow(self, target: FloatArray) -> None:
         """Go on towards the device's place [m], (3,); `limited` says whether the speed kept it from getting there."""
         x, y, z = (target - self.place).tolist()
         distance, most = math.hypot(x, y, z), self._approach if self.approaching else self._largest
-        self.limited = distance > most
+        wanted = self._share * distance
+        self.limited = wanted > most
         if self.limited:
             self.place = self.place + np.array((x, y, z)) * (most / distance)
-        else:
-            self.place, self.approaching = target, False
+            return
+        self.place = target if self._share == 1.0 else self.place + self._share * (target - self.place)
+        self.approaching = False
 
     def wait(self) -> None:
         """Stay; the next device is approached anew."""

@@ -1,6 +1,6 @@
 """One device that holds one tip through a coupling."""
 
-import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.telemetry import TipTelemetry
 from surgsim_env.haptics.tip_drive import TipDrive
 from surgsim_env.haptics.watchdog import Watchdog
+
+# A pose further from the device's zero than this is no pose [m].
+REACH_LARGEST = 100.0
+# Time constant of the way of a device that does not push [s].
+SMOOTHING = 0.02
 
 
 class HeldTip:
@@ -30,8 +35,14 @@ class HeldTip:
         self.device, self.drive, self.settings = device, drive, settings
         frame, limits = settings.frame, settings.limits
         scale = frame.scale**2
-        self.coupling = settings.coupling or coupling_for(device.dynamics, drive.dynamics, haptic_step)
-        check_coupling(self.coupling, device.dynamics, drive.dynamics, haptic_step, scale)
+        dynamics, smoothing = device.dynamics, settings.smoothing
+        if dynamics is None:
+            smoothing = SMOOTHING if smoothing is None else smoothing
+        elif smoothing:
+            # |x - smoothed x| <= tau |dx/dt| summed over any way, as for a lag of tau.
+            dynamics = replace(dynamics, delay=dynamics.delay + smoothing)
+        self.coupling = settings.coupling or coupling_for(dynamics, drive.dynamics, haptic_step, scale)
+        check_coupling(self.coupling, dynamics, drive.dynamics, haptic_step, scale)
         _check_force("instrument's servo", limits.force_largest, drive.force_largest)
         if device.dynamics is not None:
             _check_force("device", limits.force_largest * frame.scale, device.dynamics.force_largest)
@@ -41,7 +52,9 @@ class HeldTip:
         self._depth = depth
         self._watchdog = Watchdog(settings.watchdog, haptic_step)
         self._slew = SlewLimit(limits.slew_largest, haptic_step)
-        self._follower = Follower(drive.position, settings.approach_speed, settings.speed_largest, haptic_step)
+        self._follower = Follower(
+            drive.position, settings.approach_speed, settings.speed_largest, smoothing or 0.0, haptic_step
+        )
         self.restart()
 
     def restart(self) -> None:
@@ -119,7 +132,8 @@ class HeldTip:
             return
         if pose is None:
             return
-        if not all(map(math.isfinite, pose.position.tolist())):
+        # No comparison with a NaN holds.
+        if not all(abs(value) <= REACH_LARGEST for value in pose.position.tolist()):
             self._refused += 1
             return
         if self._pose is not None:
@@ -140,7 +154,7 @@ class HeldTip:
         return place + self._shift
 
     def _close_jaw(self, buttons: int) -> None:
-        if self.settings.jaw_button is None:
+        if self.settings.jaw_button is None or not self.drive.has_jaw:
             return
         pressed = bool(buttons >> self.settings.jaw_button & 1)
         if pressed != self._pressed:

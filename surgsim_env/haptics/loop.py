@@ -59,27 +59,28 @@ class HapticLoop:
                 f"{len(many)} devices and {len(each)} settings for the {len(drives)} tips of scene {scene.name!r}: "
                 "give one device for each tip, and settings for all or one for each"
             )
-        radius = 0.0 if simulation.instrument.jaw is not None else scene.instrument.tip_radius
-        depth = PressDepth(simulation, radius)
-        self.held = [HeldTip(*parts, depth, dt) for parts in zip(many, drives, each, strict=True)]
+        depths = [PressDepth(simulation, 0.0 if drive.has_jaw else scene.instrument.tip_radius) for drive in drives]
+        self.held = [HeldTip(*parts, dt) for parts in zip(many, drives, each, depths, strict=True)]
         self.fault = simulation.fault
         self._tools = _tools_of_tips(simulation)
+        # The tissue's force on each tip in the last step [N].
+        self._contacts = self._contact_forces()
 
     def step(self) -> HapticTelemetry:
         """Advance by one haptic step, or let go of everything after a fault."""
+        simulation = self.simulation
         if not self.fault:
-            simulation = self.simulation
-            for held, contact in zip(self.held, self._contact_forces(), strict=True):
+            for held, contact in zip(self.held, self._contacts, strict=True):
                 held.step(contact)
             simulation.control_step(1)
             simulation.instrument.refresh()
             self.fault = simulation.fault or simulation.instrument.warning()
+            self._contacts = self._contact_forces()
         if self.fault:
             for held in self.held:
                 held.release()
-        contacts = self._contact_forces()
-        tips = tuple(held.telemetry(contact) for held, contact in zip(self.held, contacts, strict=True))
-        return HapticTelemetry(self.simulation.time, self.fault, tips)
+        tips = tuple(held.telemetry(contact) for held, contact in zip(self.held, self._contacts, strict=True))
+        return HapticTelemetry(simulation.time, self.fault, tips)
 
     def reset(self, organ_model: OrganModel | None = None, tip_position: FloatArray | None = None) -> None:
         """Start anew: forces are zero, and devices are approached slowly from where the tip is put.
@@ -99,6 +100,7 @@ class HapticLoop:
         else:
             simulation.reset(organ_model, place)
         self.fault = simulation.fault
+        self._contacts = self._contact_forces()
         for held in self.held:
             held.restart()
 

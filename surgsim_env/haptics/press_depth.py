@@ -26,11 +26,13 @@ class PressDepth:
         simulation = self._simulation
         if simulation.organ_model is not self._model:
             self._look_at(simulation.organ_model)
-        touched = np.flatnonzero(simulation.organ_state.contact_engaged.max(axis=0)) // QUADRATURE_COUNT
+        engaged = simulation.organ_state.contact_engaged
+        # Of any shape; counted along the last axis.
+        touched = np.flatnonzero(engaged) % engaged.shape[1] // QUADRATURE_COUNT
         if not len(touched):
             return 0.0
         across = tip - self._centres[touched]
-        nearest = int((across * across).sum(axis=1).argmin())
+        nearest = int(np.einsum("tx,tx->t", across, across).argmin())
         return self._radius - float(self._normals[touched[nearest]] @ across[nearest])
 
     def _look_at(self, model: OrganModel) -> None:

@@ -1,5 +1,6 @@
 """What a haptic loop may be told: the coupling, its limits, its watchdog, where the device's frame lies."""
 
+import math
 from dataclasses import dataclass, field
 
 from surgsim_env.haptics.coupling import VirtualCoupling
@@ -19,6 +20,8 @@ class HapticSettings:
         watchdog: how long a device may be silent.
         frame: where the device's frame lies in the scene.
         relative: whether the device's first pose after a reset means where the tip is, whatever frame.origin says.
+        smoothing: time constant of the device's way [s]; None: 0 for a device that pushes, where it counts as lag, and
+            20 ms for one that does not, whose poses may come thirty times a second.
         approach_speed: of the tip towards a device that it is not with yet [m/s].
         speed_largest: at which the tip is told to follow [m/s]; chosen above what a hand does with care.
         jaw_button: bit of `DevicePose.buttons` that closes a jaw while it is pressed; None: none does.
@@ -32,11 +35,14 @@ class HapticSettings:
     watchdog: WatchdogTimes = field(default_factory=WatchdogTimes)
     frame: DeviceFrame = field(default_factory=DeviceFrame)
     relative: bool = False
+    smoothing: float | None = None
     approach_speed: float = 0.05
     speed_largest: float = 1.0
     jaw_button: int | None = 0
 
     def __post_init__(self) -> None:
+        if self.smoothing is not None and not (math.isfinite(self.smoothing) and self.smoothing >= 0.0):
+            raise ValueError(f"haptic smoothing is {self.smoothing!r} s; it must be finite and not negative")
         require_positive("haptic approach_speed", self.approach_speed, "m/s")
         require_positive("haptic speed_largest", self.speed_largest, "m/s")
         if self.jaw_button is not None and self.jaw_button not in range(32):

@@ -17,14 +17,15 @@ class TipTelemetry(NamedTuple):
         coupling_force: of the coupling on the tip, in the scene [N]                          (3,)
         force: on the device, in its own frame [N]                                            (3,)
         contact_force: of the tissue on the tip, in the step that just ended [N]              (3,)
-        depth: of the tip below the organ's resting surface, while it touches [m]
+        depth: of the tip's ball, or of the point between its pads, below the resting surface where it touches [m]; 0
+            without contact
         clamped: the coupling's force is held at its largest
         slewed: the device's force is held back by its largest change
         share: of the force that the watchdog lets through, 0 to 1
         approaching: the tip is on its slow way to the device
         speed_limited: the device is faster than the tip may follow
         workspace_limited: the edge of its workspace holds the tip
-        refused_pose_count: poses with a number that is not finite, so far
+        refused_pose_count: poses with a number that is not finite or beyond 100 m, so far
         device_fault: why the device could not be read or written in this step, or ""
         energy: that the device's hand has put in, less what it got back, since the reset [J]
     """

@@ -27,10 +27,12 @@ class TipDrive(Protocol):
     Fields:
         dynamics: mass and damping that the coupling meets
         force_largest: what it can be pushed with [N]
+        has_jaw: whether it carries a jaw to command
     """
 
     dynamics: TipDynamics
     force_largest: float
+    has_jaw: bool
 
     @property
     def position(self) -> FloatArray:
@@ -79,6 +81,7 @@ class CartesianDrive:
         """
         model, servo = instrument.model, instrument.servo
         self._instrument = instrument
+        self.has_jaw = instrument.jaw is not None
         hold, pace = servo.position[:3], servo.speed[:3]
         joints = model.actuator_trnid[hold, 0]
         slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -139,6 +142,7 @@ class SteeredDrive:
     def __init__(self, steered: SteeredArm, haptic_step: float, turn: int = 0) -> None:
         """Steer an arm in steps of `haptic_step` [s]; two arms take turns, 0 and 1."""
         self._steered = steered
+        self.has_jaw = steered.jaw is not None
         self._haptic_step = haptic_step
         self._first = (turn * STEER_EVERY // 2) % STEER_EVERY
         self._step = 0

@@ -1,0 +1,131 @@
+"""A device that plays a recorded trajectory, and the CSV file that it is recorded in."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.haptics.device import DevicePose, require_positive
+
+COLUMNS = ("time", "x", "y", "z", "buttons")
+# A trajectory of an hour at 1 kHz.
+ROWS_LARGEST = 3_600_000
+
+
+class TrajectoryDevice:
+    """Plays positions over time, linearly between its rows, one haptic step at each `read`; forces are kept, not felt.
+
+    Fields:
+        force: the last that was written [N]                               (3,)
+    """
+
+    dynamics = None
+
+    def __init__(
+        self,
+        time: FloatArray,
+        position: FloatArray,
+        buttons: Sequence[int] | None = None,
+        *,
+        haptic_step: float = 1e-3,
+    ) -> None:
+        """Play a trajectory; its last pose is held when it is over.
+
+        Args:
+            time: of each row [s], growing, (n,).
+            position: in the device's frame [m], (n, 3).
+            buttons: pressed from each row on, (n,); none by default.
+            haptic_step: of the loop that reads it [s].
+
+        Raises:
+            ValueError: shapes that do not fit, a number that is not finite, a time that does not grow (names the row).
+        """
+        require_positive("haptic_step", haptic_step, "s")
+        self._time = np.array(time, dtype=np.float64)
+        self._position = np.array(position, dtype=np.float64)
+        count = len(self._time)
+        self._buttons = np.zeros(count, dtype=np.int64) if buttons is None else np.array(buttons, dtype=np.int64)
+        if self._time.shape != (count,) or count < 1 or self._position.shape != (count, 3):
+            raise ValueError(
+                f"a trajectory has times (n,) and positions (n, 3), n at least 1; these are {self._time.shape} and "
+                f"{self._position.shape}"
+            )
+        if self._buttons.shape != (count,):
+            raise ValueError(f"a trajectory of {count} rows has buttons of shape {self._buttons.shape}; give one a row")
+        finite = np.isfinite(self._time) & np.isfinite(self._position).all(axis=1)
+        if not finite.all():
+            raise ValueError(f"row {np.flatnonzero(~finite)[0]} of the trajectory has a number that is not finite")
+        backward = np.flatnonzero(np.diff(self._time) <= 0.0)
+        if len(backward):
+            row = int(backward[0]) + 1
+            raise ValueError(f"time of row {row} of the trajectory, {self._time[row]:g} s, is not after the row before")
+        self.force = np.zeros(3)
+        self._step = 0
+        self._haptic_step = haptic_step
+
+    @classmethod
+    def load(cls, path: Path, *, haptic_step: float = 1e-3) -> "TrajectoryDevice":
+        """Read a CSV file with a header: time [s], x, y, z [m] and, if it likes, buttons; other columns are left.
+
+        Raises:
+            ValueError: a missing column, a row that is no numbers, too many rows, or what `TrajectoryDevice` refuses;
+                names file and row.
+        """
+        rows: list[list[float]] = []
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            reader = csv.DictReader(file)
+            names = reader.fieldnames or []
+            missing = [name for name in COLUMNS[:4] if name not in names]
+            if missing:
+                raise ValueError(
+                    f"{path.name}: column {missing[0]!r} is missing; a trajectory has {', '.join(COLUMNS)}"
+                )
+            columns = [name for name in COLUMNS if name in names]
+            for number, row in enumerate(reader):
+                if number >= ROWS_LARGEST:
+                    raise ValueError(f"{path.name}: more than {ROWS_LARGEST} rows; cut it into parts")
+                try:
+                    rows.append([float(row[name]) for name in columns])
+                except (TypeError, ValueError):
+                    raise ValueError(f"{path.name}: row {number} is not {', '.join(columns)} in numbers") from None
+        if not rows:
+            raise ValueError(f"{path.name}: no rows below the header")
+        table = np.array(rows)
+        buttons = [int(number) if np.isfinite(number) else 0 for number in table[:, 4]] if len(columns) > 4 else None
+        try:
+            return cls(table[:, 0], table[:, 1:4], buttons, haptic_step=haptic_step)
+        except ValueError as error:
+            raise ValueError(f"{path.name}: {error}") from None
+
+    @property
+    def over(self) -> bool:
+        """Whether the last row has been played."""
+        return self._time[0] + self._step * self._haptic_step > self._time[-1]
+
+    def read(self) -> DevicePose | None:
+        """The pose of the next haptic step."""
+        now = self._time[0] + self._step * self._haptic_step
+        self._step += 1
+        row = int(np.searchsorted(self._time, now, side="right")) - 1
+        place = np.array([np.interp(now, self._time, column) for column in self._position.T])
+        return DevicePose(place, float(now), int(self._buttons[row]))
+
+    def write(self, force: FloatArray) -> None:
+        """Keep the force."""
+        self.force = np.array(force)
+
+    def rewind(self) -> None:
+        """Play from the start again."""
+        self._step = 0
+
+
+def save_trajectory(path: Path, time: FloatArray, position: FloatArray, buttons: Sequence[int] | None = None) -> None:
+    """Write a trajectory that `TrajectoryDevice.load` reads: time [s] (n,), position [m] (n, 3), to the last bit."""
+    pressed = [0] * len(time) if buttons is None else buttons
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for row in zip(np.asarray(time).tolist(), np.asarray(position).tolist(), pressed, strict=True):
+            writer.writerow([repr(row[0]), *map(repr, row[1]), int(row[2])])

@@ -17,13 +17,12 @@ import minari
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.cloning import CloningCurve, CloningOptions, clone, normalise_by, pad
 from agents.training.algorithms import algorithm_class
-from agents.training.policy_files import PolicyDescription, TrainedPolicy, save_policy
+from agents.training.policy_files import PolicyDescription, TrainedPolicy, describe, save_policy
 
 # Episodes are scored on seeds from here on; demonstrations come from lower ones.
 FIRST_SEED = 500_000
@@ -61,15 +60,9 @@ def _new_model(normalisation: VecNormalize, recurrent: bool, width: int) -> Base
 
 
 def _description(model: BaseAlgorithm, normalisation: VecNormalize, dataset: minari.MinariDataset) -> PolicyDescription:
-    spec, statistics = dataset.spec.env_spec, normalisation.obs_rms
-    assert spec is not None and isinstance(statistics, RunningMeanStd)
-    return PolicyDescription(
-        algorithm=type(model).__name__,
-        env_id=spec.id,
-        env_kwargs=dict(spec.kwargs),
-        observation_mean=statistics.mean.tolist(),
-        observation_variance=statistics.var.tolist(),
-    )
+    spec = dataset.spec.env_spec
+    assert spec is not None
+    return describe(model, normalisation, env_id=spec.id, env_kwargs=dict(spec.kwargs))
 
 
 def play(env: gym.Env, policy: TrainedPolicy, seeds: Sequence[int]) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from agents.cloning import CloningOptions, clone, normalise_by
 from agents.expert_palpate import PalpateExpert
 from agents.palpate_surrogate import PalpateSurrogate
 from agents.training.extractors import MemorySummary
-from agents.training.policy_files import PolicyDescription, TrainedPolicy, save_policy
+from agents.training.policy_files import TrainedPolicy, describe, save_policy
 from surgsim_env.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
@@ -132,12 +132,11 @@ def main() -> None:
             f"{time.time() - begin:6.0f} s round {index}: {len(won)} episodes, success {success:.2f}, loss {loss:.5f}",
             flush=True,
         )
-        description = PolicyDescription(
-            algorithm="PPO",
+        description = describe(
+            model,
+            scaled,
             env_id="SurgSim/Palpate-v0",
             env_kwargs={"scene": arguments.scene, "level": "standard", "memory": True},
-            observation_mean=scaled.obs_rms.mean.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
-            observation_variance=scaled.obs_rms.var.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
             trained_steps=len(real),
         )
         save_policy(model, description, arguments.out)

@@ -22,7 +22,7 @@ from agents.expert_palpate import PalpateExpert
 from agents.learn_palpate import ERROR, ERROR_KEPT
 from agents.palpate_surrogate import PalpateSurrogate
 from agents.training.extractors import BEFORE, PlaceAndForce
-from agents.training.policy_files import PolicyDescription, TrainedPolicy, save_policy
+from agents.training.policy_files import TrainedPolicy, describe, save_policy
 from surgsim_env.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {
@@ -41,8 +41,12 @@ def play_episodes(
     policy: TrainedPolicy | None,
     steps: int,
     rng: np.random.Generator,
+    repeat: int,
 ) -> tuple[list[NDArray], list[NDArray], list[NDArray], list[bool]]:
-    """First episode of each environment: its short observations, the expert's actions, weights, success."""
+    """First episode of each environment: its short observations, the expert's actions, weights, success.
+
+    A decision lasts `repeat` control steps; what lies between decisions is left out.
+    """
     observation, _ = envs.reset(seed=int(rng.integers(2**31)))
     begins, running = np.ones(envs.num_envs, dtype=np.bool_), np.ones(envs.num_envs, dtype=np.bool_)
     length, won = np.zeros(envs.num_envs, dtype=np.int64), [False] * envs.num_envs
@@ -50,13 +54,14 @@ def play_episodes(
     if policy is not None:
         policy.reset(envs.num_envs)
     seen, told, weight = [], [], []
-    for _ in range(steps):
-        wanted = expert.act(observation)
-        seen.append(observation[:, :BEFORE])
-        told.append(wanted)
-        weight.append(np.where(observation[:, expert.last] > 0.5, BACK_WEIGHT, 1.0))
+    for step in range(steps):
+        if step % repeat == 0:
+            wanted = expert.act(observation)
+            seen.append(observation[:, :BEFORE])
+            told.append(wanted)
+            weight.append(np.where(observation[:, expert.last] > 0.5, BACK_WEIGHT, 1.0))
+            error = ERROR_KEPT * error + ERROR * rng.normal(size=error.shape) * [1.0, 1.0, 0.5]
         action = wanted.copy() if policy is None else policy.act(observation[:, :BEFORE], begins)
-        error = ERROR_KEPT * error + ERROR * rng.normal(size=error.shape) * [1.0, 1.0, 0.5]
         erring = 0.4 * error * (np.arange(envs.num_envs) % 2 == 0)[:, None]
         action[:, :3] = np.clip(action[:, :3] + erring, -1.0, 1.0)
         length += running
@@ -68,7 +73,7 @@ def play_episodes(
         if not running.any():
             break
     columns = [np.stack(rows, axis=1) for rows in (seen, told, weight)]
-    parts = [[column[index, : length[index]] for index in range(envs.num_envs)] for column in columns]
+    parts = [[column[index, : -(-length[index] // repeat)] for index in range(envs.num_envs)] for column in columns]
     return parts[0], parts[1], parts[2], won
 
 
@@ -80,6 +85,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--envs", type=int, default=192, help="episodes of a round")
     parser.add_argument("--steps", type=int, default=420, help="of an episode at most")
+    parser.add_argument("--repeat", type=int, default=2, help="control steps that a decision lasts")
+    parser.add_argument("--batch-size", type=int, default=8, help="episodes of a gradient step")
     parser.add_argument("--epochs", type=int, default=50, help="of each round")
     parser.add_argument("--seed", type=int, default=2_000_000)
     arguments = parser.parse_args()
@@ -93,12 +100,12 @@ def main() -> None:
     episodes: list[list[NDArray]] = [[], [], []]
     begin, policy = time.time(), None
     for index in range(arguments.rounds):
-        *parts, won = play_episodes(envs, expert, policy, arguments.steps, rng)
+        *parts, won = play_episodes(envs, expert, policy, arguments.steps, rng, arguments.repeat)
         for kept, new in zip(episodes, parts, strict=True):
             kept += new
-        observations, inside = pad(episodes[0], arguments.steps)
-        actions, _ = pad(episodes[1], arguments.steps)
-        weights, _ = pad([one[:, None] for one in episodes[2]], arguments.steps)
+        observations, inside = pad(episodes[0])
+        actions, _ = pad(episodes[1])
+        weights, _ = pad([one[:, None] for one in episodes[2]])
         if index == 0:
             normalise_by(scaled, np.concatenate(episodes[0]))
         curve = clone(
@@ -108,7 +115,12 @@ def main() -> None:
             sample_weight=inside * weights[:, :, 0],
             normalisation=scaled,
             options=CloningOptions(
-                epochs=arguments.epochs, patience=10, batch_size=8, learning_rate=2e-3, std=0.05, seed=index
+                epochs=arguments.epochs,
+                patience=10,
+                batch_size=arguments.batch_size,
+                learning_rate=2e-3,
+                std=0.05,
+                seed=index,
             ),
         )
         print(
@@ -116,12 +128,12 @@ def main() -> None:
             f"loss {curve.validation[curve.best]:.5f}",
             flush=True,
         )
-        description = PolicyDescription(
-            algorithm="RecurrentPPO",
+        description = describe(
+            model,
+            scaled,
             env_id="SurgSim/Palpate-v0",
             env_kwargs={"scene": arguments.scene, "level": "standard", "memory": False},
-            observation_mean=scaled.obs_rms.mean.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
-            observation_variance=scaled.obs_rms.var.tolist(),  # pyright: ignore[reportAttributeAccessIssue]
+            action_repeat=arguments.repeat,
             trained_steps=int(sum(len(one) for one in episodes[0])),
         )
         save_policy(model, description, arguments.out)

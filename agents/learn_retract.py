@@ -26,7 +26,7 @@ import surgsim_env  # noqa: F401  (registers the ids)
 from agents.cloning import CloningOptions
 from agents.dagger import dagger
 from agents.expert_retract import RetractExpert
-from agents.training.policy_files import PolicyDescription, save_policy
+from agents.training.policy_files import describe, save_policy
 from agents.training.wrappers import blinded
 from surgsim_env.stable_baselines import VectorEnvForStableBaselines
 
@@ -102,12 +102,11 @@ def learn(arguments: argparse.Namespace) -> None:
     ):
         rounds.append({**vars(done), "seconds": round(time.time() - began)})
         print(json.dumps(rounds[-1]), flush=True)
-        description = PolicyDescription(
-            algorithm="PPO",
+        description = describe(
+            model,
+            normalisation,
             env_id=ID,
             force_entries=entries,
-            observation_mean=normalisation.obs_rms.mean.tolist(),  # type: ignore[union-attr]
-            observation_variance=normalisation.obs_rms.var.tolist(),  # type: ignore[union-attr]
             trained_steps=done.sample_count,
             seed=arguments.seed,
         )

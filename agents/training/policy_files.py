@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.site_belief import BeliefSettings, SiteBelief
 from agents.training.algorithms import algorithm_class
@@ -47,6 +48,14 @@ class PolicyDescription:
     trained_steps: int = 0
     seed: int = 0
     score: float | None = None
+
+
+def describe(model: BaseAlgorithm, normalisation: VecNormalize | None, **fields: Any) -> PolicyDescription:
+    """The description of a model that sees observations through a normalisation; `fields` say the rest."""
+    if normalisation is not None and normalisation.norm_obs:
+        statistics: Any = normalisation.obs_rms
+        fields |= {"observation_mean": statistics.mean.tolist(), "observation_variance": statistics.var.tolist()}
+    return PolicyDescription(algorithm=type(model).__name__, **fields)
 
 
 class TrainedPolicy:

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from agents.training.algorithms import algorithm_class, keywords, policy_class
 from agents.training.config import TrainingConfig, config_text
 from agents.training.environments import belief_settings, force_entries, make_environments, normalized, training_seed
-from agents.training.policy_files import PolicyDescription, load_policy
+from agents.training.policy_files import PolicyDescription, describe, load_policy
 from agents.training.whole_folders import keep_newest, whole_folders, write_file, write_folder
 
 # The observations that a warm start's mean and variance count for: new ones hardly move what the policy was cloned on.
@@ -53,20 +53,15 @@ class Run:
 
     def description(self, score: float | None = None) -> PolicyDescription:
         """The policy as it is now, in words."""
-        settings, scaled = self.config.environment, self.normalization
-        mean = variance = None
-        if scaled is not None and scaled.norm_obs:
-            statistics: Any = scaled.obs_rms
-            mean, variance = statistics.mean.tolist(), statistics.var.tolist()
-        return PolicyDescription(
-            algorithm=self.config.algorithm,
+        settings = self.config.environment
+        return describe(
+            self.model,
+            self.normalization,
             env_id=settings.id,
             env_kwargs=settings.kwargs,
             action_repeat=settings.action_repeat,
             force_entries=self.blind_entries,
             belief=asdict(belief_settings(self.bare)) if settings.belief else None,
-            observation_mean=mean,
-            observation_variance=variance,
             trained_steps=self.model.num_timesteps,
             seed=self.config.seed,
             score=score,

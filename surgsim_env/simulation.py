@@ -116,10 +116,11 @@ class Simulation:
         """Start with an organ at rest and the tip at rest at a position [m].
 
         Raises:
-            OrganError: the scene's fixed number of substeps is too small for this organ (says how many it needs).
+            OrganError: the scene's fixed number of substeps is too small for this organ (says how many it needs); the
+                simulation goes on with the organ it had.
         """
+        self._check_step(organ_model)
         self.organ_model = organ_model
-        self._check_step()
         self.organ_state = rest_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
         # Where the organ rests: as scanned, or settled under gravity, and how it sticks to what it rests on.
         self._rest_position = self.organ_state.node_position.copy()
@@ -286,8 +287,8 @@ class Simulation:
         self.fault = str(arrays["fault"])
         self._taken = None
 
-    def _check_step(self) -> None:
-        limit = stable_dt(self.organ_model, self.contact)
+    def _check_step(self, organ_model: OrganModel) -> None:
+        limit = stable_dt(organ_model, self.contact)
         needed = substeps_needed(self.haptic_dt, limit)
         if needed > self.substep_count:
             raise OrganError(

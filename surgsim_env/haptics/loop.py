@@ -90,7 +90,7 @@ class HapticLoop:
             tip_position: [m], (3,), or (2, 3) for a pair; where the instrument parks by default.
 
         Raises:
-            OrganError: the scene's number of substeps is too small for this organ.
+            OrganError: the scene's number of substeps is too small for this organ; the loop goes on with its own.
             ValueError: an arm does not reach that place.
         """
         simulation = self.simulation

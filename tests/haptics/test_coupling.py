@@ -1,0 +1,118 @@
+"""How stiff a coupling may be: the limit's own inequality, its known special cases, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from surgsim_env.haptics.coupling import TipDynamics, VirtualCoupling, check_coupling, coupling_for, stiffness_limit
+from surgsim_env.haptics.device import DeviceDynamics
+
+DT = 1e-3
+TIP = TipDynamics(mass=0.14, damping=2.0)
+positive = st.floats(0.01, 20.0)
+lags = st.floats(0.0, 0.01)
+
+
+def margin(stiffness, device, tip, damping):
+    """Least eigenvalue of diag(b_d, b_t) - S (1 1; 1 1) - D (1 1/2; 1/2 0): what is left of the energy taken a step."""
+    shared, late = stiffness * DT / 2 + damping, stiffness * device.lag(DT)
+    taken = np.diag([device.damping, tip.damping])
+    given_back = shared * np.ones((2, 2)) + late * np.array([[1.0, 0.5], [0.5, 0.0]])
+    return np.linalg.eigvalsh(taken - given_back)[0]
+
+
+@given(positive, positive, st.floats(0.0, 0.9), lags)
+def test_limit_is_where_the_energy_taken_ends(mine, other, share, lag):
+    """Independent of the closed form: just below the limit the quadratic form is positive, just above it is not."""
+    device, tip = DeviceDynamics(mine, 0.05, lag), TipDynamics(0.14, other)
+    damping = share * mine * other / (mine + other)
+    limit = stiffness_limit(device, tip, damping, DT)
+    assert limit > 0.0
+    assert margin(0.999 * limit, device, tip, damping) > 0.0 > margin(1.001 * limit, device, tip, damping)
+
+
+@given(positive, st.floats(0.0, 0.9), lags)
+def test_tip_that_stands_still_gives_the_limit_of_colgate_and_schenkel(mine, share, lag):
+    """K <= 2 (b - |B|) / (T + 2 L): Colgate & Schenkel 1997 for L = 0; a sample of lag costs K T of damping."""
+    device = DeviceDynamics(mine, 0.05, lag)
+    limit = stiffness_limit(device, TipDynamics(1.0, 1e9), share * mine, DT)
+    assert limit == pytest.approx(2.0 * (mine - share * mine) / (DT + 2.0 * lag), rel=1e-6)
+
+
+def test_no_coupling_where_its_damper_alone_is_too_much():
+    assert stiffness_limit(DeviceDynamics(0.5, 0.05), TIP, 0.4, DT) == 0.0  # 0.5 * 2 / 2.5
+
+
+def test_rarer_poses_and_delay_cost_stiffness():
+    limits = [
+        stiffness_limit(device, TIP, 0.0, DT)
+        for device in (
+            DeviceDynamics(0.5, 0.05),
+            DeviceDynamics(0.5, 0.05, pose_interval=2e-3),
+            DeviceDynamics(0.5, 0.05, delay=1e-3),
+            DeviceDynamics(0.5, 0.05, delay=1e-3, pose_interval=2e-3),
+        )
+    ]
+    assert limits[0] == pytest.approx(800.0)  # (2 / T) b_d b_t / (b_d + b_t)
+    assert limits[1] == limits[2]
+    assert limits[0] > limits[1] > limits[3]
+
+
+@given(st.floats(0.05, 5.0), lags, st.floats(0.2, 5.0))
+def test_chosen_coupling_is_borne(mine, lag, scale):
+    device = DeviceDynamics(mine, 0.05, lag)
+    coupling = coupling_for(device, TIP, DT, scale)
+    check_coupling(coupling, device, TIP, DT, scale)
+    assert coupling.damping > 0.0
+
+
+def test_chosen_coupling_without_a_device_that_pushes_damps_the_tip():
+    coupling = coupling_for(None, TIP, DT)
+    assert coupling.stiffness == 500.0
+    # Critical: B = 2 sqrt(K m).
+    assert coupling.damping == pytest.approx(2.0 * math.sqrt(500.0 * 0.14))
+    check_coupling(coupling, None, TIP, DT)
+
+
+def test_coupling_stiffer_than_the_limit_is_refused_with_the_limit():
+    device = DeviceDynamics(0.5, 0.05)
+    check_coupling(VirtualCoupling(799.9), device, TIP, DT)
+    with pytest.raises(
+        ValueError, match=r"801 N/m at the device's handle is stiffer than 800 N/m.*lower the stiffness"
+    ):
+        check_coupling(VirtualCoupling(801.0), device, TIP, DT)
+
+
+def test_scaled_motion_stiffens_the_device():
+    """A device whose metre is two of the scene feels 4 K: F_device = 2 F, x = 2 x_device; the tip's damping too."""
+    device = DeviceDynamics(0.5, 0.05)
+    limit = stiffness_limit(device, TipDynamics(0.56, 8.0), 0.0, DT) / 4.0
+    check_coupling(VirtualCoupling(0.999 * limit), device, TIP, DT, scale=4.0)
+    with pytest.raises(ValueError, match="is stiffer than"):
+        check_coupling(VirtualCoupling(1.001 * limit), device, TIP, DT, scale=4.0)
+
+
+def test_coupling_too_stiff_for_the_tip_is_refused():
+    with pytest.raises(ValueError, match=r"too stiff for a tip of 140 g.*at most 2 m, 0\.28 kg, and is 0\.3 kg"):
+        check_coupling(VirtualCoupling(1e5, 100.0), None, TIP, DT)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: VirtualCoupling(0.0), "coupling stiffness is 0.0 N/m"),
+        (lambda: VirtualCoupling(math.nan), "coupling stiffness is nan N/m"),
+        (lambda: VirtualCoupling(100.0, -1.0), "coupling damping is -1.0 N s/m"),
+        (lambda: DeviceDynamics(0.0, 0.05), "device damping is 0.0 N s/m"),
+        (lambda: DeviceDynamics(0.5, math.inf), "device mass is inf kg"),
+        (lambda: DeviceDynamics(0.5, 0.05, delay=-1e-3), "device delay is -0.001 s"),
+        (lambda: DeviceDynamics(0.5, 0.05, pose_interval=0.0), "device pose_interval is 0.0 s"),
+        (lambda: DeviceDynamics(0.5, 0.05, force_largest=0.0), "device force_largest is 0.0 N"),
+    ],
+)
+def test_bad_numbers_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

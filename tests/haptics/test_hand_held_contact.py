@@ -1,0 +1,171 @@
+"""Hand-held contact takes energy and dies out up to the stiffness promised, and not much beyond it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surgsim_env.haptics.coupling import coupling_for, stiffness_limit
+from surgsim_env.haptics.device import DeviceDynamics
+from surgsim_env.haptics.limits import ForceLimits
+from surgsim_env.haptics.loop import HapticLoop
+from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.simulated import Hand, SimulatedDevice
+from surgsim_env.haptics.tip_drive import tip_drives
+from tests.haptics.bench_hand import (
+    DT,
+    START,
+    UndeclaredDevice,
+    bare_settings,
+    held_device,
+    run,
+    touching_simulation,
+)
+
+# What rounding may give back of some millijoules [J].
+ROUNDING = 1e-12
+# What devices are, and how much of the coupling's damper: little and much damping, light and heavy, late by a sample.
+DEVICES = {
+    "usual": ({"damping": 0.5}, 0.125),
+    "no damper": ({"damping": 0.5}, 0.0),
+    "light": ({"damping": 0.1, "mass": 0.01}, 0.025),
+    "heavy": ({"damping": 2.0, "mass": 0.3}, 0.5),
+    "late pose": ({"damping": 0.5, "pose_delay": 1}, 0.125),
+    "late force": ({"damping": 0.5, "force_delay": 1}, 0.125),
+}
+
+
+def limit(simulation, dynamics: DeviceDynamics, damping: float) -> float:
+    (drive,) = tip_drives(simulation.instrument, DT)
+    return stiffness_limit(dynamics, drive.dynamics, damping, DT)
+
+
+def pushed(what: dict, damping: float, share: float, count: int) -> tuple[float, float]:
+    """A hand pushes, the coupling a share of its limit: least energy held [J], speed in the last fifth [m/s]."""
+    simulation = touching_simulation()
+    stiffness = share * limit(simulation, held_device(**what).dynamics, damping)
+    device = held_device(made=UndeclaredDevice, **what)
+    loop = HapticLoop(simulation, device, bare_settings(stiffness, damping))
+    least, late_speed = 0.0, 0.0
+    for step, told in enumerate(run(loop, device, count)):
+        least = min(least, -device.work)
+        if step > 0.8 * count:
+            late_speed = max(late_speed, float(np.abs(device.velocity).max()))
+        if told.fault:
+            return least, np.inf
+    return least, late_speed
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_contact_at_the_limit_takes_energy_and_dies_out(name):
+    """The loop never gives back more than the hand has put in, at the largest stiffness that is not refused."""
+    what, damping = DEVICES[name]
+    least, late_speed = pushed(what, damping, 1.0, 2500)
+    assert least >= -ROUNDING
+    # The press itself begins at some 50 mm/s.
+    assert late_speed < 5e-3
+
+
+@pytest.mark.parametrize("name", [name for name in DEVICES if name != "heavy"])
+def test_limit_is_not_far_from_what_fails(name):
+    """Six times the limit gives energy to the hand without end: the limit is worth having.
+
+    It does not know the device's mass, so that it holds for any hand; a heavy device alone bears more.
+    """
+    what, damping = DEVICES[name]
+    least, late_speed = pushed(what, damping, 6.0, 1500)
+    assert least < -1e-2
+    assert late_speed > 0.1
+
+
+def tapping(device_mass: float, seconds: float, encoder: float) -> None:
+    """A hand taps the phantom once a second with a coupling at its limit; energy is never given, never grows."""
+    simulation = touching_simulation()
+
+    def path(time: float) -> np.ndarray:
+        # 4.5 mm into the phantom and out again.
+        return START - np.array([0.0, 0.0, 2.5e-3 * (1.0 - np.cos(2.0 * np.pi * time))])
+
+    device = SimulatedDevice(
+        mass=device_mass,
+        damping=0.5,
+        haptic_step=DT,
+        position=START,
+        hand=Hand(stiffness=300.0, damping=1.0),
+        path=path,
+        encoder=encoder,
+    )
+    (drive,) = tip_drives(simulation.instrument, DT)
+    chosen = coupling_for(device.dynamics, drive.dynamics, DT)
+    stiffest = limit(simulation, device.dynamics, chosen.damping)
+    loop = HapticLoop(simulation, device, bare_settings(stiffest * (1.0 - 1e-9), chosen.damping))
+    peaks, taken, largest = [], [], 0.0
+    for step, told in enumerate(run(loop, device, round(seconds / DT))):
+        assert not told.fault
+        # Rounded to its encoder the device's place is off by half a count: that much work at the force that acts.
+        slack = ROUNDING + encoder * float(np.abs(told.tip.force).sum())
+        assert -device.work >= -slack
+        largest = max(largest, device.energy())
+        if (step + 1) % 1000 == 0:
+            peaks.append(largest)
+            taken.append(-device.work)
+            largest = 0.0
+    # After the first, gentle taps each is as the one before, and takes energy.
+    assert max(peaks[2:]) < 1.01 * peaks[1]
+    assert (np.diff(taken[1:]) > 0.0).all()
+
+
+@pytest.mark.parametrize("encoder", [0.0, 2e-5])
+def test_ten_seconds_of_tapping_give_no_energy(encoder):
+    tapping(0.05, 10.0, encoder)
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_tapping_give_no_energy():
+    tapping(0.05, 600.0, 0.0)
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_holding_die_out():
+    """A hand that pushes steadily, with no damping of its own: after a minute nothing moves any more."""
+    simulation = touching_simulation()
+    device = held_device()
+    coupling = bare_settings((1.0 - 1e-9) * limit(simulation, device.dynamics, 0.125), 0.125)
+    loop = HapticLoop(simulation, device, coupling)
+    fastest = []
+    for step, told in enumerate(run(loop, device, 600_000)):
+        assert not told.fault
+        assert -device.work >= -ROUNDING
+        if step % 60_000 == 0:
+            fastest.append(0.0)
+        fastest[-1] = max(fastest[-1], float(np.abs(device.velocity).max()))
+    assert max(fastest[1:]) < 1e-6
+
+
+def test_hand_feels_what_the_tissue_gives():
+    """At rest the force on the device is the tissue's on the tip: the servo pushes as the coupling says."""
+    simulation = touching_simulation()
+    device = held_device()
+    loop = HapticLoop(simulation, device, HapticSettings())
+    *_, told = run(loop, device, 6000)
+    tip = told.tip
+    np.testing.assert_allclose(tip.force, tip.contact_force, atol=2e-6)
+    np.testing.assert_allclose(tip.force, [0.0, 0.0, 0.3], atol=2e-6)
+    # Both ends of the spring: the tip lags by F / K.
+    lag = 0.3 / loop.held[0].coupling.stiffness
+    assert tip.tip[2] - device.position[2] == pytest.approx(lag, abs=1e-7)
+    # The ball of 8 mm stood 0.5 mm over the face.
+    assert tip.depth == pytest.approx(START[2] - 5e-4 - tip.tip[2], abs=1e-9)
+
+
+def test_clamped_coupling_takes_energy_too():
+    """A hand of 2 N against a coupling held at 1 N: a spring that gives way gives no energy either."""
+    simulation = touching_simulation()
+    device = held_device(hand=Hand(stiffness=200.0, damping=2.0), path=lambda time: START - [0, 0, min(0.02, time)])
+    settings = replace(bare_settings(400.0, 0.125), limits=ForceLimits(force_largest=1.0, slew_largest=1e5))
+    loop = HapticLoop(simulation, device, settings)
+    for told in run(loop, device, 1500):
+        assert np.linalg.norm(told.tip.force) <= 1.0 + 1e-12
+        assert -device.work >= -ROUNDING
+    assert told.tip.clamped
+    assert np.linalg.norm(told.tip.force) == pytest.approx(1.0)

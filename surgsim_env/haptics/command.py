@@ -20,7 +20,7 @@ from surgsim_env.haptics.telemetry import HapticTelemetry
 from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.haptics.udp import UdpDevice
 from surgsim_env.out_folder import writable_folder
-from surgsim_env.scenes import Scene, load_scene, make_scene
+from surgsim_env.scenes import Scene, load_scene, make_scene, pair_names
 from surgsim_env.simulation import Simulation
 
 TELEMETRY_NAME = "telemetry.csv"
@@ -89,7 +89,7 @@ def _hold(options: Haptics, loop: HapticLoop, device: HapticDevice, pace: Pace, 
 
 def _scene(name: str) -> Scene:
     scene = load_scene(Path(name)) if Path(name).suffix == ".toml" else make_scene(name)
-    if "+" in scene.instrument.model or scene.instrument.model.startswith("psm_pair"):
+    if pair_names(scene.instrument.model) is not None:
         raise ValueError(f"scene {scene.name!r} has two arms; one device holds one tip: choose a scene with one")
     return scene
 

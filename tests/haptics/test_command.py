@@ -1,0 +1,113 @@
+"""`surgsim haptics`: a trajectory and a bridge in real time, what it writes, and what it refuses."""
+
+import csv
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from surgsim_env.cli import main
+from surgsim_env.haptics.pace import BEHIND_LARGEST, Pace
+from surgsim_env.haptics.trajectory import save_trajectory
+from surgsim_env.haptics.udp_client import run
+from surgsim_env.scene_files import scenes_folder
+
+DT = 1e-3
+
+
+class Clock:
+    """Time that passes when it is asked for, and when somebody sleeps."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 1e-6
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        self.now += duration
+
+
+def test_pace_keeps_to_the_clock():
+    clock = Clock()
+    pace = Pace(DT, clock=clock, sleep=clock.sleep)
+    for _ in range(1000):
+        clock.now += 3e-4
+        assert pace.wait() < 5e-6
+    assert clock.now == pytest.approx(1.0, abs=1e-5)
+    assert pace.rate == pytest.approx(1000.0, rel=1e-4)
+    assert pace.skipped == 0
+
+
+def test_pace_catches_up_a_little_and_gives_up_the_rest():
+    clock = Clock()
+    pace = Pace(DT, clock=clock, sleep=clock.sleep)
+    clock.now += 0.0105
+    late = [pace.wait() for _ in range(20)]
+    # 9.5 ms late, and a millisecond less at each step that takes no time.
+    np.testing.assert_allclose(late[:9], 9.5e-3 - DT * np.arange(9), atol=5e-5)
+    assert max(late[10:]) < 5e-5 and pace.skipped == 0
+    clock.now += BEHIND_LARGEST + 0.1
+    pace.wait()
+    assert pace.skipped == pytest.approx(119, abs=1)
+    assert pace.wait() < DT
+    assert pace.lateness(1.0) > 0.1
+
+
+def test_trajectory_runs_to_its_end_and_is_written(tmp_path, capsys):
+    way = np.outer([0, 0, 1, 1], [0.0, 0.0, -0.014])
+    save_trajectory(tmp_path / "press.csv", np.array([0.0, 0.05, 0.45, 0.6]), way)
+    out = tmp_path / "out"
+    arguments = ["haptics", "--scene", "phantom_small", "--trajectory", str(tmp_path / "press.csv"), "--out", str(out)]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "coupling 500 N/m" in said and "haptic steps a second" in said
+    with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 601
+    assert float(rows[-1]["depth"]) > 1e-3
+    assert float(rows[-1]["contact_force_z"]) > 0.02
+    assert sorted(path.name for path in out.iterdir()) == ["telemetry.csv"]
+
+
+def test_bridge_feels_the_organ(capsys):
+    """The example client beside the command: its poses are answered with the force of the press."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    felt: list[float] = []
+    client = threading.Thread(target=lambda: felt.append(run(port, 2.5)))
+    client.start()
+    assert main(["haptics", "--scene", "phantom_small", "--port", str(port), "--seconds", "2.0"]) == 0
+    client.join()
+    assert felt[0] > 0.2
+    assert "accepted=" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--scene", "phantom_smal"], "did you mean 'phantom_small'"),
+        (["--seconds", "0"], "--seconds is 0; it must be above 0"),
+        (["--damping", "1"], "--damping is of a coupling whose --stiffness is given"),
+        (["--device-damping", "0.5", "--stiffness", "2000"], "is stiffer than 800 N/m"),
+        (["--device-damping", "-1"], "device damping is -1.0 N s/m"),
+        (["--force-largest", "30"], "asks for 30 N; the instrument's servo can push with 20 N"),
+        (["--trajectory", "nowhere.csv"], "nowhere.csv"),
+        (["--port", "70000"], "port is 70000"),
+    ],
+)
+def test_bad_input_is_one_line(more, words, capsys):
+    arguments = ["haptics", *([] if "--scene" in more else ["--scene", "phantom_small"]), *more]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1 and "Traceback" not in said
+
+
+def test_two_arms_are_refused(tmp_path, capsys):
+    text = (scenes_folder() / "organs" / "lobe.toml").read_text(encoding="utf-8")
+    (tmp_path / "two.toml").write_text(text.replace("grasper.xml", "psm_pair"), encoding="utf-8")
+    assert main(["haptics", "--scene", str(tmp_path / "two.toml")]) == 2
+    assert "has two arms; one device holds one tip" in capsys.readouterr().err

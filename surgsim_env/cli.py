@@ -1,4 +1,4 @@
-"""The command line: `surgsim palpate`, `retract`, `arms`, `organ`, `scenes`, `validate`, `bench`, `haptics`."""
+"""The command line: `surgsim palpate`, `retract`, `arms`, `organ`, `scenes`, `validate`, `bench`, `haptics`, `view`."""
 
 import contextlib
 import io
@@ -18,6 +18,7 @@ from msdm_core.length_unit import LengthUnit
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.haptics.options import Haptics
+from surgsim_env.live.options import View
 from surgsim_env.out_folder import writable_folder
 from surgsim_env.scenes import Ball, Scene, list_scenes, load_scene, make_scene
 
@@ -180,6 +181,7 @@ Command = (
     | Annotated[Validate, tyro.conf.subcommand("validate")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Haptics, tyro.conf.subcommand("haptics")]
+    | Annotated[View, tyro.conf.subcommand("view")]
 )
 
 
@@ -209,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench | Haptics) -> int:
+def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench | Haptics | View) -> int:
     console = Console()
     if isinstance(command, Palpate):
         _palpate(command, console)
@@ -234,6 +236,10 @@ def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench |
         from surgsim_env.haptics.command import run_haptics
 
         run_haptics(command, console)
+    elif isinstance(command, View):
+        from surgsim_env.live.command import view
+
+        return view(command, console)
     elif isinstance(command, Organ):
         from surgsim_env.organ_report import report_organ
 

@@ -64,6 +64,7 @@ HEAVY = {
     "torch",
     "trimesh",
     "tyro",
+    "viser",
 }
 
 
@@ -198,7 +199,7 @@ def pictures_are_asked_for(source: Source) -> Iterator[str]:
     may = (
         *("surgsim_env/rendering/", "surgsim_env/__init__.py", "surgsim_env/surgical_env.py", "surgsim_env/cli.py"),
         *("surgsim_env/evaluation/arms.py", "surgsim_env/evaluation/arm_pictures.py"),
-        *("surgsim_env/scripting/retract_command.py", "surgsim_env/evaluation/episodes.py"),
+        *("surgsim_env/scripting/retract_command.py", "surgsim_env/evaluation/episodes.py", "surgsim_env/live/"),
     )
     if not source.path.startswith(may):
         for name, line in imported(source.tree):
@@ -211,6 +212,14 @@ def scripts_stand_on_top(source: Source) -> Iterator[str]:
     if not source.path.startswith("surgsim_env/scripting/") and source.path not in SCRIPT_USERS:
         for name, line in imported(source.tree):
             if name.startswith("surgsim_env.scripting"):
+                yield f"line {line} imports {name}"
+
+
+def live_stands_on_top(source: Source) -> Iterator[str]:
+    """A live session runs what is below it; nothing but the command line knows of it."""
+    if not source.path.startswith("surgsim_env/live/") and source.path != "surgsim_env/cli.py":
+        for name, line in imported(source.tree):
+            if name.startswith("surgsim_env.live"):
                 yield f"line {line} imports {name}"
 
 
@@ -244,6 +253,7 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     arms_know_no_task,
     pictures_are_asked_for,
     scripts_stand_on_top,
+    live_stands_on_top,
     short_enough,
     named_for_what_it_does,
 )
@@ -301,6 +311,7 @@ PLANTED = [
     (pictures_are_asked_for, "surgsim_env/simulation.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (arms_know_no_task, "surgsim_env/evaluation/reach.py", "from surgsim_env.simulation import Simulation"),
     (scripts_stand_on_top, "surgsim_env/env.py", "from surgsim_env.scripting.run import run_script"),
+    (live_stands_on_top, "surgsim_env/haptics/loop.py", "from surgsim_env.live.session import Session"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
     (short_enough, "msdm_core/organ.py", "def f():\n" + "    x = 1\n" * LINES_PER_FUNCTION),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),
@@ -318,6 +329,7 @@ ALLOWED = [
     (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.environment_words import WORDS"),
     (pictures_are_asked_for, "surgsim_env/surgical_env.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (scripts_stand_on_top, "surgsim_env/scripting/run.py", "from surgsim_env.scripting.trace import Trace"),
+    (live_stands_on_top, "surgsim_env/cli.py", "from surgsim_env.live.command import view"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * LINES_PER_FILE),
     (named_for_what_it_does, "msdm_core/mesh_io.py", ""),
 ]

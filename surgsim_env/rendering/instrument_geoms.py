@@ -44,7 +44,7 @@ def shown_geoms(model: mujoco.MjModel) -> list[int]:
     for geom in range(model.ngeom):
         group, body = int(model.geom_group[geom]), int(model.geom_bodyid[geom])
         wanted = group < CONTACT_GROUP or (group == CONTACT_GROUP and body not in dressed)
-        if wanted and _is_drawn(model, geom) and _colour(model, geom)[3] > 0.0:
+        if wanted and _is_drawn(model, geom) and geom_colour(model, geom)[3] > 0.0:
             shown.append(geom)
     return shown
 
@@ -56,7 +56,7 @@ def add_instrument(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         added = spec.worldbody.add_geom(
             name=_name(model, geom),
             type=mujoco.mjtGeom(kind),
-            rgba=_colour(model, geom),
+            rgba=geom_colour(model, geom),
             material=_cloth(spec) if _is_support(model, geom) else _material(spec, model, int(model.geom_matid[geom])),
             contype=0,
             conaffinity=0,
@@ -101,7 +101,8 @@ def _cloth(spec: mujoco.MjSpec) -> str:
     return name
 
 
-def _colour(model: mujoco.MjModel, geom: int) -> FloatArray:
+def geom_colour(model: mujoco.MjModel, geom: int) -> FloatArray:
+    """Red, green, blue and opacity of a geom, its material's where it has none of its own, shape (4,)."""
     colour, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     if material >= 0 and np.array_equal(colour, _NO_COLOUR):
         colour = model.mat_rgba[material]

@@ -34,7 +34,7 @@ class Tissue:
     def __init__(self, anatomy: Anatomy, surface: DrawnSurface, lesions: Sequence[Lesion], cut_away: bool) -> None:
         """Lesions are ellipsoids; those that are tagged regions of the mesh are left out."""
         self._rest, self._surface = anatomy.mesh.points, surface
-        self.lesions = [_ball(self._rest, lesion) for lesion in lesions if lesion.centre is not None]
+        self.lesions = [lesion_ball(self._rest, lesion) for lesion in lesions if lesion.centre is not None]
         held = np.isin(surface.triangles, anatomy.anchors).all(axis=1)
         held = np.repeat(held, surface.splits**2)
         self._faces = {"organ": surface.faces[~held], "held": surface.faces[held]}
@@ -99,7 +99,8 @@ def cut_plane(anatomy: Anatomy, lesions: Sequence[LesionBall]) -> tuple[FloatArr
     return (lesions[0].centre if lesions else face), cut_direction(anatomy)
 
 
-def _ball(rest: FloatArray, lesion: Lesion) -> LesionBall:
+def lesion_ball(rest: FloatArray, lesion: Lesion) -> LesionBall:
+    """An ellipsoidal lesion in an organ whose nodes rest at `rest` [m], (n_node, 3)."""
     centre = np.asarray(lesion.centre, dtype=np.float64)
     distance = np.linalg.norm((rest - centre) / lesion.half_axes, axis=1)
     nodes = np.flatnonzero(distance <= max(1.0, float(distance.min())))

@@ -1,0 +1,206 @@
+"""A viser server that cannot be reached but through the gate, and never opens a tunnel."""
+
+import asyncio
+import http
+import threading
+from collections.abc import Awaitable, Callable
+from contextlib import contextmanager
+from importlib.resources import files
+from typing import Any
+from unittest import mock
+
+import viser
+import viser.infra
+import websockets.asyncio.server
+from viser import _messages
+from websockets import Headers
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from surgsim_env.live.gate import Gate, asks_for_socket, listening_socket, names_of, refuse
+from surgsim_env.live.hand_messages import HAND_PATH
+from surgsim_env.live.web_messages import Judge, NonsenseError
+
+# What one client may send at once [bytes]: a pose, a slider, where its camera stands.
+MESSAGE_SIZE_MOST = 16 * 1024
+# Sockets that may be open at the same time; a tab has two.
+SOCKETS_MOST = 16
+# How long a client may be silent to a ping before it is given up [s].
+PING_INTERVAL = 10.0
+
+HandServer = Callable[[ServerConnection], Awaitable[None]]
+
+
+class GuardedServer:
+    """A viser server whose every request passes a `Gate`, and whose every message passes a `Judge`.
+
+    viser 1.1 binds all interfaces, takes any Origin, and lets any client ask for a public tunnel. It calls
+    `websockets.asyncio.server.serve` once, from its constructor: that call is taken over here. Where a later viser does
+    not make it, nothing is served.
+
+    Fields:
+        viser: the server whose scene and panel are filled
+        gate: who may connect
+        judge: which messages are let through
+        address: what to open, token included
+    """
+
+    def __init__(self, host: str, port: int, *, remote: bool, judge: Judge, serve_hand: HandServer) -> None:
+        """Listen.
+
+        Args:
+            host: address to listen on.
+            port: 0 takes a free one.
+            remote: whether other machines may connect.
+            judge: of messages.
+            serve_hand: takes over the sockets that keyboards and gamepads steer through.
+
+        Raises:
+            ValueError: an address that is not to be had, or reaches beyond this machine without `remote`.
+            RuntimeError: a version of viser that would answer beside the gate.
+        """
+        self._listening = listening_socket(host, port, remote=remote)
+        bound_port = self._listening.getsockname()[1]
+        self.gate = Gate(bound_port, names_of(host, remote=remote), remote)
+        self.judge, self._serve_hand = judge, serve_hand
+        self._guards = 0
+        with self._taking_over_serve():
+            self.viser = viser.ViserServer(host=host, port=bound_port, label="surgsim", verbose=False)
+        if self._guards != 1:
+            self.viser.stop()
+            self._listening.close()
+            raise RuntimeError(
+                f"viser {viser.__version__} serves in a way that surgsim cannot guard: install viser>=1.1,<1.2"
+            )
+        self._forget_tunnels()
+        shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
+        shown = f"[{shown}]" if ":" in shown else shown
+        self.address = f"http://{shown}:{bound_port}/?token={self.gate.token}"
+
+    def stop(self) -> None:
+        """Close every socket and the door."""
+        self.viser.stop()
+        self._listening.close()
+
+    @contextmanager
+    def _taking_over_serve(self):
+        real = websockets.asyncio.server.serve
+
+        def serve(handler: Any, host: str, port: int, **given: Any) -> Any:
+            self._guards += 1
+            for name in ("max_size", "create_connection", "ping_interval", "open_timeout"):
+                given.pop(name, None)
+            return real(
+                self._dispatch(handler),
+                sock=self._listening,
+                max_size=MESSAGE_SIZE_MOST,
+                ping_interval=PING_INTERVAL,
+                ping_timeout=PING_INTERVAL,
+                open_timeout=PING_INTERVAL,
+                create_connection=self._connection_type(),
+                process_request=self._answer(given.pop("process_request")),
+                **given,
+            )
+
+        # viser's own thread makes the call; nobody else may serve in between.
+        with _SERVING, mock.patch.object(websockets.asyncio.server, "serve", serve), _without_announcement():
+            yield
+
+    def _answer(self, viser_answer: Callable[..., Response | None]) -> Callable[..., Response | None]:
+        """What is answered to a request: a refusal, viser's page, or None to open a socket."""
+
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
+            refusal = self.gate.refusal(request)
+            if refusal is not None:
+                return refusal
+            if asks_for_socket(request):
+                if len(connection.server.connections) > SOCKETS_MOST:
+                    return refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{SOCKETS_MOST} sockets are open already")
+                return None
+            # Not packed: there is a script to put in.
+            del request.headers["Accept-Encoding"]
+            response = viser_answer(connection, request)
+            if response is None:
+                return refuse(http.HTTPStatus.BAD_REQUEST, "no request for a page or a socket")
+            if response.status_code == http.HTTPStatus.OK and request.path.partition("?")[0] == "/":
+                response = _with_script(response)
+            self.gate.welcome(request, response)
+            return response
+
+        return answer
+
+    def _dispatch(self, viser_handler: Callable[..., Awaitable[None]]) -> Callable[[ServerConnection], Awaitable[None]]:
+        async def handle(connection: ServerConnection) -> None:
+            assert connection.request is not None
+            if connection.request.path.partition("?")[0] == HAND_PATH:
+                await self._serve_hand(connection)
+            else:
+                await viser_handler(connection)
+
+        return handle
+
+    def _connection_type(self) -> type[ServerConnection]:
+        judge = self.judge
+
+        class JudgedConnection(ServerConnection):
+            """A connection whose messages are judged before viser decodes them; nonsense closes it."""
+
+            def __init__(self, *given: Any, **named: Any) -> None:
+                super().__init__(*given, **named)
+                self._pace = judge.new_pace()
+
+            async def recv(self, decode: bool | None = None) -> Any:
+                while True:
+                    message = await super().recv(decode)
+                    try:
+                        self._pace.count()
+                        if self.request is not None and self.request.path.partition("?")[0] == HAND_PATH:
+                            return message
+                        if judge.lets_through(message):
+                            return message
+                    except NonsenseError as error:
+                        judge.dropped += 1
+                        await self.close(1008, str(error)[:100])
+
+        return JudgedConnection
+
+    def _forget_tunnels(self) -> None:
+        """Take away viser's handlers that open a public tunnel when a client asks; and the way to open one."""
+        handlers = self.viser._websock_server._incoming_handlers
+        for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+            handlers.pop(kind, None)
+
+        def no_tunnel(*_: Any, **__: Any) -> None:
+            raise RuntimeError("surgsim never opens a public tunnel: use SSH to reach the page from elsewhere")
+
+        self.viser.request_share_url = no_tunnel  # type: ignore[method-assign]
+
+
+_SERVING = threading.Lock()
+
+
+@contextmanager
+def _without_announcement():
+    """Viser prints an address without the token; ours is printed instead."""
+    with mock.patch("rich.print", lambda *_, **__: None):
+        yield
+
+
+def _with_script(response: Response) -> Response:
+    """The page with the script that reads keys and gamepads."""
+    script = files("surgsim_env.live").joinpath("hand.js").read_bytes()
+    head, mark, rest = response.body.partition(b"</head>")
+    if not mark:
+        raise RuntimeError(f"viser {viser.__version__} has a page without a head: install viser>=1.1,<1.2")
+    body = head + b"<script>" + script + b"</script>" + mark + rest
+    headers = Headers(response.headers)
+    for name in ("Content-Length", "Content-Encoding"):
+        if name in headers:
+            del headers[name]
+    headers["Content-Length"] = str(len(body))
+    return Response(response.status_code, response.reason_phrase, headers, body)
+
+
+def close_soon(connection: ServerConnection, code: int, reason: str) -> "asyncio.Task[None]":
+    """Close a connection without waiting for its end."""
+    return asyncio.get_running_loop().create_task(connection.close(code, reason))

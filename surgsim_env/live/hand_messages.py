@@ -1,0 +1,45 @@
+"""What keyboards and gamepads say: how fast the tip shall go, in a packet of 16 bytes that `hand.js` sends."""
+
+import math
+import struct
+from dataclasses import dataclass
+
+from surgsim_env.live.web_messages import NonsenseError
+
+HAND_PATH = "/hand"
+# Little-endian: along the view's right, away from the viewer, out of the organ, each -1 to 1; which arm, 0 or 1; 1 to
+# turn its jaw from open to closed or back, else 0.
+_PACKET = struct.Struct("<3fHH")
+PACKET_SIZE = _PACKET.size
+AXIS_SLACK = 1e-6
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """Where a hand pushes: right, away and out, each -1 to 1; which arm it moves, and whether its jaw shall change."""
+
+    axes: tuple[float, float, float]
+    arm: int
+    turns_jaw: bool = False
+
+
+def read_hand(message: object, *, arm_count: int) -> HandMotion:
+    """The motion that a packet asks for.
+
+    Raises:
+        NonsenseError: another size, a number that is not finite or beyond 1, an arm that there is not.
+    """
+    if not isinstance(message, bytes) or len(message) != PACKET_SIZE:
+        raise NonsenseError(f"a hand sends {PACKET_SIZE} bytes at a time")
+    *axes, arm, turns_jaw = _PACKET.unpack(message)
+    if not all(math.isfinite(axis) and abs(axis) <= 1.0 + AXIS_SLACK for axis in axes):
+        raise NonsenseError("a hand's axes are from -1 to 1")
+    if arm >= arm_count or turns_jaw > 1:
+        raise NonsenseError(f"arm {arm} of {arm_count}, jaw {turns_jaw}")
+    right, away, out = axes
+    return HandMotion((right, away, out), arm, bool(turns_jaw))
+
+
+def write_hand(motion: HandMotion) -> bytes:
+    """The packet that says a motion."""
+    return _PACKET.pack(*motion.axes, motion.arm, motion.turns_jaw)

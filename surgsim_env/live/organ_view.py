@@ -1,0 +1,143 @@
+"""The organ on the page: its surface as it deforms, what was felt painted on it, and the lesions it hides."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from msdm_core.regions import Lesion
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.live.felt_map import FeltMap
+from surgsim_env.live.instrument_view import SCALE
+from surgsim_env.rendering.surface import drawn_surface
+from surgsim_env.rendering.tissue import lesion_ball
+
+ORGAN_COLOUR, LESION_COLOUR = (158, 58, 50), (250, 214, 120)
+# Contrast from the first to the last colour, in medians of what was felt softest; colours from soft to stiff.
+CONTRASTS = (0.75, 2.25)
+COLOURS = (
+    (45, 67, 148),
+    (42, 120, 173),
+    (49, 168, 160),
+    (116, 198, 118),
+    (205, 216, 85),
+    (248, 184, 62),
+    (240, 117, 48),
+    (205, 46, 46),
+)
+# The paint lies this far above the surface [m].
+PAINT_ABOVE = 0.0004
+
+
+class OrganView:
+    """Nodes of a viser scene for an organ, its paint, and its lesions."""
+
+    def __init__(self, scene: Any, anatomy: Anatomy) -> None:
+        """Add the organ at rest."""
+        self._scene, self._points = scene, anatomy.mesh.points
+        self._surface = drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+        vertices, _ = self._surface.follow(anatomy.mesh.points)
+        self._organ = scene.add_mesh_simple(
+            "/organ", _scaled(vertices), self._surface.faces.astype(np.uint32), color=ORGAN_COLOUR
+        )
+        self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(COLOURS)]
+        self._painted = -1
+        self.paints = True
+        self._lesions: list[tuple[Any, Any]] = []
+
+    def follow(self, node_position: FloatArray) -> None:
+        """Take the surface where the nodes are [m], (n_node, 3)."""
+        vertices, normals = self._surface.follow(node_position)
+        self._organ.vertices = _scaled(vertices)
+        if self.paints:
+            above = _scaled(vertices + PAINT_ABOVE * normals)
+            for paint in self._paint:
+                paint.follow(above)
+        for ball, node in self._lesions:
+            node.position = ball.centre_now(self._points, node_position) * SCALE
+
+    def paint(self, felt: FeltMap) -> None:
+        """Colour what was felt since the last time; the softest of it is blue."""
+        if not self.paints or felt.version == self._painted:
+            return
+        self._painted = felt.version
+        value = np.full(len(self._points), np.nan)
+        known = felt.felt
+        value[felt.nodes[known]] = felt.contrast[known]
+        corner = value[self._surface.corner_node]
+        vertex = self._surface.weights @ np.nan_to_num(corner)
+        vertex[self._surface.weights @ np.isnan(corner).astype(np.float64) > 1e-9] = np.nan
+        face = vertex[self._surface.faces].mean(axis=1)
+        level = colour_levels(face)
+        for index, paint in enumerate(self._paint):
+            paint.cover(self._surface.faces[level == index])
+
+    def show_paint(self, on: bool) -> None:
+        """Show or hide what was felt."""
+        self.paints, self._painted = on, -1
+        if not on:
+            for paint in self._paint:
+                paint.cover(np.zeros((0, 3), dtype=np.int32))
+
+    def show_lesions(self, lesions: Sequence[Lesion]) -> None:
+        """Show lesions inside an organ that is seen through; none: it is not."""
+        for _, node in self._lesions:
+            node.remove()
+        self._lesions = []
+        self._organ.opacity = 0.45 if lesions else None
+        for index, lesion in enumerate(lesions):
+            ball = lesion_ball(self._points, lesion)
+            node = self._scene.add_icosphere(
+                f"/lesion/{index}",
+                radius=float(ball.half_axes.max()) * SCALE,
+                color=LESION_COLOUR,
+                position=ball.centre * SCALE,
+            )
+            self._lesions.append((ball, node))
+
+
+class _Paint:
+    """One colour's part of the surface."""
+
+    def __init__(self, scene: Any, name: str, colour: tuple[int, int, int]) -> None:
+        self._scene, self._name, self._colour = scene, name, colour
+        self._used = np.zeros(0, dtype=np.int64)
+        self._node: Any = None
+        self._local = None
+
+    def cover(self, faces: np.ndarray) -> None:
+        self._used, local = np.unique(faces, return_inverse=True)
+        self._local: np.ndarray | None = local.reshape(-1, 3).astype(np.uint32)
+
+    def follow(self, vertices: np.ndarray) -> None:
+        if self._node is None:
+            if len(self._used):
+                self._node = self._scene.add_mesh_simple(
+                    self._name, vertices[self._used], self._local, color=self._colour, cast_shadow=False
+                )
+                self._local = None
+            return
+        if self._local is not None:
+            self._node.visible = bool(len(self._used))
+        if not len(self._used):
+            return
+        self._node.vertices = vertices[self._used]
+        if self._local is not None:
+            self._node.faces, self._local = self._local, None
+
+
+def colour_levels(contrast: FloatArray) -> np.ndarray:
+    """Which of COLOURS shows each contrast, -1 where it is NaN: relative to the lower quartile of what was felt."""
+    level = np.full(len(contrast), -1)
+    known = np.isfinite(contrast)
+    if known.any():
+        low, high = CONTRASTS
+        reference = np.quantile(contrast[known], 0.25)
+        share = (contrast[known] / max(reference, 1e-12) - low) / (high - low)
+        level[known] = np.clip((share * len(COLOURS)).astype(np.int64), 0, len(COLOURS) - 1)
+    return level
+
+
+def _scaled(vertices: FloatArray) -> np.ndarray:
+    return (vertices * SCALE).astype(np.float32)

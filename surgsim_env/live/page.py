@@ -1,0 +1,249 @@
+"""The page: what the picture shows of frames, what the panel asks of the session, thirty times a second."""
+
+import asyncio
+import html
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.server import ServerConnection
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.live.exchange_records import Phase
+from surgsim_env.live.felt_map import FeltMap
+from surgsim_env.live.guarded_server import GuardedServer
+from surgsim_env.live.hand_messages import read_hand
+from surgsim_env.live.instrument_view import SCALE, InstrumentView
+from surgsim_env.live.organ_choice import chosen_lesions
+from surgsim_env.live.organ_view import OrganView
+from surgsim_env.live.pacing import timeliness
+from surgsim_env.live.panel import Panel
+from surgsim_env.live.recording import write_recording
+from surgsim_env.live.requests import Change, Pause, Record, Replay, Reset
+from surgsim_env.live.session import Session
+from surgsim_env.live.stage import add_force_arrows, add_handle, prepare
+from surgsim_env.live.web_messages import Judge, NonsenseError
+
+# Pictures, plots and words a second.
+PICTURE_RATE, PLOT_RATE, STATUS_RATE = 30.0, 10.0, 2.0
+FORCE_LENGTH = 0.06  # of the arrow [m/N]
+TITLES = {
+    Phase.STARTING: "starting",
+    Phase.RUNNING: "running",
+    Phase.PAUSED: "paused",
+    Phase.FAULT: "stopped by a fault: press Reset",
+    Phase.ENDED: "ended",
+}
+
+
+class Page:
+    """A session on a guarded viser server.
+
+    Fields:
+        session, server: both ends
+        felt: what the tips have felt of this organ
+        pictures: how many were made
+    """
+
+    def __init__(self, session: Session, *, host: str, port: int, remote: bool, out: Path) -> None:
+        """Serve.
+
+        Args:
+            session: that has begun.
+            host: see `GuardedServer`.
+            port: see `GuardedServer`.
+            remote: see `GuardedServer`.
+            out: folder that recordings are written to.
+
+        Raises:
+            ValueError: an address that is not to be had.
+        """
+        self.session, self._out = session, out
+        self._judge = Judge()
+        self.server = GuardedServer(host, port, remote=remote, judge=self._judge, serve_hand=self._serve_hand)
+        self.felt = FeltMap(session.anatomy)
+        self.pictures = 0
+        self._organ_number, self._traced = 1, 0
+        self._grabs: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._held: set[int] = set()
+        self._shows_lesions = False
+        self._was_recording = False
+        self._said = ""
+        viser = self.server.viser
+        with viser.atomic():
+            session.directions = prepare(viser, session.anatomy)
+            self._organ = OrganView(viser.scene, session.anatomy)
+            model = session.instrument.model
+            self._instrument = InstrumentView(viser.scene, model, session.geoms, session.arm_count)
+            self._judge.nodes.update(self._instrument.on_drag(self._dragged))
+            self._handles = [
+                add_handle(viser.scene, arm, place, session.directions, self._pulled)
+                for arm, place in enumerate(session.parked)
+            ]
+            self._judge.nodes.update(handle.name for handle in self._handles)
+            self._arrows = add_force_arrows(viser.scene, session.arm_count)
+            calls = {
+                "pause": lambda on: session.ask(Pause(on)),
+                "reset": self._reset,
+                "record": lambda on: session.ask(Record(on)),
+                "replay": lambda on: session.ask(Replay(on)),
+                "show_lesions": self._show_lesions,
+                "paint": self._show_paint,
+                "clear_map": self.felt.clear,
+                "close_jaw": session.close_jaw,
+            }
+            self._panel = Panel(
+                viser.gui, self._judge, session.scene, session.arm_count, session.instrument.jaw is not None, calls
+            )
+
+    def run(self, until: Callable[[], bool]) -> None:
+        """Make pictures until told to stop, or the physics is gone.
+
+        Raises:
+            RuntimeError: the physics died.
+        """
+        due = time.monotonic()
+        self._before, self._pictures_before = self.session.timing(), 0
+        plot_every, status_every = round(PICTURE_RATE / PLOT_RATE), round(PICTURE_RATE / STATUS_RATE)
+        count = 0
+        while not until():
+            if not self.session.alive:
+                raise RuntimeError("the physics' process died: its own message stands above")
+            count += 1
+            frame = self.session.frame()
+            self._attend(frame)
+            if self.server.viser.get_clients():
+                with self.server.viser.atomic():
+                    self._show(frame)
+                    if count % plot_every == 0:
+                        self._panel.plot(self.session.trace())
+                self.pictures += 1
+            if count % status_every == 0:
+                self._say(frame)
+            due = max(due + 1.0 / PICTURE_RATE, time.monotonic() - 1.0 / PICTURE_RATE)
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def _pulled(self, arm: int, phase: str, place: FloatArray) -> None:
+        """A hand's own handle is pulled to a place [m]."""
+        if phase == "start":
+            self._held.add(arm)
+        self.session.move_to(arm, place)
+        if phase == "end":
+            self._held.discard(arm)
+
+    def _dragged(self, arm: int, phase: str, pointer: FloatArray) -> None:
+        """The instrument itself is dragged across the view."""
+        if phase == "start" or arm not in self._grabs:
+            self._grabs[arm] = (self.session.targets[arm], pointer)
+        start, grabbed = self._grabs[arm]
+        self.session.move_to(arm, start + pointer - grabbed)
+        if phase == "end":
+            del self._grabs[arm]
+
+    async def _serve_hand(self, connection: ServerConnection) -> None:
+        """Keys and sticks of one tab."""
+        async for message in _messages(connection):
+            try:
+                self.session.push(read_hand(message, arm_count=max(2, self.session.arm_count)))
+            except NonsenseError as error:
+                self._judge.dropped += 1
+                await connection.close(1008, str(error)[:100])
+
+    def _reset(self) -> None:
+        self.session.park()
+        self.session.ask(Reset())
+
+    def _show_lesions(self, on: bool) -> None:
+        self._shows_lesions = on
+        with self.server.viser.atomic():
+            self._organ.show_lesions(chosen_lesions(self.session.anatomy, self.session.choice) if on else [])
+
+    def _show_paint(self, on: bool) -> None:
+        self._organ.show_paint(on)
+
+    def _attend(self, frame: np.ndarray) -> None:
+        """What is to be done whether anybody looks or not: touches felt, sliders heeded, recordings written."""
+        session = self.session
+        choice = self._panel.settled_choice()
+        if choice is not None and choice != session.choice:
+            session.park()
+            session.ask(Change(choice))
+        if int(frame["organ"]) != self._organ_number:
+            self._organ_number = int(frame["organ"])
+            self.felt.clear()
+            if self._shows_lesions:
+                self._show_lesions(True)
+        self._feel()
+        recording = bool(frame["recording"])
+        if self._was_recording and not recording:
+            self._said = write_recording(session.exchange.recorded.steps.copy(), self._out)
+        self._was_recording = recording
+
+    def _feel(self) -> None:
+        """Take the trace's new rows into the map."""
+        trace = self.session.exchange.trace.read()
+        count = int(trace["count"])
+        self._traced = min(self._traced, count)
+        rows = trace["row"]
+        for index in range(max(self._traced, count - len(rows)), count):
+            row = rows[index % len(rows)]
+            for arm in range(self.session.arm_count):
+                self.felt.feel(row["tip"][arm], float(row["depth"][arm]), float(np.linalg.norm(row["force"][arm])))
+        self._traced = count
+
+    def _show(self, frame: np.ndarray) -> None:
+        """One picture."""
+        self._organ.paint(self.felt)
+        self._organ.follow(frame["node"].astype(np.float64))
+        self._instrument.follow(frame["geom"], frame["turn"])
+        tip, force = frame["tip"], frame["force"]
+        self._arrows.points = (np.stack([tip, tip + FORCE_LENGTH * force], axis=1) * SCALE).astype(np.float32)
+        targets = self.session.targets
+        for arm, handle in enumerate(self._handles):
+            if arm not in self._held and np.abs(handle.position / SCALE - targets[arm]).max() > 1e-6:
+                handle.position = targets[arm] * SCALE
+
+    def _say(self, frame: np.ndarray) -> None:
+        """How it goes, in words and figures."""
+        now, pictures = self.session.timing(), self.pictures
+        wall = now[1] - self._before[1]
+        kept = timeliness(self._before[0], now[0], wall)
+        fps = (pictures - self._pictures_before) / wall
+        self._before, self._pictures_before = now, pictures
+        phase = Phase(int(frame["phase"]))
+        headline = "replaying" if frame["replaying"] else "recording" if frame["recording"] else TITLES[phase]
+        rows = [
+            ("simulated time", f"{float(frame['time']):.1f} s"),
+            ("physics", f"{kept.rate:.0f} steps/s"),
+            ("real-time factor", f"{kept.real_time:.3f}"),
+            ("late, median / 99 %", f"{kept.late_p50 * 1e3:.2f} / {kept.late_p99 * 1e3:.2f} ms"),
+            ("a step takes", f"{kept.spent_p50 * 1e3:.2f} ms"),
+            ("steps skipped so far", f"{int(now[0]['skipped'])}"),
+            ("pictures", f"{fps:.0f} /s"),
+        ]
+        if float(frame["added_mass"]) > 0.0:
+            rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))
+        words = bytes(frame["said"]).decode("utf-8", "replace") or self._said
+        if words:
+            rows.append(("", html.escape(words)))
+        self._panel.show_status(headline, rows)
+        self._panel.show_phase(
+            paused=phase == Phase.PAUSED,
+            recording=bool(frame["recording"]),
+            replaying=bool(frame["replaying"]),
+            recorded=self.session.exchange.recorded.count,
+            step=self.session.scene.timing.haptic_step,
+            jaw_closed=self.session.jaw_closed,
+        )
+
+
+async def _messages(connection: ServerConnection) -> AsyncIterator[Any]:
+    from websockets.exceptions import ConnectionClosed
+
+    while True:
+        try:
+            yield await connection.recv()
+        except (ConnectionClosed, asyncio.CancelledError):
+            return

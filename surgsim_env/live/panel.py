@@ -1,0 +1,249 @@
+"""The page's panel: buttons, sliders, plots, and how well the physics keeps time."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
+from surgsim_env.live.organ_view import COLOURS, CONTRASTS
+from surgsim_env.live.web_messages import Judge, is_flag, is_number, is_one_of
+from surgsim_env.scenes import Scene
+
+# The plots show so much time [s], in so many points.
+PLOTTED, PLOT_POINTS = 10.0, 250
+# The upper end of a plot that shows little; it doubles as needed.
+PLOT_LEAST = {"N": 0.5, "mm": 4.0}
+# A slider that has stood still for so long [s] means what it says.
+SETTLED = 0.35
+BUTTON_COLOUR = (52, 84, 96)
+ARM_COLOURS = ("#e8590c", "#1971c2")
+STEERING = """
+| | |
+|---|---|
+| mouse | drag the probe, or an arrow of its handle |
+| arrow keys | across the organ |
+| Page up / down | out / in (also shift + up / down) |
+| gamepad | left stick across, triggers out / in |{jaw}{second}
+
+Drag elsewhere to turn the view, wheel to zoom.
+"""
+
+
+class Panel:
+    """Everything beside the picture. Callbacks are called from viser's threads.
+
+    Fields:
+        choice: the organ that the sliders say
+    """
+
+    def __init__(
+        self, gui: Any, judge: Judge, scene: Scene, arm_count: int, has_jaw: bool, calls: dict[str, Callable[..., None]]
+    ) -> None:
+        """Build it.
+
+        Args:
+            gui: viser's.
+            judge: is told what each element may be set to.
+            scene: of the session.
+            arm_count: 1 or 2.
+            has_jaw: whether the first arm has a jaw.
+            calls: what is called, by name: pause(on), reset(), record(on), replay(on), show_lesions(on), paint(on),
+                clear_map(), close_jaw(on).
+        """
+        self._gui, self._judge, self._scene, self._calls = gui, judge, scene, calls
+        self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
+        self._changed: float | None = None
+        self._status = gui.add_html(_status_html("starting", []))
+        self._add_buttons()
+        self._jaw = gui.add_checkbox("Close the jaw", initial_value=False, visible=has_jaw)
+        self._knows(self._jaw, is_flag)
+        self._jaw.on_update(lambda _: calls["close_jaw"](self._jaw.value))
+        with gui.add_folder("Force and depth"):
+            self._force = _plot(gui, "N", arm_count)
+            self._depth = _plot(gui, "mm", arm_count)
+        with gui.add_folder("Tissue"):
+            self._add_tissue()
+        with gui.add_folder("What was felt"):
+            self._add_map()
+        with gui.add_folder("How to steer", expand_by_default=False):
+            second = "\n| X, or a shoulder button | the other arm |" if arm_count > 1 else ""
+            jaw = "\n| G, or the first button | close or open the jaw |" if has_jaw else ""
+            gui.add_markdown(STEERING.format(second=second, jaw=jaw))
+
+    def settled_choice(self) -> OrganChoice | None:
+        """The organ that sliders were moved to, once they stand still; None otherwise."""
+        if self._changed is None or time.monotonic() - self._changed < SETTLED:
+            return None
+        self._changed = None
+        return self.choice
+
+    def show_status(self, headline: str, rows: list[tuple[str, str]]) -> None:
+        """Say how it goes: a headline, and names with values."""
+        self._status.content = _status_html(headline, rows)
+
+    def show_phase(
+        self, *, paused: bool, recording: bool, replaying: bool, recorded: int, step: float, jaw_closed: bool
+    ) -> None:
+        """Name the buttons after what they do next."""
+        if self._jaw.value != jaw_closed:
+            self._jaw.value = jaw_closed
+        self._name(self._pause, "Go on" if paused else "Pause")
+        self._name(self._record, f"End recording ({recorded * step:.0f} s)" if recording else "Record")
+        self._name(self._replay, "End replay" if replaying else f"Replay ({recorded * step:.1f} s)")
+        disabled = recorded == 0 or recording
+        if self._replay.disabled != disabled:
+            self._replay.disabled = disabled
+
+    def plot(self, trace: np.ndarray) -> None:
+        """Show a trace's rows: time [s], force [N] and depth [m] of each arm."""
+        if len(trace) < 2:
+            return
+        now = float(trace["time"][-1])
+        trace = trace[trace["time"] >= now - PLOTTED]
+        trace = trace[:: max(1, len(trace) // PLOT_POINTS)]
+        since = np.ascontiguousarray(trace["time"])
+        force = np.linalg.norm(trace["force"], axis=2)
+        for plot, unit, values in ((self._force, "N", force), (self._depth, "mm", trace["depth"] * 1e3)):
+            top = PLOT_LEAST[unit]
+            while top < 1.05 * values.max():
+                top *= 2.0
+            if plot.scales["y"]["max"] != top:
+                plot.scales = _scales(top)
+            plot.data = (since, *(np.ascontiguousarray(one) for one in values.T))
+
+    def _add_buttons(self) -> None:
+        calls = self._calls
+        self._pause = self._button("Pause", "stand still, or go on")
+        self._pause.on_click(lambda _: calls["pause"](self._pause.label == "Pause"))
+        reset = self._button("Reset", "the same organ at rest, tips parked")
+        reset.on_click(lambda _: calls["reset"]())
+        self._record = self._button(
+            "Record", "record hands, tips and forces a thousand times a second; written to a CSV file"
+        )
+        self._record.on_click(lambda _: calls["record"](self._record.label == "Record"))
+        self._replay = self._button("Replay", "move as recorded, from the state that the recording began with")
+        self._replay.on_click(lambda _: calls["replay"](self._replay.label.startswith("Replay")))
+        self._replay.disabled = True
+
+    def _add_tissue(self) -> None:
+        gui, scene = self._gui, self._scene
+        self._modulus = self._slider("Young's modulus [kPa]", 0.5, 2.0, 0.05, 1.0, scene.material.youngs_modulus / 1e3)
+        self._damping = self._slider("Damping [1/s]", 0.25, 4.0, 0.05, 1.0, max(scene.damping.alpha, 1e-3))
+        kinds = lesion_kinds(scene)
+        self._lesions = gui.add_dropdown("Lesions", kinds, initial_value=kinds[0])
+        self._knows(self._lesions, is_one_of(*kinds))
+        ratio = max(
+            (one.modulus_ratio for one in scene.demonstration),
+            default=scene.lesion.modulus_ratio[1] if scene.lesion else 8.0,
+        )
+        self._ratio = self._slider("Lesions' modulus / tissue's", 1.0, 12.0, 0.5, min(float(ratio), 12.0))
+        self._size = self._slider("Lesions' size", 0.5, 1.3, 0.05, 1.0)
+        hide = self._button("Hide another lesion", "draw one from the scene's ranges")
+        hide.visible = HIDDEN in kinds
+        for one in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
+            one.on_update(lambda _: self._choose())
+        hide.on_click(lambda _: self._hide())
+        show = gui.add_checkbox("Show lesions", initial_value=False)
+        self._knows(show, is_flag)
+        show.on_update(lambda _: self._calls["show_lesions"](show.value))
+
+    def _add_map(self) -> None:
+        gui = self._gui
+        gui.add_html(_legend_html())
+        paint = gui.add_checkbox("Paint it on the organ", initial_value=True)
+        self._knows(paint, is_flag)
+        paint.on_update(lambda _: self._calls["paint"](paint.value))
+        self._button("Clear", "forget what was felt").on_click(lambda _: self._calls["clear_map"]())
+
+    def _choose(self, **changes: Any) -> None:
+        scene = self._scene
+        self.choice = OrganChoice(
+            modulus_factor=self._modulus.value / (scene.material.youngs_modulus / 1e3),
+            damping_factor=self._damping.value / max(scene.damping.alpha, 1e-3),
+            lesions=self._lesions.value,
+            lesion_ratio=self._ratio.value if self._lesions.value in (SHOWN, HIDDEN) else None,
+            lesion_size=self._size.value,
+            seed=changes.get("seed", self.choice.seed),
+        )
+        self._changed = time.monotonic()
+
+    def _hide(self) -> None:
+        self._lesions.value = HIDDEN
+        self._choose(seed=self.choice.seed + 1)
+        # A click says what it means at once.
+        self._changed = time.monotonic() - SETTLED
+
+    def _slider(self, label: str, low: float, high: float, step: float, start: float, unit: float = 1.0) -> Any:
+        values = [round(value * unit, 6) for value in (low, high, step, start)]
+        slider = self._gui.add_slider(label, min=values[0], max=values[1], step=values[2], initial_value=values[3])
+        self._knows(slider, is_number(values[0] - 1e-9, values[1] + 1e-9))
+        return slider
+
+    def _button(self, label: str, hint: str) -> Any:
+        button = self._gui.add_button(label, hint=hint, color=BUTTON_COLOUR)
+        self._knows(button, is_flag)
+        return button
+
+    def _knows(self, handle: Any, allowed: Callable[[Any], bool]) -> None:
+        self._judge.values[handle._impl.uuid] = allowed
+
+    @staticmethod
+    def _name(button: Any, label: str) -> None:
+        if button.label != label:
+            button.label = label
+
+
+def _scales(top: float) -> dict[str, Any]:
+    return {"x": {"time": False, "auto": True}, "y": {"auto": False, "min": 0.0, "max": top}}
+
+
+def _plot(gui: Any, unit: str, arm_count: int) -> Any:
+    start = (np.array([0.0, 1.0]), *(np.zeros(2) for _ in range(arm_count)))
+    names = ("left arm", "right arm") if arm_count > 1 else ("force" if unit == "N" else "depth",)
+    series: list[dict[str, Any]] = [{"label": "s"}]
+    for name, colour in zip(names, ARM_COLOURS, strict=False):
+        series.append({"label": f"{name} [{unit}]", "stroke": colour, "width": 2, "points": {"show": False}})
+    axes = (
+        {"stroke": "#888", "grid": {"stroke": "#8883", "width": 1}},
+        {"stroke": "#888", "grid": {"stroke": "#8883", "width": 1}, "size": 44},
+    )
+    return gui.add_uplot(
+        start,
+        tuple(series),
+        scales=_scales(PLOT_LEAST[unit]),
+        axes=axes,
+        legend={"show": True, "live": False},
+        padding=(12, 16, 0, 0),
+        height=150,
+    )
+
+
+def _status_html(headline: str, rows: list[tuple[str, str]]) -> str:
+    cells = "".join(
+        f'<tr><td style="opacity:.65;padding-right:.8em">{name}</td>'
+        f'<td style="text-align:right;font-variant-numeric:tabular-nums">{value}</td></tr>'
+        for name, value in rows
+    )
+    return (
+        f'<div style="padding:.2em .9em .5em;font-size:.85em"><b>{headline}</b>'
+        f'<table style="width:100%;border-spacing:0">{cells}</table></div>'
+    )
+
+
+def _legend_html() -> str:
+    colours = ", ".join(f"rgb{colour}" for colour in COLOURS)
+    low, high = CONTRASTS
+    return (
+        '<div style="padding:.2em .9em;font-size:.8em"><div style="height:.7em;border-radius:.35em;'
+        f'background:linear-gradient(to right, {colours})"></div>'
+        f'<div style="display:flex;justify-content:space-between"><span>{low:g}</span><span>stiffness over the softest '
+        f"quarter felt</span><span>{high:g} and more</span></div></div>"
+    )
+
+
+def millimetres(place: FloatArray) -> str:
+    """A place in words."""
+    return ", ".join(f"{value * 1e3:.1f}" for value in place) + " mm"

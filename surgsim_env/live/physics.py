@@ -1,0 +1,282 @@
+"""The physics of a live session: a process of its own that makes a haptic step whenever one is due."""
+
+import contextlib
+import ctypes
+import gc
+import os
+import sys
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from msdm_core.kernels import OrganModel
+from msdm_core.mesh import FloatArray
+from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.haptics.loop import HapticLoop
+from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.telemetry import HapticTelemetry
+from surgsim_env.instrument import Instrument, Probe
+from surgsim_env.live.browser_device import BrowserDevice, Hands, RecordedHand
+from surgsim_env.live.exchange_records import TRACE_LENGTH, TRACE_STEPS, Exchange, Phase, said
+from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
+from surgsim_env.live.pacing import Pacer, PaceSettings
+from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Request, Reset
+from surgsim_env.rendering.instrument_geoms import shown_geoms
+from surgsim_env.scenes import Scene
+from surgsim_env.simulation import Simulation
+
+# A probe begins this far from the organ [m].
+HOME_GAP = 0.015
+# A frame for the page is written once in so many steps, the parent and the page's requests looked at likewise.
+FRAME_STEPS, LOOK_STEPS = 16, 8
+# Unix's measure of how gladly a process lets others go first: below 0 is for administrators.
+NICENESS = -10
+# The hand may go through the air at this speed [m/s] before a tip follows no more.
+SPEED_LARGEST, APPROACH_SPEED = 0.25, 0.05
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a physics process is started with.
+
+    Args:
+        scene: of the session.
+        choice: its first organ.
+        pace: of the steps.
+    """
+
+    scene: Scene
+    choice: OrganChoice
+    pace: PaceSettings
+
+
+def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
+    """Where tips begin: before the middle of the palpable face, in sight; arms where they park. [m], (3,) or (2, 3)."""
+    if type(instrument) is not Probe:
+        return instrument.parked
+    face = anatomy.face
+    corners = face.points[face.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    point, normal = face.project(np.average(corners.mean(axis=1), axis=0, weights=area))
+    place = point + normal * (anatomy.scene.instrument.tip_radius + HOME_GAP)
+    return np.clip(place, instrument.lower, instrument.upper)
+
+
+def run_physics(setup: Setup, exchange: Exchange, requests: Connection, parent: int) -> None:
+    """The child's whole life; it ends on request, or when the process with the id `parent` is gone."""
+    _sleep_sharply()
+    _go_first()
+    physics = Physics(setup, exchange, requests)
+    # What is there by now stays; nothing that is made in a step lies in a cycle.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    physics.run(lambda: os.getppid() == parent)
+
+
+class Physics:
+    """Steps a simulation that the page's hands hold, tells the page, and does what it asks between two steps."""
+
+    def __init__(self, setup: Setup, exchange: Exchange, requests: Connection) -> None:
+        """Load the scene, compile what is to be compiled, and couple the hands."""
+        self._exchange, self._requests = exchange, requests
+        self._anatomy = load_anatomy(setup.scene)
+        self._simulation = Simulation(self._anatomy)
+        self._organ: OrganModel = chosen_organ(self._anatomy, setup.choice)
+        self._organ_number = 1
+        instrument = self._simulation.instrument
+        self._home = home_of(self._anatomy, instrument)
+        self._simulation.reset(self._organ, self._home)
+        dt = self._simulation.haptic_dt
+        places = np.atleast_2d(self._home)
+        self._hands = [Hands(BrowserDevice(exchange.hand, arm, dt, place)) for arm, place in enumerate(places)]
+        settings = HapticSettings(approach_speed=APPROACH_SPEED, speed_largest=SPEED_LARGEST)
+        self._loop = HapticLoop(self._simulation, self._hands, settings)
+        self._geoms = np.array(shown_geoms(instrument.model), dtype=np.int64)
+        self._pacer = Pacer(setup.pace, exchange.timing.peek)
+        self._phase, self._said = Phase.RUNNING, ""
+        self._recording, self._replaying = False, False
+        self._start_state: dict[str, np.ndarray] | None = None
+        self._peak = np.zeros(len(self._hands))
+        self._asked = int(exchange.hand.peek["requests"])
+        # The first steps load and compile.
+        self._last = self._loop.step()
+        self._begin_again()
+
+    def run(self, parent_lives: Any) -> None:
+        """Step until told to end."""
+        count, frame_steps = 0, FRAME_STEPS
+        self._pacer.start()
+        while True:
+            self._pacer.wait()
+            if self._phase == Phase.RUNNING:
+                self._last = self._loop.step()
+                self._keep(self._last)
+                self._pacer.done(self._simulation.haptic_dt)
+            count += 1
+            if count % frame_steps == 0:
+                self._tell()
+            if count % LOOK_STEPS == 0 and not self._look(parent_lives):
+                break
+        self._phase = Phase.ENDED
+        self._tell()
+
+    def _look(self, parent_lives: Any) -> bool:
+        """Do what was asked for; False to end."""
+        if not parent_lives():
+            return False
+        asked = int(self._exchange.hand.peek["requests"])
+        if asked == self._asked:
+            return True
+        try:
+            while self._requests.poll():
+                request = self._requests.recv()
+                if isinstance(request, End):
+                    return False
+                self._do(request)
+        except (EOFError, OSError):
+            return False
+        self._asked = asked
+        # What took long was asked for: the clock starts again.
+        self._pacer.start()
+        return True
+
+    def _do(self, request: Request) -> None:
+        self._said = ""
+        if isinstance(request, Pause):
+            if self._phase in (Phase.RUNNING, Phase.PAUSED):
+                self._phase = Phase.PAUSED if request.on else Phase.RUNNING
+        elif isinstance(request, Reset):
+            self._rest()
+        elif isinstance(request, Change):
+            self._change(request.choice)
+        elif isinstance(request, Record):
+            self._record(request.on)
+        elif isinstance(request, Replay):
+            self._replay(request)
+        self._tell()
+
+    def _rest(self, organ: OrganModel | None = None) -> None:
+        self._recording = self._replaying = False
+        for hand in self._hands:
+            hand.recorded = None
+        self._loop.reset(organ, self._home)
+        self._begin_again()
+
+    def _begin_again(self) -> None:
+        """The tips were put somewhere: hands start from there, and the trace anew."""
+        self._phase = Phase.RUNNING
+        for hand, held in zip(self._hands, self._loop.held, strict=True):
+            hand.browser.restart(held.drive.tip)
+        with self._exchange.trace.writing() as trace:
+            trace["organ"], trace["count"] = self._organ_number, 0
+        self._peak[:] = 0.0
+        self._tell()
+
+    def _change(self, choice: OrganChoice) -> None:
+        before, number = self._organ, self._organ_number
+        try:
+            organ = chosen_organ(self._anatomy, choice)
+            self._organ_number += 1
+            self._rest(organ)
+            self._organ, self._start_state = organ, None
+        except ValueError as error:
+            self._organ_number = number
+            self._rest(before)
+            self._said = f"not that organ: {error}"
+
+    def _record(self, on: bool) -> None:
+        if on and not self._replaying:
+            self._exchange.recorded.clear()
+            # From a held instrument's state and couplings that start anew, so that a replay can start the same.
+            self._start_state = self._simulation.get_state()
+            for held in self._loop.held:
+                held.restart()
+        self._recording = on and not self._replaying
+
+    def _replay(self, request: Replay) -> None:
+        self._recording = False
+        if not request.on or self._exchange.recorded.count == 0:
+            self._replaying = False
+            for hand in self._hands:
+                hand.recorded = None
+            return
+        if request.given or self._start_state is None:
+            self._loop.reset(None, self._home)
+        else:
+            self._simulation.set_state(self._organ, self._start_state)
+            self._loop.fault = self._simulation.fault
+            for held in self._loop.held:
+                held.restart()
+        self._begin_again()
+        for arm, hand in enumerate(self._hands):
+            hand.recorded = RecordedHand(self._exchange.recorded, arm)
+        self._replaying = True
+
+    def _keep(self, told: HapticTelemetry) -> None:
+        """Note a step in trace and recording, and see what it came to."""
+        exchange, simulation = self._exchange, self._simulation
+        for arm, tip in enumerate(told.tips):
+            x, y, z = tip.contact_force.tolist()
+            self._peak[arm] = max(self._peak[arm], (x * x + y * y + z * z) ** 0.5)
+        step = round(told.time / simulation.haptic_dt)
+        if step % TRACE_STEPS == 0:
+            with exchange.trace.writing() as trace:
+                row = trace["row"][int(trace["count"]) % TRACE_LENGTH]
+                row["time"] = told.time
+                for arm, tip in enumerate(told.tips):
+                    row["tip"][arm], row["depth"][arm], row["force"][arm] = tip.tip, tip.depth, tip.contact_force
+                row["peak"] = self._peak
+                trace["count"] += 1
+            self._peak[:] = 0.0
+        if self._recording:
+            if exchange.recorded.full:
+                self._recording, self._said = False, "the recording is full"
+            else:
+                poses = [hand.pose for hand in self._hands]
+                places = np.array([np.full(3, np.nan) if pose is None else pose.position for pose in poses])
+                tips = np.array([tip.tip for tip in told.tips])
+                buttons = [0 if pose is None else pose.buttons for pose in poses]
+                exchange.recorded.append(
+                    told.time, places, buttons, tips, np.array([tip.contact_force for tip in told.tips])
+                )
+        if self._replaying and all(hand.recorded is None or hand.recorded.done for hand in self._hands):
+            self._replaying = False
+            for hand, held in zip(self._hands, self._loop.held, strict=True):
+                hand.recorded = None
+                hand.browser.restart(held.drive.tip)
+        if told.fault:
+            self._phase, self._said, self._recording = Phase.FAULT, told.fault, False
+            self._tell()
+
+    def _tell(self) -> None:
+        """Write a frame for the page."""
+        simulation, told = self._simulation, self._last
+        data = simulation.instrument.data
+        with self._exchange.frame.writing() as frame:
+            frame["phase"], frame["organ"] = int(self._phase), self._organ_number
+            frame["recording"], frame["replaying"] = self._recording, self._replaying
+            frame["time"], frame["said"] = simulation.time, said(self._said)
+            frame["added_mass"] = self._organ.added_mass
+            for arm, tip in enumerate(told.tips):
+                frame["tip"][arm] = self._loop.held[arm].drive.tip
+                frame["place"][arm], frame["force"][arm] = tip.target, tip.contact_force
+                frame["pushed"][arm], frame["share"][arm] = tip.force, tip.share
+                frame["limited"][arm] = tip.clamped or tip.workspace_limited
+            frame["node"] = simulation.organ_state.node_position[:, :3]
+            frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
+
+
+def _go_first() -> None:
+    """Ask for the processor before pictures and browsers; where that is not allowed, all wait in line."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+
+
+def _sleep_sharply() -> None:
+    """Ask Linux to end sleeps when they are over, not up to 50 us later; elsewhere nothing is done."""
+    if sys.platform == "linux":
+        set_timer_slack = 29
+        ctypes.CDLL(None).prctl(set_timer_slack, 1, 0, 0, 0)

@@ -1,0 +1,103 @@
+"""What stands around the organ on the page: camera, ground, handles of the hands, arrows of force."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.anatomy import Anatomy
+from surgsim_env.live.instrument_view import SCALE
+from surgsim_env.rendering.cameras import scene_cameras
+
+HAND_COLOURS = ((255, 146, 43), (77, 171, 247))
+GROUND_COLOUR, FORCE_COLOUR, BRAND_COLOUR = (28, 58, 66), (255, 224, 102), (232, 89, 12)
+# The ground lies this far below the organ [m], and reaches so many times its size.
+GROUND_GAP, GROUND_REACH = 0.002, 4.0
+# In the page's own decimetres.
+HANDLE_SIZE, BALL_RADIUS = 0.35, 0.03
+SHAFT_RADIUS, HEAD_RADIUS, HEAD_LENGTH = 0.012, 0.035, 0.07
+
+
+def prepare(viser: Any, anatomy: Anatomy) -> FloatArray:
+    """Set camera, light and ground; unit vectors right, away and out of the organ for whoever looks, (3, 3)."""
+    camera = scene_cameras(anatomy, aspect=1.2)["overview"]
+    viser.scene.set_up_direction(camera.up)
+    first = viser.initial_camera
+    first.position, first.look_at, first.up = camera.position * SCALE, camera.target * SCALE, camera.up
+    first.fov, first.near = math.radians(camera.fov), 0.05
+    viser.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False, brand_color=BRAND_COLOUR)
+    viser.scene.world_axes.visible = False
+    right, ahead = camera.rotation[:, 0], -camera.rotation[:, 2]
+    level = ahead - (ahead @ camera.up) * camera.up
+    directions = np.stack([right, level / np.linalg.norm(level), -anatomy.face.approach])
+    _add_ground(viser.scene, anatomy.mesh.points, camera.up, right)
+    return directions
+
+
+def add_handle(
+    scene: Any, arm: int, place: FloatArray, directions: FloatArray, pulled: Callable[[int, str, FloatArray], None]
+) -> Any:
+    """The arrows that pull a hand out of the organ, into it, and across it.
+
+    Args:
+        scene: viser's.
+        arm: whose hand it is.
+        place: where it begins [m], (3,).
+        directions: see `prepare`.
+        pulled: called with the arm, the drag's phase and the place [m].
+    """
+    out = directions[2]
+    across = np.cross(directions[1], out)
+    across /= np.linalg.norm(across)
+    turn = np.zeros(4)
+    mujoco.mju_mat2Quat(turn, np.column_stack([across, np.cross(out, across), out]).ravel())
+    name = f"/hand/{arm}"
+    handle = scene.add_transform_controls(
+        name,
+        scale=HANDLE_SIZE,
+        disable_rotations=True,
+        disable_sliders=True,
+        depth_test=False,
+        opacity=0.75,
+        wxyz=turn,
+        position=place * SCALE,
+    )
+    scene.add_icosphere(f"{name}/ball", radius=BALL_RADIUS, color=HAND_COLOURS[arm], opacity=0.9, cast_shadow=False)
+
+    @handle.on_update
+    async def _(event: Any) -> None:
+        pulled(arm, event.phase, np.asarray(handle.position, dtype=np.float64) / SCALE)
+
+    return handle
+
+
+def add_force_arrows(scene: Any, arm_count: int) -> Any:
+    """An arrow for each arm, of no length."""
+    return scene.add_arrows(
+        "/force",
+        np.zeros((arm_count, 2, 3)),
+        FORCE_COLOUR,
+        shaft_radius=SHAFT_RADIUS,
+        head_radius=HEAD_RADIUS,
+        head_length=HEAD_LENGTH,
+    )
+
+
+def _add_ground(scene: Any, points: FloatArray, up: FloatArray, right: FloatArray) -> None:
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    low = float((points @ up).min()) - GROUND_GAP
+    ground = middle + up * (low - middle @ up)
+    half = GROUND_REACH * float(np.ptp(points, axis=0).max())
+    along = np.cross(up, right)
+    corners = [ground + half * (x * right + y * along) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    scene.add_mesh_simple(
+        "/ground",
+        (np.array(corners) * SCALE).astype(np.float32),
+        np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
+        color=GROUND_COLOUR,
+        side="double",
+        cast_shadow=False,
+    )

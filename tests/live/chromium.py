@@ -1,0 +1,142 @@
+"""A headless Chromium, spoken to through its own debugging protocol: no driver needed, software drawing enough."""
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import connect
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+class Browser:
+    """One page of a browser; closed at the end of a `with`."""
+
+    def __init__(self, folder: Path, width: int, height: int) -> None:
+        assert CHROMIUM is not None
+        self._folder = folder
+        self._process = subprocess.Popen(
+            [
+                *(CHROMIUM, "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars"),
+                *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-first-run"),
+                *(
+                    "--disable-background-networking",
+                    "--remote-debugging-port=0",
+                    f"--user-data-dir={folder / 'profile'}",
+                ),
+                *(f"--window-size={width},{height}", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"),
+                "about:blank",
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self._count = 0
+        self.events: list[dict[str, Any]] = []
+
+    def __enter__(self) -> "Browser":
+        port_file = self._folder / "profile" / "DevToolsActivePort"
+        deadline = time.monotonic() + 60
+        while not (port_file.is_file() and port_file.read_text().count("\n")):
+            assert time.monotonic() < deadline and self._process.poll() is None, "Chromium does not start"
+            time.sleep(0.1)
+        port = port_file.read_text().splitlines()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
+            page = next(one for one in json.load(answer) if one["type"] == "page")
+        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None, ping_interval=None)
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.do(f"{domain}.enable")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+        self._process.terminate()
+        self._process.wait(timeout=20)
+
+    def do(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """One command, and its answer; events that come meanwhile are kept."""
+        self._count += 1
+        self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=90))
+            if answer.get("id") == self._count:
+                assert "error" not in answer, answer
+                return answer["result"]
+            self.events.append(answer)
+
+    def open(self, address: str) -> None:
+        self.do("Page.navigate", url=address)
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        result = self.do("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in result, result["exceptionDetails"]
+        return result["result"].get("value")
+
+    def wait_for(self, script: str, seconds: float = 60.0) -> Any:
+        """Until an expression is true."""
+        deadline = time.monotonic() + seconds
+        while True:
+            value = self.run(script)
+            if value:
+                return value
+            assert time.monotonic() < deadline, f"{script} stays {value!r}; console: {self.complaints()}"
+            time.sleep(0.1)
+
+    def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
+        pressed = {"button": "left"} if kind != "mouseMoved" or buttons else {}
+        self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=buttons, clickCount=1, **pressed)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], *, steps: int = 12, hold: float = 0.5) -> None:
+        (x, y), (to_x, to_y) = start, end
+        self.mouse("mouseMoved", x, y)
+        time.sleep(0.3)
+        self.mouse("mousePressed", x, y, 1)
+        for step in range(1, steps + 1):
+            share = step / steps
+            self.mouse("mouseMoved", x + share * (to_x - x), y + share * (to_y - y), 1)
+            time.sleep(0.05)
+        time.sleep(hold)
+        self.mouse("mouseReleased", to_x, to_y)
+
+    def key(self, code: str, seconds: float) -> None:
+        self.do("Input.dispatchKeyEvent", type="keyDown", code=code, key=code)
+        time.sleep(seconds)
+        self.do("Input.dispatchKeyEvent", type="keyUp", code=code, key=code)
+
+    def click_on(self, text: str) -> None:
+        """Click the button with a text."""
+        box = self.run(
+            "(() => { const b = [...document.querySelectorAll('button')]"
+            f".find(one => one.textContent.includes({text!r}));"
+            " if (!b) return null; b.scrollIntoView({block: 'nearest'}); const r = b.getBoundingClientRect();"
+            " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+        )
+        assert box, f"no button {text!r}"
+        self.mouse("mousePressed", *box, 1)
+        self.mouse("mouseReleased", *box)
+
+    def text(self) -> str:
+        return self.run("document.body?.innerText")
+
+    def shot(self, path: Path) -> None:
+        path.write_bytes(base64.b64decode(self.do("Page.captureScreenshot", format="png")["data"]))
+
+    def complaints(self) -> list[str]:
+        """Errors on the page's console, and what the browser refused."""
+        found = []
+        for event in self.events:
+            if event.get("method") == "Runtime.exceptionThrown":
+                found.append(
+                    event["params"]["exceptionDetails"].get("text", "")
+                    + str(event["params"]["exceptionDetails"].get("exception", {}).get("description"))
+                )
+            if event.get("method") == "Log.entryAdded" and event["params"]["entry"]["level"] == "error":
+                found.append(event["params"]["entry"]["text"] + " " + event["params"]["entry"].get("url", ""))
+            if event.get("method") == "Runtime.consoleAPICalled" and event["params"]["type"] == "error":
+                found.append(str([one.get("value") for one in event["params"]["args"]]))
+        return found

@@ -21,6 +21,7 @@ from agents.expert_palpate import PalpateExpert
 from agents.palpate_surrogate import PalpateSurrogate
 from agents.training.extractors import MemorySummary
 from agents.training.policy_files import TrainedPolicy, describe, save_policy
+from agents.training.wrappers import blinded
 from surgsim_env.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
@@ -98,11 +99,15 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=12, help="of each round")
     parser.add_argument("--imagined", type=int, default=100_000, help="observations of a round that are made up")
     parser.add_argument("--seed", type=int, default=2_000_000)
+    parser.add_argument(
+        "--without-force", action="store_true", help="the network sees no force, nor what follows from it"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rng = np.random.default_rng(arguments.seed)
     envs = PalpateSurrogate(arguments.envs, arguments.scene)
     expert = PalpateExpert(envs.envs[0])
+    entries = list(envs.task.force_entries) if arguments.without_force else []
     scaled = VecNormalize(VectorEnvForStableBaselines(envs), norm_reward=False)
     model = PPO("MlpPolicy", scaled, policy_kwargs=NETWORK, device="cpu", seed=0)
     begun = (envs.reset(seed=arguments.seed)[0], np.ones(envs.num_envs, dtype=np.bool_))
@@ -116,12 +121,12 @@ def main() -> None:
         told += new_told
         real = np.concatenate(seen)
         if index < EXPERT_ROUNDS:
-            normalise_by(scaled, real)
+            normalise_by(scaled, blinded(real, entries))
         made = imagined(real[rng.integers(len(real), size=arguments.imagined)], envs, expert, rng)
         options = CloningOptions(epochs=arguments.epochs, patience=4, batch_size=512, std=0.05, seed=index)
         curve = clone(
             model,
-            np.concatenate([real, made]),
+            blinded(np.concatenate([real, made]), entries),
             np.concatenate([*told, expert.act(made)]),
             normalisation=scaled,
             options=options,
@@ -137,6 +142,7 @@ def main() -> None:
             scaled,
             env_id="SurgSim/Palpate-v0",
             env_kwargs={"scene": arguments.scene, "level": "standard", "memory": True},
+            force_entries=entries,
             trained_steps=len(real),
         )
         save_policy(model, description, arguments.out)

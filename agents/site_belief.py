@@ -1,7 +1,7 @@
 """What presses make one believe: the observation of SurgSim/PalpateSites-v0 as maps of expected excess and doubt.
 
-The maps are those of the benchmark's own estimator (`LesionEstimator`), at the sites of the observation's grid, found
-from the observation alone: contrast and visits that it remembers. A policy reads them as a picture and names a site.
+The maps are those of the agents gp_*.py (`agents/site_process.py`), at the sites of the observation's grid, found from
+the observation alone: contrast and visits that it remembers. A policy reads them as a picture and names a site.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from agents.site_process import LENGTH_SHARE
 from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_SPREAD, LesionEstimator
 
 # Bound of a feature; expected excess is some 3 spreads at most.
@@ -37,8 +38,9 @@ class SiteBelief:
         self.settings, self.site_count = settings, settings.site_count
         estimator = LesionEstimator(settings.extent, tip_radius=settings.tip_radius, noise=settings.noise)
         self.noise_variance = estimator.noise_variance
+        length = LENGTH_SHARE * estimator.length
         columns, rows = (np.linspace(0.0, extent, self.site_count) for extent in settings.extent)
-        along = [np.exp(-0.5 * ((axis[:, None] - axis) / estimator.length) ** 2) for axis in (rows, columns)]
+        along = [np.exp(-0.5 * ((axis[:, None] - axis) / length) ** 2) for axis in (rows, columns)]
         # Prior covariance of the excess between the sites, (n n, n n).
         self._excess = EXCESS_SPREAD**2 * np.kron(*along)
 

@@ -12,18 +12,19 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 # Before learning: score = SHARPNESS x (expected excess + CURIOSITY x doubt), both in units of the prior's spread.
-SHARPNESS = 4.0
-CURIOSITY = 2.0
+SHARPNESS = 6.0
+CURIOSITY = 3.0
 WIDTH = 16
-# Of a site that was touched: a chance of nothing, and finite, as the entropy needs it.
-TOUCHED_SCORE = -1e4
+# Of a site that is not offered: a chance of nothing, and finite, as the entropy needs it.
+CLOSED_SCORE = -1e4
 
 
 class SiteScores(nn.Module):
     """Scores of all sites, and what the value is estimated from; convolutions, so of any size of grid.
 
     Channels: expected excess, doubt, what was touched, the share of presses left, and where a site lies on the chart
-    (x^2, y^2, and the distance from its middle). A site that was touched is not chosen again.
+    (x^2, y^2, and the distance from its middle). A site that was touched is not chosen again, and none of the outermost
+    row is: the agents gp_*.py leave it out too.
     """
 
     def __init__(self, site_count: int) -> None:
@@ -32,6 +33,7 @@ class SiteScores(nn.Module):
         axis = torch.linspace(-1.0, 1.0, site_count)
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         self.register_buffer("place", torch.stack([x * x, y * y, x.abs().maximum(y.abs())]), persistent=False)
+        self.register_buffer("closed", x.abs().maximum(y.abs()) > 1.0 - 1e-6, persistent=False)
         self.body = nn.Sequential(
             nn.Conv2d(7, WIDTH, 3, padding=1),
             nn.ReLU(),
@@ -54,7 +56,8 @@ class SiteScores(nn.Module):
         place = self.place.expand(count, 3, n, n)
         seen = self.body(torch.cat([maps, left[:, :, None, None].expand(count, 1, n, n), place], dim=1))
         bound = SHARPNESS * (maps[:, 0] + CURIOSITY * maps[:, 1])
-        scores = (self.score(seen)[:, 0] + bound).masked_fill(maps[:, 2] > 0.5, TOUCHED_SCORE).flatten(1)
+        closed = (maps[:, 2] > 0.5) | self.closed
+        scores = (self.score(seen)[:, 0] + bound).masked_fill(closed, CLOSED_SCORE).flatten(1)
         return scores, torch.cat([seen.mean(dim=(2, 3)), seen.amax(dim=(2, 3)), left], dim=1)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:

@@ -155,8 +155,12 @@ def test_extractors_choose_what_they_say():
 
 @pytest.mark.parametrize(
     ("script", "memory", "more"),
-    [("learn_palpate", True, ["--imagined", "200"]), ("learn_palpate_recurrent", False, [])],
-    ids=["feed-forward", "lstm"],
+    [
+        ("learn_palpate", True, ["--imagined", "200"]),
+        ("learn_palpate", True, ["--imagined", "200", "--without-force"]),
+        ("learn_palpate_recurrent", False, []),
+    ],
+    ids=["feed-forward", "without force", "lstm"],
 )
 def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script: str, memory: bool, more: list):
     from importlib import import_module
@@ -174,6 +178,10 @@ def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script
     observation, _ = envs.reset(seed=1)
     action = policy.act(observation, np.ones(3, dtype=bool))
     assert action.shape == (3, 4) and np.isfinite(action).all()
+    if "--without-force" in more:
+        forced = observation + np.isin(np.arange(observation.shape[1]), envs.task.force_entries).astype(np.float32)
+        policy.reset(3)
+        np.testing.assert_array_equal(policy.act(forced, np.ones(3, dtype=bool)), action)
 
 
 @pytest.mark.parametrize("path", sorted(POLICIES.glob("palpate_*.json")), ids=lambda path: path.stem)

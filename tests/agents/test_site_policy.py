@@ -1,4 +1,4 @@
-"""The learned acquisition function: what it sees is the estimator's belief, and what it names is the site pressed."""
+"""The learned acquisition function: it sees the belief of the agents gp_*.py and names the site that is pressed."""
 
 from dataclasses import asdict
 
@@ -10,14 +10,17 @@ import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
 
+from agents.site_agent import SiteFacts
 from agents.site_belief import BeliefSettings, SiteBelief
 from agents.site_policy import CURIOSITY, SHARPNESS, SitePolicy
+from agents.site_process import LENGTH_SHARE, SiteProcess
 from agents.training.policy_files import PolicyDescription, load_policy, save_policy
 from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_LENGTH, EXCESS_SPREAD, LesionEstimator
 
 pytestmark = pytest.mark.agents
 SETTINGS = BeliefSettings(extent=(0.04, 0.03), site_count=7, tip_radius=0.008, noise=0.04)
 SITES = SETTINGS.site_count**2
+OUTERMOST = np.pad(np.zeros((5, 5), dtype=bool), 1, constant_values=True).ravel()
 
 
 def observed(contrast: dict[int, float], left: float = 0.6) -> np.ndarray:
@@ -34,13 +37,22 @@ def place(site: int) -> tuple[float, float]:
     return column / 6 * SETTINGS.extent[0], row / 6 * SETTINGS.extent[1]
 
 
-def test_expected_excess_is_the_estimators():
-    contrast = {3: 0.1, 17: 0.5, 24: -0.2, 40: 0.05}
-    features = SiteBelief(SETTINGS).features(observed(contrast)[None])[0]
+def test_belief_is_that_of_the_gaussian_process_agents():
+    """They have it from scikit-learn."""
+    observation = observed({3: 0.1, 17: 0.5, 24: -0.2, 40: 0.05})
+    features = SiteBelief(SETTINGS).features(observation[None])[0].reshape(-1)
+    process = SiteProcess(SiteFacts(SETTINGS.extent, SETTINGS.site_count, SETTINGS.tip_radius, SETTINGS.noise, 25))
+    belief = process.belief(observation)
+    np.testing.assert_allclose(features[:SITES][process.candidates] * EXCESS_SPREAD, belief.excess, atol=1e-6)
+    np.testing.assert_allclose(
+        features[SITES : 2 * SITES][process.candidates] * EXCESS_SPREAD, belief.spread, atol=1e-5
+    )
+    # A belief of the estimator's own length is another one.
     estimator = LesionEstimator(SETTINGS.extent, tip_radius=0.008, noise=0.04)
     estimator.axes = tuple(np.linspace(0.0, extent, 7) for extent in SETTINGS.extent)
-    _, excess = estimator.posterior(np.array([place(site) for site in contrast]), np.array(list(contrast.values())))
-    np.testing.assert_allclose(features[:SITES] * EXCESS_SPREAD, excess.ravel(), atol=1e-6)
+    pressed = [3, 17, 24, 40]
+    _, excess = estimator.posterior(np.array([place(site) for site in pressed]), observation[pressed])
+    assert np.abs(features[:SITES] * EXCESS_SPREAD - excess.ravel()).max() > 0.01
 
 
 def test_doubt_is_that_of_the_joint_normal_distribution():
@@ -51,7 +63,9 @@ def test_doubt_is_that_of_the_joint_normal_distribution():
     places = np.array([place(site) for site in range(SITES)])
     squared = ((places[:, None] - places) ** 2).sum(axis=2)
     prior = np.zeros((SITES + 1, SITES + 1))
-    prior[:-1, :-1] = EXCESS_SPREAD**2 * np.exp(-0.5 * squared / EXCESS_LENGTH**2) + 1e-8 * np.eye(SITES)
+    prior[:-1, :-1] = EXCESS_SPREAD**2 * np.exp(-0.5 * squared / (LENGTH_SHARE * EXCESS_LENGTH) ** 2) + 1e-8 * np.eye(
+        SITES
+    )
     prior[-1, -1] = BACKGROUND_SPREAD**2
     seen = np.eye(SITES + 1)[visited]
     seen[:, -1] = 1.0
@@ -70,8 +84,9 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
     features = belief.features(np.stack([observed({3: 0.1, 17: 0.5}), observed({40: 0.3})]))
     logits = policy.get_distribution(torch.as_tensor(features)).distribution.logits
     bound = SHARPNESS * (features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES])
-    touched = features[:, 2 * SITES : 3 * SITES] > 0.5
-    assert touched.sum(axis=1).tolist() == [2, 1]
+    touched = (features[:, 2 * SITES : 3 * SITES] > 0.5) | OUTERMOST
+    # Site 3 lies in the outermost row.
+    assert touched.sum(axis=1).tolist() == [24 + 1, 24 + 1]
     assert (logits.exp().detach().numpy()[touched] == 0.0).all()
     difference = logits.detach().numpy() - bound
     for one, hidden in zip(difference, touched, strict=True):
@@ -96,6 +111,6 @@ def test_a_saved_policy_presses_what_its_scores_say(tmp_path):
     belief = SiteBelief(SETTINGS)
     features = belief.features(observations)
     bound = features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES]
-    bound[features[:, 2 * SITES : 3 * SITES] > 0.5] = -np.inf
+    bound[(features[:, 2 * SITES : 3 * SITES] > 0.5) | OUTERMOST] = -np.inf
     np.testing.assert_array_equal(actions, belief.action(bound.argmax(axis=1)))
     assert actions.dtype == np.float32

@@ -194,6 +194,16 @@ def arms_know_no_task(source: Source) -> Iterator[str]:
                 yield f"line {line} imports {name}"
 
 
+def haptics_know_no_task(source: Source) -> Iterator[str]:
+    """A haptic loop steps a simulation: it knows no task, no environment and no picture."""
+    if source.path.startswith("surgsim_env/haptics/"):
+        for name, line in imported(source.tree):
+            if name.split(".")[0] == "gymnasium" or re.match(
+                r"surgsim_env\.(tasks|env|vector_env|surgical_env)\b", name
+            ):
+                yield f"line {line} imports {name}"
+
+
 def pictures_are_asked_for(source: Source) -> Iterator[str]:
     """Only environments, the command line and reports draw: the simulation and its tasks do not know how they look."""
     may = (
@@ -251,6 +261,7 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     kernels_repeat_to_the_bit,
     tasks_do_not_advance,
     arms_know_no_task,
+    haptics_know_no_task,
     pictures_are_asked_for,
     scripts_stand_on_top,
     live_stands_on_top,
@@ -310,6 +321,8 @@ PLANTED = [
     (tasks_do_not_advance, "surgsim_env/rendering/stage.py", "mujoco.mj_step(model, data)"),
     (pictures_are_asked_for, "surgsim_env/simulation.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (arms_know_no_task, "surgsim_env/evaluation/reach.py", "from surgsim_env.simulation import Simulation"),
+    (haptics_know_no_task, "surgsim_env/haptics/loop.py", "from surgsim_env.tasks.palpate import PalpateTask"),
+    (haptics_know_no_task, "surgsim_env/haptics/loop.py", "import gymnasium"),
     (scripts_stand_on_top, "surgsim_env/env.py", "from surgsim_env.scripting.run import run_script"),
     (live_stands_on_top, "surgsim_env/haptics/loop.py", "from surgsim_env.live.session import Session"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),
@@ -327,6 +340,7 @@ ALLOWED = [
     (kernels_repeat_to_the_bit, "msdm_core/kernels.py", "@njit(fastmath=False)\ndef f(x): return math.sqrt(x)"),
     (tasks_do_not_advance, "surgsim_env/env.py", "simulation.haptic_step()"),
     (arms_know_no_task, "surgsim_env/arms/arm.py", "from surgsim_env.environment_words import WORDS"),
+    (haptics_know_no_task, "surgsim_env/haptics/loop.py", "from surgsim_env.simulation import Simulation"),
     (pictures_are_asked_for, "surgsim_env/surgical_env.py", "from surgsim_env.rendering.renderer import OrganRenderer"),
     (scripts_stand_on_top, "surgsim_env/scripting/run.py", "from surgsim_env.scripting.trace import Trace"),
     (live_stands_on_top, "surgsim_env/cli.py", "from surgsim_env.live.command import view"),

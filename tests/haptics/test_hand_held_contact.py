@@ -126,17 +126,17 @@ def test_ten_minutes_of_tapping_give_no_energy():
 
 
 @pytest.mark.slow
-def test_ten_minutes_of_holding_die_out():
-    """A hand that pushes steadily, with no damping of its own: after a minute nothing moves any more."""
+def test_holding_dies_out():
+    """A hand that pushes steadily, with no damping of its own: after ten seconds nothing moves any more."""
     simulation = touching_simulation()
     device = held_device()
     coupling = bare_settings((1.0 - 1e-9) * limit(simulation, device.dynamics, 0.125), 0.125)
     loop = HapticLoop(simulation, device, coupling)
     fastest = []
-    for step, told in enumerate(run(loop, device, 600_000)):
+    for step, told in enumerate(run(loop, device, 60_000)):
         assert not told.fault
         assert -device.work >= -ROUNDING
-        if step % 60_000 == 0:
+        if step % 10_000 == 0:
             fastest.append(0.0)
         fastest[-1] = max(fastest[-1], float(np.abs(device.velocity).max()))
     assert max(fastest[1:]) < 1e-6

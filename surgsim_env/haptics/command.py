@@ -1,6 +1,7 @@
 """`surgsim haptics`: a device holds a scene's instrument in real time."""
 
 import csv
+import gc
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -54,6 +55,9 @@ def run_haptics(options: Haptics, console: Console) -> None:
         loop.reset(tip_position=parked_place(anatomy))
         if isinstance(device, TrajectoryDevice):
             device.rewind()
+        # What is there by now stays, and nothing that a step makes lies in a cycle: no collection delays a step.
+        gc.collect()
+        gc.freeze()
         pace = Pace(simulation.haptic_dt)
         try:
             _hold(options, loop, device, pace, note, console)

@@ -66,6 +66,15 @@ def test_contact_at_the_limit_takes_energy_and_dies_out(name):
     assert late_speed < 5e-3
 
 
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.6])
+def test_softer_couplings_take_energy_and_die_out(share):
+    """The range reaches down to where the spring is as soft as the tissue (50 N/m at 2 mm) and softer."""
+    what, damping = DEVICES["usual"]
+    least, late_speed = pushed(what, damping, share, 2500)
+    assert least >= -ROUNDING
+    assert late_speed < 2e-2
+
+
 @pytest.mark.parametrize("name", [name for name in DEVICES if name != "heavy"])
 def test_limit_is_not_far_from_what_fails(name):
     """Six times the limit gives energy to the hand without end: the limit is worth having.
@@ -105,6 +114,7 @@ def tapping(device_mass: float, seconds: float, encoder: float) -> None:
         # Rounded to its encoder the device's place is off by half a count: that much work at the force that acts.
         slack = ROUNDING + encoder * float(np.abs(told.tip.force).sum())
         assert -device.work >= -slack
+        assert told.tip.energy == pytest.approx(-device.work, abs=slack)
         largest = max(largest, device.energy())
         if (step + 1) % 1000 == 0:
             peaks.append(largest)

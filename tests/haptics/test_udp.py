@@ -24,7 +24,10 @@ from surgsim_env.haptics.packet import (
     unpack_force,
     unpack_pose,
 )
+from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.telemetry import TipTelemetry
 from surgsim_env.haptics.udp import PACKETS_PER_READ, UdpDevice
+from surgsim_env.haptics.watchdog import WatchdogTimes
 from tests.haptics.bench_hand import touching_simulation
 
 coordinate = st.floats(-POSITION_LARGEST, POSITION_LARGEST)
@@ -88,7 +91,7 @@ def sender(device):
     made.socket.close()
 
 
-def told(device: UdpDevice):
+def arrived(device: UdpDevice):
     """What comes within half a second; loopback delivers at once, or nothing at all."""
     for _ in range(500):
         if (pose := device.read()) is not None:
@@ -181,7 +184,7 @@ def test_hostile_packet_is_dropped_counted_and_not_answered(name, device, sender
     assert sender.silent()
     # And the port works on.
     sender.pose(1)
-    assert told(device) is not None
+    assert arrived(device) is not None
 
 
 @given(st.binary(max_size=200))
@@ -216,7 +219,7 @@ def test_device_survives_any_packets(packets):
             device.read()
             device.write(np.zeros(3))
         sender.pose(2**31)
-        pose = told(device)
+        pose = arrived(device)
         assert pose is not None and np.isfinite(pose.position).all()
     finally:
         device.close()
@@ -236,7 +239,7 @@ def test_sequence_goes_round(last, ahead):
 
 def test_pose_is_read_and_answered_once(device, sender):
     sender.pose(3, (0.01, 0.02, 0.03), buttons=2, rotation=np.array((0.0, 1.0, 0.0, 0.0)))
-    pose = told(device)
+    pose = arrived(device)
     assert pose is not None and pose.buttons == 2 and pose.time == 100.0
     np.testing.assert_array_equal(pose.position, (0.01, 0.02, 0.03))
     np.testing.assert_array_equal(pose.rotation, (0.0, 1.0, 0.0, 0.0))
@@ -259,7 +262,7 @@ def test_newest_pose_wins_and_one_answer_goes_out(device, sender):
     for sequence in range(1, 6):
         sender.pose(sequence, (0.001 * sequence, 0.0, 0.0))
     time.sleep(0.05)
-    pose = told(device)
+    pose = arrived(device)
     assert pose is not None and pose.position[0] == 0.005
     device.write(np.zeros(3))
     assert len(sender.answer()) == FORCE.size
@@ -277,7 +280,7 @@ def test_old_doubled_and_reordered_packets_are_dropped(device, sender):
 def test_second_sender_is_a_stranger_until_the_first_is_silent(device, sender, clock):
     other = Sender(device)
     sender.pose(1, (0.001, 0.0, 0.0))
-    assert told(device) is not None
+    assert arrived(device) is not None
     first = device.peer
     other.pose(500, (0.5, 0.5, 0.5))
     drained(device, 2)
@@ -291,7 +294,7 @@ def test_second_sender_is_a_stranger_until_the_first_is_silent(device, sender, c
     assert device.counts.stranger == 2
     clock.now += 0.02
     other.pose(5)
-    assert told(device) is not None
+    assert arrived(device) is not None
     assert device.peer != first
     device.write(np.zeros(3))
     assert len(other.answer()) == FORCE.size
@@ -300,7 +303,7 @@ def test_second_sender_is_a_stranger_until_the_first_is_silent(device, sender, c
 
 def test_garbage_and_old_poses_do_not_keep_a_silent_peer_attached(device, sender, clock):
     sender.pose(10)
-    assert told(device) is not None
+    assert arrived(device) is not None
     for number in range(12):
         clock.now += 0.1
         sender.raw(b"garbage")
@@ -339,10 +342,34 @@ def test_loop_rides_on_a_flood(device, sender):
     other.socket.close()
 
 
+def test_bridge_that_stops_sending_loses_its_force(device, sender):
+    """The whole chain: packets stop, after 50 ms the force fades to zero in 100 ms; packets come, it comes back."""
+    watchdog = WatchdogTimes(resume=0.02)
+    settings = HapticSettings(watchdog=watchdog, relative=True, smoothing=0.0, approach_speed=0.5)
+    loop = HapticLoop(touching_simulation(), device, settings)
+
+    def steps(first: int, count: int, height: float) -> TipTelemetry:
+        for sequence in range(first, first + count):
+            sender.pose(sequence, (0.0, 0.0, height))
+            told = loop.step()
+        return told.tip
+
+    # The first pose means where the tip is; then 3 mm down.
+    steps(1, 1, 0.5)
+    before = steps(2, 300, 0.497)
+    assert before.force[2] > 0.1 and not before.faded
+    silent = [loop.step().tip for _ in range(160)]
+    assert not silent[45].faded and silent[60].faded
+    np.testing.assert_array_equal(silent[-1].force, 0.0)
+    assert silent[-1].contact_force[2] > 0.1
+    back = steps(302, 100, 0.497)
+    np.testing.assert_allclose(back.force, before.force, atol=0.01)
+
+
 def test_peer_that_has_gone_is_no_fault(device, sender):
     """A closed port's refusal (ICMP) comes back as an error of the socket on some systems."""
     sender.pose(1)
-    assert told(device) is not None
+    assert arrived(device) is not None
     sender.socket.close()
     for _ in range(5):
         device.write(np.zeros(3))

@@ -173,7 +173,7 @@ def mesh_surface(
         raise MeshError(f"cell_size is {cell_size}; the rule is a positive length in metres")
     coarsest = checked_coarsest(size, coarse_cell_size, fine_triangles, fine_depth)
     points, corners = check_surface(vertices, triangles)
-    _check_cell_size(points, corners, size)
+    check_cell_size(np.ptp(points, axis=0), surface_volume(points, corners), size)
     if coarsest:
         check_coarse_cell_size(points, size, coarsest)
         fine = checked_fine_triangles(fine_triangles, len(corners))
@@ -185,6 +185,17 @@ def mesh_surface(
             f"cell_size {size:g} m leaves no tets: every part of the surface is thinner than a cell; try {size / 2:g} m"
         )
     finer = f"a coarse_cell_size below {coarse_cell_size:g} m" if coarsest else f"a cell_size below {size:g} m"
+    return largest_body_mesh(nodes, tets, finer)
+
+
+def largest_body_mesh(nodes: FloatArray, tets: Int64Array, finer: str) -> TetMesh:
+    """The largest body of tets of any sense, in the kernels' favourite order; warns as `mesh_surface` does.
+
+    Args:
+        nodes: points [m], shape (n, 3).
+        tets: shape (n_tet, 4), not oriented.
+        finer: what keeps thinner parts, for the warnings.
+    """
     tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), finer)
     used, renumbered = np.unique(tets, return_inverse=True)
     mesh = _swept_mesh(nodes[used], renumbered.reshape(-1, 4))
@@ -192,22 +203,21 @@ def mesh_surface(
     return mesh
 
 
-def _check_cell_size(points: FloatArray, corners: Int64Array, size: float) -> None:
-    extent = np.ptp(points, axis=0)
+def check_cell_size(extent: FloatArray, volume: float, size: float) -> None:
+    """Refuse cells that are too coarse or too fine for a body of an extent (3,) [m] and a volume [m^3]."""
     smallest = extent.min()
     if smallest < CELLS_ACROSS_MIN * size:
         raise MeshError(
-            f"cell_size {size:g} m is too coarse: the surface is {smallest:.4g} m across its smallest extent, the "
+            f"cell_size {size:g} m is too coarse: the body is {smallest:.4g} m across its smallest extent, the "
             f"rule is at least {CELLS_ACROSS_MIN} cells: use {smallest / (2 * CELLS_ACROSS_MIN):.2g} m or less"
         )
-    volume = surface_volume(points, corners)
     tet_count = TETS_PER_CELL * volume / size**3
     grid_count = np.prod(2 * extent / size)
     finest = max((TETS_PER_CELL * volume / TET_LIMIT) ** (1 / 3), 2 * (np.prod(extent) / GRID_LIMIT) ** (1 / 3))
     if tet_count > TET_LIMIT or grid_count > GRID_LIMIT:
         raise MeshError(
             f"cell_size {size:g} m would give about {tet_count:.3g} tets in {grid_count / 8:.3g} cells; the rule is "
-            f"at most {TET_LIMIT:g} tets: use {1.05 * finest:.2g} m or more (is the surface in metres?)"
+            f"at most {TET_LIMIT:g} tets: use {1.05 * finest:.2g} m or more (is it in metres?)"
         )
 
 
@@ -238,7 +248,7 @@ def _largest_body(tets: Int64Array, volumes: FloatArray, finer: str) -> Int64Arr
         f"{count - 1} part(s) of {int((~kept).sum())} tets ({share:.2%} of the volume) hang on the body by less than "
         f"a face and were dropped; {finer} keeps thinner parts",
         UserWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
     return tets[kept]
 
@@ -253,5 +263,5 @@ def _warn_of_pinches(mesh: TetMesh, finer: str) -> None:
             f"{pinched.size} edge(s) of the boundary, first {first}-{second}, belong to more than two boundary "
             f"triangles: the body is pinched to nothing there; {finer} resolves the wall",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )

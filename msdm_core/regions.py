@@ -156,10 +156,34 @@ def lesion_fraction(mesh: TetMesh, lesion: Lesion) -> FloatArray:
     centroid = scaled[mesh.tets].mean(axis=1)
     reach = np.linalg.norm(scaled[mesh.tets] - centroid[:, None], axis=2).max(axis=1)
     near = (np.linalg.norm(centroid, axis=1) < 1.0 + reach) & (corners_inside < 4)
-    samples = _BARYCENTRIC_SAMPLES @ scaled[mesh.tets[near]]
+    samples = tet_samples(scaled[mesh.tets[near]])
     fraction[near] = (np.einsum("tij,tij->ti", samples, samples) <= 1.0).mean(axis=1)
     _check_lesion(mesh, lesion, axes, fraction)
     return fraction
+
+
+def lesion_extent(mesh: TetMesh, lesion: Lesion) -> tuple[FloatArray, FloatArray]:
+    """Centre [m] and half axes along x, y, z [m] of a lesion, each (3,).
+
+    Those of a tagged region are of the ellipsoid with its centroid and its variances: a solid ellipsoid has a^2 / 5
+    along a half axis a, a tet with corners x_i about the origin (sum x_i^2 + (sum x_i)^2) / 20.
+    """
+    if lesion.region is None:
+        return np.asarray(lesion.centre, dtype=np.float64), lesion.half_axes
+    chosen = mesh.region == mesh.region_tag(lesion.region)
+    if not chosen.any():
+        raise OrganError(f"{lesion.name}: region {lesion.region!r} of the mesh has no tets: leave it out")
+    weight = mesh.volumes[chosen] / mesh.volumes[chosen].sum()
+    corners = mesh.points[mesh.tets[chosen]]
+    centre = weight @ corners.mean(axis=1)
+    corners = corners - centre
+    variance = weight @ ((corners**2).sum(axis=1) + corners.sum(axis=1) ** 2) / 20.0
+    return centre, np.sqrt(5.0 * variance)
+
+
+def tet_samples(corners: FloatArray) -> FloatArray:
+    """165 points spread evenly over each of the tets with corners (n, 4, 3), in their unit, shape (n, 165, 3)."""
+    return _BARYCENTRIC_SAMPLES @ corners
 
 
 def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: FloatArray) -> None:

@@ -15,7 +15,7 @@ from msdm_core.meshing import box_mesh, mesh_surface
 from msdm_core.ordering import in_sweep_order
 from msdm_core.organ import OrganSpec, compile_organ
 from msdm_core.quality import surface_cell
-from msdm_core.regions import Lesion
+from msdm_core.regions import Lesion, Material
 from msdm_core.support import SupportLaw
 from msdm_core.surface import triangles_facing
 from msdm_core.triangles import nearest_triangle
@@ -63,14 +63,14 @@ class Anatomy:
     def specification(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganSpec:
         """What `organ` compiles, for changes that a scene's draw makes to it."""
         scene, capsule = self.scene, self.scene.capsule
-        material = replace(scene.material, youngs_modulus=scene.material.youngs_modulus * modulus_factor)
+        material = _stiffer(scene.material, modulus_factor)
         if capsule is not None:
             capsule = replace(capsule, youngs_modulus=capsule.youngs_modulus * modulus_factor)
         return OrganSpec(
             mesh=self.mesh,
             materials=material,
             capsule=capsule,
-            lesions=tuple(lesions),
+            lesions=(*self._standing_regions(modulus_factor), *lesions),
             anchors=self.anchors,
             damping=scene.damping,
             stiffness_rule=scene.stiffness_rule,
@@ -78,6 +78,11 @@ class Anatomy:
             supports=scene.supports,
             support_law=scene.support_law or SupportLaw(scene.contact.stiffness, scene.contact.damping),
         )
+
+    def _standing_regions(self, modulus_factor: float) -> list[Lesion]:
+        """The regions that every organ of the scene has, their moduli times a factor."""
+        standing = [region.as_lesion for region in self.scene.regions if not region.lesion]
+        return [replace(one, material=_stiffer(one.material, modulus_factor)) for one in standing]
 
     def compiled(self, specification: OrganSpec) -> OrganModel:
         """The organ of a specification, with the mass that the scene's number of substeps needs if it says so."""
@@ -158,13 +163,19 @@ class Anatomy:
         return Lesion(centre=(x, y, z), radius=radius, material=material, name=name)
 
     def demonstration_lesions(self) -> list[Lesion]:
-        """The lesions that the scene file shows."""
-        return [self._fixed(lesion) for lesion in self.scene.demonstration]
+        """The lesions that the scene file shows: regions of its mesh, and balls."""
+        regions = [region.as_lesion for region in self.scene.regions if region.lesion]
+        return regions + [self._fixed(lesion) for lesion in self.scene.demonstration]
 
     def _fixed(self, lesion: FixedLesion) -> Lesion:
         return self.lesion_below(
             np.asarray(lesion.below), lesion.radius, lesion.cover, lesion.modulus_ratio, lesion.name
         )
+
+
+def _stiffer(material: Material | None, factor: float) -> Material:
+    assert material is not None
+    return replace(material, youngs_modulus=material.youngs_modulus * factor)
 
 
 def load_anatomy(scene: Scene) -> Anatomy:
@@ -180,14 +191,19 @@ def load_anatomy(scene: Scene) -> Anatomy:
 @lru_cache(maxsize=8)
 def _load_anatomy(scene: Scene, file_time: int | None) -> Anatomy:
     """`load_anatomy`, remembered for as long as the mesh file keeps its time of change [ns]."""
-    mesh = _load_mesh(scene)
-    anchors = _anchored_nodes(mesh, scene.anchors)
-    face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)
-    anatomy = Anatomy(scene, mesh, anchors, face)
+    anatomy = anatomy_of(scene, _load_mesh(scene))
     warn_of_coarse_cells(
         f"scene {scene.name!r}", anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth
     )
     return anatomy
+
+
+def anatomy_of(scene: Scene, mesh: TetMesh) -> Anatomy:
+    """The anatomy of a scene on a mesh that is at hand; the scene's own mesh is not looked for."""
+    for region in scene.regions:
+        mesh.region_tag(region.name)
+    face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)
+    return Anatomy(scene, mesh, _anchored_nodes(mesh, scene.anchors), face)
 
 
 def _load_mesh(scene: Scene) -> TetMesh:

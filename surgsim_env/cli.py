@@ -14,20 +14,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from msdm_core.length_unit import LengthUnit
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.haptics.options import Haptics
 from surgsim_env.live.options import View
-from surgsim_env.out_folder import writable_folder
-from surgsim_env.scenes import Ball, Scene, list_scenes, load_scene, make_scene
+from surgsim_env.scenes import list_scenes, make_scene
 
 # Options whose value is a list of numbers, which may begin with a minus.
 NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around")
-
-# Of the lattice that fills a surface, where nothing else is said [m].
-CELL_SIZE = 0.010
-
 
 # Options that may be left out, shown with what they hold and without tyro's "{None}|" and "(default: None)".
 MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
@@ -49,10 +41,15 @@ class Palpate:
     """Instead: a scene file of your own (TOML)."""
     surface: MaybePath = None
     """Instead: a closed surface (STL, OBJ, PLY); what it does not say is taken from the scene liver."""
+    segmentation: MaybePath = None
+    """Instead: a label image of a scan (NIfTI, NRRD, DICOM); makes the organ as `surgsim organ` does, into --out."""
+    labels: MaybeText = None
+    """Of --segmentation: NAME=LABEL,..., the organ first, such as liver=1,lesion=2."""
     length_unit: MaybeText = None
     """Of --surface: m, cm, mm, or metres per unit as a number."""
-    cell_size: float | None = None
-    """Of the lattice that fills --surface [m]; default: 0.010."""
+    cell_size: MaybeNumber = None
+    """Of the lattice that fills --surface or --segmentation [m]; default: in proportion to the organ, and so are tip,
+    press depth and spacing (docs/patient.md)."""
     lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """x,y,z,radius,ratio: centre and radius [m], modulus over the healthy one; repeatable; replaces the scene's."""
     anchors: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -127,18 +124,35 @@ class Arms:
 
 @dataclass(frozen=True)
 class Organ:
-    """Build an organ from a closed surface or a tetrahedral mesh, report on it, and write it."""
+    """Build an organ from a scan's labels, closed surfaces or a tetrahedral mesh, report on it, and write it.
 
-    file: tyro.conf.Positional[Path]
-    """Closed surface (STL, OBJ, PLY) or tets (vtu, vtk, msh, mesh)."""
+    With --out patient.vtu of labels or surfaces also patient.toml, a scene for every command and environment of
+    palpation, and report.html. docs/patient.md tells more.
+    """
+
+    files: tyro.conf.Positional[tuple[Path, ...]]
+    """A label image (nii, nii.gz, nrrd, dcm); or closed surfaces (STL, OBJ, PLY), the organ first, then a file for each
+    region in it, named after its file; or one file of tets (vtu, vtk, msh, mesh)."""
+    labels: MaybeText = None
+    """Of an image: NAME=LABEL,..., the organ first, such as liver=1,lesion=2."""
+    region: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=FILE: one more region from a closed surface; repeatable."""
     length_unit: MaybeText = None
     """m, cm, mm, or metres per unit as a number; required where the format has none."""
-    cell_size: float = CELL_SIZE
-    """Of the lattice that fills a surface [m]."""
+    cell_size: MaybeNumber = None
+    """Of the lattice that fills it [m]; default: in proportion to the organ."""
     out: MaybePath = None
     """Where the mesh is written (vtu, vtk, msh, mesh)."""
     youngs_modulus: MaybeNumber = None
-    """[Pa]; default: the liver's."""
+    """Of the healthy tissue [Pa]; default: by the organ's name, else the liver's."""
+    modulus: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=PASCAL: Young's modulus of a region; repeatable; default: by its name."""
+    approach: MaybeText = None
+    """x,y,z: direction of the probe; default: from the front and above in a scan, 0,0,-1 for surfaces."""
+    mend: bool = False
+    """Close holes, resolve self-intersections, fill cavities; says what it did."""
+    mesher: MaybeText = None
+    """lattice (default), or tetwild: conforming region surfaces (extra `tetwild`)."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +228,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench | Haptics | View) -> int:
     console = Console()
     if isinstance(command, Palpate):
-        _palpate(command, console)
+        from surgsim_env.palpation import palpate_command
+
+        palpate_command.palpate(palpate_command.Request(**vars(command)), console)
     elif isinstance(command, Retract):
         from surgsim_env.scripting.retract_command import Request as Retraction
         from surgsim_env.scripting.retract_command import retract
@@ -241,10 +257,9 @@ def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench |
 
         return view(command, console)
     elif isinstance(command, Organ):
-        from surgsim_env.organ_report import report_organ
+        from surgsim_env.patient import command as patient
 
-        unit = None if command.length_unit is None else _unit(command.length_unit)
-        report_organ(command.file, unit, command.cell_size, command.youngs_modulus, command.out, console)
+        patient.make_organ(patient.Request(**vars(command)), console)
     else:
         table = Table()
         table.add_column("scene")
@@ -253,122 +268,6 @@ def _run(command: Palpate | Retract | Arms | Organ | Scenes | Validate | Bench |
             table.add_row(name, make_scene(name).description)
         console.print(table)
     return 0
-
-
-def _palpate(command: Palpate, console: Console) -> None:
-    from surgsim_env.palpation.figures import write_stiffness_map
-    from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, run_palpation
-    from surgsim_env.palpation.report import (
-        CSV_NAME,
-        PICTURE_NAME,
-        SUMMARY_NAME,
-        print_report,
-        write_csv,
-        write_summary,
-    )
-    from surgsim_env.palpation.surface_scene import load_stable_anatomy
-
-    scene = _scene(command, console)
-    anatomy = load_anatomy(scene)
-    lesions = _lesions(command, anatomy)
-    anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-    if command.seed < 0:
-        raise ValueError(f"--seed is {command.seed}; it must be a whole number of at least 0")
-    around = None
-    if command.around is not None:
-        x, y, z, radius = _numbers("--around", command.around, "x,y,z,radius")
-        if not 0.0 < radius < float("inf"):
-            raise ValueError(f"--around {command.around}: the radius is {radius:g} m; it must be finite and above 0")
-        around = Ball((x, y, z), radius)
-    # Before the work: a place that cannot be written is better known now than after it.
-    folder = writable_folder(command.out or _free_folder(scene.name), (CSV_NAME, SUMMARY_NAME, PICTURE_NAME))
-    found = run_palpation(
-        anatomy, lesions=lesions, around=around, seed=command.seed, workers=command.workers, console=console
-    )
-    write_csv(found, folder / CSV_NAME)
-    write_summary(found, folder / SUMMARY_NAME, vars(command))
-    write_stiffness_map(found, folder / PICTURE_NAME)
-    print_report(found, console)
-    console.print(f"written: {folder}/{{{CSV_NAME},{SUMMARY_NAME},{PICTURE_NAME}}}", highlight=False, soft_wrap=True)
-
-
-def _scene(command: Palpate, console: Console) -> Scene:
-    from surgsim_env.palpation.surface_scene import SurfaceOptions, surface_scene, with_options
-
-    if sum(source is not None for source in (command.scene, command.organ, command.surface)) > 1:
-        raise ValueError("give only one of --scene, --organ and --surface")
-    approach = None
-    if command.approach is not None:
-        x, y, z = _numbers("--approach", command.approach, "x,y,z")
-        approach = (x, y, z)
-    balls = (_numbers("--anchors", text, "x,y,z,radius") for text in command.anchors)
-    options = SurfaceOptions(
-        approach=approach,
-        anchors=tuple((x, y, z, radius) for x, y, z, radius in balls),
-        press_depth=command.press_depth,
-        tip_radius=command.tip_radius,
-        spacing=command.spacing,
-        youngs_modulus=command.youngs_modulus,
-    )
-    if command.surface is None:
-        for option in ("anchors", "cell_size", "length_unit"):
-            if getattr(command, option):
-                name = option.replace("_", "-")
-                raise ValueError(f"--{name} goes with --surface; a scene states its own mesh and anchors")
-        scene = load_scene(command.organ) if command.organ else make_scene(command.scene or "liver")
-        return with_options(scene, options)
-    if command.length_unit is None:
-        raise ValueError('--surface needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none')
-    unit = _unit(command.length_unit)
-    cell_size = CELL_SIZE if command.cell_size is None else command.cell_size
-    scene = surface_scene(command.surface, length_unit=unit, cell_size=cell_size, options=options)
-    x, y, z = scene.instrument.approach
-    held = "the anchors given" if command.anchors else "its bed, the deepest 15 % along the approach"
-    material, depth, tip = scene.material, scene.palpation.press_depth, scene.instrument.tip_radius
-    console.print(
-        f"{command.surface.name}: pressed along {x:.3g}, {y:.3g}, {z:.3g} of the file's axes (--approach), "
-        f"held by {held}; E {material.youngs_modulus:g} Pa, nu {material.poisson_ratio:g}, tip {tip * 1e3:g} mm, "
-        f"depth {depth * 1e3:g} mm, capsule and damping as in the scene liver",
-        highlight=False,
-    )
-    return scene
-
-
-def _lesions(command: Palpate, anatomy: Anatomy) -> list[Lesion]:
-    if not command.lesion:
-        return anatomy.demonstration_lesions()
-    lesions = []
-    for number, text in enumerate(command.lesion, start=1):
-        x, y, z, radius, ratio = _numbers("--lesion", text, "x,y,z,radius,ratio")
-        if not ratio > 0.0:
-            raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
-        lesions.append(anatomy.lesion_at((x, y, z), radius, ratio, f"lesion {number}"))
-    return lesions
-
-
-def _numbers(option: str, text: str, form: str) -> tuple[float, ...]:
-    """The numbers of a list such as 0,0,-1; ValueError with the form it should have."""
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != len(form.split(",")):
-        raise ValueError(f"{option} is {text!r}; the form is {form}, numbers with commas and no blanks between them")
-    return numbers
-
-
-def _unit(text: str) -> LengthUnit:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _free_folder(scene: str) -> Path:
-    number = 1
-    while (folder := Path("runs") / f"palpate-{scene}-{number}").exists():
-        number += 1
-    return folder
 
 
 def _joined(arguments: list[str]) -> list[str]:

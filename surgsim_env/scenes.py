@@ -16,6 +16,7 @@ from surgsim_env.arms.description import list_arms
 from surgsim_env.arms.port import Port
 from surgsim_env.retraction import Retraction, RetractionCamera
 from surgsim_env.scene_files import scenes_folder
+from surgsim_env.tissue_region import TissueRegion
 from surgsim_env.toml_tables import fill, nearest, read_toml
 
 # Instruments carried by slides; their models are NAME.xml in scenes/instruments.
@@ -275,7 +276,8 @@ class Scene:
 
     The organ is settled under `gravity` [m/s^2] onto its anchors and `supports`, which push as contact does where no
     `support_law` is given. `port` is where an arm enters the body; if it is not given,
-    `arms.port_placement.default_port` finds one. `ports` are those of two arms, the left one's first.
+    `arms.port_placement.default_port` finds one. `ports` are those of two arms, the left one's first. `regions` of
+    the mesh have materials of their own.
     """
 
     name: str
@@ -302,6 +304,7 @@ class Scene:
     gravity: Vector = (0.0, 0.0, 0.0)
     supports: tuple[Support, ...] = ()
     support_law: SupportLaw | None = None
+    regions: tuple[TissueRegion, ...] = ()
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
@@ -318,7 +321,7 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
 _TABLES = (
     *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
     *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Endoscope, Port),
-    *(Retraction, RetractionCamera, Support, SupportLaw),
+    *(Retraction, RetractionCamera, Support, SupportLaw, TissueRegion),
 )
 
 

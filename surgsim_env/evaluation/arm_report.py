@@ -25,50 +25,8 @@ from surgsim_env.evaluation.arm_quantities import (
 from surgsim_env.evaluation.arm_results import REASONS, ArmsEvaluation
 from surgsim_env.evaluation.arm_table import RANKING_RULE, Ranked, columns
 from surgsim_env.evaluation.episode_figures import FIGURES, Episodes, clause, median_of, what_was_run
-
-# Nothing is loaded from anywhere: the browser itself refuses it.
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-STYLE = """
-:root { color-scheme: light; }
-body { margin: 0 auto; max-width: 72rem; padding: 1.5rem; color: #20242c; background: #fff;
-       font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .75rem; }
-h2 { font-size: 1.25rem; margin: 2.25rem 0 .5rem; border-bottom: 1px solid #c9cdd4; padding-bottom: .2rem; }
-p, li { max-width: 60rem; }
-.verdict { font-size: 1.15rem; border-left: .3rem solid #0072b2; padding-left: 1rem; margin: 1rem 0; }
-nav ul { list-style: none; padding: 0; margin: 0; display: flex; flex-wrap: wrap; gap: .25rem 1.25rem; }
-a { color: #005a8f; }
-figure { margin: 1.25rem 0 1.75rem; }
-figcaption { max-width: 60rem; margin-top: .4rem; }
-figcaption b { display: block; }
-img { max-width: 100%; height: auto; display: block; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; margin: .75rem 0 1rem; font-variant-numeric: tabular-nums; }
-caption { text-align: left; font-weight: 600; padding-bottom: .35rem; }
-th, td { padding: .3rem .7rem; border-bottom: 1px solid #d9dce1; text-align: left; vertical-align: top; }
-thead th { border-bottom: 2px solid #20242c; vertical-align: bottom; }
-tbody th { font-weight: 500; }
-td.number, th.number { text-align: right; }
-td.number { white-space: nowrap; }
-td.wide { min-width: 14rem; }
-.total th, .total td { border-top: 2px solid #20242c; font-weight: 600; }
-.group { border-left: 1px solid #d9dce1; }
-code, pre { font: .9rem/1.45 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; }
-pre { background: #f3f4f6; padding: .75rem 1rem; white-space: pre-wrap; overflow-wrap: anywhere; }
-td code { overflow-wrap: anywhere; }
-dt { font-weight: 600; margin-top: .6rem; }
-dd { margin: 0 0 0 1.25rem; max-width: 60rem; }
-@media print {
-  body { max-width: none; padding: 0; font-size: 10pt; }
-  nav { display: none; }
-  h2 { break-after: avoid; }
-  figure, tr, dt { break-inside: avoid; }
-  .scroll { overflow: visible; }
-  table { font-size: 8.5pt; }
-  th, td { padding: .15rem .35rem; }
-  a { color: inherit; text-decoration: none; }
-}
-"""
+from surgsim_env.html_page import POLICY as POLICY
+from surgsim_env.html_page import html_page
 
 
 def write_report(
@@ -109,22 +67,7 @@ def write_report(
         ("command", "The command that made this report", f"<pre><code>{escape(command)}</code></pre>"),
     ]
     shown = [section for section in sections if section is not None and section[2]]
-    links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, heading, _ in shown)
-    body = "\n".join(
-        f'<section id="{name}" aria-labelledby="{name}-heading">\n<h2 id="{name}-heading">{escape(heading)}</h2>\n'
-        f"{content}\n</section>"
-        for name, heading, content in shown
-    )
-    path.write_text(
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n<style>{STYLE}</style>\n</head>\n<body>\n'
-        f'<header>\n<h1>{escape(title)}</h1>\n<p class="verdict">{escape(said)}</p>\n'
-        f'<nav aria-label="Contents"><ul>{links}</ul></nav>\n</header>\n<main>\n{body}\n</main>\n</body>\n</html>\n',
-        encoding="utf-8",
-        newline="\n",
-    )
+    path.write_text(html_page(title, said, shown), encoding="utf-8", newline="\n")
 
 
 def _figures(folder: Path, files: Sequence[Picture]) -> str:

@@ -35,7 +35,7 @@ class OrganView:
 
     def __init__(self, scene: Any, anatomy: Anatomy) -> None:
         """Add the organ at rest."""
-        self._scene, self._points = scene, anatomy.mesh.points
+        self._scene, self._mesh, self._points = scene, anatomy.mesh, anatomy.mesh.points
         self._surface = drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
         vertices, _ = self._surface.follow(anatomy.mesh.points)
         self._organ = scene.add_mesh_simple(
@@ -87,7 +87,7 @@ class OrganView:
         self._lesions = []
         self._organ.opacity = 0.45 if lesions else None
         for index, lesion in enumerate(lesions):
-            ball = lesion_ball(self._points, lesion)
+            ball = lesion_ball(self._mesh, lesion)
             node = self._scene.add_icosphere(
                 f"/lesion/{index}",
                 radius=float(ball.half_axes.max()) * SCALE,

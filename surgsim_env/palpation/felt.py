@@ -7,8 +7,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from msdm_core.geodesic import SurfaceDistance
-from msdm_core.mesh import FloatArray
-from msdm_core.regions import Lesion
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.regions import Lesion, lesion_extent
 from surgsim_env.palpation.analysis import healthy_majority, robust_spread
 
 # A maximum is felt where the smoothed contrast exceeds its surroundings by the floor, and by this many times the
@@ -138,13 +138,13 @@ def _surroundings(smooth: FloatArray, distance: FloatArray, majority: float) -> 
     return float(np.quantile(smooth[ring], 0.25)) if ring.sum() >= FEWEST_SURROUNDING else majority
 
 
-def seen_from_surface(lesions: Sequence[Lesion], project: Projection) -> list[Truth]:
+def seen_from_surface(lesions: Sequence[Lesion], mesh: TetMesh, project: Projection) -> list[Truth]:
     """The lesions with the nearest point of the palpable face and the normal there."""
     truths = []
     for lesion in lesions:
-        centre = np.asarray(lesion.centre, dtype=np.float64)
+        centre, half_axes = lesion_extent(mesh, lesion)
         point, normal = project(centre)
-        truths.append(Truth(lesion.name, centre, point, normal, float(lesion.half_axes.max())))
+        truths.append(Truth(lesion.name, centre, point, normal, float(half_axes.max())))
     return truths
 
 

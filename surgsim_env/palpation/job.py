@@ -116,7 +116,7 @@ def run_palpation(
             f"no press gave a stiffness at the set depth of {scene.palpation.press_depth * 1e3:g} mm; the first ended "
             f"by: {why}: change the press depth, limits.hard_force or the sensor"
         )
-    truths = tuple(seen_from_surface(hidden, anatomy.face.project))
+    truths = tuple(seen_from_surface(hidden, anatomy.mesh, anatomy.face.project))
     return Palpation(
         anatomy=anatomy,
         lesions=hidden,

@@ -60,7 +60,7 @@ def surface_scene(file: Path, *, length_unit: LengthUnit, cell_size: float, opti
         description=f"the surface {file.name}",
         folder=Path.cwd(),
         mesh=MeshSource(surface=SurfaceMesh(str(file), length_unit, cell_size)),
-        anchors=_anchors(options, scene.instrument.approach),
+        anchors=anchors_of(options, scene.instrument.approach),
         contact=replace(scene.contact, stiffness=contact),
         palpation=replace(scene.palpation, thickness_smallest=THICKNESS_PRESS_DEPTHS * scene.palpation.press_depth),
         demonstration=(),
@@ -129,7 +129,8 @@ def _direction(vector: Vector) -> Vector:
     return x, y, z
 
 
-def _anchors(options: SurfaceOptions, approach: Vector) -> tuple[Anchor, ...]:
+def anchors_of(options: SurfaceOptions, approach: Vector) -> tuple[Anchor, ...]:
+    """The balls that options name as anchors, else the bed along the approach."""
     if not options.anchors:
         return (Anchor("bed", bed=Bed(approach, BED_SHARE)),)
     balls = []

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from msdm_core.mesh import FloatArray, IntArray
-from msdm_core.regions import Lesion
+from msdm_core.mesh import FloatArray, IntArray, TetMesh
+from msdm_core.regions import Lesion, lesion_extent
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.cutting import clip_triangles, cut_tets
@@ -32,9 +32,9 @@ class Tissue:
     """An organ with certain lesions, ready to be drawn wherever its nodes are."""
 
     def __init__(self, anatomy: Anatomy, surface: DrawnSurface, lesions: Sequence[Lesion], cut_away: bool) -> None:
-        """Lesions are ellipsoids; those that are tagged regions of the mesh are left out."""
+        """Lesions are drawn as ellipsoids, tagged regions of the mesh too (`msdm_core.regions.lesion_extent`)."""
         self._rest, self._surface = anatomy.mesh.points, surface
-        self.lesions = [lesion_ball(self._rest, lesion) for lesion in lesions if lesion.centre is not None]
+        self.lesions = [lesion_ball(anatomy.mesh, lesion) for lesion in lesions]
         held = np.isin(surface.triangles, anatomy.anchors).all(axis=1)
         held = np.repeat(held, surface.splits**2)
         self._faces = {"organ": surface.faces[~held], "held": surface.faces[held]}
@@ -99,9 +99,9 @@ def cut_plane(anatomy: Anatomy, lesions: Sequence[LesionBall]) -> tuple[FloatArr
     return (lesions[0].centre if lesions else face), cut_direction(anatomy)
 
 
-def lesion_ball(rest: FloatArray, lesion: Lesion) -> LesionBall:
-    """An ellipsoidal lesion in an organ whose nodes rest at `rest` [m], (n_node, 3)."""
-    centre = np.asarray(lesion.centre, dtype=np.float64)
-    distance = np.linalg.norm((rest - centre) / lesion.half_axes, axis=1)
+def lesion_ball(mesh: TetMesh, lesion: Lesion) -> LesionBall:
+    """A lesion of an organ at rest as an ellipsoid; see `msdm_core.regions.lesion_extent`."""
+    centre, half_axes = lesion_extent(mesh, lesion)
+    distance = np.linalg.norm((mesh.points - centre) / half_axes, axis=1)
     nodes = np.flatnonzero(distance <= max(1.0, float(distance.min())))
-    return LesionBall(centre, lesion.half_axes, nodes.astype(np.int32))
+    return LesionBall(centre, half_axes, nodes.astype(np.int32))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from msdm_core.geodesic import SurfaceDistance
+from msdm_core.meshing import box_mesh
 from msdm_core.regions import Lesion, Material
 from surgsim_env.palpation.analysis import (
     contrast_with_model,
@@ -175,7 +176,9 @@ def test_truth_is_the_nearest_point_of_the_face():
     tissue = Material(5000.0, 1060.0)
     lesion = Lesion(centre=(0.03, 0.04, -0.02), radius=0.01, material=tissue, name="A")
     up = np.array([0.0, 0.0, 1.0])
-    (truth,) = seen_from_surface([lesion], lambda point: (point * [1.0, 1.0, 0.0], up))
+    (truth,) = seen_from_surface(
+        [lesion], box_mesh((0.1, 0.1, 0.05), (2, 2, 1)), lambda point: (point * [1.0, 1.0, 0.0], up)
+    )
     np.testing.assert_allclose(truth.point, [0.03, 0.04, 0.0])
     assert truth.radius == 0.01
 

@@ -1,0 +1,1 @@
+"""From a patient's scan, or surfaces drawn from one, to a scene: labels, mesh, materials, report."""

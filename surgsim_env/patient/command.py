@@ -1,0 +1,197 @@
+"""What `surgsim organ` does with labels, surfaces and tets, and how `surgsim palpate` begins from a scan."""
+
+import os
+import shlex
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from msdm_core.surface_io import SURFACE_SUFFIXES
+from surgsim_env.command_values import unit_of, vector_of
+from surgsim_env.organ_report import check_target, print_organ, report_organ
+from surgsim_env.palpation.surface_scene import SurfaceOptions
+from surgsim_env.patient.label_image import IMAGE_SUFFIXES, is_image, read_label_image
+from surgsim_env.patient.label_names import FORM, parse_labels
+from surgsim_env.patient.patient_mesh import PatientMesh, mesh_image
+from surgsim_env.patient.patient_scene import PatientScene, patient_scene
+from surgsim_env.patient.report import MARK, report_page
+from surgsim_env.patient.scene_text import FIRST_LINE, scene_text
+from surgsim_env.patient.surface_mesh import mesh_surfaces
+from surgsim_env.scenes import Scene, load_scene
+
+if TYPE_CHECKING:
+    from surgsim_env.palpation.palpate_command import Request as PalpateRequest
+
+MESHERS = ("lattice", "tetwild")
+REPORT_NAME = "report.html"
+
+
+@dataclass(frozen=True)
+class Request:
+    """The options of `surgsim organ`, as the command line explains them."""
+
+    files: tuple[Path, ...]
+    labels: str | None = None
+    region: tuple[str, ...] = ()
+    length_unit: str | None = None
+    cell_size: float | None = None
+    out: Path | None = None
+    youngs_modulus: float | None = None
+    modulus: tuple[str, ...] = ()
+    approach: str | None = None
+    mend: bool = False
+    mesher: str | None = None
+
+    @property
+    def command(self) -> str:
+        """The command line that says the same."""
+        words = ["surgsim", "organ", *map(str, self.files)]
+        for name, value in vars(self).items():
+            option = f"--{name.replace('_', '-')}"
+            if name == "files" or value in (None, (), False):
+                continue
+            for one in value if isinstance(value, tuple) else (value,):
+                words += [option] if one is True else [option, str(one)]
+        return shlex.join(words)
+
+
+def make_organ(request: Request, console: Console) -> None:
+    """Make an organ, print what it is like, and with `out` write its mesh, its scene and its report.
+
+    Raises:
+        MeshError: a file that cannot become an organ.
+        ValueError: options that do not go together, or a place that cannot be written.
+    """
+    if not request.files:
+        raise ValueError(f"give a file: a label image ({', '.join(IMAGE_SUFFIXES)}), surfaces or a mesh of tets")
+    unit = unit_of(request.length_unit)
+    first = request.files[0]
+    if not is_image(first) and first.suffix.lower() not in SURFACE_SUFFIXES:
+        _refuse(request, ("labels", "region", "modulus", "approach", "mend", "mesher"), "a label image or surfaces")
+        if len(request.files) > 1:
+            raise ValueError(f"{first}: one file of tets is taken, {len(request.files)} are given")
+        report_organ(first, unit, request.youngs_modulus, request.out, console)
+        return
+    if request.out is not None:
+        _check_targets(request.out)
+    options = SurfaceOptions(approach=vector_of("--approach", request.approach), youngs_modulus=request.youngs_modulus)
+    patient = _patient(request)
+    folder, name = (request.out.parent, request.out) if request.out else (Path(), Path("patient.vtu"))
+    found = patient_scene(patient, name.stem, folder, name.name, options=options, moduli=_moduli(request.modulus))
+    _tell(found, console)
+    if request.out is not None:
+        written = write_patient(found, request.out, request.command)
+        console.print(f"written: {', '.join(map(str, written))}", highlight=False, soft_wrap=True)
+
+
+def palpable_patient(request: "PalpateRequest", folder: Path, console: Console) -> Scene:
+    """The scene of the file that `surgsim palpate` was given, made by the way and written to a folder."""
+    file = request.segmentation or request.surface
+    assert file is not None
+    asked = Request((file,), labels=request.labels, length_unit=request.length_unit, cell_size=request.cell_size)
+    out = folder / f"{file.name.split('.')[0]}.vtu"
+    _check_targets(out)
+    found = patient_scene(_patient(asked), out.stem, folder, out.name, options=request.options, moduli={})
+    _tell(found, console)
+    write_patient(found, out, asked.command)
+    return load_scene(out.with_suffix(".toml"))
+
+
+def write_patient(found: PatientScene, out: Path, command: str) -> list[Path]:
+    """Write the mesh, the scene beside it and report.html, all of them or none; returns their paths."""
+    from msdm_core.mesh_io import write_mesh
+
+    text, scene_file = scene_text(found), out.with_suffix(".toml")
+    page = report_page(found, text, scene_file.name, command)
+    targets = [out, scene_file, out.with_name(REPORT_NAME)]
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".surgsim-part-") as part:
+        write_mesh(Path(part, out.name), found.patient.mesh)
+        Path(part, scene_file.name).write_text(text, encoding="utf-8", newline="\n")
+        Path(part, REPORT_NAME).write_text(page, encoding="utf-8", newline="\n")
+        load_scene(Path(part, scene_file.name))
+        for target in targets:
+            os.replace(Path(part, target.name), target)
+    return targets
+
+
+def _patient(request: Request) -> PatientMesh:
+    first, mesher = request.files[0], request.mesher or MESHERS[0]
+    if mesher not in MESHERS:
+        raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
+    if is_image(first):
+        _refuse(request, ("region", "length_unit"), "surfaces; an image has its own")
+        if len(request.files) > 1:
+            raise ValueError(f"{first}: one image is taken, {len(request.files)} files are given")
+        if request.labels is None:
+            raise ValueError(f"{first}: which labels are the organ? Give {FORM}")
+        image = read_label_image(first, parse_labels(request.labels))
+        return mesh_image(image, first.name, cell_size=request.cell_size, mesher=mesher, mend=request.mend)
+    _refuse(request, ("labels",), "a label image; regions of surfaces have a file each")
+    wrong = [file for file in request.files if file.suffix.lower() not in SURFACE_SUFFIXES]
+    if wrong:
+        raise ValueError(f"{wrong[0]}: is no surface; beside {first} only {', '.join(SURFACE_SUFFIXES)} are taken")
+    unit = unit_of(request.length_unit)
+    if unit is None:
+        raise ValueError(f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none')
+    return mesh_surfaces(
+        request.files, request.region, unit, cell_size=request.cell_size, mesher=mesher, mend=request.mend
+    )
+
+
+def _refuse(request: Request, names: Sequence[str], what: str) -> None:
+    for name in names:
+        if getattr(request, name):
+            raise ValueError(f"--{name.replace('_', '-')} goes with {what}")
+
+
+def _moduli(texts: Sequence[str]) -> Mapping[str, float]:
+    moduli = {}
+    for text in texts:
+        name, found, value = text.partition("=")
+        try:
+            moduli[name.strip()] = float(value)
+        except ValueError:
+            found = ""
+        if not found:
+            raise ValueError(f"--modulus is {text!r}; the form is NAME=PASCAL, such as lesion=40000")
+    return moduli
+
+
+def _check_targets(out: Path) -> None:
+    """Refuse places that cannot be written, and files that are not an earlier run's, before the work."""
+    check_target(out)
+    for path, mark in ((out.with_suffix(".toml"), FIRST_LINE), (out.with_name(REPORT_NAME), MARK)):
+        if path.is_dir():
+            raise ValueError(f"--out {out}: {path.name} is a folder there; choose another place or remove it")
+        if path.exists() and mark not in path.read_text(encoding="utf-8", errors="replace"):
+            raise ValueError(
+                f"--out {out}: {path} is there, and not of an earlier run; choose another place or remove it"
+            )
+
+
+def _tell(found: PatientScene, console: Console) -> None:
+    """Print what the organ is like, and warn of what was dropped or is odd."""
+    patient, scene = found.patient, found.scene
+    touch = (scene.instrument.tip_radius, scene.palpation.press_depth)
+    rows = {}
+    for one in patient.volumes[1:]:
+        modulus = found.regions[one.name].material.youngs_modulus
+        rows[one.name] = f"{one.mesh * 1e6:.2f} ml (error {one.error:+.2%}), E {modulus:g} Pa"
+    print_organ(
+        ", ".join(patient.sources),
+        patient.mesh,
+        found.anatomy.organ(found.anatomy.demonstration_lesions()),
+        material=scene.material,
+        volume_error=patient.volume_error,
+        cell=found.anatomy.palpable_cell,
+        touch=touch,
+        more=rows,
+        console=console,
+    )
+    for note in (*patient.notes, *found.notes):
+        warnings.warn(note, UserWarning, stacklevel=2)

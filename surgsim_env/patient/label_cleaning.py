@@ -1,0 +1,123 @@
+"""A label image made ready to be meshed: one part, each lesion a region of its own, cavities filled where asked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from msdm_core.segmentation_meshing import largest_part, parts_of
+from surgsim_env.patient.label_image import LabelImage
+from surgsim_env.patient.materials import is_lesion
+
+# A lesion smaller than a ball of half a cell's radius cannot be shown (the rule of `msdm_core.regions.Lesion`).
+SMALLEST_SHARE_OF_CELL = np.pi / 6.0
+# More parts of one label than this are no lesions but noise.
+PARTS_MOST = 24
+
+
+@dataclass(frozen=True, eq=False)
+class CleanLabels:
+    """Labels of one body.
+
+    Fields:
+        tags: n for the n-th of `names`, counted from 1, 0 outside       (n_x, n_y, n_z) uint8
+        names: the organ first; parts of a lesion's label are numbered, the largest first
+        lesions: which of the names are lesions
+        notes: what was left out, filled or is odd
+        image: where they come from
+    """
+
+    tags: NDArray[np.uint8]
+    names: tuple[str, ...]
+    lesions: tuple[str, ...]
+    notes: tuple[str, ...]
+    image: LabelImage
+
+
+def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLabels:
+    """The largest part of the labels, its lesions apart, its cavities filled if `mend`.
+
+    A part of a lesion's label too small for the cells becomes healthy tissue, and is said to be.
+    """
+    tags, notes = _one_part(image)
+    notes += _at_border(tags, image)
+    filled, more = _cavities(tags, image, mend)
+    notes += more
+    names = [image.names[0]]
+    result = np.where(filled > 0, np.uint8(1), np.uint8(0))
+    lesions = []
+    smallest = SMALLEST_SHARE_OF_CELL * cell_size**3
+    for tag, name in enumerate(image.names[1:], start=2):
+        chosen = filled == tag
+        if not chosen.any():
+            notes.append(f"{name}: none of it lies in the largest part; left out")
+            continue
+        parts, too_small = _parts(chosen, smallest / image.voxel_volume, split=is_lesion(name))
+        if too_small:
+            millilitres = sum(too_small) * image.voxel_volume * 1e6
+            notes.append(
+                f"{name}: {len(too_small)} part(s), {millilitres:.3g} ml together, are smaller than what cells of "
+                f"{cell_size * 1e3:.3g} mm can show ({smallest * 1e6:.2g} ml) and became {image.names[0]}"
+            )
+        for number, part in enumerate(parts, start=1):
+            names.append(name if len(parts) == 1 else f"{name} {number}")
+            result[part] = len(names)
+            if is_lesion(name):
+                lesions.append(names[-1])
+    return CleanLabels(result, tuple(names), tuple(lesions), tuple(notes), image)
+
+
+def _one_part(image: LabelImage) -> tuple[NDArray[np.uint8], list[str]]:
+    every = list(range(1, len(image.names) + 1))
+    organ, corner, dropped = largest_part(image.tags, every)
+    tags = np.zeros_like(image.tags)
+    box = tuple(slice(low, low + n) for low, n in zip(corner, organ.shape, strict=True))
+    tags[box] = np.where(organ, image.tags[box], 0)
+    if not dropped:
+        return tags, []
+    share = sum(dropped) / (np.count_nonzero(organ) + sum(dropped))
+    sizes = ", ".join(f"{size * image.voxel_volume * 1e6:.3g}" for size in dropped[:5])
+    return tags, [
+        f"{len(dropped)} part(s) apart from the largest were left out: {sum(dropped)} voxels, {share:.2%} of all "
+        f"({sizes}{', ...' if len(dropped) > 5 else ''} ml)"
+    ]
+
+
+def _at_border(tags: NDArray[np.uint8], image: LabelImage) -> list[str]:
+    notes = []
+    for axis in range(3):
+        used = np.flatnonzero(tags.any(axis=tuple({0, 1, 2} - {axis}))) + image.corner[axis]
+        for touches, high in ((used[0] == 0, False), (used[-1] == image.shape[axis] - 1, True)):
+            if touches:
+                notes.append(
+                    f"the organ touches the image's border towards the {image.geometry.side(axis, high=high)}: it is "
+                    "cut off there, and ends in a flat face"
+                )
+    return notes
+
+
+def _cavities(tags: NDArray[np.uint8], image: LabelImage, mend: bool) -> tuple[NDArray[np.uint8], list[str]]:
+    inside = tags > 0
+    holes = np.asarray(ndimage.binary_fill_holes(inside), dtype=bool) & ~inside
+    count = parts_of(holes)[1]
+    if not count:
+        return tags, []
+    size = f"{count} cavity(ies) inside the labels, {np.count_nonzero(holes) * image.voxel_volume * 1e6:.3g} ml"
+    if not mend:
+        return tags, [f"{size}, were left as they are (--mend fills them)"]
+    return np.where(holes, np.uint8(1), tags), [f"mended: {size}, were filled with {image.names[0]}"]
+
+
+def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> tuple[Sequence[NDArray[np.bool_]], list[int]]:
+    """The parts of at least so many voxels, largest first, and the sizes of the others; whole if not to be split."""
+    if not split:
+        count = int(np.count_nonzero(chosen))
+        return ([chosen], []) if count >= smallest else ([], [count])
+    label, count = parts_of(chosen, corners=True)
+    sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
+    order = np.argsort(-sizes, kind="stable")
+    kept = [part for part in order[:PARTS_MOST].tolist() if sizes[part] >= smallest]
+    rest = [int(sizes[part]) for part in order.tolist() if part not in kept]
+    return [label == part + 1 for part in kept], rest

@@ -1,0 +1,85 @@
+"""Materials of tissues by their names, each with its source; what has no entry takes the liver's, and says so."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from msdm_core.regions import Material
+
+# A common textbook value for soft organs [kg/m^3], not checked against a source.
+DENSITY = 1060.0
+# Chosen: nearly incompressible.
+POISSON_RATIO = 0.45
+
+
+@dataclass(frozen=True)
+class TissueMaterial:
+    """What a region is made of, and where its modulus comes from."""
+
+    material: Material
+    source: str
+
+
+# Young's moduli of healthy tissue [Pa].
+ORGANS: Mapping[str, tuple[float, str]] = {
+    "liver": (
+        5000.0,
+        "chosen; normal liver by shear-wave elastography 6.63 +- 1.65 kPa (doi 10.1177/8756479317733713)",
+    ),
+    "kidney": (8000.0, "chosen below the 10.2 kPa that elastography takes for the limit of health (PMC10403462)"),
+    "stomach": (5000.0, "chosen as the liver's, filled with tissue; no source was looked up"),
+    "spleen": (5000.0, "chosen as the liver's; no source was looked up"),
+}
+# How many times stiffer than the organ around it a lesion is.
+LESIONS: Mapping[str, tuple[float, str]] = {
+    "adenoma": (1.9, "1.91 +- 1.70 times the liver by elastography (PMID 26299323)"),
+    "fnh": (7.9, "7.94 +- 6.43 times the liver by elastography (PMID 26299323)"),
+    "lesion": (8.0, "chosen: HCC 51 kPa and metastases 50 kPa in liver of 6.6 kPa (doi 10.1177/8756479317733713)"),
+}
+KIDNEY_LESION = (4.0, "chosen: strain index of renal cell carcinoma 4.04 +- 0.72 (PMID 26880174)")
+LESION_WORD = re.compile(r"lesion|tumou?r|metastas|carcinoma|hcc|nodule|mass|cancer|adenoma|fnh", re.IGNORECASE)
+
+
+def is_lesion(name: str) -> bool:
+    """Whether a region's name is that of something a palpation looks for."""
+    return LESION_WORD.search(name) is not None
+
+
+def organ_material(name: str, youngs_modulus: float | None = None) -> TissueMaterial:
+    """Material of the organ of a name such as "liver" or "left kidney", or with a given modulus [Pa]."""
+    if youngs_modulus is not None:
+        return TissueMaterial(Material(youngs_modulus, DENSITY, POISSON_RATIO), "given on the command line")
+    for word, (modulus, source) in ORGANS.items():
+        if word in name.lower():
+            return TissueMaterial(Material(modulus, DENSITY, POISSON_RATIO), source)
+    modulus, _ = ORGANS["liver"]
+    source = f"the liver's: nothing is known of {name!r} here (--youngs-modulus)"
+    return TissueMaterial(Material(modulus, DENSITY, POISSON_RATIO), source)
+
+
+def region_material(name: str, organ_name: str, organ: Material, moduli: Mapping[str, float]) -> TissueMaterial:
+    """Material of a region inside an organ.
+
+    Args:
+        name: of the region.
+        organ_name: of what is around it.
+        organ: its material.
+        moduli: given on the command line, by name or by the name before its number [Pa].
+    """
+    given = moduli.get(name, moduli.get(re.sub(r" \d+$", "", name)))
+    if given is not None:
+        return TissueMaterial(Material(given, organ.density, organ.poisson_ratio), "given on the command line")
+    if not is_lesion(name):
+        for word, (modulus, source) in ORGANS.items():
+            if word in name.lower():
+                return TissueMaterial(Material(modulus, organ.density, organ.poisson_ratio), source)
+        source = f"that of the organ around it: nothing is known of {name!r} here (--modulus)"
+        return TissueMaterial(organ, source)
+    ratio, source = LESIONS["lesion"]
+    if "kidney" in organ_name.lower():
+        ratio, source = KIDNEY_LESION
+    for word, entry in LESIONS.items():
+        if word in name.lower() and word != "lesion":
+            ratio, source = entry
+    modulus = ratio * organ.youngs_modulus
+    return TissueMaterial(Material(modulus, organ.density, organ.poisson_ratio), f"{ratio:g} x the organ's; {source}")

@@ -1,0 +1,273 @@
+"""A scene for a patient's organ: tip, press, limits and hidden lesions in proportion to its cells and its tissue."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from msdm_core.regions import Material
+from msdm_core.stability import stable_dt
+from surgsim_env.anatomy import Anatomy, anatomy_of
+from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, plan_sites
+from surgsim_env.palpation.surface_scene import (
+    CONTACT_MODULI_PER_CELL,
+    PATTERN,
+    SUBSTEPS_MOST,
+    SurfaceOptions,
+    anchors_of,
+    with_options,
+)
+from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material
+from surgsim_env.patient.patient_mesh import PatientMesh
+from surgsim_env.scenes import LesionDraw, Limits, MeshSource, Palpation, Scene, TetFile, Vector, make_scene
+from surgsim_env.timing import substeps_needed
+from surgsim_env.tissue_region import TissueRegion
+
+# As in the scene liver, from where the organ's mesh is 0.85 of the contact radius sqrt(tip radius x press depth).
+CELL_PER_CONTACT_RADIUS = 0.85
+DEPTH_PER_TIP = 7.0 / 12.0
+SPACING_PER_TIP = 13.0 / 12.0
+TIP_STEP, TIP_RANGE = 5e-4, (0.002, 0.015)
+DEPTH_STEP, SPACING_STEP = 1e-4, 5e-4
+# From the front and above in a patient's axes; along the third axis of files whose axes nobody stated.
+APPROACH_SCAN: Vector = (0.0, math.sqrt(0.5), -math.sqrt(0.5))
+APPROACH_FILE: Vector = (0.0, 0.0, -1.0)
+# More raster sites than this cost minutes: the raster is then wider.
+SITES_MOST = 60
+# Organ below a site, in press depths: the first that leaves sites to press is taken.
+THICKNESSES = (5.0, 3.0, 0.0)
+# Of a healthy press (Hertz), as in the scene liver.
+SOFT_PER_PRESS, HARD_PER_PRESS = 2.0, 4.0
+# Ranges of hidden lesions in tip radii, as in the scene liver; smaller ones where the organ has no room for those.
+LESION_RADIUS, LESION_COVER, LESION_RIM = (1.5, 2.1), (0.25, 0.65), 2.1
+LESION_RATIO = (5.0, 8.0)
+LESION_SHRINKS = (1.0, 0.75, 0.55)
+LESION_DRAWS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class PatientScene:
+    """A patient's organ ready for every command and environment of palpation.
+
+    Fields:
+        patient: its mesh and where that comes from
+        anatomy: the scene on its mesh, as it will be read again
+        organ, regions: materials with their sources, of the healthy tissue and of each region by name
+        site_count: sites of its raster
+        notes: what had to differ from the usual
+    """
+
+    patient: PatientMesh
+    anatomy: Anatomy
+    organ: TissueMaterial
+    regions: Mapping[str, TissueMaterial]
+    site_count: int
+    notes: tuple[str, ...]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.anatomy.scene
+
+
+def patient_scene(
+    patient: PatientMesh,
+    name: str,
+    folder: Path,
+    mesh_file: str,
+    *,
+    options: SurfaceOptions,
+    moduli: Mapping[str, float],
+) -> PatientScene:
+    """The scene of a patient's organ, whose mesh will be `mesh_file` in `folder`.
+
+    Args:
+        patient: the organ.
+        name: of the scene.
+        folder: where its mesh will be read from.
+        mesh_file: the mesh's name there.
+        options: what is said of touch, anchors and healthy tissue.
+        moduli: of regions by name [Pa].
+
+    Raises:
+        ValueError: a modulus of a region that is not there, a value that is impossible, no site to press.
+    """
+    organ = organ_material(patient.organ_name, options.youngs_modulus)
+    regions = {
+        one.name: region_material(one.name, patient.organ_name, organ.material, moduli) for one in patient.volumes[1:]
+    }
+    _check_moduli(moduli, list(regions))
+    scene = _first_scene(patient, name, folder, mesh_file, organ.material, regions, options)
+    notes: list[str] = []
+    anatomy, sites = _with_sites(scene, patient, options, notes)
+    anatomy = _with_lesions(anatomy, notes)
+    return PatientScene(patient, _with_substeps(anatomy), organ, regions, sites, tuple(notes))
+
+
+def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
+    for name in moduli:
+        if not any(one == name or one.rsplit(" ", 1)[0] == name for one in names):
+            raise ValueError(f"--modulus {name}=...: there is no such region; there are {', '.join(names) or 'none'}")
+
+
+def _first_scene(
+    patient: PatientMesh,
+    name: str,
+    folder: Path,
+    mesh_file: str,
+    material: Material,
+    regions: Mapping[str, TissueMaterial],
+    options: SurfaceOptions,
+) -> Scene:
+    """All that follows from the cells and the tissue."""
+    liver, cell = make_scene(PATTERN), patient.cell_size
+    tip = options.tip_radius or _tip_radius(cell)
+    depth = options.press_depth or _rounded(DEPTH_PER_TIP * tip, DEPTH_STEP)
+    approach = options.approach or (APPROACH_SCAN if patient.is_scan else APPROACH_FILE)
+    described = f"{patient.organ_name} of {', '.join(patient.sources)}, {patient.mesh.volumes.sum() * 1e6:.0f} ml"
+    if patient.lesions:
+        described += f", {len(patient.lesions)} segmented lesion(s)"
+    scene = replace(
+        liver,
+        name=name,
+        description=described,
+        folder=folder,
+        mesh=MeshSource(tets=TetFile(mesh_file, "m")),
+        material=material,
+        contact=replace(liver.contact, stiffness=_digits(CONTACT_MODULI_PER_CELL * material.youngs_modulus / cell, 3)),
+        limits=_limits(material, tip, depth),
+        palpation=Palpation(
+            press_depth=depth,
+            face_angle_deg=liver.palpation.face_angle_deg,
+            face_margin=tip,
+            site_spacing=options.spacing or _rounded(SPACING_PER_TIP * tip, SPACING_STEP),
+        ),
+        lesion=None,
+        demonstration=(),
+        regions=tuple(TissueRegion(one, what.material, one in patient.lesions) for one, what in regions.items()),
+    )
+    # Turns the approach into a unit vector, and refuses impossible values.
+    scene = with_options(scene, replace(options, approach=approach, tip_radius=tip, press_depth=depth))
+    x, y, z = (round(part, 6) + 0.0 for part in scene.instrument.approach)
+    direction = (x, y, z)
+    return replace(
+        scene,
+        instrument=replace(scene.instrument, approach=direction),
+        anchors=anchors_of(options, direction),
+        material=material,
+    )
+
+
+def _tip_radius(cell: float) -> float:
+    wanted = cell / (CELL_PER_CONTACT_RADIUS * math.sqrt(DEPTH_PER_TIP))
+    low, high = TIP_RANGE
+    return min(max(_rounded(math.ceil(wanted / TIP_STEP) * TIP_STEP, TIP_STEP), low), high)
+
+
+def _limits(material: Material, tip: float, depth: float) -> Limits:
+    """Twice and four times a healthy press, F = 4/3 E / (1 - nu^2) sqrt(R d^3) (Hertz 1881)."""
+    stiffness = material.youngs_modulus / (1.0 - material.poisson_ratio**2)
+    press = 4.0 / 3.0 * stiffness * math.sqrt(tip * depth**3)
+    return Limits(_digits(SOFT_PER_PRESS * press, 2), _digits(HARD_PER_PRESS * press, 2))
+
+
+def _with_sites(scene: Scene, patient: PatientMesh, options: SurfaceOptions, notes: list[str]) -> tuple[Anatomy, int]:
+    """The anatomy with a raster that has sites, and not too many; and how many."""
+    palpation = scene.palpation
+    for thickness in THICKNESSES:
+        thick = replace(palpation, thickness_smallest=_rounded(thickness * palpation.press_depth, DEPTH_STEP))
+        anatomy = anatomy_of(replace(scene, palpation=thick), patient.mesh)
+        try:
+            count = len(plan_sites(anatomy)[0])
+        except ValueError:
+            if thickness == THICKNESSES[-1]:
+                raise
+            continue
+        if thickness != THICKNESSES[0]:
+            notes.append(f"the organ is thin: sites with {thickness:g} instead of 5 press depths of organ are pressed")
+        break
+    while count > SITES_MOST and options.spacing is None:
+        wider = math.ceil(thick.site_spacing * max(math.sqrt(count / SITES_MOST), 1.02) / SPACING_STEP) * SPACING_STEP
+        thick = replace(thick, site_spacing=_rounded(wider, SPACING_STEP))
+        anatomy = anatomy_of(replace(scene, palpation=thick), patient.mesh)
+        count = len(plan_sites(anatomy)[0])
+    return anatomy, count
+
+
+def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
+    """The anatomy with ranges of hidden lesions for which it has room; without where it has none."""
+    tip = anatomy.scene.instrument.tip_radius
+    for shrink in LESION_SHRINKS:
+        draw = LesionDraw(
+            radius=_pair(LESION_RADIUS, shrink * tip),
+            cover=_pair(LESION_COVER, shrink * tip),
+            modulus_ratio=LESION_RATIO,
+            rim_distance=_rounded(LESION_RIM * shrink * tip, DEPTH_STEP),
+        )
+        tried = replace(anatomy, scene=replace(anatomy.scene, lesion=draw))
+        if _has_room(tried):
+            if shrink != 1.0:
+                notes.append(
+                    f"hidden lesions are {shrink:g} times as large as the tip would ask for: the organ is small"
+                )
+            return tried
+    notes.append("the organ has no room for hidden lesions: there is no [lesion] table, and environments refuse it")
+    return anatomy
+
+
+def _has_room(anatomy: Anatomy) -> bool:
+    draws = np.random.default_rng(0)
+    assert anatomy.scene.lesion is not None
+    low, high = anatomy.scene.lesion.radius
+    largest = replace(anatomy.scene.lesion, radius=(high, high))
+    try:
+        for number in range(LESION_DRAWS):
+            anatomy.random_lesion(draws, largest if number % 2 else None)
+    except ValueError:
+        return False
+    return low > 0.0
+
+
+def _with_substeps(anatomy: Anatomy) -> Anatomy:
+    """The anatomy with as many substeps as its worst organ needs: lesions, stiffer models, the worst hidden lesions."""
+    scene = anatomy.scene
+    organs = [anatomy.organ(anatomy.demonstration_lesions()), anatomy.organ(modulus_factor=1.0 + MODEL_MODULUS_ERROR)]
+    if scene.lesion is not None:
+        draw, worst = scene.lesion, np.random.default_rng(0)
+        hardest = replace(
+            draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[0],) * 2, modulus_ratio=(draw.modulus_ratio[1],) * 2
+        )
+        organs += [anatomy.organ([anatomy.random_lesion(worst, hardest)]) for _ in range(2)]
+    step = min(stable_dt(organ, scene.contact.law) for organ in organs)
+    count = max(substeps_needed(scene.timing.haptic_step, step), 1)
+    if count > SUBSTEPS_MOST:
+        raise ValueError(
+            f"this organ needs {count} substeps in {scene.timing.haptic_step:g} s, its stable step is {step:.3g} s; at "
+            f"most {SUBSTEPS_MOST} are allowed: are the moduli in pascals? Else use larger cells"
+        )
+    return replace(anatomy, scene=replace(scene, timing=replace(scene.timing, substep_count=count)))
+
+
+def _pair(share: tuple[float, float], length: float) -> tuple[float, float]:
+    return _rounded(share[0] * length, DEPTH_STEP), _rounded(share[1] * length, DEPTH_STEP)
+
+
+def _rounded(value: float, step: float) -> float:
+    """To whole steps [m], as a short decimal."""
+    return round(round(value / step) * step, 7)
+
+
+def _digits(value: float, count: int) -> float:
+    return float(f"{value:.{count}g}")
+
+
+def material_rows(found: PatientScene) -> list[tuple[str, TissueMaterial, float]]:
+    """Name, material and volume of mesh [m^3] of the healthy tissue and each region."""
+    mesh = found.patient.mesh
+    rows = []
+    for tag, name in mesh.region_names:
+        what = found.organ if tag == 1 else found.regions[name]
+        rows.append((name, what, float(mesh.volumes[mesh.region == tag].sum())))
+    return rows

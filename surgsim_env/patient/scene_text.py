@@ -1,0 +1,161 @@
+"""A patient's scene as the text of a TOML file, with the reasons of its numbers."""
+
+import json
+import math
+from typing import Any
+
+from surgsim_env.patient.materials import TissueMaterial
+from surgsim_env.patient.patient_scene import (
+    CELL_PER_CONTACT_RADIUS,
+    HARD_PER_PRESS,
+    SITES_MOST,
+    SOFT_PER_PRESS,
+    PatientScene,
+)
+
+# By this first line an earlier run's file is known, which may be replaced.
+FIRST_LINE = "# Made by surgsim from a patient's organ."
+
+
+def scene_text(found: PatientScene) -> str:
+    """The text of a scene file; `surgsim_env.scenes.load_scene` reads it."""
+    patient, scene = found.patient, found.scene
+    tets, lines = scene.mesh.tets, [FIRST_LINE]
+    assert tets is not None
+    lines += [
+        f"# From {_comment(', '.join(patient.sources))}.",
+        f"# Mesh: {patient.mesher}, cells of {patient.cell_size * 1e3:.4g} mm.",
+        f"# Axes: {patient.convention}.",
+        "# Change any number here; surgsim organ replaces this file only if it begins as it does.",
+        *(f"# Note: {_comment(note)}" for note in (*patient.notes, *found.notes)),
+        _entry("description", scene.description),
+        "",
+        "[mesh.tets]",
+        _entry("file", tets.file),
+        _entry("length_unit", tets.length_unit),
+        "",
+        "[material]             # " + _comment(f"{patient.organ_name}: {found.organ.source}"),
+        *_material(found.organ),
+    ]
+    for region in scene.regions:
+        what = found.regions[region.name]
+        lines += [
+            "",
+            "[[regions]]            # tets of the mesh with a material of their own",
+            _entry("name", region.name),
+        ]
+        if region.lesion:
+            lines.append(_entry("lesion", True, "palpation looks for it; healthy organs do not have it"))
+        lines += [f"[regions.material]     # {_comment(what.source)}", *_material(what)]
+    return "\n".join([*lines, *_body(found), *_touch(found), ""])
+
+
+def _body(found: PatientScene) -> list[str]:
+    scene = found.scene
+    capsule = scene.capsule
+    assert capsule is not None and capsule.thickness is not None
+    lines = [
+        "",
+        "[capsule]              # on the boundary; as in the scene liver, with its sources; delete it where none is",
+        _entry("youngs_modulus", capsule.youngs_modulus, "[Pa]"),
+        _entry("thickness", capsule.thickness, "[m]; only modulus x thickness matters"),
+        "",
+        "[damping]              # as in the scene liver",
+        _entry("alpha", scene.damping.alpha, "[1/s]"),
+        _entry("beta", scene.damping.beta),
+    ]
+    for anchor in scene.anchors:
+        lines += ["", "[[anchors]]", _entry("name", anchor.name)]
+        if anchor.bed is not None:
+            shown = f"{{ direction = {json.dumps(anchor.bed.direction)}, share = {anchor.bed.share!r} }}"
+            lines.append(f"bed = {shown} # chosen: it lies on the side away from the probe; put its ligaments here")
+        else:
+            assert anchor.ball is not None
+            centre = json.dumps(anchor.ball.centre)
+            lines.append(f"ball = {{ centre = {centre}, radius = {anchor.ball.radius!r} }} # given on the command line")
+    return lines
+
+
+def _touch(found: PatientScene) -> list[str]:
+    scene, palpation = found.scene, found.scene.palpation
+    tip, share = scene.instrument.tip_radius, found.anatomy.palpable_cell
+    share /= math.sqrt(tip * palpation.press_depth)
+    lines = [
+        "",
+        "[contact]",
+        _entry("stiffness", scene.contact.stiffness, "[N/m^3] chosen: 18 E / cell"),
+        _entry("damping", scene.contact.damping, "[N s/m^3] as in the scene liver"),
+        _entry("friction", scene.contact.friction, "as in the scene liver"),
+        "",
+        "[instrument]",
+        _entry("model", scene.instrument.model),
+        _entry(
+            "tip_radius",
+            tip,
+            f"[m] chosen for the cells: cell / contact radius {share:.2f}, asked for {CELL_PER_CONTACT_RADIUS}",
+        ),
+        _entry("approach", scene.instrument.approach, "direction of the probe, in the axes above"),
+        "",
+        "[timing]",
+        _entry("haptic_step", scene.timing.haptic_step, "[s]"),
+        _entry(
+            "substep_count",
+            scene.timing.substep_count,
+            "stable with contact, with every lesion here and the worst drawn",
+        ),
+        _entry("haptic_steps_per_control", scene.timing.haptic_steps_per_control),
+        "",
+        f"[limits]               # [N] chosen: {SOFT_PER_PRESS:g} and {HARD_PER_PRESS:g} times a healthy press (Hertz)",
+        _entry("soft_force", scene.limits.soft_force),
+        _entry("hard_force", scene.limits.hard_force),
+        "",
+        "[sensor]               # per axis, as in the scene liver",
+        _entry("noise", scene.sensor.noise, "[N]"),
+        _entry("bias", scene.sensor.bias, "[N]"),
+        _entry("range", scene.sensor.range, "[N]"),
+        "",
+        "[palpation]",
+        _entry("press_depth", palpation.press_depth, "[m] chosen: 7/12 of the tip's radius, as in the scene liver"),
+        _entry("face_angle_deg", palpation.face_angle_deg),
+        _entry("face_margin", palpation.face_margin, "[m]"),
+        _entry("thickness_smallest", palpation.thickness_smallest, "[m] of organ below a site"),
+        _entry(
+            "site_spacing", palpation.site_spacing, f"[m] {found.site_count} sites, at most {SITES_MOST} unless given"
+        ),
+        _entry("clearance", palpation.clearance, "[m]"),
+    ]
+    if scene.lesion is not None:
+        draw = scene.lesion
+        lines += [
+            "",
+            "[lesion]               # hidden anew in each episode, in the organ without its segmented lesions",
+            _entry("radius", draw.radius, "[m] chosen in proportion to the tip, as in the scene liver"),
+            _entry("cover", draw.cover, "[m] tissue above its top"),
+            _entry(
+                "modulus_ratio",
+                draw.modulus_ratio,
+                "HCC 51, metastases 50 in 6.6 kPa liver (doi 10.1177/8756479317733713)",
+            ),
+            _entry("rim_distance", draw.rim_distance, "[m]"),
+        ]
+    return lines
+
+
+def _material(what: TissueMaterial) -> list[str]:
+    return [
+        _entry("youngs_modulus", what.material.youngs_modulus, "[Pa]"),
+        _entry("density", what.material.density, "[kg/m^3] a common textbook value, not checked against a source"),
+        _entry("poisson_ratio", what.material.poisson_ratio, "chosen: nearly incompressible"),
+    ]
+
+
+def _entry(name: str, value: Any, comment: str = "") -> str:
+    # JSON's strings, lists and booleans are TOML's, but for what a name may not hold here.
+    text = repr(value) if isinstance(value, float) else json.dumps(value)
+    line = f"{name} = {text}"
+    return f"{line:<22} # {_comment(comment)}" if comment else line
+
+
+def _comment(text: str) -> str:
+    """What TOML lets stand in a comment: one line without control characters."""
+    return "".join(one if one.isprintable() else " " for one in text)

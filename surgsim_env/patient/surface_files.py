@@ -1,0 +1,145 @@
+"""Surfaces of an organ and its regions from STL, OBJ and PLY files, one file a region."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from msdm_core.errors import MeshError
+from msdm_core.length_unit import LengthUnit
+from msdm_core.mesh import FloatArray
+from msdm_core.surface import check_surface, merge_vertices, surface_volume
+from surgsim_env.patient.label_names import check_name
+from surgsim_env.patient.materials import is_lesion
+from surgsim_env.patient.surface_voxels import voxels_inside
+
+Triangles = NDArray[np.int64]
+# Voxels of a mended surface along one cell.
+MENDING_VOXELS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedSurface:
+    """A closed surface: vertices [m] (n_vertex, 3), outward triangles (n_triangle, 3), and its region's name."""
+
+    name: str
+    vertices: FloatArray
+    triangles: Triangles
+
+    @property
+    def volume(self) -> float:
+        """[m^3]."""
+        return surface_volume(self.vertices, self.triangles)
+
+
+@dataclass(frozen=True, eq=False)
+class BrokenSurface:
+    """A surface that only `--mend` makes a body of: what is wrong with it, and its triangles [m]."""
+
+    name: str
+    vertices: FloatArray
+    triangles: Triangles
+    fault: str
+
+
+def region_name(file: Path) -> str:
+    """A region's name from its file's: its stem, with what no name may have made an underscore."""
+    kept = "".join(one if one.isascii() and (one.isalnum() or one in "_ .-") else "_" for one in file.stem)[:40]
+    return check_name(kept.strip(" .-") or "organ", str(file))
+
+
+def read_organ_surface(
+    file: Path, length_unit: LengthUnit, *, mend: bool
+) -> tuple[ClosedSurface | BrokenSurface, list[str]]:
+    """The largest body of a surface file, and notes of what was left out.
+
+    Raises:
+        MeshError: a surface that is open, crosses itself or is no manifold, unless it is to be mended.
+    """
+    from msdm_core.mesh_io import read_surface
+
+    vertices, triangles = read_surface(file, length_unit=length_unit)
+    bodies, name = bodies_of(vertices, triangles.astype(np.int64)), region_name(file)
+    notes = []
+    if len(bodies) > 1 and not mend:
+        volumes = ", ".join(f"{abs(surface_volume(*one)) * 1e6:.3g}" for one in bodies[1:6])
+        notes.append(
+            f"{file.name}: {len(bodies) - 1} surface(s) apart from the largest were left out ({volumes}"
+            f"{', ...' if len(bodies) > 6 else ''} ml)"
+        )
+    try:
+        return ClosedSurface(name, *check_surface(*bodies[0])), notes
+    except MeshError as error:
+        if not mend:
+            raise MeshError(f"{file}: {error}; or --mend rebuilds it from voxels") from None
+        every = merge_vertices(vertices, triangles)
+        return BrokenSurface(name, *every, fault=str(error)), notes
+
+
+def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list[ClosedSurface]:
+    """The closed surfaces of a region, largest first; those of a lesion are numbered where there are several.
+
+    Raises:
+        MeshError: names the file and what is wrong with a surface in it.
+    """
+    from msdm_core.mesh_io import read_surface
+
+    vertices, triangles = read_surface(file, length_unit=length_unit)
+    bodies = bodies_of(vertices, triangles.astype(np.int64))
+    if len(bodies) > 1 and not is_lesion(name):
+        raise MeshError(
+            f"{file}: region {name!r} has {len(bodies)} surfaces, and one is taken: give a file for each (--region)"
+        )
+    surfaces = []
+    for number, body in enumerate(bodies, start=1):
+        try:
+            closed = check_surface(*body)
+        except MeshError as error:
+            raise MeshError(f"{file}: {error}") from None
+        surfaces.append(ClosedSurface(name if len(bodies) == 1 else f"{name} {number}", *closed))
+    return surfaces
+
+
+def mended_voxels(surface: BrokenSurface, cell_size: float) -> tuple[NDArray[np.uint8], FloatArray, FloatArray, str]:
+    """A broken surface as voxels of 1 inside (n_x, n_y, n_z), their spacing [m] and first centre [m] (3,), and a note.
+
+    Raises:
+        MeshError: nothing in it is enclosed.
+    """
+    step = cell_size / MENDING_VOXELS
+    inside, first = voxels_inside(surface.vertices, surface.triangles, step, vote=True)
+    filled = ndimage.binary_fill_holes(inside)
+    assert filled is not None
+    if not filled.any():
+        raise MeshError(
+            f"{surface.name}: encloses nothing, also when mended ({surface.fault}): repair it in a mesh editor"
+        )
+    note = f"mended: {surface.name} was rebuilt from voxels of {step * 1e3:.3g} mm, for {surface.fault}"
+    start = np.asarray(first * step, dtype=np.float64)
+    return filled.astype(np.uint8), np.full(3, step), start, note
+
+
+def bodies_of(vertices: FloatArray, triangles: Triangles) -> list[tuple[FloatArray, Triangles]]:
+    """The parts of a surface that share no vertex, the one that encloses most first."""
+    edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
+    count, part = connected_components(graph, directed=False)
+    if count == 1:
+        return [(vertices, triangles)]
+    owner = part[triangles[:, 0]]
+    bodies = [merge_vertices(vertices, triangles[owner == one]) for one in np.unique(owner)]
+    return sorted(bodies, key=lambda body: -abs(surface_volume(*body)))
+
+
+def checked_names(names: Sequence[str]) -> None:
+    """Refuse two regions of one name."""
+    for name in names:
+        if list(names).count(name) > 1:
+            raise MeshError(
+                f"region {name!r} is given twice; give the files other names, or name them: --region NAME=FILE"
+            )

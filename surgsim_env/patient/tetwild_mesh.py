@@ -1,0 +1,115 @@
+"""Meshes whose faces follow the surfaces of an organ and its regions, by fTetWild (Hu et al. 2020; extra `tetwild`)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.meshing import largest_body_mesh
+from msdm_core.region_tags import voxels_at
+from msdm_core.segmentation_meshing import SmoothedShare, smoothed_share
+from msdm_core.surface import check_surface
+from surgsim_env.patient.image_geometry import CONVENTION
+from surgsim_env.patient.label_cleaning import CleanLabels
+from surgsim_env.patient.patient_mesh import PatientMesh, region_volumes
+from surgsim_env.patient.surface_files import ClosedSurface, bodies_of
+from surgsim_env.patient.surface_voxels import voxels_inside
+
+# Edge of fTetWild's tets over a lattice's cell: about as many tets.
+EDGE_PER_CELL = 0.9
+# How far its surface may leave the given one, as a share of the box's diagonal: its own default.
+EPSILON = 1e-3
+# Voxels of a region's surface along a cell, to tell which tets lie in it.
+REGION_VOXELS = 12
+
+
+def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh:
+    """Tets of the first surface, which holds the others; its regions are tagged from 2 in their order.
+
+    fTetWild is not deterministic: twice the same surfaces give two meshes.
+
+    Raises:
+        MeshError: it is not installed, or made nothing of the surfaces.
+    """
+    try:
+        import pytetwild  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise MeshError(f"--mesher tetwild needs pytetwild ({error}): pip install 'surgsim[tetwild]'") from None
+    starts = np.cumsum([0, *(len(one.vertices) for one in surfaces)])
+    vertices = np.concatenate([one.vertices for one in surfaces])
+    triangles = np.concatenate([one.triangles + start for one, start in zip(surfaces, starts, strict=False)])
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    share = EDGE_PER_CELL * cell_size / diagonal
+    nodes, tets = pytetwild.tetrahedralize(
+        vertices, triangles.astype(np.int32), edge_length_fac=share, epsilon=EPSILON, optimize=True, quiet=True
+    )[:2]
+    if not len(tets):
+        raise MeshError(f"fTetWild made no tets of {surfaces[0].name}; use --mesher lattice")
+    nodes, tets = np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int64)
+    body = largest_body_mesh(nodes, tets, f"a cell_size below {cell_size:g} m")
+    tags = np.ones(body.tet_count, dtype=np.int32)
+    middles = body.points[body.tets].mean(axis=1)
+    for tag, one in enumerate(surfaces[1:], start=2):
+        tags[_inside(one, middles, cell_size)] = tag
+        if not (tags == tag).any():
+            raise MeshError(f"region {one.name!r} holds no tet: use smaller cells, or leave it out")
+    return TetMesh(body.points, body.tets, tags, tuple((n, one.name) for n, one in enumerate(surfaces, start=1)))
+
+
+def mesh_labels_conforming(labels: CleanLabels, source: str, cell_size: float) -> PatientMesh:
+    """The mesh of an image's labels: level sets of the smoothed labels as surfaces, filled by fTetWild."""
+    image = labels.image
+    volumes = {tag: float(np.count_nonzero(labels.tags == tag)) * image.voxel_volume for tag in _tags(labels)}
+    whole = sum(volumes.values())
+    organ = _smoothed(labels, 1, cell_size)
+    surfaces = [
+        ClosedSurface(labels.names[0], *_level_surface(organ, whole)),
+        *(
+            ClosedSurface(labels.names[tag - 1], *_level_surface(_smoothed(labels, tag, cell_size), volumes[tag]))
+            for tag in _tags(labels)[1:]
+        ),
+    ]
+    placed = tetwild_mesh(surfaces, cell_size)
+    mesh = TetMesh(image.geometry.places(placed.points), placed.tets, placed.region, placed.region_names)
+    return PatientMesh(
+        mesh=mesh,
+        lesions=labels.lesions,
+        volumes=region_volumes(mesh, labels.names, whole, volumes),
+        cell_size=cell_size,
+        mesher="tetwild",
+        convention=CONVENTION,
+        sources=(source,),
+        notes=(*image.notes, *labels.notes),
+        is_scan=True,
+        smoothing=organ.smoothing,
+        smoothing_change=organ.volume_above(0.5) / whole - 1.0,
+    )
+
+
+def _tags(labels: CleanLabels) -> list[int]:
+    return list(range(1, len(labels.names) + 1))
+
+
+def _smoothed(labels: CleanLabels, tag: int, cell_size: float) -> SmoothedShare:
+    """A label smoothed, the whole organ for tag 1."""
+    mask = labels.tags > 0 if tag == 1 else labels.tags == tag
+    return smoothed_share(mask, np.zeros(3, dtype=np.int64), labels.image.geometry.spacing, cell_size)
+
+
+def _level_surface(field: SmoothedShare, volume: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """The largest closed surface on which a smoothed share has the level that encloses a volume [m^3]."""
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError:
+        raise MeshError("--mesher tetwild of labels needs scikit-image: pip install 'surgsim[tetwild]'") from None
+    vertices, faces = marching_cubes(field.values, field.level_of(volume))[:2]
+    points = field.start + np.asarray(vertices, dtype=np.float64) * field.step
+    return check_surface(*bodies_of(points, np.asarray(faces, dtype=np.int64))[0])
+
+
+def _inside(surface: ClosedSurface, places: FloatArray, cell_size: float) -> NDArray[np.bool_]:
+    step = min(cell_size, float(np.ptp(surface.vertices, axis=0).min())) / REGION_VOXELS
+    inside, first = voxels_inside(surface.vertices, surface.triangles, step)
+    return voxels_at(places, inside, first, np.full(3, step))

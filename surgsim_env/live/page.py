@@ -93,10 +93,16 @@ class Page:
                 "paint": self._show_paint,
                 "clear_map": self.felt.clear,
                 "close_jaw": session.close_jaw,
+                "shadows": self.show_shadows,
             }
             self._panel = Panel(
                 viser.gui, self._judge, session.scene, session.arm_count, session.instrument.jaw is not None, calls
             )
+
+    def show_shadows(self, on: bool) -> None:
+        """Draw shadows or not, on every page."""
+        self.server.viser.scene.configure_default_lights(enabled=True, cast_shadow=on)
+        self._panel.show_shadows(on)
 
     def run(self, until: Callable[[], bool]) -> None:
         """Make pictures until told to stop, or the physics is gone.

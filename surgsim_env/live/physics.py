@@ -173,6 +173,8 @@ class Physics:
         with self._exchange.trace.writing() as trace:
             trace["organ"], trace["count"] = self._organ_number, 0
         self._peak[:] = 0.0
+        untouched = tuple(held.telemetry(np.zeros(3)) for held in self._loop.held)
+        self._last = HapticTelemetry(self._simulation.time, "", untouched)
         self._tell()
 
     def _change(self, choice: OrganChoice) -> None:

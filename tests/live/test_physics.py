@@ -1,0 +1,259 @@
+"""The physics' side of a session, step by step in this process: what hands do, requests, recordings, faults."""
+
+import multiprocessing
+
+import numpy as np
+import pytest
+
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.live.exchange_records import TRACE_STEPS, Phase, new_exchange
+from surgsim_env.live.felt_map import FeltMap
+from surgsim_env.live.organ_choice import (
+    HIDDEN,
+    NONE,
+    OrganChoice,
+    chosen_lesions,
+    chosen_organ,
+    lesion_kinds,
+    live_scene,
+)
+from surgsim_env.live.organ_view import COLOURS, colour_levels
+from surgsim_env.live.pacing import PaceSettings
+from surgsim_env.live.physics import Physics, Setup
+from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Reset
+from surgsim_env.rendering.instrument_geoms import shown_geoms
+from surgsim_env.scenes import make_scene
+from surgsim_env.simulation import Simulation
+
+ASIDE, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+class Bench:
+    """A physics without a process: its hands are moved, and it is stepped, by the test."""
+
+    def __init__(self) -> None:
+        self.scene = live_scene(make_scene("phantom_small"))
+        self.anatomy = load_anatomy(self.scene)
+        geoms = shown_geoms(Simulation(self.anatomy).instrument.model)
+        self.exchange = new_exchange(1, self.anatomy.mesh.node_count, len(geoms))
+        self.pipe, child = multiprocessing.Pipe()
+        self.kind = lesion_kinds(self.scene)[0]
+        self.physics = Physics(Setup(self.scene, OrganChoice(lesions=self.kind), PaceSettings()), self.exchange, child)
+        point, self.normal = self.anatomy.face.project(self.anatomy.mesh.points.mean(axis=0) + UP)
+        self.above = point + self.normal * (self.scene.instrument.tip_radius + 0.004)
+        self.pressed = point + self.normal * (self.scene.instrument.tip_radius - 0.004)
+
+    def hold(self, place, *, beats: bool = True) -> None:
+        with self.exchange.hand.writing() as hand:
+            hand["target"] = place
+            hand["beat"] += beats
+
+    def step(self, count: int, place=None) -> None:
+        """What `Physics.run` does in as many steps, without the clock."""
+        for _ in range(count):
+            if place is not None:
+                self.hold(place)
+            if self.physics._phase == Phase.RUNNING:
+                self.physics._last = self.physics._loop.step()
+                self.physics._keep(self.physics._last)
+        self.physics._tell()
+
+    def ask(self, request) -> bool:
+        self.pipe.send(request)
+        with self.exchange.hand.writing() as hand:
+            hand["requests"] += 1
+        return self.physics._look(lambda: True)
+
+    @property
+    def frame(self):
+        return self.exchange.frame.read()
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_hand_presses_the_organ_and_the_page_is_told(bench):
+    rest = bench.frame["node"].copy()
+    bench.step(400, bench.above)
+    assert not bench.frame["force"].any()
+    bench.step(1000, bench.pressed)
+    frame = bench.frame
+    assert 0.03 < frame["force"][0] @ bench.normal < 1.0
+    # At the place that it is led to, a millimetre or so behind it; and the tissue has given way.
+    assert np.linalg.norm(frame["tip"][0] - bench.pressed) < 0.002
+    assert np.linalg.norm(frame["node"] - rest, axis=1).max() > 0.002
+    assert frame["phase"] == Phase.RUNNING and frame["time"] == pytest.approx(1.4, abs=0.002)
+    trace = bench.exchange.trace.read()
+    assert trace["count"] == 1400 // TRACE_STEPS
+    row = trace["row"][int(trace["count"]) - 1]
+    assert 0.002 < row["depth"][0] < 0.005 and row["peak"][0] >= np.linalg.norm(row["force"][0]) - 1e-9
+
+
+def test_a_page_that_is_gone_lets_the_force_fade(bench):
+    """Its process beats no more: the watchdog takes what is shown to zero, and the tip stays where it is."""
+    bench.step(1500, bench.pressed)
+    assert np.linalg.norm(bench.frame["pushed"][0]) > 0.02 and bench.frame["share"][0] == 1.0
+    before = bench.frame["tip"][0].copy()
+    bench.step(400)
+    assert not bench.frame["pushed"].any() and bench.frame["share"][0] == 0.0
+    assert np.linalg.norm(bench.frame["tip"][0] - before) < 0.002
+    bench.step(1200, bench.above)
+    assert bench.frame["share"][0] == 1.0
+
+
+def test_a_place_that_is_not_finite_moves_nothing(bench):
+    bench.step(300, bench.above)
+    before = bench.frame["tip"][0].copy()
+    bench.step(200, np.full(3, np.nan))
+    bench.step(300)
+    assert bench.frame["phase"] == Phase.RUNNING
+    assert np.linalg.norm(bench.frame["tip"][0] - before) < 0.005
+
+
+def test_a_replay_repeats_every_bit(bench):
+    bench.step(700, bench.above)
+    bench.ask(Record(True))
+    bench.step(300, bench.pressed)
+    bench.step(100)
+    bench.step(300, bench.pressed + 0.003 * ASIDE)
+    bench.ask(Record(False))
+    steps = bench.exchange.recorded.steps.copy()
+    assert len(steps) == 700 and np.linalg.norm(steps["force"], axis=2).max() > 0.02
+    bench.step(200, bench.above)
+    bench.ask(Replay(True))
+    assert bench.frame["replaying"]
+    forces = []
+    for _ in range(700):
+        bench.step(1)
+        forces.append(bench.frame["force"][0].copy())
+    assert np.array_equal(np.array(forces), steps["force"][:, 0])
+    bench.step(1)
+    assert not bench.frame["replaying"]
+
+
+def test_a_recording_from_elsewhere_starts_at_rest(bench):
+    steps = np.zeros(500, dtype=bench.exchange.recorded.dtype)
+    steps["time"], steps["hand"] = 1e-3 * np.arange(500), bench.above
+    bench.exchange.recorded.fill(steps)
+    bench.step(100, bench.pressed)
+    bench.ask(Replay(True, given=True))
+    bench.step(501)
+    assert bench.frame["time"] == pytest.approx(0.501) and not bench.frame["replaying"]
+
+
+def test_pause_and_reset(bench):
+    bench.step(500, bench.pressed)
+    bench.ask(Pause(True))
+    time = float(bench.frame["time"])
+    bench.step(50, bench.pressed)
+    assert bench.frame["phase"] == Phase.PAUSED and bench.frame["time"] == time
+    bench.ask(Pause(False))
+    bench.step(50, bench.pressed)
+    assert bench.frame["time"] == pytest.approx(time + 0.050)
+    bench.ask(Reset())
+    assert bench.frame["time"] == 0.0 and not bench.frame["force"].any()
+    assert bench.exchange.trace.read()["count"] == 0
+    assert not bench.ask(End())
+
+
+def test_sliders_make_another_organ(bench):
+    forces = []
+    for factor in (1.0, 2.0):
+        bench.ask(Change(OrganChoice(modulus_factor=factor, lesions=NONE)))
+        bench.step(600, bench.above)
+        bench.step(1200, bench.pressed)
+        forces.append(float(bench.frame["force"][0] @ bench.normal))
+    # A coupling lies between hand and tip, so that twice the stiffness is a little less than twice the force.
+    assert 1.6 < forces[1] / forces[0] < 2.0
+    assert bench.frame["organ"] == 3
+
+
+def test_an_organ_that_cannot_be_is_refused_and_the_last_one_stays(bench):
+    bench.ask(Change(OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)))
+    frame = bench.frame
+    assert bytes(frame["said"]).startswith(b"not that organ") and frame["organ"] == 1
+    bench.step(200, bench.above)
+    assert bench.frame["phase"] == Phase.RUNNING
+
+
+def test_a_fault_stops_and_a_reset_goes_on(bench):
+    bench.step(100, bench.above)
+    bench.physics._simulation.organ_state.node_velocity[:, 2] = np.nan
+    bench.step(5, bench.above)
+    frame = bench.frame
+    assert frame["phase"] == Phase.FAULT and bytes(frame["said"])
+    assert not frame["pushed"].any()
+    bench.ask(Pause(False))
+    assert bench.frame["phase"] == Phase.FAULT
+    bench.ask(Reset())
+    bench.step(100, bench.above)
+    assert bench.frame["phase"] == Phase.RUNNING and np.isfinite(bench.frame["node"]).all()
+
+
+def test_nobody_left_ends_it(bench):
+    assert not bench.physics._look(lambda: False)
+    bench.pipe.close()
+    with bench.exchange.hand.writing() as hand:
+        hand["requests"] += 1
+    assert not bench.physics._look(lambda: True)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("modulus_factor", 0.0), ("modulus_factor", float("nan")), ("damping_factor", -1.0), ("lesion_size", 0.0)),
+        *(("lesion_ratio", 0.0), ("lesion_ratio", float("inf")), ("lesions", "some")),
+    ],
+)
+def test_choices_that_are_none_are_refused(field, value):
+    with pytest.raises(ValueError, match=field):
+        OrganChoice(**{field: value})
+
+
+def test_choices_are_what_they_say():
+    anatomy = load_anatomy(live_scene(make_scene("liver")))
+    plain = chosen_lesions(anatomy, OrganChoice())
+    assert [one.name for one in plain] == [one.name for one in anatomy.demonstration_lesions()]
+    changed = chosen_lesions(anatomy, OrganChoice(modulus_factor=2.0, lesion_ratio=3.0, lesion_size=0.5))
+    for one, other in zip(plain, changed, strict=True):
+        assert other.radius == pytest.approx(0.5 * one.radius) and other.centre == one.centre
+        assert other.material.youngs_modulus == pytest.approx(6.0 * anatomy.scene.material.youngs_modulus)
+    assert chosen_lesions(anatomy, OrganChoice(lesions=NONE)) == []
+    hidden = [chosen_lesions(anatomy, OrganChoice(lesions=HIDDEN, seed=seed))[0].centre for seed in (1, 1, 2)]
+    assert hidden[0] == hidden[1] != hidden[2]
+    damped = chosen_organ(anatomy, OrganChoice(damping_factor=3.0, lesions=NONE))
+    assert damped.alpha == pytest.approx(3.0 * anatomy.scene.damping.alpha)
+
+
+def test_the_map_is_stiff_where_touches_were():
+    anatomy = load_anatomy(make_scene("phantom_small"))
+    felt = FeltMap(anatomy)
+    assert not felt.felt.any()
+    radius, depth = anatomy.scene.instrument.tip_radius, anatomy.scene.palpation.press_depth
+    healthy = felt._indenter.force(depth)
+    middle = anatomy.mesh.points.mean(axis=0)
+    places = []
+    for aside, factor in ((-0.012, 1.0), (0.012, 2.0)):
+        point, normal = anatomy.face.project(middle + aside * ASIDE + UP)
+        places.append(point)
+        for _ in range(5):
+            felt.feel(point + normal * (radius - depth), depth, factor * healthy)
+    assert felt.felt.any() and not felt.felt.all()
+    for place, factor in zip(places, (1.0, 2.0), strict=True):
+        nearest = np.argmin(np.linalg.norm(anatomy.mesh.points[felt.nodes] - place, axis=1))
+        assert felt.felt[nearest] and felt.contrast[nearest] == pytest.approx(factor, rel=0.05)
+    version = felt.version
+    felt.feel(places[0] + radius * UP, 0.0, 1.0)
+    felt.feel(places[0] + UP, depth, 1.0)
+    assert felt.version == version
+    felt.clear()
+    assert not felt.felt.any()
+
+
+def test_colours_go_from_soft_to_stiff():
+    levels = colour_levels(np.array([np.nan, 1.0, 1.0, 1.0, 1.5, 9.0]))
+    assert levels[0] == -1 and levels[5] == len(COLOURS) - 1
+    assert levels[1] < levels[4] < levels[5]
+    assert (colour_levels(np.full(3, np.nan)) == -1).all()

@@ -1,0 +1,67 @@
+"""Recordings: what is written can be read again, played by the haptic package, and never elsewhere than told."""
+
+import numpy as np
+import pytest
+
+from surgsim_env.haptics.trajectory import TrajectoryDevice
+from surgsim_env.live.exchange_records import recording_type
+from surgsim_env.live.recording import read_recording, write_recording
+
+
+def made_steps(arm_count=1, count=50):
+    rng = np.random.default_rng(1)
+    steps = np.zeros(count, dtype=recording_type(arm_count))
+    steps["time"] = 1e-3 * np.arange(1, count + 1)
+    for name in ("hand", "tip", "force"):
+        steps[name] = rng.normal(size=(count, arm_count, 3))
+    steps["buttons"] = rng.integers(0, 2, size=(count, arm_count))
+    return steps
+
+
+@pytest.mark.parametrize("arm_count", [1, 2])
+def test_what_is_written_is_read(tmp_path, arm_count):
+    steps = made_steps(arm_count)
+    assert "recording-1.csv" in write_recording(steps, tmp_path / "new")
+    assert "recording-2.csv" in write_recording(steps, tmp_path / "new")
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["recording-1.csv", "recording-2.csv"]
+    read = read_recording(tmp_path / "new" / "recording-1.csv", arm_count)
+    for name in ("time", "hand", "buttons"):
+        np.testing.assert_allclose(read[name], steps[name], rtol=1e-8)
+
+
+def test_the_haptic_package_plays_it(tmp_path):
+    steps = made_steps()
+    write_recording(steps, tmp_path)
+    device = TrajectoryDevice.load(tmp_path / "recording-1.csv")
+    np.testing.assert_allclose(device.read().position, steps["hand"][0, 0], rtol=1e-8)
+
+
+def test_nothing_recorded_writes_nothing(tmp_path):
+    assert "nothing" in write_recording(made_steps(count=0), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_said(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "not written" in write_recording(made_steps(), tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "no column 'time'"),
+        ("time,x,y\n0,0,0\n", "no column 'z'"),
+        ("time,x,y,z\n", "no rows"),
+        ("time,x,y,z\n0,0,0,zero\n", "line 2"),
+        ("time,x,y,z\n0,0,0\n", "line 2"),
+        ("time,x,y,z\nnan,0,0,0\n", "not finite"),
+        ("time,x,y,z\n0,0,0,inf\n", "not finite"),
+        ("time,x,y,z,buttons\n0,0,0,0,one\n", "line 2"),
+        ("time,x,y,z,buttons\n0,0,0,0,inf\n", "line 2"),
+    ],
+)
+def test_files_that_are_none_are_refused(tmp_path, text, told):
+    path = tmp_path / "made.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=told):
+        read_recording(path, 1)

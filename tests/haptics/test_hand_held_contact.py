@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.arms.arm_instrument import parked_place
 from surgsim_env.haptics.coupling import coupling_for, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.limits import ForceLimits
@@ -12,6 +14,8 @@ from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.tip_drive import tip_drives
+from surgsim_env.scenes import make_scene
+from surgsim_env.simulation import Simulation
 from tests.haptics.bench_hand import (
     DT,
     START,
@@ -150,6 +154,28 @@ def test_holding_dies_out():
             fastest.append(0.0)
         fastest[-1] = max(fastest[-1], float(np.abs(device.velocity).max()))
     assert max(fastest[1:]) < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["liver", "lobe"])
+def test_contact_at_the_limit_on_other_organs(scene):
+    """A probe on the liver and a grasper on the lobe: the tip's mass and the organ differ, the promise does not."""
+    anatomy = load_anatomy(make_scene(scene))
+    simulation = Simulation(anatomy)
+    simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
+    push = tuple((0.3 * anatomy.face.approach).tolist())
+    device = SimulatedDevice(
+        mass=0.05, damping=0.5, haptic_step=DT, position=parked_place(anatomy), hand=Hand(push=push)
+    )
+    stiffest = limit(simulation, device.dynamics, 0.125)
+    loop = HapticLoop(simulation, device, bare_settings(stiffest * (1.0 - 1e-9), 0.125))
+    touched = False
+    for told in run(loop, device, 5000):
+        assert not told.fault
+        assert -device.work >= -ROUNDING
+        touched |= bool(told.tip.contact_force.any())
+    assert touched
+    assert np.abs(device.velocity).max() < 5e-3
 
 
 def test_hand_feels_what_the_tissue_gives():

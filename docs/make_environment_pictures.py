@@ -1,6 +1,9 @@
-"""Make the moving pictures of the pages on environments: python docs/make_environment_pictures.py (some minutes)."""
+"""Make the pictures of the environments and tutorials: python docs/make_environment_pictures.py [NAME ...] (minutes)."""
 
+import contextlib
+import re
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -77,17 +80,33 @@ def film_presses(path: Path, *, seed: int) -> None:
     write(frames, path, PRESS_SHOWN_MS)
 
 
+def draw_tutorial(path: Path) -> None:
+    """What docs/tutorials/own_organ.md shows, by its own code."""
+    text = (Path(__file__).parent / "tutorials" / "own_organ.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for title, code in re.findall(r'^```(?:python|toml title="(.*?)")\n(.*?)^```$', text, flags=re.M | re.S):
+            if title:
+                Path(title).write_text(code, encoding="utf-8")
+            else:
+                exec(code, names)
+    Image.fromarray(names["picture"]).save(path, optimize=True)
+
+
 def main(names: list[str]) -> None:
     films = {
         "palpate": lambda path: film_oracle("SurgSim/Palpate-v0", path, "overview", seed=3, show_lesion=True),
         "palpate_sites": lambda path: film_presses(path, seed=4),
         "retract": lambda path: film_oracle("SurgSim/Retract-v0", path, "overview", "endoscope", seed=4),
         "bimanual_retract": lambda path: film_oracle(
-            "SurgSim/BimanualRetract-v0", path, "overview", "endoscope", seed=4
+            "SurgSim/BimanualRetract-v0", path, "overview", "endoscope", seed=4, every=4
         ),
     }
-    for name in names or films:
-        films[name](IMAGES / f"env_{name}.webp")
+    for name in names or [*films, "organ"]:
+        if name == "organ":
+            draw_tutorial(IMAGES / "tutorial_organ.png")
+        else:
+            films[name](IMAGES / f"env_{name}.webp")
 
 
 if __name__ == "__main__":

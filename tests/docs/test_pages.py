@@ -65,7 +65,7 @@ def test_names_are_resolved_or_not():
 
 def test_pictures_are_small():
     pictures = [path for path in (ROOT / "docs" / "images").rglob("*") if path.is_file()]
-    assert pictures and all(path.stat().st_size < 500_000 for path in pictures)
+    assert pictures and all(200 < path.stat().st_size < 500_000 for path in pictures)
 
 
 @pytest.mark.parametrize(

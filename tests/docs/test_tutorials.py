@@ -1,0 +1,140 @@
+"""The tutorials run: their files are written, their Python and their commands run in order, what they print is so.
+
+A block ```LANGUAGE title="NAME" is a file; ```python without a title runs in one namespace for the page; ```sh are
+commands; ```text title="prints" is what the last Python printed, its numbers within some per cent.
+"""
+
+import importlib
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from surgsim_env.cli import main
+from surgsim_env.rendering import gl
+
+TUTORIALS = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
+NAMES = sorted(path.stem for path in TUTORIALS.glob("*.md") if path.stem != "index")
+# The same in less time: what is written, and what runs here.
+QUICK = {
+    "own_organ": [("--out runs/kidney", "--out runs/kidney --around 0.02,0.01,0.021,0.012")],
+    "own_robot": [("--points 200 --episodes 0", "--points 10 --episodes 0")],
+}
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+# Numbers repeat to the bit on one machine; libraries of other versions may mesh or round otherwise.
+RELATIVE, ABSOLUTE = 0.05, 0.015
+
+
+class Block(NamedTuple):
+    language: str
+    title: str
+    text: str
+
+
+def blocks(page: str) -> list[Block]:
+    found = re.findall(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', page, flags=re.MULTILINE | re.DOTALL)
+    return [Block(*one) for one in found]
+
+
+def page(name: str) -> str:
+    text = (TUTORIALS / f"{name}.md").read_text(encoding="utf-8")
+    for written, quick in QUICK.get(name, []):
+        assert text.count(written) == 1, written
+        text = text.replace(written, quick)
+    return text
+
+
+def agrees(printed: str, told: str) -> bool:
+    """Whether all words are the same and all numbers nearly so."""
+    one, other = (" ".join(text.split()) for text in (printed, told))
+    if NUMBER.sub("#", one) != NUMBER.sub("#", other):
+        return False
+    pairs = zip(map(float, NUMBER.findall(one)), map(float, NUMBER.findall(other)))
+    return all(abs(a - b) <= max(ABSOLUTE, RELATIVE * abs(b)) for a, b in pairs)
+
+
+def run_command(line: str) -> None:
+    """One line of a shell: our own commands in this process, Python's in another one, pip's not at all."""
+    program, *arguments = shlex.split(line, comments=True)
+    if program == "surgsim":
+        assert main(arguments) == 0, line
+    elif program == "python":
+        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=600)
+        assert done.returncode == 0, done.stdout + done.stderr
+    else:
+        assert program in ("pip", "tensorboard"), line
+
+
+def run_tutorial(text: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, object] = {}
+    for block in blocks(text):
+        if block.title == "prints":
+            printed = capsys.readouterr().out
+            assert agrees(printed, block.text), f"{name} prints\n{printed}\nand says\n{block.text}"
+        elif block.title:
+            Path(block.title).write_text(block.text, encoding="utf-8")
+        elif block.language == "sh":
+            for line in block.text.splitlines():
+                run_command(line)
+        elif block.language == "python" and not (".render()" in block.text and not draws()):
+            capsys.readouterr()
+            exec(compile(block.text, f"docs/tutorials/{name}.md", "exec"), names)
+
+
+def draws() -> bool:
+    try:
+        gl.context()
+    except gl.NoGLError:
+        return False
+    return True
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder to run in, from which modules are imported; what it brought is forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    importlib.invalidate_caches()
+    before = set(sys.modules)
+    yield tmp_path
+    for module in set(sys.modules) - before:
+        if str(getattr(sys.modules[module], "__file__", "") or "").startswith(str(tmp_path)):
+            del sys.modules[module]
+
+
+NEEDS_AGENTS = {"train_an_agent"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.agents) if name in NEEDS_AGENTS else name for name in NAMES]
+)
+def test_it_runs(name, folder, capsys):
+    if name in NEEDS_AGENTS:
+        pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+    run_tutorial(page(name), name, capsys)
+
+
+def test_what_is_printed_is_compared(folder, capsys):
+    text = '```python\nprint("3 lesions, 0.24 N")\n```\n\n```text title="prints"\nSAID\n```\n'
+    run_tutorial(text.replace("SAID", "3 lesions, 0.25 N"), "made", capsys)
+    for wrong in ("3 lesions, 0.34 N", "3 lesion, 0.24 N", "4 lesions, 0.24 N", "3 lesions"):
+        with pytest.raises(AssertionError, match="and says"):
+            run_tutorial(text.replace("SAID", wrong), "made", capsys)
+
+
+def test_a_command_that_fails_is_noticed(folder, capsys):
+    with pytest.raises(AssertionError, match="nowhere"):
+        run_tutorial("```sh\nsurgsim organ nowhere.stl --length-unit mm\n```\n", "made", capsys)
+    with pytest.raises(AssertionError, match="rm -r"):
+        run_tutorial("```sh\nrm -r everything\n```\n", "made", capsys)
+
+
+def test_getting_started_runs(folder, capsys):
+    text = (TUTORIALS.parent / "getting_started.md").read_text(encoding="utf-8")
+    run_tutorial(re.sub(r"^```sh\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL), "getting_started", capsys)
+    printed = capsys.readouterr().out
+    assert re.search(r"True largest force 0\.2\d N", printed), printed

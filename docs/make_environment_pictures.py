@@ -1,4 +1,4 @@
-"""Make the pictures of the environments and tutorials: python docs/make_environment_pictures.py [NAME ...] (minutes)."""
+"""Make the pictures of environments and tutorials: python docs/make_environment_pictures.py [NAME ...] (minutes)."""
 
 import contextlib
 import re

@@ -1,4 +1,4 @@
-"""Pages of large tables take the room of the table of contents as well; commands write these pages, so it is said here."""
+"""Pages of large tables take the room of the table of contents as well; commands write them, so it is said here."""
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import Files

@@ -54,7 +54,8 @@ def live_scene(scene: Scene) -> Scene:
 
 def lesion_kinds(scene: Scene) -> tuple[str, ...]:
     """What a scene's lesions may be, the first what it begins with."""
-    kinds = (SHOWN,) if scene.demonstration else ()
+    shown = scene.demonstration or any(region.lesion for region in scene.regions)
+    kinds = (SHOWN,) if shown else ()
     return (*kinds, *((HIDDEN,) if scene.lesion is not None else ()), NONE)
 
 
@@ -88,9 +89,14 @@ def chosen_organ(anatomy: Anatomy, choice: OrganChoice) -> OrganModel:
 
 
 def _resized(anatomy: Anatomy, lesion: Lesion, choice: OrganChoice) -> Lesion:
-    assert lesion.centre is not None and lesion.radius is not None and lesion.material is not None
+    assert lesion.material is not None
     healthy = anatomy.scene.material.youngs_modulus
     ratio = lesion.material.youngs_modulus / healthy if choice.lesion_ratio is None else choice.lesion_ratio
+    if lesion.region is not None:
+        # A region keeps its tets, and so its size.
+        modulus = ratio * choice.modulus_factor * healthy
+        return replace(lesion, material=replace(lesion.material, youngs_modulus=modulus))
+    assert lesion.centre is not None and lesion.radius is not None
     return anatomy.lesion_at(
         lesion.centre, lesion.radius * choice.lesion_size, ratio * choice.modulus_factor, lesion.name
     )

@@ -1,6 +1,6 @@
-"""Label images that SimpleITK reads: NRRD, MetaImage, and DICOM files of one volume."""
+"""Label images that SimpleITK reads: NRRD, MetaImage, and plain DICOM images."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,9 @@ ADVICE = "export or copy it again"
 # SimpleITK reads whole images [bytes].
 BYTES_MOST = 4_000_000_000
 SLICES = 16
+# Of SimpleITK's reasons the end says most [characters].
+REASON_LENGTH = 200
 READERS = {".nrrd": "NrrdImageIO", ".mha": "MetaImageIO", ".dcm": "GDCMImageIO"}
-# DICOM's class of segmentations, the tags of class, frames and of a segment's number.
-SEGMENTATION_CLASS = "1.2.840.10008.5.1.4.1.1.66.4"
-CLASS_TAG = "0008|0016"
 
 
 def open_itk(file: Path) -> LabelSource:
@@ -36,9 +35,7 @@ def open_itk(file: Path) -> LabelSource:
     reader: Any = SimpleITK.ImageFileReader()
     reader.SetImageIO(READERS[file.suffix.lower()])
     reader.SetFileName(str(file))
-    parsed(file, lambda _: reader.ReadImageInformation(), ADVICE)
-    if file.suffix.lower() == ".dcm":
-        _check_dicom(reader, file)
+    _asked(file, reader.ReadImageInformation)
     shape = checked_shape(reader.GetSize(), file)
     components = reader.GetNumberOfComponents()
     if components != 1:
@@ -48,7 +45,7 @@ def open_itk(file: Path) -> LabelSource:
     if np.prod(np.array(shape, dtype=np.float64)) * width > BYTES_MOST:
         raise MeshError(
             f"{file}: holds {' x '.join(map(str, shape))} voxels of {width} bytes; at most {BYTES_MOST / 1e9:g} GB of "
-            f"this format are read at once: crop it, or save it as {8}-bit NIfTI"
+            f"this format are read at once: crop it, or save it as NIfTI of 8 bits"
         )
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
@@ -57,7 +54,7 @@ def open_itk(file: Path) -> LabelSource:
     notes = _stated_space(file)
 
     def slabs() -> Iterator[tuple[int, NDArray]]:
-        image = parsed(file, lambda _: reader.Execute(), ADVICE)
+        image = _asked(file, reader.Execute)
         values = SimpleITK.GetArrayViewFromImage(image).reshape(shape[::-1]).T
         for first in range(0, shape[2], SLICES):
             yield first, values[:, :, first : first + SLICES]
@@ -65,17 +62,13 @@ def open_itk(file: Path) -> LabelSource:
     return LabelSource(file, shape, geometry, slabs, notes)
 
 
-def _check_dicom(reader: Any, file: Path) -> None:
-    """Refuse segmentation objects whose frames SimpleITK stacks without knowing which segment and place each has."""
-    is_segmentation = (
-        CLASS_TAG in reader.GetMetaDataKeys() and reader.GetMetaData(CLASS_TAG).strip() == SEGMENTATION_CLASS
-    )
-    # SimpleITK gives neither the frames' segments nor their places; dcmqi does.
-    if is_segmentation:
-        raise MeshError(
-            f"{file}: is a DICOM segmentation object, of whose frames SimpleITK tells neither segment nor place: "
-            "convert it first, for instance: segimage2itkimage --inputDICOM FILE --outputDirectory DIR -t nii (dcmqi)"
-        )
+def _asked(file: Path, question: Callable[[], Any]) -> Any:
+    """What SimpleITK answers; where it cannot, its reason without the places in its own sources."""
+    try:
+        return parsed(file, lambda _: question(), ADVICE)
+    except MeshError as error:
+        lines = [line.strip() for line in str(error.__cause__).splitlines() if line.strip()]
+        raise MeshError(f"{file}: cannot be parsed: {' '.join(lines)[-REASON_LENGTH:]}: {ADVICE}") from None
 
 
 def _stated_space(file: Path) -> tuple[str, ...]:

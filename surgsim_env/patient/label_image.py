@@ -68,7 +68,7 @@ def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
         MeshError: names the file and what is wrong: missing, cut short, wrongly compressed, not three axes, sheared,
             too large, numbers that are not whole, a label that is nowhere in it (says which are).
     """
-    source = _source(file)
+    source = _source(file, [label.value for label in labels])
     found = np.zeros(source.shape, dtype=np.uint8, order="F")
     counts = np.zeros(len(labels) + 1, dtype=np.int64)
     for first, values in source.slabs():
@@ -130,7 +130,8 @@ def checked_whole(values: NDArray, file: Path) -> NDArray:
     return values
 
 
-def _source(file: Path) -> LabelSource:
+def _source(file: Path, wanted: Sequence[int]) -> LabelSource:
+    from surgsim_env.patient.dicom_segmentation import open_segmentation
     from surgsim_env.patient.itk_labels import open_itk
     from surgsim_env.patient.nifti_labels import open_nifti
 
@@ -140,7 +141,10 @@ def _source(file: Path) -> LabelSource:
         raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
     if not file.stat().st_size:
         raise MeshError(f"{file}: is empty (0 bytes); export it again")
-    return open_nifti(file) if file.name.lower().endswith((".nii", ".nii.gz")) else open_itk(file)
+    if file.name.lower().endswith((".nii", ".nii.gz")):
+        return open_nifti(file)
+    segmentation = open_segmentation(file, wanted) if file.suffix.lower() == ".dcm" else None
+    return segmentation or open_itk(file)
 
 
 def _there(source: LabelSource) -> str:

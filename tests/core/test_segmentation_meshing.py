@@ -1,0 +1,176 @@
+"""Label images filled with tets: volumes, places, shapes, regions, what is left out and what is refused."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh import TetMesh
+from msdm_core.quality import mesh_quality
+from msdm_core.regions import Lesion, Material, lesion_extent
+from msdm_core.segmentation_meshing import fill_labels, mesh_segmentation
+
+HALF_AXES = np.array([0.040, 0.030, 0.025])
+NAMES = {1: "liver", 2: "lesion"}
+
+
+def ellipsoid(spacing, lesion=0.010):
+    """Labels with a ball of 2 in the middle, and the place of the middle [m]."""
+    spacing = np.asarray(spacing)
+    shape = np.ceil(2 * (HALF_AXES + 0.004) / spacing).astype(int)
+    middle = (shape - 1) / 2 * spacing
+    place = np.moveaxis(np.indices(shape), 0, -1) * spacing - middle
+    labels = (((place / HALF_AXES) ** 2).sum(axis=-1) <= 1).astype(np.int16)
+    labels[(place**2).sum(axis=-1) <= lesion**2] = 2
+    return labels, middle
+
+
+def edge_counts(mesh):
+    sides = np.sort(mesh.boundary_triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return np.unique(sides, axis=0, return_counts=True)[1]
+
+
+@pytest.mark.parametrize("spacing", [(0.001, 0.001, 0.001), (0.0008, 0.0008, 0.005), (0.003, 0.002, 0.0025)])
+def test_a_body_keeps_its_volume_its_place_and_its_shape(spacing):
+    labels, middle = ellipsoid(spacing)
+    filled = fill_labels(labels, spacing, cell_size=0.006, region_names=NAMES)
+    # The level is moved until 0.2 % are left.
+    assert abs(filled.volume_error) < 0.004
+    # The voxels of a smooth body hold its volume but for what chance leaves at its rim, most with slices of 5 mm.
+    assert filled.label_volume == pytest.approx(4 / 3 * np.pi * HALF_AXES.prod(), rel=0.01)
+    quality = mesh_quality(filled.mesh)
+    assert quality.dihedral_smallest_deg > 10
+    assert (edge_counts(filled.mesh) == 2).all()
+    centred = filled.mesh.points - middle
+    radius = np.linalg.norm(centred[filled.mesh.boundary_nodes] / HALF_AXES, axis=1)
+    # Within half of the widest voxel, that is 0.5 x spacing of 25 mm.
+    assert np.abs(radius - 1).max() < 0.5 * max(spacing) / HALF_AXES.min()
+    centre = filled.mesh.volumes @ filled.mesh.points[filled.mesh.tets].mean(axis=1) / filled.mesh.volumes.sum()
+    np.testing.assert_allclose(centre, middle, atol=2e-4)
+
+
+def test_smoothing_alone_takes_volume_and_the_level_gives_it_back():
+    labels, _ = ellipsoid((0.0008, 0.0008, 0.005))
+    filled = fill_labels(labels, (0.0008, 0.0008, 0.005), cell_size=0.006, region_names=NAMES)
+    assert filled.smoothing == pytest.approx(0.7 * 0.005)
+    # A Gaussian of deviation s moves the level 1/2 of a sphere of radius R inward by s^2 / R: 3 s^2 / R^2 of its volume,
+    # with R^2 = 3 / (1/a^2 + 1/b^2 + 1/c^2) here.
+    expected = -(filled.smoothing**2) * (1 / HALF_AXES**2).sum()
+    assert filled.smoothing_change == pytest.approx(expected, rel=0.5)
+    assert abs(filled.volume_error) < 0.2 * abs(filled.smoothing_change)
+
+
+def test_regions_keep_volume_and_place():
+    labels, middle = ellipsoid((0.001, 0.001, 0.001))
+    filled = fill_labels(labels, (0.001, 0.001, 0.001), cell_size=0.005, region_names=NAMES)
+    mesh = filled.mesh
+    assert mesh.region_names == ((1, "liver"), (2, "lesion"))
+    # To half a tet, a^3 / 24.
+    tagged = mesh.volumes[mesh.region == 2].sum()
+    assert abs(tagged - filled.region_volumes[2]) < 0.005**3 / 24
+    centre, half_axes = lesion_extent(mesh, Lesion(region="lesion", material=Material(1e4, 1e3), name="lesion"))
+    np.testing.assert_allclose(centre, middle, atol=5e-4)
+    np.testing.assert_allclose(half_axes, 0.010, rtol=0.06)
+
+
+def test_extent_of_a_region_that_is_an_ellipsoid_of_whole_tets():
+    """Variances of tets are exact: a block of them has L^2 / 12 along each axis, an ellipsoid a^2 / 5."""
+    from msdm_core.meshing import box_mesh
+
+    block = box_mesh((0.06, 0.04, 0.02), (6, 4, 2))
+    mesh = TetMesh(block.points, block.tets, np.full(block.tet_count, 7), {7: "all"})
+    centre, half_axes = lesion_extent(mesh, Lesion(region="all", material=Material(1e4, 1e3)))
+    np.testing.assert_allclose(centre, [0.03, 0.02, 0.01], atol=1e-12)
+    np.testing.assert_allclose(half_axes, np.sqrt(5 / 12) * np.array([0.06, 0.04, 0.02]), rtol=1e-9)
+
+
+def test_parts_beside_the_largest_are_left_out_and_said():
+    labels, _ = ellipsoid((0.002, 0.002, 0.002))
+    labels[0, 0, 0] = 1
+    labels[-2:, 0, 0] = 1
+    with pytest.warns(UserWarning, match=r"2 part\(s\) of 3 voxels"):
+        mesh = mesh_segmentation(labels, (0.002,) * 3, cell_size=0.008, region_names={1: "liver"})
+    assert np.ptp(mesh.points, axis=0).max() < 0.085
+
+
+def test_only_named_labels_are_filled():
+    labels, _ = ellipsoid((0.002, 0.002, 0.002))
+    half = labels.copy()
+    half[half.shape[0] // 2 :][half[half.shape[0] // 2 :] > 0] = 9
+    whole, part = (
+        mesh_segmentation(one, (0.002,) * 3, cell_size=0.008, region_names={1: "liver"}) for one in (labels, half)
+    )
+    assert part.volumes.sum() == pytest.approx(0.5 * whole.volumes.sum(), rel=0.15)
+
+
+def test_the_same_image_gives_the_same_bits():
+    labels, _ = ellipsoid((0.002, 0.002, 0.003))
+    first, second = (
+        mesh_segmentation(one, (0.002, 0.002, 0.003), cell_size=0.007, region_names=NAMES)
+        for one in (labels, np.pad(labels, 3)[3:-3, 3:-3, 3:-3].astype(np.uint8))
+    )
+    np.testing.assert_array_equal(first.tets, second.tets)
+    np.testing.assert_array_equal(first.region, second.region)
+    assert first.points.tobytes() == second.points.tobytes()
+
+
+def test_where_the_image_begins_does_not_matter():
+    labels, _ = ellipsoid((0.002, 0.002, 0.002))
+    first = mesh_segmentation(labels, (0.002,) * 3, cell_size=0.008, region_names=NAMES)
+    padded = mesh_segmentation(
+        np.pad(labels, ((5, 0), (2, 7), (0, 1))), (0.002,) * 3, cell_size=0.008, region_names=NAMES
+    )
+    np.testing.assert_allclose(padded.points - [0.010, 0.004, 0.0], first.points, atol=1e-12)
+    np.testing.assert_array_equal(padded.region, first.region)
+
+
+def test_a_label_at_the_border_is_closed_there():
+    labels = np.ones((20, 20, 20), dtype=np.uint8)
+    mesh = mesh_segmentation(labels, (0.002,) * 3, cell_size=0.006, region_names={1: "block"})
+    assert (edge_counts(mesh) == 2).all()
+    assert mesh.volumes.sum() == pytest.approx(0.04**3, rel=0.01)
+
+
+GOOD = np.pad(np.ones((10, 10, 10), dtype=np.uint8), 1)
+
+
+@pytest.mark.parametrize(
+    ("labels", "spacing", "cell_size", "names", "words"),
+    [
+        (GOOD[None], (0.004,) * 3, 0.008, {1: "a"}, "three axes"),
+        (GOOD.astype(float), (0.004,) * 3, 0.008, {1: "a"}, "whole numbers"),
+        (GOOD, (0.004, 0.0, 0.004), 0.008, {1: "a"}, "spacing is"),
+        (GOOD, (0.004, np.nan, 0.004), 0.008, {1: "a"}, "spacing is"),
+        (GOOD, (0.004,) * 3, 0.0, {1: "a"}, "cell_size is 0"),
+        (GOOD, (0.004,) * 3, 0.008, {}, "one name or more"),
+        (GOOD, (0.004,) * 3, 0.008, {0: "air"}, "none of 0"),
+        (GOOD, (0.004,) * 3, 0.008, [(1, "a"), (1, "b")], "each of another label"),
+        (GOOD, (0.004,) * 3, 0.008, {3: "kidney"}, r"label 3 \('kidney'\) is nowhere in the image.*0, 1"),
+        (GOOD, (0.004,) * 3, 0.030, {1: "a"}, "too coarse.*use 0.01 m or less"),
+        (GOOD, (0.004,) * 3, 0.0001, {1: "a"}, "use .* m or more"),
+    ],
+)
+def test_what_cannot_be_filled_is_refused(labels, spacing, cell_size, names, words):
+    with pytest.raises(MeshError, match=words):
+        mesh_segmentation(labels, spacing, cell_size=cell_size, region_names=names)
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.3, 0.7), st.tuples(*[st.sampled_from((0.001, 0.002, 0.004))] * 3))
+def test_any_blob_becomes_a_sound_mesh_or_a_clear_error(seed, share, spacing):
+    noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(16, 16, 16)), 2)
+    labels = (noise > np.quantile(noise, share)).astype(np.uint8)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mesh = mesh_segmentation(labels, spacing, cell_size=0.004, region_names={1: "blob"})
+    except MeshError as error:
+        assert "use" in str(error) or "try" in str(error)
+        return
+    assert mesh.volumes.min() > 0
+    assert mesh_quality(mesh).dihedral_smallest_deg > 9.3  # the lattice's own bound
+    assert np.unique(np.sort(mesh.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), 1), axis=0).size

@@ -1,0 +1,49 @@
+"""Label images that tests make: an ellipsoid of an organ with two lesions, as a CT's segmentation would show it."""
+
+from pathlib import Path
+
+import nibabel
+import numpy as np
+
+# Half axes along x, y, z of LPS, and of the lesions the centre and radius [mm].
+AXES = np.array([45.0, 36.0, 30.0])
+LESIONS = ((np.array([18.0, -17.0, 8.0]), 9.0), (np.array([-16.0, -14.0, 12.0]), 7.5))
+# The organ's middle in the patient, LPS [mm].
+MIDDLE = np.array([-60.0, 25.0, 110.0])
+ORGAN_VOLUME = 4.0 / 3.0 * np.pi * np.prod(AXES) * 1e-9  # [m^3]
+
+
+def labels_on(affine: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """1 in the organ, 2 in its lesions, at the voxels of a RAS affine [mm] (4, 4)."""
+    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    ras = index @ affine[:3, :3].T + affine[:3, 3]
+    place = ras * [-1.0, -1.0, 1.0] - MIDDLE
+    labels = ((place / AXES) ** 2).sum(axis=-1) <= 1.0
+    lesions = [((place - centre) ** 2).sum(axis=-1) <= radius**2 for centre, radius in LESIONS]
+    return np.where(labels & np.any(lesions, axis=0), 2, labels).astype(np.uint8)
+
+
+def affine_of(spacing=(2.0, 2.0, 2.0), turn: np.ndarray | None = None, margin: float = 6.0):
+    """A RAS affine [mm] and a shape whose box holds the organ with a margin [mm]."""
+    turn = np.eye(3) if turn is None else turn
+    matrix = turn * np.asarray(spacing)
+    reach = np.abs(turn.T) @ AXES + margin
+    shape = tuple(int(n) for n in np.ceil(2.0 * reach / np.asarray(spacing)))
+    affine = np.eye(4)
+    affine[:3, :3] = matrix
+    affine[:3, 3] = MIDDLE * [-1.0, -1.0, 1.0] - matrix @ ((np.array(shape) - 1) / 2)
+    return affine, shape
+
+
+def write_nifti(path: Path, labels: np.ndarray, affine: np.ndarray, *, unit: str = "mm") -> Path:
+    """A NIfTI file of labels; `affine` is in the unit."""
+    image = nibabel.Nifti1Image(labels, affine)
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, path)
+    return path
+
+
+def scan(path: Path, **geometry) -> Path:
+    """The organ as a NIfTI file."""
+    affine, shape = affine_of(**geometry)
+    return write_nifti(path, labels_on(affine, shape), affine)

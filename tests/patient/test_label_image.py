@@ -1,0 +1,284 @@
+"""Label images read from files: where voxels lie in the patient, and every way a file can be wrong."""
+
+import gzip
+import struct
+import tracemalloc
+
+import nibabel
+import numpy as np
+import pytest
+import SimpleITK
+
+from msdm_core.errors import MeshError
+from surgsim_env.patient.label_image import VOXELS_MOST, read_label_image
+from surgsim_env.patient.label_names import parse_labels
+from tests.patient.scans import AXES, MIDDLE, affine_of, labels_on, write_nifti
+from tests.patient.segmentation_object import write_segmentation
+
+BOTH = parse_labels("liver=1,lesion=2")
+
+
+def turned(angles):
+    """A rotation about z, y and x [radians]."""
+    cz, cy, cx = np.cos(angles)
+    sz, sy, sx = np.sin(angles)
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return about_z @ about_y @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+
+
+TURNS = {
+    "RAS": np.eye(3),
+    "LPS": np.diag([-1.0, -1.0, 1.0]),
+    "PSR": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+    "LAS, left-handed": np.diag([-1.0, 1.0, 1.0]),
+    "oblique": turned([0.4, -0.3, 0.2]),
+}
+
+
+def places(image, tag):
+    """LPS places of a tag's voxels [mm], (n, 3)."""
+    return 1e3 * image.geometry.places(np.argwhere(image.tags == tag) * image.geometry.spacing)
+
+
+def check_organ(image, spacing):
+    """The organ lies where `tests.patient.scans` has it in the patient, whatever the image's axes."""
+    both = np.concatenate([places(image, 1), places(image, 2)])
+    # Means over some thousand voxels, extents to two voxels.
+    np.testing.assert_allclose(both.mean(axis=0), MIDDLE, atol=0.3)
+    np.testing.assert_allclose(np.ptp(both, axis=0), 2 * AXES, atol=2 * max(spacing))
+    lesions = places(image, 2).mean(axis=0) - MIDDLE
+    # Both lesions lie to the front and the head, the larger to the left.
+    assert lesions[0] > 2.0
+    assert lesions[1] < -12.0
+    assert lesions[2] > 6.0
+
+
+@pytest.mark.parametrize("name", TURNS)
+def test_nifti_lies_in_the_patient_as_its_header_says(name, tmp_path):
+    spacing = (2.0, 2.5, 3.0)
+    affine, shape = affine_of(spacing, TURNS[name])
+    image = read_label_image(write_nifti(tmp_path / "a.nii.gz", labels_on(affine, shape), affine), BOTH)
+    np.testing.assert_allclose(image.geometry.spacing, np.array(spacing) * 1e-3, rtol=1e-6)
+    assert image.names == ("liver", "lesion")
+    check_organ(image, spacing)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("meter", 1e-3), ("micron", 1e3)])
+def test_the_header_s_length_unit_counts(unit, scale, tmp_path):
+    affine, shape = affine_of()
+    scaled = np.vstack([affine[:3] * scale, affine[3]])
+    image = read_label_image(write_nifti(tmp_path / "a.nii", labels_on(affine, shape), scaled, unit=unit), BOTH)
+    check_organ(image, (2.0, 2.0, 2.0))
+
+
+def test_what_the_header_leaves_open_is_said(tmp_path):
+    affine, shape = affine_of()
+    image = nibabel.Nifti1Image(labels_on(affine, shape), None)
+    image.header.set_zooms((2.0, 2.0, 2.0))
+    nibabel.save(image, tmp_path / "a.nii")
+    notes = " ".join(read_label_image(tmp_path / "a.nii", BOTH).notes)
+    assert "no length unit: millimetres" in notes
+    assert "no orientation: left and right" in notes
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".dcm"])
+def test_what_simpleitk_reads_lies_there_too(suffix, tmp_path):
+    affine, shape = affine_of((2.0, 2.0, 3.0))
+    labels = labels_on(affine, shape)
+    image = SimpleITK.GetImageFromArray(labels.T)
+    image.SetSpacing((2.0, 2.0, 3.0))
+    # SimpleITK's world is LPS.
+    image.SetDirection((-1.0, 0, 0, 0, -1.0, 0, 0, 0, 1.0))
+    image.SetOrigin((-affine[0, 3], -affine[1, 3], affine[2, 3]))
+    if suffix == ".dcm":
+        image = SimpleITK.Cast(image, SimpleITK.sitkUInt16)
+    SimpleITK.WriteImage(image, str(tmp_path / f"a{suffix}"))
+    found = read_label_image(tmp_path / f"a{suffix}", BOTH)
+    if suffix != ".dcm":  # SimpleITK writes no place of a volume's slices into a DICOM file
+        check_organ(found, (2.0, 2.0, 3.0))
+    assert np.count_nonzero(found.tags) == np.count_nonzero(labels)
+
+
+def test_nrrd_without_a_space_says_what_is_taken(tmp_path):
+    (tmp_path / "a.nrrd").write_bytes(
+        b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 4 4\nspacings: 2 2 2\nencoding: raw\n\n" + bytes([1] * 64)
+    )
+    image = read_label_image(tmp_path / "a.nrrd", parse_labels("liver=1"))
+    assert "names no anatomical space" in " ".join(image.notes)
+
+
+def segmentation(tmp_path, **options):
+    shape, spacing = (40, 36, 20), (2.5, 2.25, 3.5)
+    labels = labels_on(np.diag([-1.0, -1.0, 1.0, 1.0]) @ _lps_affine(shape, spacing), shape)
+    masks = {"Liver": labels > 0, "Vessel": np.roll(labels == 2, 3, axis=0), "Tumor": labels == 2}
+    origin = MIDDLE - (np.array(shape) - 1) / 2 * spacing
+    return write_segmentation(tmp_path / "seg.dcm", masks, spacing, origin, **options), labels
+
+
+def _lps_affine(shape, spacing):
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = MIDDLE - (np.array(shape) - 1) / 2 * spacing
+    return affine
+
+
+def test_dicom_segmentation_with_segments_that_overlap(tmp_path):
+    file, labels = segmentation(tmp_path)
+    image = read_label_image(file, parse_labels("liver=1,lesion=3"))
+    assert np.count_nonzero(image.tags == 2) == np.count_nonzero(labels == 2)
+    assert np.count_nonzero(image.tags) == np.count_nonzero(labels)
+    check_organ(image, (2.5, 2.25, 3.5))
+
+
+def test_dicom_segmentation_names_its_segments(tmp_path):
+    file, _ = segmentation(tmp_path)
+    with pytest.raises(MeshError, match=r"segment 7 is nowhere in it; there are 1 \('Liver'\), 2 \('Vessel'\), 3"):
+        read_label_image(file, parse_labels("liver=7"))
+
+
+def test_sheared_stack_of_dicom_frames_is_refused(tmp_path):
+    file, _ = segmentation(tmp_path, shift=0.5)
+    with pytest.raises(MeshError, match=r"off an even stack of 3\.5 mm slices: sheared"):
+        read_label_image(file, BOTH)
+
+
+# ---- files that are wrong ---------------------------------------------------------------------------------------
+
+
+def plain(path):
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    return write_nifti(path, labels_on(affine, shape), affine)
+
+
+def refused(file, words, labels=BOTH):
+    with pytest.raises(MeshError, match=words) as caught:
+        read_label_image(file, labels)
+    assert file.name in str(caught.value)
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.95])
+def test_a_file_that_was_cut_short(name, share, tmp_path):
+    whole = plain(tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
+    refused(tmp_path / name, "cut short|cannot be parsed")
+
+
+def test_a_file_that_is_compressed_otherwise_than_it_is_named(tmp_path):
+    data = plain(tmp_path / "a.nii").read_bytes()
+    (tmp_path / "b.nii.gz").write_bytes(data)
+    refused(tmp_path / "b.nii.gz", r"is named \.nii\.gz and is not compressed")
+    (tmp_path / "c.nii").write_bytes(gzip.compress(data))
+    refused(tmp_path / "c.nii", r"is named \.nii and is compressed")
+
+
+def test_compressed_data_with_a_wrong_bit(tmp_path):
+    data = bytearray(plain(tmp_path / "a.nii.gz").read_bytes())
+    data[-7] ^= 1  # in the checksum
+    (tmp_path / "a.nii.gz").write_bytes(data)
+    refused(tmp_path / "a.nii.gz", "cannot be parsed: .*CRC")
+
+
+def test_a_file_that_goes_on_after_its_image(tmp_path):
+    data = plain(tmp_path / "a.nii").read_bytes()
+    (tmp_path / "b.nii.gz").write_bytes(gzip.compress(data + bytes(3_000_000)))
+    refused(tmp_path / "b.nii.gz", "goes on far beyond")
+
+
+def test_four_axes_shear_and_numbers_that_are_no_labels(tmp_path):
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    labels = labels_on(affine, shape)
+    refused(write_nifti(tmp_path / "4d.nii", np.stack([labels, labels], axis=-1), affine), r"4 axes \(.* x 2\)")
+    read_label_image(write_nifti(tmp_path / "ok.nii", labels[..., None], affine), BOTH)
+    sheared = affine.copy()
+    sheared[0, 2] = 1.0
+    refused(write_nifti(tmp_path / "shear.nii", labels, sheared), r"axes 0 and 2 .*75.96 degrees; sheared")
+    refused(write_nifti(tmp_path / "float.nii", labels * 0.5, affine), "holds 0.5, which is no whole number")
+    read_label_image(write_nifti(tmp_path / "whole.nii", labels.astype(np.float32), affine), BOTH)
+    refused(write_nifti(tmp_path / "far.nii", labels, affine * 100), "voxels are 400 x 400 x 400 mm")
+    flat = affine.copy()
+    flat[:, 1] = 0.0
+    header = bytearray(plain(tmp_path / "flat.nii").read_bytes())
+    header[280 + 4 : 280 + 8] = struct.pack("<f", float("nan"))  # srow_x[1]
+    (tmp_path / "flat.nii").write_bytes(header)
+    refused(tmp_path / "flat.nii", "not finite")
+
+
+def test_a_label_that_is_not_there_and_an_image_without_any(tmp_path):
+    file = plain(tmp_path / "a.nii.gz")
+    refused(file, r"label 5 \('liver'\) is nowhere in the image; there are labels 1, 2", parse_labels("liver=5"))
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    refused(write_nifti(tmp_path / "0.nii", np.zeros(shape, np.uint8), affine), "no labels at all, every voxel is 0")
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".nrrd", ".mha", ".dcm"])
+@pytest.mark.parametrize("data", [b"", b"\x1f\x8b\x08rubbish", b"solid cube\n" * 50, bytes(range(256)) * 20])
+def test_rubbish_is_one_error(suffix, data, tmp_path):
+    (tmp_path / f"a{suffix}").write_bytes(data)
+    refused(tmp_path / f"a{suffix}", "empty|cannot be parsed|compressed|unable|is no")
+
+
+def test_no_file_and_a_folder(tmp_path):
+    refused(tmp_path / "none.nii", "no such file")
+    (tmp_path / "folder.nii").mkdir()
+    refused(tmp_path / "folder.nii", "is a directory")
+
+
+def test_a_huge_image_is_refused_by_its_header(tmp_path):
+    header = nibabel.Nifti1Header()
+    header.set_data_shape((32000, 32000, 2000))
+    header.set_data_dtype(np.uint8)
+    header["magic"], header["vox_offset"] = b"n+1", 352
+    header.set_sform(np.diag([1.0, 1.0, 1.0, 1.0]), code=1)
+    (tmp_path / "a.nii").write_bytes(header.binaryblock + bytes(1000))
+    refused(tmp_path / "a.nii", r"2\.05e\+12 voxels; at most 1e\+09")
+    assert VOXELS_MOST == 1_000_000_000
+    (tmp_path / "a.nrrd").write_bytes(
+        b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 32000 32000 2000\nspacings: 1 1 1\nencoding: raw\n\n" + bytes(9)
+    )
+    refused(tmp_path / "a.nrrd", "at most 1e[+]09 are read|cannot be parsed")
+
+
+def test_memory_is_a_byte_a_voxel_and_some_slices(tmp_path):
+    labels = np.zeros((256, 256, 120), dtype=np.float64)
+    labels[100:150, 100:150, 40:80] = 1
+    file = write_nifti(tmp_path / "a.nii.gz", labels, np.diag([1.0, 1.0, 1.0, 1.0]))
+    size = labels.size
+    del labels
+    tracemalloc.start()
+    image = read_label_image(file, parse_labels("liver=1"))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert image.tags.shape == (50, 50, 40)
+    # As it lies in the file it has 8 bytes a voxel; slabs of 32 MB, and what comparing one takes.
+    assert peak < size + 5 * 32_000_000
+    assert peak < 8 * size * 2.7
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("liver", "'liver' is no NAME=LABEL"),
+        ("liver=1,", "'' is no NAME=LABEL"),
+        ("liver=one", "no NAME=LABEL"),
+        ("liver=-1", "no NAME=LABEL"),
+        ("liver=0", "0 is outside"),
+        ("liver=1,liver=2", "'liver' is given twice"),
+        ("liver=1,lesion=1", "1 is given twice"),
+        ('li"ver=1', "cannot be a region's name"),
+        ("=1", "cannot be a region's name"),
+        ("liver=9999999999", "labels are from 1 to"),
+        (",".join(f"a{n}={n}" for n in range(1, 40)), "at most 32"),
+    ],
+)
+def test_labels_that_make_no_sense(text, words):
+    with pytest.raises(MeshError, match=words):
+        parse_labels(text)
+
+
+def test_labels_are_read_in_order():
+    assert [(one.name, one.value) for one in parse_labels("left kidney = 7 ,lesion=2")] == [
+        ("left kidney", 7),
+        ("lesion", 2),
+    ]

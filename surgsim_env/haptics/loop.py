@@ -74,7 +74,9 @@ class HapticLoop:
                 held.step(contact)
             simulation.control_step(1)
             simulation.instrument.refresh()
-            self.fault = simulation.fault or simulation.instrument.warning()
+            self.fault = simulation.fault
+            if not self.fault and simulation.instrument.data.warning.number.any():
+                self.fault = simulation.instrument.warning()
             self._contacts = self._contact_forces()
         if self.fault:
             for held in self.held:

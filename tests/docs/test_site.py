@@ -3,15 +3,11 @@
 import html.parser
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
 
-pytest.importorskip("material", reason="needs the `docs` extra")
-pytest.importorskip("mkdocstrings", reason="needs the `docs` extra")
 ROOT = Path(__file__).resolve().parents[2]
 # What a browser fetches by itself; links are fetched when somebody follows them.
 FETCHED = {"img": "src", "script": "src", "link": "href", "source": "src", "iframe": "src", "video": "src"}
@@ -36,32 +32,15 @@ class Html(html.parser.HTMLParser):
             self.fetched.append(given[FETCHED[tag]])
 
 
-def build(folder: Path, *options: str, configuration: Path = ROOT / "mkdocs.yml") -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder), *options]
-    settings = {**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1", "NO_COLOR": "1"}
-    command += ["--config-file", str(configuration)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, env=settings)
-
-
 @pytest.fixture(scope="module")
-def site(tmp_path_factory) -> dict[str, Html]:
+def site(site_folder) -> dict[str, Html]:
     """Every page of the built site, by its path."""
-    folder = tmp_path_factory.mktemp("site")
-    done = build(folder)
-    assert done.returncode == 0, done.stderr
-    assert "WARNING" not in done.stderr
-    return {
-        path.relative_to(folder).as_posix(): Html(path.read_text(encoding="utf-8")) for path in folder.rglob("*.html")
-    } | {"": Html(f'<a name="{folder}">')}
-
-
-@pytest.fixture(scope="module")
-def folder(site) -> Path:
-    return Path(*site[""].ids)
+    found = site_folder.rglob("*.html")
+    return {path.relative_to(site_folder).as_posix(): Html(path.read_text(encoding="utf-8")) for path in found}
 
 
 def pages(site: dict[str, Html]) -> dict[str, Html]:
-    return {path: page for path, page in site.items() if path not in ("", "404.html")}
+    return {path: page for path, page in site.items() if path != "404.html"}
 
 
 def test_every_page_of_docs_is_on_the_site(site):
@@ -86,7 +65,7 @@ def test_every_page_is_in_the_navigation(site):
     assert set(pages(site)) - reached == set()
 
 
-def test_links_lead_somewhere(site, folder):
+def test_links_lead_somewhere(site, site_folder):
     """mkdocs looks at links of Markdown; this one also at those of generated and of HTML parts."""
     lost = []
     for path, page in pages(site).items():
@@ -95,35 +74,35 @@ def test_links_lead_somewhere(site, folder):
                 continue
             target, _, anchor = unquote(link).partition("#")
             place = os.path.normpath(os.path.join(os.path.dirname(path), target)) if target else path
-            if not (folder / place).is_file():
+            if not (site_folder / place).is_file():
                 lost.append(f"{path}: {link}")
             elif anchor and place in site and anchor not in site[place].ids:
                 lost.append(f"{path}: {link}")
     assert lost == []
 
 
-def test_nothing_is_fetched_from_elsewhere(site, folder):
+def test_nothing_is_fetched_from_elsewhere(site, site_folder):
     fetched = {link for page in pages(site).values() for link in page.fetched}
     assert fetched, "no page fetches its own style sheet?"
     assert [link for link in fetched if re.match(r"(?:[a-z]+:)?//", link)] == []
-    styles = [path.read_text(encoding="utf-8") for path in folder.rglob("*.css")]
+    styles = [path.read_text(encoding="utf-8") for path in site_folder.rglob("*.css")]
     assert styles and not any(re.search(r"(?:url\(|@import\s+)[\"']?(?:https?:)?//", style) for style in styles)
 
 
-def test_equations_became_mathml(folder):
-    for path in folder.rglob("*.html"):
+def test_equations_became_mathml(site_folder):
+    for path in site_folder.rglob("*.html"):
         text = path.read_text(encoding="utf-8")
         assert "arithmatex" not in text, path
         for drawn in re.findall(r"<math.*?</math>", text, flags=re.DOTALL):
             assert "\\" not in drawn and "merror" not in drawn, (path, drawn)
-    assert (folder / "concepts.html").read_text(encoding="utf-8").count("equation-number") >= 6
+    assert (site_folder / "concepts.html").read_text(encoding="utf-8").count("equation-number") >= 6
 
 
 @pytest.mark.parametrize(
     "fault",
     ["[lost](nowhere.md)", "[lost](arms.md#nowhere)", "![lost](images/nowhere.png)", r"$\nocommand{x}$"],
 )
-def test_a_fault_ends_the_build(tmp_path, fault):
+def test_a_fault_ends_the_build(build, tmp_path, fault):
     """That warnings are errors, and that each of these is noticed: a site of two pages with our configuration."""
     docs = tmp_path / "docs"
     docs.mkdir()

@@ -89,5 +89,6 @@ def summary_table(id: str) -> str:
 
 
 def _lists_apart(text: str) -> str:
-    """Markdown wants an empty line before a list or a table that follows a paragraph."""
-    return re.sub(r"^(?![*|\s])(.+)\n(?=[*|])", r"\1\n\n", text, flags=re.MULTILINE)
+    """Markdown wants an empty line before a list or a table that follows a paragraph; 6-8 stays on one line."""
+    apart = re.sub(r"^(?![*|\s])(.+)\n(?=[*|])", r"\1\n\n", text, flags=re.MULTILINE)
+    return re.sub(r"^\| (\(?\d+)-(\d+\)?) \|", "| \\1\N{NON-BREAKING HYPHEN}\\2 |", apart, flags=re.MULTILINE)

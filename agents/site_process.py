@@ -22,9 +22,9 @@ from surgsim_env.palpation.lesion_estimator import (
     REFERENCE_TIP_RADIUS,
 )
 
-# Sites nearer to the chart's border than this share of the tip's radius are not pressed: half of what a press there
-# would tell lies where no lesion can be.
-BORDER = 0.4
+# Sites nearer to the chart's border than this share of its side are not pressed: half of what a press there would tell
+# lies where no lesion can be.
+BORDER = 0.07
 # Share of the estimator's correlation length: with the whole of it, weak lesions between two presses are overlooked.
 LENGTH_SHARE = 0.8
 # On a chart of so few correlation lengths the first four presses are a raster of 2 x 2, at these shares of its sides:
@@ -88,5 +88,6 @@ class SiteProcess:
 
 @lru_cache(maxsize=8)
 def _off_border(facts: SiteFacts) -> NDArray[np.bool_]:
-    from_border = np.minimum(facts.sites, np.array(facts.extent) - facts.sites).min(axis=1)
-    return from_border >= BORDER * facts.tip_radius
+    extent = np.array(facts.extent)
+    from_border = np.minimum(facts.sites, extent - facts.sites) / extent
+    return from_border.min(axis=1) >= BORDER

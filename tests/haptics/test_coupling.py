@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgsim_env.haptics.coupling import TipDynamics, VirtualCoupling, check_coupling, coupling_for, stiffness_limit
@@ -24,6 +24,7 @@ def margin(stiffness, device, tip, damping):
     return np.linalg.eigvalsh(taken - given_back)[0]
 
 
+@settings(deadline=None)
 @given(positive, positive, st.floats(0.0, 0.9), lags)
 def test_limit_is_where_the_energy_taken_ends(mine, other, share, lag):
     """Independent of the closed form: just below the limit the quadratic form is positive, just above it is not."""
@@ -34,6 +35,7 @@ def test_limit_is_where_the_energy_taken_ends(mine, other, share, lag):
     assert margin(0.999 * limit, device, tip, damping) > 0.0 > margin(1.001 * limit, device, tip, damping)
 
 
+@settings(deadline=None)
 @given(positive, st.floats(0.0, 0.9), lags)
 def test_tip_that_stands_still_gives_the_limit_of_colgate_and_schenkel(mine, share, lag):
     """K <= 2 (b - |B|) / (T + 2 L): Colgate & Schenkel 1997 for L = 0; a sample of lag costs K T of damping."""
@@ -61,6 +63,7 @@ def test_rarer_poses_and_delay_cost_stiffness():
     assert limits[0] > limits[1] > limits[3]
 
 
+@settings(deadline=None)
 @given(st.floats(0.05, 5.0), lags, st.floats(0.2, 5.0))
 def test_chosen_coupling_is_borne(mine, lag, scale):
     device = DeviceDynamics(mine, 0.05, lag)

@@ -28,6 +28,8 @@ from tests.haptics.bench_hand import (
 
 # What rounding may give back of some millijoules [J].
 ROUNDING = 1e-12
+# Once a hand has got so much more than it put in, contact has failed [J]: a press of 0.3 N to 3 mm takes a tenth of it.
+GIVEN_FOR_GOOD = -1e-2
 # What devices are, and how much of the coupling's damper: little and much damping, light and heavy, late by a sample.
 DEVICES = {
     "usual": ({"damping": 0.5}, 0.125),
@@ -53,6 +55,8 @@ def pushed(what: dict, damping: float, share: float, count: int) -> tuple[float,
     least, late_speed = 0.0, 0.0
     for step, told in enumerate(run(loop, device, count)):
         least = min(least, -device.work)
+        if least < GIVEN_FOR_GOOD:
+            return least, np.inf
         if step > 0.8 * count:
             late_speed = max(late_speed, float(np.abs(device.velocity).max()))
         if told.fault:
@@ -64,7 +68,7 @@ def pushed(what: dict, damping: float, share: float, count: int) -> tuple[float,
 def test_contact_at_the_limit_takes_energy_and_dies_out(name):
     """The loop never gives back more than the hand has put in, at the largest stiffness that is not refused."""
     what, damping = DEVICES[name]
-    least, late_speed = pushed(what, damping, 1.0, 2500)
+    least, late_speed = pushed(what, damping, 1.0, 2000)
     assert least >= -ROUNDING
     # The press itself begins at some 50 mm/s.
     assert late_speed < 5e-3
@@ -74,7 +78,7 @@ def test_contact_at_the_limit_takes_energy_and_dies_out(name):
 def test_softer_couplings_take_energy_and_die_out(share):
     """The range reaches down to where the spring is as soft as the tissue (50 N/m at 2 mm) and softer."""
     what, damping = DEVICES["usual"]
-    least, late_speed = pushed(what, damping, share, 2500)
+    least, late_speed = pushed(what, damping, share, 2000)
     assert least >= -ROUNDING
     assert late_speed < 2e-2
 
@@ -86,9 +90,8 @@ def test_limit_is_not_far_from_what_fails(name):
     It does not know the device's mass, so that it holds for any hand; a heavy device alone bears more.
     """
     what, damping = DEVICES[name]
-    least, late_speed = pushed(what, damping, 6.0, 1500)
-    assert least < -1e-2
-    assert late_speed > 0.1
+    least, _ = pushed(what, damping, 6.0, 1500)
+    assert least < GIVEN_FOR_GOOD
 
 
 def tapping(device_mass: float, seconds: float, encoder: float) -> None:

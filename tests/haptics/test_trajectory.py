@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgsim_env.haptics.loop import HapticLoop
@@ -28,6 +28,7 @@ def test_plays_in_the_steps_of_its_loop():
     assert [device.read().position[0] for _ in range(5)] == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(*[st.floats(-1e3, 1e3)] * 3), min_size=1, max_size=20))
 def test_file_keeps_every_bit(tmp_path_factory, rows):
     path = tmp_path_factory.mktemp("way") / "way.csv"

@@ -114,6 +114,7 @@ def drained(device: UdpDevice, packets: int) -> None:
 # ---- packets ----------------------------------------------------------------------------------------------------
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), finite, places, st.integers(0, 2**16 - 1))
 def test_pose_travels_to_the_bit(sequence, sent, place, buttons):
     data = pack_pose(PosePacket(sequence, sent, np.array(place), buttons))
@@ -123,6 +124,7 @@ def test_pose_travels_to_the_bit(sequence, sent, place, buttons):
     np.testing.assert_array_equal(back.position, place)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), finite, st.tuples(finite, finite, finite))
 def test_force_travels_to_the_bit(sequence, sent, force):
     back = unpack_force(pack_force(ForcePacket(sequence, sent, np.array(force))))
@@ -187,6 +189,7 @@ def test_hostile_packet_is_dropped_counted_and_not_answered(name, device, sender
     assert arrived(device) is not None
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=200))
 def test_bytes_are_no_pose_or_a_good_one(data):
     pose = unpack_pose(data)
@@ -226,6 +229,7 @@ def test_device_survives_any_packets(packets):
         sender.socket.close()
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 2**31 - 1))
 def test_sequence_goes_round(last, ahead):
     after = (last + ahead) % 2**32

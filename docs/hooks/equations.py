@@ -36,7 +36,8 @@ def math(latex: str, place: str, *, display: str = "inline") -> str:
         raise PluginError(f"{place}: the equation {latex.strip()!r} is not understood: {error!r}") from error
     if "\\" in drawn:
         raise PluginError(f"{place}: the equation {latex.strip()!r} has a command that latex2mathml does not know")
-    return drawn
+    # An operator's space around the bars of |x| would tear it apart.
+    return drawn.replace('<mo stretchy="false">&#x0007C;', '<mo stretchy="false" lspace="0" rspace="0">&#x0007C;')
 
 
 def _displayed(latex: str, place: str) -> str:

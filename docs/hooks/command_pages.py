@@ -53,11 +53,24 @@ def _parts(text: str) -> tuple[str, str, list[tuple[str, list[tuple[str, str]]]]
     """Usage, description, and for each box its title and rows of two."""
     head, *boxes = re.split(r"^[╭ ]─?\s?([a-z][a-z ]*?)\s*─*╮?\s*$", text, flags=re.MULTILINE)
     usage, _, description = head.strip().partition("\n\n")
-    tables = []
-    for title, body in zip(boxes[::2], boxes[1::2]):
-        rows = re.findall(r"^[│ ] {1,2}(\S.*?)(?: {2,}(\S.*?))?\s*│?$", body, flags=re.MULTILINE)
-        tables.append((title, [row for row in rows if set(row[0]) - set("-─╰╯") and row[0] != "-h, --help"]))
+    tables = [(title, _rows(body)) for title, body in zip(boxes[::2], boxes[1::2])]
     return usage.removeprefix("usage: "), description.strip(), tables
+
+
+def _rows(body: str) -> list[tuple[str, str]]:
+    """What a box has: options, and what is told of each in its line or in those below, which stand farther in."""
+    rows: list[tuple[str, str]] = []
+    for line in body.splitlines():
+        content = line.strip("│╰╯").rstrip()
+        if not set(content) - set("-─ "):
+            continue
+        if re.match(r" {1,3}\S", content):
+            what, *told = re.split(r" {2,}", content.strip(), maxsplit=1)
+            rows.append((what, " ".join(told)))
+        elif rows:
+            what, told = rows[-1]
+            rows[-1] = (what, f"{told} {content.strip()}".strip())
+    return [row for row in rows if row[0] != "-h, --help"]
 
 
 def _first_sentence(text: str) -> str:

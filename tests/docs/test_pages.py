@@ -121,7 +121,9 @@ def test_every_command_and_every_option_is_on_the_page():
         _, _, section = text.partition(f"## surgsim {name}\n")
         section = section.partition("\n## ")[0]
         options = set(re.findall(r"^\W*(--[a-z][\w-]*)", module.said(name, "--help"), flags=re.MULTILINE)) - {"--help"}
-        assert options == set(re.findall(r"^\| <code>(?:-\w, )?(--[\w-]+)", section, flags=re.MULTILINE)), name
+        rows = dict(re.findall(r"^\| <code>(?:-\w, )?(--[\w-]+)[^|]*\| (.*) \|$", section, flags=re.MULTILINE))
+        assert options == set(rows), name
+        assert [option for option, told in rows.items() if len(told) < 5 or told.endswith(",")] == [], name
 
 
 def test_paths_of_pages_become_links_outside_of_code():

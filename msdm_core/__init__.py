@@ -18,6 +18,7 @@ from msdm_core.meshing import box_mesh, mesh_surface
 from msdm_core.organ import OrganSpec, compile_organ, rest_state
 from msdm_core.quality import mesh_quality
 from msdm_core.regions import Capsule, Lesion, Material
+from msdm_core.segmentation_meshing import mesh_segmentation
 from msdm_core.stability import stable_dt
 from msdm_core.stepping import advance
 from msdm_core.stiffness import spring_network
@@ -42,6 +43,7 @@ __all__ = [
     "compile_organ",
     "lump_mass",
     "mesh_quality",
+    "mesh_segmentation",
     "mesh_surface",
     "read_mesh",
     "read_surface",

@@ -77,6 +77,6 @@ def voxels_at(
 ) -> NDArray[np.bool_]:
     """The mask's values at places [m] (..., 3), False beyond it, shape (...); the rest as in `label_share`."""
     index = np.rint(places / step).astype(np.int64) - corner
-    within: NDArray[np.bool_] = np.logical_and(index >= 0, index < np.array(mask.shape)).all(axis=-1)
+    within = np.asarray(np.logical_and(index >= 0, index < np.array(mask.shape)).all(axis=-1))
     i, j, k = np.moveaxis(np.where(within[..., None], index, 0), -1, 0)
     return mask[i, j, k] & within

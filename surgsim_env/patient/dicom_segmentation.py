@@ -20,6 +20,7 @@ CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 BYTES_MOST = 2_000_000_000
 # Places of frames may be off the grid by this share of a slice, or of a millimetre across it.
 SLACK = 0.02
+REASON_LENGTH = 200
 
 
 def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
@@ -44,9 +45,8 @@ def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
     try:
         return _source(file, data, wanted)
     except (AttributeError, KeyError, IndexError, TypeError) as error:
-        raise MeshError(
-            f"{file}: is no complete DICOM segmentation ({' '.join(str(error).split())}): {ADVICE}"
-        ) from None
+        reason = " ".join(str(error).split())[:REASON_LENGTH]
+        raise MeshError(f"{file}: is no complete DICOM segmentation ({reason}): {ADVICE}") from None
 
 
 def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:

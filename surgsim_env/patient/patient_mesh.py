@@ -1,12 +1,13 @@
 """What a scan or surfaces became: the mesh with its regions, and what that did to volumes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from msdm_core.mesh import TetMesh
+from msdm_core.quality import dihedral_angles
 from msdm_core.segmentation_meshing import fill_labels
 from surgsim_env.patient.image_geometry import CONVENTION
 from surgsim_env.patient.label_cleaning import clean_labels
@@ -16,6 +17,9 @@ from surgsim_env.patient.label_image import LabelImage
 CELLS_WANTED = 2000
 # Default cells are whole multiples of this [m], and none is smaller than the last.
 CELL_STEP, CELL_SMALLEST = 1e-4, 1e-3
+# A default mesh with a smaller dihedral angle [degrees] is made again with so much smaller cells.
+DIHEDRAL_SMALLEST = 10.0
+CELL_SHARES = (1.0, 0.98, 0.96, 0.94)
 
 
 @dataclass(frozen=True)
@@ -77,10 +81,32 @@ def default_cell_size(volume: float) -> float:
     return max(math.ceil(wanted / CELL_STEP) * CELL_STEP, CELL_SMALLEST)
 
 
+def well_shaped(make: Callable[[float], PatientMesh], cell_size: float | None, volume: float) -> PatientMesh:
+    """A mesh of given cells [m], else of the default ones, or of slightly smaller ones if an angle is too small.
+
+    Lattices keep 9.3 degrees wherever a surface cuts them; a little smaller cells are cut elsewhere.
+    """
+    if cell_size is not None:
+        return make(cell_size)
+    best, largest = None, -math.inf
+    for share in CELL_SHARES:
+        mesh = make(round(share * default_cell_size(volume), 6))
+        angle = float(dihedral_angles(mesh.mesh).min())
+        if angle > largest:
+            best, largest = mesh, angle
+        if angle >= DIHEDRAL_SMALLEST or mesh.mesher != "lattice":
+            break
+    assert best is not None
+    return best
+
+
 def mesh_image(image: LabelImage, source: str, *, cell_size: float | None, mesher: str, mend: bool) -> PatientMesh:
     """The largest part of an image's labels as a mesh in LPS."""
-    if cell_size is None:
-        cell_size = default_cell_size(float(np.count_nonzero(image.tags)) * image.voxel_volume)
+    volume = float(np.count_nonzero(image.tags)) * image.voxel_volume
+    return well_shaped(lambda size: _mesh_labels(image, source, size, mesher, mend), cell_size, volume)
+
+
+def _mesh_labels(image: LabelImage, source: str, cell_size: float, mesher: str, mend: bool) -> PatientMesh:
     labels = clean_labels(image, cell_size=cell_size, mend=mend)
     if mesher == "tetwild":
         from surgsim_env.patient.tetwild_mesh import mesh_labels_conforming

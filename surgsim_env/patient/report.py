@@ -9,13 +9,13 @@ from msdm_core.quality import mesh_quality
 from msdm_core.stability import stable_dt
 from surgsim_env.cell_share import share_text
 from surgsim_env.html_page import html_page, html_picture, html_table
+from surgsim_env.patient.patient_mesh import DIHEDRAL_SMALLEST
 from surgsim_env.patient.patient_scene import PatientScene, material_rows
 from surgsim_env.patient.pictures import organ_picture, quality_picture
 
 # By this an earlier run's report is known, which may be replaced.
 MARK = "surgsim organ"
 VOLUME_ERROR_LARGEST = 0.02
-DIHEDRAL_SMALLEST = 10.0
 
 
 def report_page(found: PatientScene, scene_text: str, scene_file: str, command: str) -> str:

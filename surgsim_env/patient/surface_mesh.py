@@ -1,6 +1,7 @@
 """An organ's mesh from closed surfaces: its own, and one for each region in it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from msdm_core.segmentation_meshing import fill_labels
 from msdm_core.surface import surface_volume
 from surgsim_env.patient.label_names import check_name
 from surgsim_env.patient.materials import is_lesion
-from surgsim_env.patient.patient_mesh import PatientMesh, default_cell_size, region_volumes
+from surgsim_env.patient.patient_mesh import PatientMesh, region_volumes, well_shaped
 from surgsim_env.patient.surface_files import (
     BrokenSurface,
     ClosedSurface,
@@ -58,8 +59,25 @@ def mesh_surfaces(
         inner += read_region_surfaces(file, length_unit, name)
     names = [organ.name, *(one.name for one in inner)]
     checked_names(names)
-    if cell_size is None:
-        cell_size = default_cell_size(abs(surface_volume(organ.vertices, organ.triangles)))
+    sources = tuple(file.name for file in files) + tuple(_named(text)[1].name for text in regions)
+    given = _Surfaces(organ, tuple(inner), sources, tuple(notes))
+    volume = abs(surface_volume(organ.vertices, organ.triangles))
+    return well_shaped(lambda size: _mesh_given(given, size, mesher), cell_size, volume)
+
+
+@dataclass(frozen=True, eq=False)
+class _Surfaces:
+    """What was read: the organ, the regions in it, the files' names, and what was left out."""
+
+    organ: ClosedSurface | BrokenSurface
+    inner: tuple[ClosedSurface, ...]
+    files: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def _mesh_given(given: _Surfaces, cell_size: float, mesher: str) -> PatientMesh:
+    organ, inner, notes = given.organ, given.inner, list(given.notes)
+    names = [organ.name, *(one.name for one in inner)]
     smoothing = change = None
     if isinstance(organ, BrokenSurface):
         tags, step, start, note = mended_voxels(organ, cell_size)
@@ -74,15 +92,15 @@ def mesh_surfaces(
         plain, volume = tetwild_mesh([organ, *inner], cell_size), organ.volume
     else:
         plain, volume = mesh_surface(organ.vertices, organ.triangles, cell_size=cell_size), organ.volume
-    mesh, sources = _with_regions(plain, names[0], inner, cell_size)
+    mesh, tagged = _with_regions(plain, names[0], inner, cell_size)
     return PatientMesh(
         mesh=mesh,
         lesions=tuple(name for name in names[1:] if is_lesion(name)),
-        volumes=region_volumes(mesh, names, volume, sources),
+        volumes=region_volumes(mesh, names, volume, tagged),
         cell_size=cell_size,
         mesher="lattice" if isinstance(organ, BrokenSurface) else mesher,
         convention=CONVENTION,
-        sources=tuple(file.name for file in files) + tuple(_named(text)[1].name for text in regions),
+        sources=given.files,
         notes=tuple(notes),
         is_scan=False,
         smoothing=smoothing,

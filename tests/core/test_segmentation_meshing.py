@@ -57,7 +57,7 @@ def test_smoothing_alone_takes_volume_and_the_level_gives_it_back():
     labels, _ = ellipsoid((0.0008, 0.0008, 0.005))
     filled = fill_labels(labels, (0.0008, 0.0008, 0.005), cell_size=0.006, region_names=NAMES)
     assert filled.smoothing == pytest.approx(0.7 * 0.005)
-    # A Gaussian of deviation s moves the level 1/2 of a sphere of radius R inward by s^2 / R: 3 s^2 / R^2 of its volume,
+    # A Gaussian of deviation s moves the level 1/2 of a sphere of radius R inward by s^2 / R, 3 s^2 / R^2 of all,
     # with R^2 = 3 / (1/a^2 + 1/b^2 + 1/c^2) here.
     expected = -(filled.smoothing**2) * (1 / HALF_AXES**2).sum()
     assert filled.smoothing_change == pytest.approx(expected, rel=0.5)

@@ -212,7 +212,7 @@ def test_the_largest_surface_is_kept(tmp_path, capsys):
     )
     both.export(tmp_path / "liver.stl")
     assert main(["organ", str(tmp_path / "liver.stl"), "--length-unit", "mm", "--cell-size", "0.01"]) == 0
-    assert "1 surface(s) apart from the largest were left out (0.4" in capsys.readouterr().err
+    assert "1 surface(s) apart from the largest were left out (0.506 ml)" in capsys.readouterr().err
 
 
 def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, capsys):

@@ -1,5 +1,7 @@
 """Meshes whose faces follow the surfaces of an organ and its regions, by fTetWild (Hu et al. 2020; extra `tetwild`)."""
 
+import contextlib
+import tempfile
 from collections.abc import Sequence
 
 import numpy as np
@@ -42,9 +44,11 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
     triangles = np.concatenate([one.triangles + start for one, start in zip(surfaces, starts, strict=False)])
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     share = EDGE_PER_CELL * cell_size / diagonal
-    nodes, tets = pytetwild.tetrahedralize(
-        vertices, triangles.astype(np.int32), edge_length_fac=share, epsilon=EPSILON, optimize=True, quiet=True
-    )[:2]
+    # It leaves a file, __tracked_surface.stl, in the current folder.
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        nodes, tets = pytetwild.tetrahedralize(
+            vertices, triangles.astype(np.int32), edge_length_fac=share, epsilon=EPSILON, optimize=True, quiet=True
+        )[:2]
     if not len(tets):
         raise MeshError(f"fTetWild made no tets of {surfaces[0].name}; use --mesher lattice")
     nodes, tets = np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int64)

@@ -291,3 +291,22 @@ def check_run(folder, name):
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert summary["volume_ratio_smallest"] > 0.0
     assert summary["sites"]["in_maps"] >= 10
+
+
+@pytest.mark.slow
+def test_tetwild_makes_conforming_regions_and_leaves_nothing_behind(tmp_path, monkeypatch):
+    pytest.importorskip("pytetwild", reason="needs the `tetwild` extra")
+    monkeypatch.chdir(tmp_path)
+    file = scan(tmp_path / "ct.nii.gz", spacing=(2.0, 2.0, 2.0))
+    out = tmp_path / "out"
+    out.mkdir()
+    given = ["organ", str(file), *LABELS, "--cell-size", "0.01", "--mesher", "tetwild", "--out", str(out / "a.vtu")]
+    assert main(given) == 0
+    assert {path.name for path in tmp_path.rglob("*")} == {"ct.nii.gz", "out", "a.vtu", "a.toml", "report.html"}
+    mesh = read_mesh(out / "a.vtu")
+    assert mesh.volumes.sum() == pytest.approx(ORGAN_VOLUME, rel=0.02)
+    # Whole tets follow the surface of the lesion: to its chords and the smoothing, also in cells as wide as it is.
+    centre, radius = LESIONS[0]
+    corners = mesh.points[np.unique(mesh.tets[mesh.region == 2])]
+    reach = np.linalg.norm(corners - 1e-3 * (MIDDLE + centre), axis=1).max()
+    assert reach == pytest.approx(1e-3 * radius, rel=0.15)

@@ -45,8 +45,8 @@ def view(request: View, console: Console) -> int:
     try:
         session.wait()
         page = Page(session, host=request.host, port=request.port, remote=request.allow_remote, out=request.out)
-        if not request.shadows:
-            page.show_shadows(False)
+        if request.plain:
+            page.show_plain(True)
         console.print(f"open {page.server.address}", highlight=False, soft_wrap=True)
         if request.allow_remote:
             console.print("other machines may connect; nothing on the way is encrypted", highlight=False)

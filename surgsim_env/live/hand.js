@@ -1,4 +1,4 @@
-// Keys and gamepads steer the instrument: 16 bytes, 40 times a second while something is held (hand_messages.py).
+// Keys and gamepads steer the instrument: packets as hand_messages.py has them, 40 times a second while something is held.
 (() => {
   "use strict";
   if (location.search.includes("token=")) history.replaceState(null, "", location.pathname);
@@ -61,5 +61,20 @@
     }
     wasMoving = moving;
   }, PERIOD);
+  // How many frames the browser comes to in a second: the server sends no more pictures than that.
+  let frames = 0;
+  const count = () => { frames += 1; requestAnimationFrame(count); };
+  requestAnimationFrame(count);
+  let since = performance.now();
+  setInterval(() => {
+    const now = performance.now(), rate = 1000 * frames / (now - since);
+    since = now;
+    frames = 0;
+    if (!document.hidden && socket !== null && socket.readyState === WebSocket.OPEN) {
+      const packet = new DataView(new ArrayBuffer(4));
+      packet.setFloat32(0, Math.min(rate, 1000), true);
+      socket.send(packet.buffer);
+    }
+  }, 1000);
   connect();
 })();

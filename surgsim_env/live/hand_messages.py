@@ -1,4 +1,4 @@
-"""What keyboards and gamepads say: how fast the tip shall go, in a packet of 16 bytes that `hand.js` sends."""
+"""What `hand.js` sends: how fast keys and gamepads move a tip, in 16 bytes, and how fast the browser draws, in 4."""
 
 import math
 import struct
@@ -11,6 +11,9 @@ HAND_PATH = "/hand"
 # turn its jaw from open to closed or back, else 0.
 _PACKET = struct.Struct("<3fHH")
 PACKET_SIZE = _PACKET.size
+# Frames a second that the browser comes to.
+_RATE = struct.Struct("<f")
+RATE_MOST = 1000.0
 AXIS_SLACK = 1e-6
 
 
@@ -38,6 +41,25 @@ def read_hand(message: object, *, arm_count: int) -> HandMotion:
         raise NonsenseError(f"arm {arm} of {arm_count}, jaw {turns_jaw}")
     right, away, out = axes
     return HandMotion((right, away, out), arm, bool(turns_jaw))
+
+
+def read_rate(message: object) -> float | None:
+    """Frames a second that a browser comes to; None where the message is another.
+
+    Raises:
+        NonsenseError: a rate that is none.
+    """
+    if not isinstance(message, bytes) or len(message) != _RATE.size:
+        return None
+    (rate,) = _RATE.unpack(message)
+    if not 0.0 <= rate <= RATE_MOST:
+        raise NonsenseError(f"a browser that draws {rate} frames a second")
+    return rate
+
+
+def write_rate(rate: float) -> bytes:
+    """The packet that says a rate."""
+    return _RATE.pack(rate)
 
 
 def write_hand(motion: HandMotion) -> bytes:

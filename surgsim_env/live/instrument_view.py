@@ -12,6 +12,8 @@ from surgsim_env.rendering.instrument_geoms import geom_colour
 
 # The page's scene is in decimetres: what viser's cameras and handles are made for is some metres large.
 SCALE = 10.0
+# What moved by less [m] is not sent again.
+STILL = 2e-6
 
 _KIND = {
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")): name for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
@@ -31,6 +33,7 @@ class InstrumentView:
             arm_count: 1, or 2 where the second one's parts are named "right_".
         """
         self.nodes, self.arms = [], []
+        self._shown: NDArray[np.float32] | None = None
         for place, geom in enumerate(geoms):
             node = _add(scene, f"/instrument/{place}", model, geom)
             self.nodes.append(node)
@@ -40,10 +43,19 @@ class InstrumentView:
 
     def follow(self, position: NDArray[np.float32], rotation: NDArray[np.float32]) -> None:
         """Put the nodes where the geoms are [m] (n_geom, 3), turned by matrices (n_geom, 9)."""
-        quaternion = np.zeros(4)
-        for node, place, turn in zip(self.nodes, position, rotation, strict=True):
+        quaternion, moved = np.zeros(4), self._moved(position, rotation)
+        for node, place, turn, has_moved in zip(self.nodes, position, rotation, moved, strict=True):
+            if not has_moved:
+                continue
             mujoco.mju_mat2Quat(quaternion, turn.astype(np.float64))
             node.position, node.wxyz = place * SCALE, quaternion.copy()
+
+    def _moved(self, position: NDArray[np.float32], rotation: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which geoms are elsewhere than they were shown last, (n_geom,)."""
+        now = np.concatenate([position, rotation], axis=1)
+        moved = np.ones(len(now), dtype=bool) if self._shown is None else np.abs(now - self._shown).max(axis=1) > STILL
+        self._shown = now if self._shown is None else np.where(moved[:, None], now, self._shown)
+        return moved
 
     def on_drag(self, moved: Callable[[int, str, FloatArray], None]) -> list[str]:
         """Call back with an arm, the drag's phase and the pointer's place [m]; returns the nodes to drag."""

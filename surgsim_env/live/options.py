@@ -27,8 +27,8 @@ class View:
     """A recording (CSV) to play first."""
     out: Path = Path("runs/live")
     """Folder for recordings."""
-    shadows: bool = True
-    """Shadows in the picture; without a graphics card they take most of a browser's time."""
+    plain: bool = False
+    """No shadows and no reflections: for a browser without a graphics card."""
     seconds: float | None = None
     """Stop after this time."""
     measure: bool = False

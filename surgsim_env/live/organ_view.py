@@ -9,7 +9,7 @@ from msdm_core.mesh import FloatArray
 from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.live.felt_map import FeltMap
-from surgsim_env.live.instrument_view import SCALE
+from surgsim_env.live.instrument_view import SCALE, STILL
 from surgsim_env.rendering.surface import drawn_surface
 from surgsim_env.rendering.tissue import lesion_ball
 
@@ -42,12 +42,15 @@ class OrganView:
             "/organ", _scaled(vertices), self._surface.faces.astype(np.uint32), color=ORGAN_COLOUR
         )
         self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(COLOURS)]
-        self._painted = -1
+        self._painted, self._fresh, self._shown = -1, 1, anatomy.mesh.points
         self.paints = True
         self._lesions: list[tuple[Any, Any]] = []
 
     def follow(self, node_position: FloatArray) -> None:
         """Take the surface where the nodes are [m], (n_node, 3)."""
+        if self._fresh == 0 and np.abs(node_position - self._shown).max() < STILL:
+            return
+        self._fresh, self._shown = 0, node_position
         vertices, normals = self._surface.follow(node_position)
         self._organ.vertices = _scaled(vertices)
         if self.paints:
@@ -61,7 +64,7 @@ class OrganView:
         """Colour what was felt since the last time; the softest of it is blue."""
         if not self.paints or felt.version == self._painted:
             return
-        self._painted = felt.version
+        self._painted, self._fresh = felt.version, 1
         value = np.full(len(self._points), np.nan)
         known = felt.felt
         value[felt.nodes[known]] = felt.contrast[known]
@@ -75,10 +78,11 @@ class OrganView:
 
     def show_paint(self, on: bool) -> None:
         """Show or hide what was felt."""
-        self.paints, self._painted = on, -1
+        self.paints, self._painted, self._fresh = on, -1, 1
         if not on:
             for paint in self._paint:
                 paint.cover(np.zeros((0, 3), dtype=np.int32))
+                paint.follow(np.zeros((0, 3), dtype=np.float32))
 
     def show_lesions(self, lesions: Sequence[Lesion]) -> None:
         """Show lesions inside an organ that is seen through; none: it is not."""
@@ -95,6 +99,7 @@ class OrganView:
                 position=ball.centre * SCALE,
             )
             self._lesions.append((ball, node))
+        self._fresh = 1
 
 
 class _Paint:

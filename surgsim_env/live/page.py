@@ -14,21 +14,21 @@ from msdm_core.mesh import FloatArray
 from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.guarded_server import GuardedServer
-from surgsim_env.live.hand_messages import read_hand
+from surgsim_env.live.hand_messages import read_hand, read_rate
 from surgsim_env.live.instrument_view import SCALE, InstrumentView
 from surgsim_env.live.organ_choice import chosen_lesions
 from surgsim_env.live.organ_view import OrganView
 from surgsim_env.live.pacing import timeliness
 from surgsim_env.live.panel import Panel
+from surgsim_env.live.picture_rate import PictureRate
 from surgsim_env.live.recording import write_recording
 from surgsim_env.live.requests import Change, Pause, Record, Replay, Reset
 from surgsim_env.live.session import Session
-from surgsim_env.live.stage import add_force_arrows, add_handle, prepare
+from surgsim_env.live.stage import ForceArrow, add_handle, light, prepare
 from surgsim_env.live.web_messages import Judge, NonsenseError
 
-# Pictures, plots and words a second.
-PICTURE_RATE, PLOT_RATE, STATUS_RATE = 30.0, 10.0, 2.0
-FORCE_LENGTH = 0.06  # of the arrow [m/N]
+# Between plots, and between words [s].
+PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
 TITLES = {
     Phase.STARTING: "starting",
     Phase.RUNNING: "running",
@@ -65,6 +65,7 @@ class Page:
         self.server = GuardedServer(host, port, remote=remote, judge=self._judge, serve_hand=self._serve_hand)
         self.felt = FeltMap(session.anatomy)
         self.pictures = 0
+        self._rate = PictureRate()
         self._organ_number, self._traced = 1, 0
         self._grabs: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._held: set[int] = set()
@@ -83,7 +84,7 @@ class Page:
                 for arm, place in enumerate(session.parked)
             ]
             self._judge.nodes.update(handle.name for handle in self._handles)
-            self._arrows = add_force_arrows(viser.scene, session.arm_count)
+            self._arrows = [ForceArrow(viser.scene, arm) for arm in range(session.arm_count)]
             calls = {
                 "pause": lambda on: session.ask(Pause(on)),
                 "reset": self._reset,
@@ -93,42 +94,44 @@ class Page:
                 "paint": self._show_paint,
                 "clear_map": self.felt.clear,
                 "close_jaw": session.close_jaw,
-                "shadows": self.show_shadows,
+                "plain": self.show_plain,
             }
             self._panel = Panel(
                 viser.gui, self._judge, session.scene, session.arm_count, session.instrument.jaw is not None, calls
             )
 
-    def show_shadows(self, on: bool) -> None:
-        """Draw shadows or not, on every page."""
-        self.server.viser.scene.configure_default_lights(enabled=True, cast_shadow=on)
-        self._panel.show_shadows(on)
+    def show_plain(self, on: bool) -> None:
+        """Leave shadows and reflections away, on every page, or draw them again."""
+        light(self.server.viser, plain=on)
+        self._panel.show_plain(on)
 
     def run(self, until: Callable[[], bool]) -> None:
-        """Make pictures until told to stop, or the physics is gone.
+        """Make pictures until told to stop, or the physics is gone; as many as browsers come to.
 
         Raises:
             RuntimeError: the physics died.
         """
         due = time.monotonic()
         self._before, self._pictures_before = self.session.timing(), 0
-        plot_every, status_every = round(PICTURE_RATE / PLOT_RATE), round(PICTURE_RATE / STATUS_RATE)
-        count = 0
+        plot_due = status_due = due
         while not until():
             if not self.session.alive:
                 raise RuntimeError("the physics' process died: its own message stands above")
-            count += 1
+            now = time.monotonic()
             frame = self.session.frame()
             self._attend(frame)
             if self.server.viser.get_clients():
                 with self.server.viser.atomic():
                     self._show(frame)
-                    if count % plot_every == 0:
+                    if now >= plot_due:
+                        plot_due = now + PLOT_PERIOD
                         self._panel.plot(self.session.trace())
                 self.pictures += 1
-            if count % status_every == 0:
+            if now >= status_due:
+                status_due = now + STATUS_PERIOD
                 self._say(frame)
-            due = max(due + 1.0 / PICTURE_RATE, time.monotonic() - 1.0 / PICTURE_RATE)
+            period = 1.0 / self._rate.rate
+            due = max(due + period, time.monotonic() - period)
             time.sleep(max(0.0, due - time.monotonic()))
 
     def _pulled(self, arm: int, phase: str, place: FloatArray) -> None:
@@ -150,12 +153,18 @@ class Page:
 
     async def _serve_hand(self, connection: ServerConnection) -> None:
         """Keys and sticks of one tab."""
+        tab = id(connection)
         async for message in _messages(connection):
             try:
+                rate = read_rate(message)
+                if rate is not None:
+                    self._rate.report(tab, rate)
+                    continue
                 self.session.push(read_hand(message, arm_count=max(2, self.session.arm_count)))
             except NonsenseError as error:
                 self._judge.dropped += 1
                 await connection.close(1008, str(error)[:100])
+        self._rate.forget(tab)
 
     def _reset(self) -> None:
         self.session.park()
@@ -204,8 +213,8 @@ class Page:
         self._organ.paint(self.felt)
         self._organ.follow(frame["node"].astype(np.float64))
         self._instrument.follow(frame["geom"], frame["turn"])
-        tip, force = frame["tip"], frame["force"]
-        self._arrows.points = (np.stack([tip, tip + FORCE_LENGTH * force], axis=1) * SCALE).astype(np.float32)
+        for arrow, tip, force in zip(self._arrows, frame["tip"], frame["force"], strict=True):
+            arrow.follow(tip, force)
         targets = self.session.targets
         for arm, handle in enumerate(self._handles):
             if arm not in self._held and np.abs(handle.position / SCALE - targets[arm]).max() > 1e-6:
@@ -218,7 +227,7 @@ class Page:
         kept = timeliness(self._before[0], now[0], wall)
         fps = (pictures - self._pictures_before) / wall
         self._before, self._pictures_before = now, pictures
-        phase = Phase(int(frame["phase"]))
+        phase, drawn = Phase(int(frame["phase"])), self._rate.slowest
         headline = "replaying" if frame["replaying"] else "recording" if frame["recording"] else TITLES[phase]
         rows = [
             ("simulated time", f"{float(frame['time']):.1f} s"),
@@ -227,7 +236,7 @@ class Page:
             ("late, median / 99 %", f"{kept.late_p50 * 1e3:.2f} / {kept.late_p99 * 1e3:.2f} ms"),
             ("a step takes", f"{kept.spent_p50 * 1e3:.2f} ms"),
             ("steps skipped so far", f"{int(now[0]['skipped'])}"),
-            ("pictures", f"{fps:.0f} /s"),
+            ("pictures", f"{fps:.0f} /s" + ("" if drawn is None else f" (browser {drawn:.0f})")),
         ]
         if float(frame["added_mass"]) > 0.0:
             rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))

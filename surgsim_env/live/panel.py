@@ -51,7 +51,7 @@ class Panel:
             arm_count: 1 or 2.
             has_jaw: whether the first arm has a jaw.
             calls: what is called, by name: pause(on), reset(), record(on), replay(on), show_lesions(on), paint(on),
-                clear_map(), close_jaw(on), shadows(on).
+                clear_map(), close_jaw(on), plain(on).
         """
         self._gui, self._judge, self._scene, self._calls = gui, judge, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
@@ -68,9 +68,9 @@ class Panel:
             self._add_tissue()
         with gui.add_folder("What was felt"):
             self._add_map()
-        self._shadows = gui.add_checkbox("Shadows", initial_value=True, hint="slow without a graphics card")
-        self._knows(self._shadows, is_flag)
-        self._shadows.on_update(lambda _: calls["shadows"](self._shadows.value))
+        self._plain = gui.add_checkbox("Plain light", initial_value=False, hint="quicker without a graphics card")
+        self._knows(self._plain, is_flag)
+        self._plain.on_update(lambda _: calls["plain"](self._plain.value))
         with gui.add_folder("How to steer", expand_by_default=False):
             second = "\n| X, or a shoulder button | the other arm |" if arm_count > 1 else ""
             jaw = "\n| G, or the first button | close or open the jaw |" if has_jaw else ""
@@ -100,10 +100,10 @@ class Panel:
         if self._replay.disabled != disabled:
             self._replay.disabled = disabled
 
-    def show_shadows(self, on: bool) -> None:
+    def show_plain(self, on: bool) -> None:
         """Tick its box."""
-        if self._shadows.value != on:
-            self._shadows.value = on
+        if self._plain.value != on:
+            self._plain.value = on
 
     def plot(self, trace: np.ndarray) -> None:
         """Show a trace's rows: time [s], force [N] and depth [m] of each arm."""

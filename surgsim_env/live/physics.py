@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import gc
 import os
+import signal
 import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -66,6 +67,8 @@ def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
 
 def run_physics(setup: Setup, exchange: Exchange, requests: Connection, parent: int) -> None:
     """The child's whole life; it ends on request, or when the process with the id `parent` is gone."""
+    # Ctrl-C is the page's to answer; it ends the physics in order.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _sleep_sharply()
     _go_first()
     physics = Physics(setup, exchange, requests)

@@ -19,6 +19,8 @@ GROUND_GAP, GROUND_REACH = 0.002, 4.0
 # In the page's own decimetres.
 HANDLE_SIZE, BALL_RADIUS = 0.35, 0.03
 SHAFT_RADIUS, HEAD_RADIUS, HEAD_LENGTH = 0.012, 0.035, 0.07
+# Of an arrow [m/N], and the force below which there is none [N].
+FORCE_LENGTH, FORCE_LEAST = 0.06, 0.005
 
 
 def prepare(viser: Any, anatomy: Anatomy) -> FloatArray:
@@ -30,6 +32,7 @@ def prepare(viser: Any, anatomy: Anatomy) -> FloatArray:
     first.fov, first.near = math.radians(camera.fov), 0.05
     viser.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False, brand_color=BRAND_COLOUR)
     viser.scene.world_axes.visible = False
+    light(viser, plain=False)
     right, ahead = camera.rotation[:, 0], -camera.rotation[:, 2]
     level = ahead - (ahead @ camera.up) * camera.up
     directions = np.stack([right, level / np.linalg.norm(level), -anatomy.face.approach])
@@ -65,7 +68,7 @@ def add_handle(
         wxyz=turn,
         position=place * SCALE,
     )
-    scene.add_icosphere(f"{name}/ball", radius=BALL_RADIUS, color=HAND_COLOURS[arm], opacity=0.9, cast_shadow=False)
+    scene.add_icosphere(f"{name}/ball", radius=BALL_RADIUS, color=HAND_COLOURS[arm], cast_shadow=False)
 
     @handle.on_update
     async def _(event: Any) -> None:
@@ -74,16 +77,46 @@ def add_handle(
     return handle
 
 
-def add_force_arrows(scene: Any, arm_count: int) -> Any:
-    """An arrow for each arm, of no length."""
-    return scene.add_arrows(
-        "/force",
-        np.zeros((arm_count, 2, 3)),
-        FORCE_COLOUR,
-        shaft_radius=SHAFT_RADIUS,
-        head_radius=HEAD_RADIUS,
-        head_length=HEAD_LENGTH,
-    )
+class ForceArrow:
+    """The tissue's force on a tip, as an arrow from the tip; a mesh like all others, which browsers have compiled."""
+
+    def __init__(self, scene: Any, arm: int) -> None:
+        """Add it, of no length."""
+        import trimesh
+
+        shaft = trimesh.creation.cylinder(radius=SHAFT_RADIUS, height=1.0, sections=12)
+        shaft.apply_translation([0.0, 0.0, 0.5])
+        head = trimesh.creation.cone(radius=HEAD_RADIUS, height=HEAD_LENGTH, sections=16)
+        self._shaft, self._head = np.array(shaft.vertices), np.array(head.vertices)
+        faces = np.concatenate([shaft.faces, head.faces + len(shaft.vertices)]).astype(np.uint32)
+        hidden = np.zeros((len(self._shaft) + len(self._head), 3), dtype=np.float32)
+        self._node = scene.add_mesh_simple(
+            f"/force/{arm}", hidden, faces, color=FORCE_COLOUR, flat_shading=False, cast_shadow=False
+        )
+        self._hidden, self._shows = hidden, False
+
+    def follow(self, tip: FloatArray, force: FloatArray) -> None:
+        """Point from a tip [m] (3,) along a force [N] (3,)."""
+        size = float(np.linalg.norm(force))
+        shows = size > FORCE_LEAST
+        if not shows:
+            if self._shows:
+                self._node.vertices, self._shows = self._hidden, False
+            return
+        self._shows = True
+        length = FORCE_LENGTH * size * SCALE
+        up = force / size
+        across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+        across /= np.linalg.norm(across)
+        turn = np.stack([across, np.cross(up, across), up])
+        points = np.concatenate([self._shaft * [1.0, 1.0, length], self._head + np.array([0.0, 0.0, length])])
+        self._node.vertices = (points @ turn + tip * SCALE).astype(np.float32)
+
+
+def light(viser: Any, *, plain: bool) -> None:
+    """Light the scene; plain: without shadows and reflections, which take most of a software renderer's time."""
+    viser.scene.configure_default_lights(enabled=True, cast_shadow=not plain)
+    viser.scene.configure_environment_map(None if plain else "warehouse", environment_intensity=0.6)
 
 
 def _add_ground(scene: Any, points: FloatArray, up: FloatArray, right: FloatArray) -> None:
@@ -98,6 +131,5 @@ def _add_ground(scene: Any, points: FloatArray, up: FloatArray, right: FloatArra
         (np.array(corners) * SCALE).astype(np.float32),
         np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
         color=GROUND_COLOUR,
-        side="double",
         cast_shadow=False,
     )

@@ -13,13 +13,24 @@ from websockets.sync.client import connect
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
+COUNT_PICTURES = """(() => {
+  window.pictures = 0;
+  let drawn = false;
+  for (const name of ["drawElements", "drawArrays", "drawElementsInstanced"]) {
+    const real = WebGL2RenderingContext.prototype[name];
+    WebGL2RenderingContext.prototype[name] = function (...given) { drawn = true; return real.apply(this, given); };
+  }
+  const tick = () => { if (drawn) window.pictures += 1; drawn = false; requestAnimationFrame(tick); };
+  requestAnimationFrame(tick);
+})()"""
+
 
 class Browser:
     """One page of a browser; closed at the end of a `with`."""
 
     def __init__(self, folder: Path, width: int, height: int) -> None:
         assert CHROMIUM is not None
-        self._folder = folder
+        self._folder, self._width, self._height = folder, width, height
         self._process = subprocess.Popen(
             [
                 *(CHROMIUM, "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars"),
@@ -50,6 +61,13 @@ class Browser:
         self._socket = connect(page["webSocketDebuggerUrl"], max_size=None, ping_interval=None)
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.do(f"{domain}.enable")
+        self.do(
+            "Emulation.setDeviceMetricsOverride",
+            width=self._width,
+            height=self._height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -78,7 +96,7 @@ class Browser:
         return result["result"].get("value")
 
     def wait_for(self, script: str, seconds: float = 60.0) -> Any:
-        """Until an expression is true."""
+        """Until an expression is true; its value."""
         deadline = time.monotonic() + seconds
         while True:
             value = self.run(script)
@@ -122,6 +140,10 @@ class Browser:
 
     def text(self) -> str:
         return self.run("document.body?.innerText")
+
+    def count_pictures(self) -> None:
+        """Count from now on, in `window.pictures`, the frames in which something was drawn in three dimensions."""
+        self.run(COUNT_PICTURES)
 
     def shot(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.do("Page.captureScreenshot", format="png")["data"]))

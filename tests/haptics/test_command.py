@@ -78,7 +78,7 @@ def test_bridge_feels_the_organ(capsys):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     felt: list[float] = []
-    client = threading.Thread(target=lambda: felt.append(run(port, 2.5)))
+    client = threading.Thread(target=lambda: felt.append(run(port, 4.0)))
     client.start()
     assert main(["haptics", "--scene", "phantom_small", "--port", str(port), "--seconds", "2.0"]) == 0
     client.join()

@@ -35,10 +35,10 @@ def test_the_bridge_feels_the_press():
     names: dict = {}
     exec(compile(BRIDGE, "docs/haptics.md", "exec"), names)
     device = UdpDevice()
-    loop = HapticLoop(touching_simulation(), device, HapticSettings(relative=True))
+    loop = HapticLoop(touching_simulation(), device, HapticSettings(relative=True, watchdog=WatchdogTimes(resume=0.01)))
     felt: list[tuple] = []
     way = iter(np.linspace(0.0, 0.006, 600))
-    arguments = (lambda: (0.0, 0.0, -next(way, 0.006)), felt.append, device.address[1], 1.0)
+    arguments = (lambda: (0.0, 0.0, -next(way, 0.006)), felt.append, device.address[1], 1.5)
     bridge = threading.Thread(target=names["bridge"], args=arguments)
     bridge.start()
     pace = Pace(DT)

@@ -19,6 +19,7 @@ IMAGES = Path(__file__).parent / "images"
 SIZE = (480, 360)
 STEP_MS = 50
 PRESSES, PRESS_SHOWN_MS = 16, 600
+TUTORIALS = ("organ", "robot")
 BOTH = ("overview", "endoscope")
 
 
@@ -80,17 +81,17 @@ def film_presses(path: Path, *, seed: int) -> None:
     write(frames, path, PRESS_SHOWN_MS)
 
 
-def draw_tutorial(path: Path) -> None:
-    """What docs/tutorials/own_organ.md shows, by its own code."""
-    text = (Path(__file__).parent / "tutorials" / "own_organ.md").read_text(encoding="utf-8")
+def draw_tutorial(name: str) -> None:
+    """What the tutorial on one's own organ or robot shows, by its own code."""
+    text = (Path(__file__).parent / "tutorials" / f"own_{name}.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        for title, code in re.findall(r'^```(?:python|toml title="(.*?)")\n(.*?)^```$', text, flags=re.M | re.S):
+        for title, code in re.findall(r'^```(?:python|\w+ title="(\w+\.\w+)")\n(.*?)^```$', text, flags=re.M | re.S):
             if title:
                 Path(title).write_text(code, encoding="utf-8")
             else:
                 exec(code, names)
-    Image.fromarray(names["picture"]).save(path, optimize=True)
+    Image.fromarray(names["picture"]).save(IMAGES / f"tutorial_{name}.png", optimize=True)
 
 
 def main(names: list[str]) -> None:
@@ -102,9 +103,9 @@ def main(names: list[str]) -> None:
             "SurgSim/BimanualRetract-v0", path, "overview", "endoscope", seed=4, every=4
         ),
     }
-    for name in names or [*films, "organ"]:
-        if name == "organ":
-            draw_tutorial(IMAGES / "tutorial_organ.png")
+    for name in names or [*films, *TUTORIALS]:
+        if name in TUTORIALS:
+            draw_tutorial(name)
         else:
             films[name](IMAGES / f"env_{name}.webp")
 

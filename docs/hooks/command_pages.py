@@ -70,7 +70,9 @@ def _rows(body: str) -> list[tuple[str, str]]:
         elif rows:
             what, told = rows[-1]
             rows[-1] = (what, f"{told} {content.strip()}".strip())
-    return [row for row in rows if row[0] != "-h, --help"]
+    # tyro writes what may be left out as {None}|PATH ... (default: None).
+    none = re.compile(r"\{None\}\||\s*\(default: (?:None)?\)")
+    return [(none.sub("", what), none.sub("", told)) for what, told in rows if what != "-h, --help"]
 
 
 def _first_sentence(text: str) -> str:

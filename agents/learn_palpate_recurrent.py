@@ -82,12 +82,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--rounds", type=int, default=8)
-    parser.add_argument("--envs", type=int, default=192, help="episodes of a round")
+    parser.add_argument("--rounds", type=int, default=1, help="those after the first are the network's own")
+    parser.add_argument("--envs", type=int, default=512, help="episodes of a round")
     parser.add_argument("--steps", type=int, default=420, help="of an episode at most")
     parser.add_argument("--repeat", type=int, default=2, help="control steps that a decision lasts")
-    parser.add_argument("--batch-size", type=int, default=8, help="episodes of a gradient step")
-    parser.add_argument("--epochs", type=int, default=50, help="of each round")
+    parser.add_argument("--batch-size", type=int, default=32, help="episodes of a gradient step")
+    parser.add_argument("--epochs", type=int, default=250, help="of each round")
     parser.add_argument("--seed", type=int, default=2_000_000)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -116,9 +116,9 @@ def main() -> None:
             normalisation=scaled,
             options=CloningOptions(
                 epochs=arguments.epochs,
-                patience=10,
+                patience=60,
                 batch_size=arguments.batch_size,
-                learning_rate=2e-3,
+                learning_rate=4e-3,
                 std=0.05,
                 seed=index,
             ),

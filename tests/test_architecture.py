@@ -223,6 +223,16 @@ def pictures_are_asked_for(source: Source) -> Iterator[str]:
                 yield f"line {line} imports {name}"
 
 
+def patients_know_no_environment(source: Source) -> Iterator[str]:
+    """What makes an organ of a scan writes a scene; it knows no task, no environment and no simulation."""
+    if source.path.startswith("surgsim_env/patient/"):
+        for name, line in imported(source.tree):
+            if name.split(".")[0] in {"gymnasium", "mujoco"} or re.match(
+                r"surgsim_env\.(tasks|env|vector_env|simulation|rendering)\b", name
+            ):
+                yield f"line {line} imports {name}"
+
+
 def scripts_stand_on_top(source: Source) -> Iterator[str]:
     """Scripts run environments; nothing else of the package knows of them but what commands ask for."""
     if not source.path.startswith("surgsim_env/scripting/") and source.path not in SCRIPT_USERS:
@@ -329,6 +339,8 @@ PLANTED = [
     (arms_know_no_task, "surgsim_env/evaluation/reach.py", "from surgsim_env.simulation import Simulation"),
     (haptics_know_no_task, "surgsim_env/haptics/loop.py", "from surgsim_env.tasks.palpate import PalpateTask"),
     (haptics_know_no_task, "surgsim_env/haptics/loop.py", "import gymnasium"),
+    (patients_know_no_environment, "surgsim_env/patient/report.py", "from surgsim_env.simulation import Simulation"),
+    (patients_know_no_environment, "surgsim_env/patient/command.py", "def late():\n    import gymnasium"),
     (scripts_stand_on_top, "surgsim_env/env.py", "from surgsim_env.scripting.run import run_script"),
     (live_stands_on_top, "surgsim_env/haptics/loop.py", "from surgsim_env.live.session import Session"),
     (short_enough, "msdm_core/organ.py", "x = 1\n" * (LINES_PER_FILE + 1)),

@@ -14,6 +14,8 @@ from surgsim_env.patient.label_names import LabelName
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")
 # One byte each is held while an image is read.
 VOXELS_MOST = 1_000_000_000
+# Of the labels' box, of which some copies of four bytes are made.
+BOX_VOXELS_MOST = 200_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +164,13 @@ def _cut(found: NDArray[np.uint8], labels: Sequence[LabelName], source: LabelSou
     for axis in range(3):
         used = np.flatnonzero(found.any(axis=tuple({0, 1, 2} - {axis})))
         box.append(slice(int(used[0]), int(used[-1]) + 1))
+    sides = [one.stop - one.start for one in box]
+    total = float(np.prod(np.array(sides, dtype=np.float64)))
+    if total > BOX_VOXELS_MOST:
+        raise MeshError(
+            f"{source.file}: the labels reach over {' x '.join(map(str, sides))} = {total:.3g} voxels; at most "
+            f"{BOX_VOXELS_MOST:.3g} are worked on: resample the image, voxels of a tenth of a cell are fine enough"
+        )
     x, y, z = (one.start for one in box)
     return LabelImage(
         np.ascontiguousarray(found[tuple(box)]),

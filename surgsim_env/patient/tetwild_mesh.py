@@ -23,8 +23,8 @@ from surgsim_env.patient.surface_voxels import voxels_inside
 EDGE_PER_CELL = 0.9
 # How far its surface may leave the given one, as a share of the box's diagonal: its own default.
 EPSILON = 1e-3
-# Voxels of a region's surface along a cell, to tell which tets lie in it.
-REGION_VOXELS = 12
+# Voxels along a region's longest extent, to tell which tets lie in it.
+REGION_VOXELS = 160
 
 
 def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh:
@@ -56,7 +56,7 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
     tags = np.ones(body.tet_count, dtype=np.int32)
     middles = body.points[body.tets].mean(axis=1)
     for tag, one in enumerate(surfaces[1:], start=2):
-        tags[_inside(one, middles, cell_size)] = tag
+        tags[_inside(one, middles)] = tag
         if not (tags == tag).any():
             raise MeshError(f"region {one.name!r} holds no tet: use smaller cells, or leave it out")
     return TetMesh(body.points, body.tets, tags, tuple((n, one.name) for n, one in enumerate(surfaces, start=1)))
@@ -113,7 +113,7 @@ def _level_surface(field: SmoothedShare, volume: float) -> tuple[FloatArray, NDA
     return check_surface(*bodies_of(points, np.asarray(faces, dtype=np.int64))[0])
 
 
-def _inside(surface: ClosedSurface, places: FloatArray, cell_size: float) -> NDArray[np.bool_]:
-    step = min(cell_size, float(np.ptp(surface.vertices, axis=0).min())) / REGION_VOXELS
+def _inside(surface: ClosedSurface, places: FloatArray) -> NDArray[np.bool_]:
+    step = float(np.ptp(surface.vertices, axis=0).max()) / REGION_VOXELS
     inside, first = voxels_inside(surface.vertices, surface.triangles, step)
     return voxels_at(places, inside, first, np.full(3, step))

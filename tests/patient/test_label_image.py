@@ -240,6 +240,11 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path):
     refused(tmp_path / "a.nrrd", "at most 1e[+]09 are read|cannot be parsed")
 
 
+def test_labels_that_reach_too_far_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("surgsim_env.patient.label_image.BOX_VOXELS_MOST", 100)
+    refused(plain(tmp_path / "a.nii"), r"the labels reach over \d+ x \d+ x \d+ = .* voxels; at most 100")
+
+
 def test_memory_is_a_byte_a_voxel_and_some_slices(tmp_path):
     labels = np.zeros((256, 256, 120), dtype=np.float64)
     labels[100:150, 100:150, 40:80] = 1

@@ -305,8 +305,8 @@ def test_tetwild_makes_conforming_regions_and_leaves_nothing_behind(tmp_path, mo
     assert {path.name for path in tmp_path.rglob("*")} == {"ct.nii.gz", "out", "a.vtu", "a.toml", "report.html"}
     mesh = read_mesh(out / "a.vtu")
     assert mesh.volumes.sum() == pytest.approx(ORGAN_VOLUME, rel=0.02)
-    # Whole tets follow the surface of the lesion: to its chords and the smoothing, also in cells as wide as it is.
+    # Tets follow the lesion's surface to its smoothing, in cells as wide as it is; whole ones would reach mm further.
     centre, radius = LESIONS[0]
     corners = mesh.points[np.unique(mesh.tets[mesh.region == 2])]
     reach = np.linalg.norm(corners - 1e-3 * (MIDDLE + centre), axis=1).max()
-    assert reach == pytest.approx(1e-3 * radius, rel=0.15)
+    assert reach == pytest.approx(1e-3 * radius, rel=0.08)

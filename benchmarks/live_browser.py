@@ -1,4 +1,4 @@
-"""How many pictures a second a software-rendered Chromium draws of a live scene, and how the physics keeps time beside it.
+"""Pictures a second that a software-rendered Chromium draws of a live scene, and how the physics keeps time beside it.
 
 From the repository's root: PYTHONPATH=. python benchmarks/live_browser.py --out docs/images/live_view.png
 Prints `name value unit` lines; with --out it presses first and keeps a picture of the page.

@@ -79,8 +79,9 @@ class Page:
             model = session.instrument.model
             self._instrument = InstrumentView(viser.scene, model, session.geoms, session.arm_count)
             self._judge.nodes.update(self._instrument.on_drag(self._dragged))
+            size = float(np.ptp(session.anatomy.mesh.points, axis=0).max())
             self._handles = [
-                add_handle(viser.scene, arm, place, session.directions, self._pulled)
+                add_handle(viser.scene, arm, place, size, session.directions, self._pulled)
                 for arm, place in enumerate(session.parked)
             ]
             self._judge.nodes.update(handle.name for handle in self._handles)

@@ -10,22 +10,35 @@ import numpy as np
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.live.instrument_view import SCALE
-from surgsim_env.rendering.cameras import scene_cameras
+from surgsim_env.rendering.cameras import Camera, scene_cameras
 
 HAND_COLOURS = ((255, 146, 43), (77, 171, 247))
 GROUND_COLOUR, FORCE_COLOUR, BRAND_COLOUR = (28, 58, 66), (255, 224, 102), (232, 89, 12)
 # The ground lies this far below the organ [m], and reaches so many times its size.
 GROUND_GAP, GROUND_REACH = 0.002, 4.0
-# In the page's own decimetres.
-HANDLE_SIZE, BALL_RADIUS = 0.35, 0.03
+# The page's camera stands so many times as far off as the overview, and looks this share of half its height aside.
+FARTHER, ASIDE = 1.5, 0.42
+# In plain light, what comes from everywhere.
+AMBIENT = 0.9
+# In the page's own decimetres; the handle is not larger than this share of the organ.
+HANDLE_SIZE, HANDLE_SHARE, BALL_RADIUS = 0.35, 0.45, 0.03
 SHAFT_RADIUS, HEAD_RADIUS, HEAD_LENGTH = 0.012, 0.035, 0.07
 # Of an arrow [m/N], and the force below which there is none [N].
 FORCE_LENGTH, FORCE_LEAST = 0.06, 0.005
 
 
+def page_camera(anatomy: Anatomy) -> Camera:
+    """Where the page is looked at from: the overview, farther off, with the organ left of the panel."""
+    near = scene_cameras(anatomy, aspect=1.2)["overview"]
+    distance = FARTHER * float(np.linalg.norm(near.position - near.target))
+    aside = ASIDE * distance * math.tan(math.radians(0.5 * near.fov)) * near.rotation[:, 0]
+    target = near.target + aside
+    return Camera.looking(target + distance * near.rotation[:, 2], target, near.up, near.fov)
+
+
 def prepare(viser: Any, anatomy: Anatomy) -> FloatArray:
     """Set camera, light and ground; unit vectors right, away and out of the organ for whoever looks, (3, 3)."""
-    camera = scene_cameras(anatomy, aspect=1.2)["overview"]
+    camera = page_camera(anatomy)
     viser.scene.set_up_direction(camera.up)
     first = viser.initial_camera
     first.position, first.look_at, first.up = camera.position * SCALE, camera.target * SCALE, camera.up
@@ -41,7 +54,12 @@ def prepare(viser: Any, anatomy: Anatomy) -> FloatArray:
 
 
 def add_handle(
-    scene: Any, arm: int, place: FloatArray, directions: FloatArray, pulled: Callable[[int, str, FloatArray], None]
+    scene: Any,
+    arm: int,
+    place: FloatArray,
+    size: float,
+    directions: FloatArray,
+    pulled: Callable[[int, str, FloatArray], None],
 ) -> Any:
     """The arrows that pull a hand out of the organ, into it, and across it.
 
@@ -49,6 +67,7 @@ def add_handle(
         scene: viser's.
         arm: whose hand it is.
         place: where it begins [m], (3,).
+        size: of the organ [m].
         directions: see `prepare`.
         pulled: called with the arm, the drag's phase and the place [m].
     """
@@ -60,7 +79,7 @@ def add_handle(
     name = f"/hand/{arm}"
     handle = scene.add_transform_controls(
         name,
-        scale=HANDLE_SIZE,
+        scale=min(HANDLE_SIZE, HANDLE_SHARE * size * SCALE),
         disable_rotations=True,
         disable_sliders=True,
         depth_test=False,
@@ -117,6 +136,7 @@ def light(viser: Any, *, plain: bool) -> None:
     """Light the scene; plain: without shadows and reflections, which take most of a software renderer's time."""
     viser.scene.configure_default_lights(enabled=True, cast_shadow=not plain)
     viser.scene.configure_environment_map(None if plain else "warehouse", environment_intensity=0.6)
+    viser.scene.add_light_ambient("/ambient", intensity=AMBIENT if plain else 0.0)
 
 
 def _add_ground(scene: Any, points: FloatArray, up: FloatArray, right: FloatArray) -> None:

@@ -45,6 +45,8 @@ class Browser:
             ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            # Linux shares the processor between sessions first: a browser has one of its own.
+            start_new_session=True,
         )
         self._count = 0
         self.events: list[dict[str, Any]] = []

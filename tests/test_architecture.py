@@ -279,6 +279,7 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     arms_know_no_task,
     haptics_know_no_task,
     pictures_are_asked_for,
+    patients_know_no_environment,
     scripts_stand_on_top,
     live_stands_on_top,
     short_enough,

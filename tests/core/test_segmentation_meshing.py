@@ -90,11 +90,17 @@ def test_extent_of_a_region_that_is_an_ellipsoid_of_whole_tets():
 
 def test_parts_beside_the_largest_are_left_out_and_said():
     labels, _ = ellipsoid((0.002, 0.002, 0.002))
-    labels[0, 0, 0] = 1
+    alone = fill_labels(labels, (0.002,) * 3, cell_size=0.008, region_names={1: "liver"})
+    # One outside the largest part's box, one in a corner of it, where a round body leaves room.
     labels[-2:, 0, 0] = 1
+    x, y, z = np.argwhere(labels == 1)[:-2].min(axis=0) + 3
+    labels[x, y, z] = 1
     with pytest.warns(UserWarning, match=r"2 part\(s\) of 3 voxels"):
         mesh = mesh_segmentation(labels, (0.002,) * 3, cell_size=0.008, region_names={1: "liver"})
-    assert np.ptp(mesh.points, axis=0).max() < 0.085
+    assert mesh.points.tobytes() == alone.mesh.points.tobytes()
+    assert (
+        fill_labels(labels, (0.002,) * 3, cell_size=0.008, region_names={1: "liver"}).label_volume == alone.label_volume
+    )
 
 
 def test_only_named_labels_are_filled():

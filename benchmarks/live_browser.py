@@ -31,7 +31,7 @@ def press_raster(session: Session, spacing: float, depth: float) -> None:
     face, radius = session.anatomy.face, session.scene.instrument.tip_radius
     sites, normals = face.raster(spacing)
     middle = sites.mean(axis=0)
-    near = ((sites - middle) ** 2).sum(axis=1).argsort()[:14]
+    near = ((sites - middle) ** 2).sum(axis=1).argsort()[:9]
     for number in near[::-1]:
         site, normal = sites[number], normals[number]
         for away in (0.006, -depth, 0.006 if number != near[0] else -depth):
@@ -72,7 +72,7 @@ def main() -> None:
             browser.count_pictures()
             if given.out is not None:
                 press_raster(session, session.scene.palpation.site_spacing, session.scene.palpation.press_depth)
-                browser.wait_for("window.pictures > 20", 300)
+                browser.wait_for("window.pictures > 8", 300)
                 browser.shot(given.out)
             if given.seconds > 0.0:
                 threads.append(threading.Thread(target=press_around, args=(session, stop)))

@@ -93,8 +93,16 @@ def palpable_patient(request: "PalpateRequest", folder: Path, console: Console) 
     """The scene of the file that `surgsim palpate` was given, made by the way and written to a folder."""
     file = request.segmentation or request.surface
     assert file is not None
-    asked = Request((file,), labels=request.labels, length_unit=request.length_unit, cell_size=request.cell_size)
     out = folder / f"{file.name.split('.')[0]}.vtu"
+    asked = Request(
+        (file,),
+        labels=request.labels,
+        length_unit=request.length_unit,
+        cell_size=request.cell_size,
+        out=out,
+        youngs_modulus=request.youngs_modulus,
+        approach=request.approach,
+    )
     _check_targets(out)
     found = patient_scene(_patient(asked), out.stem, folder, out.name, options=request.options, moduli={})
     _tell(found, console)

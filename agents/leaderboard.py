@@ -94,10 +94,11 @@ def _sites(place: str, rows: list[Result], folder: Path) -> str:
 def _tasks(place: str, rows: list[Result]) -> str:
     rows = sorted(rows, key=lambda result: -(result.figures["success"].value or 0.0))
     used = [column for column in TASKS if any(column[1] in _figures(row) for row in rows)]
-    seeds = f"{rows[0].seeds[1] - rows[0].seeds[0] + 1} episodes (seeds from {rows[0].seeds[0]})"
-    return "\n".join(
-        [f"\n## {_title(rows[0])}\n", f"{seeds}, at most {rows[0].budget} control steps.\n", _table(rows, used)]
-    )
+    counts = {row.method: row.seeds[1] - row.seeds[0] + 1 for row in rows}
+    most = max(counts.values())
+    fewer = "".join(f", {count} of {method}" for method, count in counts.items() if count < most)
+    seeds = f"{most} episodes{fewer} (seeds from {rows[0].seeds[0]}), at most {rows[0].budget} control steps.\n"
+    return "\n".join([f"\n## {_title(rows[0])}\n", seeds, _table(rows, used)])
 
 
 def _title(result: Result) -> str:

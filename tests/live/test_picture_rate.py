@@ -1,0 +1,43 @@
+"""No more pictures are made than the slowest browser draws."""
+
+import pytest
+
+from surgsim_env.live.hand_messages import read_rate, write_rate
+from surgsim_env.live.picture_rate import RATE_LEAST, RATE_MOST, REPORT_AGE_MOST, PictureRate
+from surgsim_env.live.web_messages import NonsenseError
+
+
+def test_the_slowest_browser_sets_the_rate_and_its_closing_frees_it():
+    now = [0.0]
+    rate = PictureRate(lambda: now[0])
+    assert rate.rate == RATE_MOST and rate.slowest is None
+    for _ in range(40):
+        now[0] += 1.0
+        rate.report(1, 60.0)
+        rate.report(2, 12.0)
+    assert rate.slowest == 12.0 and 8.0 < rate.rate <= 12.0
+    rate.report(2, 0.0)
+    for _ in range(20):
+        rate.report(2, 0.0)
+    assert rate.rate == RATE_LEAST
+    rate.forget(2)
+    for _ in range(40):
+        rate.report(1, 60.0)
+    assert rate.rate == RATE_MOST
+
+
+def test_a_tab_that_sleeps_counts_no_more():
+    now = [0.0]
+    rate = PictureRate(lambda: now[0])
+    rate.report(1, 1.0)
+    now[0] += REPORT_AGE_MOST + 0.1
+    assert rate.slowest is None
+    rate.forget(1)
+    assert rate.rate == RATE_MOST
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 1e9])
+def test_a_rate_that_is_none_is_nonsense(value):
+    with pytest.raises(NonsenseError, match="frames a second"):
+        read_rate(write_rate(value))
+    assert read_rate(b"0" * 16) is None and read_rate(write_rate(30.0)) == 30.0

@@ -156,7 +156,10 @@ def names_of(host: str, *, remote: bool) -> tuple[str, ...]:
 
 
 def _query_token(request: Request) -> str:
-    values = parse_qs(request.path.partition("?")[2], max_num_fields=16).get(TOKEN_FIELD, [])
+    try:
+        values = parse_qs(request.path.partition("?")[2], max_num_fields=16).get(TOKEN_FIELD, [])
+    except ValueError:
+        return ""
     return values[0] if len(values) == 1 else ""
 
 

@@ -1,6 +1,5 @@
 """A viser server that cannot be reached but through the gate, and never opens a tunnel."""
 
-import asyncio
 import http
 import threading
 from collections.abc import Awaitable, Callable
@@ -114,11 +113,13 @@ class GuardedServer:
             if refusal is not None:
                 return refusal
             if asks_for_socket(request):
-                if len(connection.server.connections) > SOCKETS_MOST:
+                # This one is not among them yet.
+                if len(connection.server.connections) >= SOCKETS_MOST:
                     return refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{SOCKETS_MOST} sockets are open already")
                 return None
             # Not packed: there is a script to put in.
-            del request.headers["Accept-Encoding"]
+            if "Accept-Encoding" in request.headers:
+                del request.headers["Accept-Encoding"]
             response = viser_answer(connection, request)
             if response is None:
                 return refuse(http.HTTPStatus.BAD_REQUEST, "no request for a page or a socket")
@@ -199,8 +200,3 @@ def _with_script(response: Response) -> Response:
             del headers[name]
     headers["Content-Length"] = str(len(body))
     return Response(response.status_code, response.reason_phrase, headers, body)
-
-
-def close_soon(connection: ServerConnection, code: int, reason: str) -> "asyncio.Task[None]":
-    """Close a connection without waiting for its end."""
-    return asyncio.get_running_loop().create_task(connection.close(code, reason))

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
 from surgsim_env.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
 from surgsim_env.live.organ_view import COLOURS, CONTRASTS
 from surgsim_env.live.web_messages import Judge, is_flag, is_number, is_one_of
@@ -250,8 +249,3 @@ def _legend_html() -> str:
         f'<div style="display:flex;justify-content:space-between"><span>{low:g}</span><span>stiffness over the softest '
         f"quarter felt</span><span>{high:g} and more</span></div></div>"
     )
-
-
-def millimetres(place: FloatArray) -> str:
-    """A place in words."""
-    return ", ".join(f"{value * 1e3:.1f}" for value in place) + " mm"

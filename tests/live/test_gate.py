@@ -101,6 +101,7 @@ def test_a_socket_needs_an_origin_whatever_it_is_called(gate, words):
         request(token=None, Cookie="surgsim_8080="),
         request(token=None, Cookie='surgsim_8080="\\'),
         request("/?token=%ff%00é", token=None),
+        request(f"/?token={TOKEN}" + "&a=1" * 16, token=None),
         socket_request(token=None),
     ],
 )

@@ -11,7 +11,7 @@ from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy, load_anatomy
 from surgsim_env.scenes import Scene
 
-# How much of an organ's mass may be added for fewer substeps, and the fewest: a press is to be felt at least twice a step.
+# How much of an organ's mass may be added for fewer substeps, and the fewest.
 ADDED_MASS_SHARE, SUBSTEPS_FEWEST = 0.01, 2
 SHOWN, HIDDEN, NONE = "as in the scene", "hidden", "none"
 
@@ -53,8 +53,8 @@ class OrganChoice:
 def live_scene(scene: Scene) -> Scene:
     """The scene in as few substeps as a hundredth of its mass more buys, so that there is time left in a haptic step.
 
-    With mass scaling (`timing.mass_scaling`), as sliders ask for organs that no number of substeps was chosen for. On the
-    liver 2 substeps instead of 4 take 0.3 % of its mass, on the nodes that limit the step.
+    With mass scaling (`timing.mass_scaling`), as sliders ask for organs that no number of substeps was chosen for. The
+    liver's 2 substeps instead of 4 take 0.3 % of its mass, on the nodes that limit the step.
 
     Raises:
         ValueError: a scene whose mesh cannot be made.

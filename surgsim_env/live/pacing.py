@@ -12,7 +12,7 @@ CLASS_WIDTH = 20e-6
 CLASS_COUNT = 1001
 # Before a step is due the process sleeps until this long before it [s], and then looks at the clock;
 SPIN = 120e-6
-# but it does not sleep where steps take more than this share of their period: a core that slept comes back slow and with
+# but it does not sleep where steps take more than this share of their period: a core that slept comes back slow, with
 # cold caches, so that a step of the liver takes 0.71 ms and not 0.53 (2 cores of a virtual machine).
 SLEEP_SHARE = 0.3
 

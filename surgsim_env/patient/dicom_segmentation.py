@@ -69,7 +69,7 @@ def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
             int(_group(data, frame, "SegmentIdentificationSequence").ReferencedSegmentNumber) for frame in frames
         ]
 
-    def slabs() -> Iterator[tuple[int, NDArray]]:
+    def runs() -> Iterator[tuple[int, NDArray]]:
         pixels = parsed(file, lambda _: np.atleast_3d(data.pixel_array), ADVICE).reshape(len(frames), rows, columns)
         for place in range(shape[2]):
             layer = np.zeros((columns, rows, 1), dtype=np.int64)
@@ -82,9 +82,9 @@ def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
                     for frame in here:
                         if numbers[frame] == number:
                             layer[pixels[frame].T > 0] = number
-            yield place, layer
+            yield place * rows * columns, layer.ravel(order="F")
 
-    return LabelSource(file, shape, geometry, slabs)
+    return LabelSource(file, shape, geometry, runs)
 
 
 def _group(data: Any, frame: Any, name: str) -> Any:

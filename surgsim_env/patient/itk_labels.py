@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from msdm_core.errors import MeshError
 from msdm_core.mesh_file import parsed
 from surgsim_env.patient.image_geometry import ImageGeometry
-from surgsim_env.patient.label_image import LabelSource, checked_shape
+from surgsim_env.patient.label_image import RUN_VOXELS, LabelSource, checked_shape
 
 ADVICE = "export or copy it again"
 # SimpleITK reads whole images [bytes].
 BYTES_MOST = 4_000_000_000
-SLICES = 16
 # Of SimpleITK's reasons the end says most [characters].
 REASON_LENGTH = 200
 READERS = {".nrrd": "NrrdImageIO", ".mha": "MetaImageIO", ".dcm": "GDCMImageIO"}
@@ -53,13 +52,14 @@ def open_itk(file: Path) -> LabelSource:
     geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * 1e-3, file)
     notes = _stated_space(file)
 
-    def slabs() -> Iterator[tuple[int, NDArray]]:
+    def runs() -> Iterator[tuple[int, NDArray]]:
         image = _asked(file, reader.Execute)
-        values = SimpleITK.GetArrayViewFromImage(image).reshape(shape[::-1]).T
-        for first in range(0, shape[2], SLICES):
-            yield first, values[:, :, first : first + SLICES]
+        # Axes are reversed in it, so that the image's first runs fastest.
+        values = SimpleITK.GetArrayViewFromImage(image).reshape(-1)
+        for first in range(0, len(values), RUN_VOXELS):
+            yield first, values[first : first + RUN_VOXELS]
 
-    return LabelSource(file, shape, geometry, slabs, notes)
+    return LabelSource(file, shape, geometry, runs, notes)
 
 
 def _asked(file: Path, question: Callable[[], Any]) -> Any:

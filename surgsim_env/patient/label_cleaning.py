@@ -1,12 +1,12 @@
 """A label image made ready to be meshed: one part, each lesion a region of its own, cavities filled where asked."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from msdm_core.errors import MeshError
 from msdm_core.segmentation_meshing import largest_part, parts_of
 from surgsim_env.patient.label_image import LabelImage
 from surgsim_env.patient.materials import is_lesion
@@ -15,6 +15,8 @@ from surgsim_env.patient.materials import is_lesion
 SMALLEST_SHARE_OF_CELL = np.pi / 6.0
 # More parts of one label than this are no lesions but noise.
 PARTS_MOST = 24
+# Tags are bytes, and 0 is outside.
+NAMES_MOST = 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,9 @@ def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLab
     """The largest part of the labels, its lesions apart, its cavities filled if `mend`.
 
     A part of a lesion's label too small for the cells becomes healthy tissue, and is said to be.
+
+    Raises:
+        MeshError: names what two regions would be called once lesions are numbered, or how many regions there are.
     """
     tags, notes = _one_part(image)
     notes += _at_border(tags, image)
@@ -54,18 +59,20 @@ def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLab
         if not chosen.any():
             notes.append(f"{name}: none of it lies in the largest part; left out")
             continue
-        parts, too_small = _parts(chosen, smallest / image.voxel_volume, split=is_lesion(name))
-        if too_small:
-            millilitres = sum(too_small) * image.voxel_volume * 1e6
+        parts = _parts(chosen, smallest / image.voxel_volume, split=is_lesion(name))
+        if parts.left_count:
+            millilitres = parts.left_voxels * image.voxel_volume * 1e6
             notes.append(
-                f"{name}: {len(too_small)} part(s), {millilitres:.3g} ml together, are smaller than what cells of "
+                f"{name}: {parts.left_count} part(s), {millilitres:.3g} ml together, are smaller than what cells of "
                 f"{cell_size * 1e3:.3g} mm can show ({smallest * 1e6:.2g} ml) and became {image.names[0]}"
             )
-        for number, part in enumerate(parts, start=1):
-            names.append(name if len(parts) == 1 else f"{name} {number}")
-            result[part] = len(names)
-            if is_lesion(name):
-                lesions.append(names[-1])
+        added = [name if parts.count == 1 else f"{name} {number}" for number in range(1, parts.count + 1)]
+        _check_names(names, added, name)
+        for number, one in enumerate(ndimage.find_objects(parts.numbers), start=1):
+            # One box at a time: masks of the whole image would take a byte a voxel each.
+            result[one][parts.numbers[one] == number] = len(names) + number
+        names += added
+        lesions += added if is_lesion(name) else []
     return CleanLabels(result, tuple(names), tuple(lesions), tuple(notes), image)
 
 
@@ -110,14 +117,41 @@ def _cavities(tags: NDArray[np.uint8], image: LabelImage, mend: bool) -> tuple[N
     return np.where(holes, np.uint8(1), tags), [f"mended: {size}, were filled with {image.names[0]}"]
 
 
-def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> tuple[Sequence[NDArray[np.bool_]], list[int]]:
-    """The parts of at least so many voxels, largest first, and the sizes of the others; whole if not to be split."""
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """The parts of a label that are kept, by their numbers from 1, 0 elsewhere, and how much is not kept."""
+
+    numbers: NDArray[np.uint8]
+    count: int
+    left_count: int
+    left_voxels: int
+
+
+def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> _Parts:
+    """The parts of at least so many voxels, largest first; whole if not to be split."""
     if not split:
         count = int(np.count_nonzero(chosen))
-        return ([chosen], []) if count >= smallest else ([], [count])
+        if count < smallest:
+            return _Parts(np.zeros(chosen.shape, dtype=np.uint8), 0, 1, count)
+        return _Parts(chosen.astype(np.uint8), 1, 0, 0)
     label, count = parts_of(chosen, corners=True)
     sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
-    order = np.argsort(-sizes, kind="stable")
-    kept = [part for part in order[:PARTS_MOST].tolist() if sizes[part] >= smallest]
-    rest = [int(sizes[part]) for part in order.tolist() if part not in kept]
-    return [label == part + 1 for part in kept], rest
+    kept = [part for part in np.argsort(-sizes, kind="stable")[:PARTS_MOST].tolist() if sizes[part] >= smallest]
+    numbers = np.zeros(count + 1, dtype=np.uint8)
+    numbers[[part + 1 for part in kept]] = np.arange(1, len(kept) + 1)
+    return _Parts(numbers[label], len(kept), count - len(kept), int(sizes.sum() - sizes[kept].sum()))
+
+
+def _check_names(names: list[str], added: list[str], label: str) -> None:
+    """Refuse a name that is there already, and more regions than tags can tell apart."""
+    twice = next((name for name in added if name in names), None)
+    if twice is not None:
+        raise MeshError(
+            f"region {twice!r} would be there twice: the parts of label {label!r} are numbered, and another label has "
+            "that name; give one of the two another name in --labels"
+        )
+    if len(names) + len(added) > NAMES_MOST:
+        raise MeshError(
+            f"{len(names) + len(added)} regions are there once the parts of {label!r} are numbered; at most "
+            f"{NAMES_MOST} can be told apart: name fewer labels in --labels, or choose larger cells (--cell-size)"
+        )

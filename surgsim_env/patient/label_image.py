@@ -14,6 +14,8 @@ from surgsim_env.patient.label_names import LabelName
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")
 # One byte each is held while an image is read.
 VOXELS_MOST = 1_000_000_000
+# So many are looked at together, of which some copies of eight bytes are made.
+RUN_VOXELS = 2_000_000
 # Of the labels' box, of which some copies of four bytes are made.
 BOX_VOXELS_MOST = 200_000_000
 
@@ -46,15 +48,15 @@ class LabelImage:
 
 @dataclass(frozen=True, eq=False)
 class LabelSource:
-    """An image file that was looked into: its shape, geometry, and its slices along the last axis, read anew each time.
+    """An image file that was looked into: its shape, geometry, and its voxels in runs, read anew each time.
 
-    `slabs` gives (first slice, values (n_x, n_y, n)) in order.
+    `runs` gives (first voxel, values (n,)) in order, the first axis running fastest.
     """
 
     file: Path
     shape: tuple[int, int, int]
     geometry: ImageGeometry
-    slabs: Callable[[], Iterator[tuple[int, NDArray]]]
+    runs: Callable[[], Iterator[tuple[int, NDArray]]]
     notes: tuple[str, ...] = ()
 
 
@@ -64,7 +66,7 @@ def is_image(file: Path) -> bool:
 
 
 def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
-    """The named labels of an image file, in memory of a byte a voxel and some slices.
+    """The named labels of an image file, in memory of a byte a voxel and some of RUN_VOXELS.
 
     Raises:
         MeshError: names the file and what is wrong: missing, cut short, wrongly compressed, not three axes, sheared,
@@ -73,13 +75,15 @@ def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
     source = _source(file, [label.value for label in labels])
     found = np.zeros(source.shape, dtype=np.uint8, order="F")
     counts = np.zeros(len(labels) + 1, dtype=np.int64)
-    for first, values in source.slabs():
+    # A view, as `found` lies in this order.
+    line = found.reshape(-1, order="F")
+    for first, values in source.runs():
         whole = checked_whole(values, file)
-        part = found[:, :, first : first + whole.shape[2]]
+        part = line[first : first + len(whole)]
         for tag, label in enumerate(labels, start=1):
             chosen = whole == label.value
             count = int(np.count_nonzero(chosen))
-            # Slices without labels are not written to: their memory is then never taken.
+            # Runs without labels are not written to: their memory is then never taken.
             if count:
                 counts[tag] += count
                 part[chosen] = tag
@@ -117,12 +121,17 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
     return counts[0], counts[1], counts[2]
 
 
+def checked_kind(dtype: np.dtype, file: Path) -> None:
+    """Refuse values such as colours or complex numbers; MeshError names their type."""
+    if dtype.kind not in "iubf":
+        raise MeshError(f"{file}: the image's values are {dtype}; labels are whole numbers: export a label map")
+
+
 def checked_whole(values: NDArray, file: Path) -> NDArray:
     """Label values; MeshError names the first that is not a whole number."""
-    if values.dtype.kind in "iub":
-        return values
+    checked_kind(values.dtype, file)
     if values.dtype.kind != "f":
-        raise MeshError(f"{file}: the image's values are {values.dtype}; labels are whole numbers: export a label map")
+        return values
     wrong = values != np.rint(values)
     if wrong.any():
         raise MeshError(
@@ -151,8 +160,8 @@ def _source(file: Path, wanted: Sequence[int]) -> LabelSource:
 
 def _there(source: LabelSource) -> str:
     values: set[int] = set()
-    for _, slab in source.slabs():
-        values |= set(np.unique(slab)[:100].astype(np.int64).tolist())
+    for _, run in source.runs():
+        values |= set(np.unique(run)[:100].astype(np.int64).tolist())
     values.discard(0)
     known = sorted(values)
     more = ", ..." if len(known) > 20 else ""

@@ -1,5 +1,6 @@
-"""NIfTI label images (.nii, .nii.gz), read slice by slice."""
+"""NIfTI label images (.nii, .nii.gz), read run by run."""
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,14 @@ from numpy.typing import NDArray
 from msdm_core.errors import MeshError
 from msdm_core.mesh_file import parsed
 from surgsim_env.patient.image_geometry import ImageGeometry
-from surgsim_env.patient.label_image import LabelSource, checked_shape
+from surgsim_env.patient.label_image import RUN_VOXELS, LabelSource, checked_kind, checked_shape
 
 ADVICE = "export or copy it again"
 # NIfTI's world is RAS, x to the right and y to the front.
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
-# So much is read at once, and so much may follow the image's last voxel [bytes].
-SLAB_BYTES = 32_000_000
-TAIL_BYTES = 1_000_000
+# So much may stand before the image's first voxel, and so much follow its last [bytes].
+HEADER_BYTES = TAIL_BYTES = 1_000_000
 
 
 def open_nifti(file: Path) -> LabelSource:
@@ -27,29 +27,33 @@ def open_nifti(file: Path) -> LabelSource:
     Raises:
         MeshError: names the file and what is wrong with it or its header.
     """
-    try:
-        import nibabel
-    except ImportError:
-        raise MeshError(f"{file}: reading NIfTI needs nibabel: pip install 'surgsim[patient]'") from None
     _check_compression(file)
-    image: Any = parsed(file, nibabel.load, ADVICE)
-    header = image.header
-    shape = checked_shape(image.shape, file)
+    header = _header(file)
+    shape = checked_shape(parsed(file, lambda _: header.get_data_shape(), ADVICE), file)
+    dtype = np.dtype(parsed(file, lambda _: header.get_data_dtype(), ADVICE))
+    checked_kind(dtype, file)
+    offset = int(header.get_data_offset())
+    if not 0 <= offset <= HEADER_BYTES:
+        raise MeshError(
+            f"{file}: its header puts the first voxel at byte {offset} (vox_offset); the rule is 0 to {HEADER_BYTES}: "
+            "export it without header extensions"
+        )
+    slope, shift = parsed(file, lambda _: header.get_slope_inter(), ADVICE)
+    scaling = (1.0 if slope is None else float(slope), 0.0 if shift is None else float(shift))
     notes = []
-    unit = str(header.get_xyzt_units()[0])
+    unit = str(parsed(file, lambda _: header.get_xyzt_units(), ADVICE)[0])
     if unit not in METRES:
         notes.append("the header states no length unit: millimetres are taken, as NIfTI's readers do")
     if not int(header["sform_code"]) and not int(header["qform_code"]):
         notes.append("the header states no orientation: left and right, front and back may be swapped")
-    metres = METRES.get(unit, 1e-3)
-    affine = np.asarray(image.affine, dtype=np.float64) * metres
+    affine = np.asarray(parsed(file, lambda _: header.get_best_affine(), ADVICE), dtype=np.float64)
+    affine = affine * METRES.get(unit, 1e-3)
     geometry = ImageGeometry.from_matrix(RAS_TO_LPS @ affine[:3, :3], RAS_TO_LPS @ affine[:3, 3], file)
-    data = image.dataobj
 
-    def slabs() -> Iterator[tuple[int, NDArray]]:
-        yield from _slabs(file, shape, data)
+    def runs() -> Iterator[tuple[int, NDArray]]:
+        yield from _runs(file, shape, dtype, offset, scaling)
 
-    return LabelSource(file, shape, geometry, slabs, tuple(notes))
+    return LabelSource(file, shape, geometry, runs, tuple(notes))
 
 
 def _check_compression(file: Path) -> None:
@@ -60,27 +64,52 @@ def _check_compression(file: Path) -> None:
         raise MeshError(f"{file}: is named {name} and {what} compressed by gzip: rename it, or {ADVICE}")
 
 
-def _slabs(file: Path, shape: tuple[int, int, int], data: Any) -> Iterator[tuple[int, NDArray]]:
-    """(first slice, values) along the last axis; the whole file is read, so that gzip's checksum is looked at."""
+def _header(file: Path) -> Any:
+    """The header without its extensions: their sizes come from the file, and nibabel.load reads as much as they say."""
+    try:
+        from nibabel.nifti1 import Nifti1Header
+        from nibabel.nifti2 import Nifti2Header
+    except ImportError:
+        raise MeshError(f"{file}: reading NIfTI needs nibabel: pip install 'surgsim[patient]'") from None
+    raw = parsed(file, lambda _: _opened(file, Nifti2Header.template_dtype.itemsize), ADVICE)
+    if len(raw) < Nifti1Header.template_dtype.itemsize:
+        raise MeshError(f"{file}: is cut short: it ends within its header, after {len(raw)} bytes: {ADVICE}")
+    # The places of the magic words in the two versions of the format.
+    for kind, magic, place in ((Nifti1Header, b"n+1\0", 344), (Nifti2Header, b"n+2\0", 4)):
+        if raw[place : place + 4] == magic:
+            size = kind.template_dtype.itemsize
+            return parsed(file, lambda _, kind=kind, size=size: kind.from_fileobj(io.BytesIO(raw[:size])), ADVICE)
+    raise MeshError(f"{file}: is no NIfTI image of one file (no n+1 or n+2 in its header): {ADVICE}")
+
+
+def _opened(file: Path, size: int) -> bytes:
     from nibabel.openers import ImageOpener
 
-    dtype = np.dtype(data.dtype)
-    layer = shape[0] * shape[1]
-    count = max(1, SLAB_BYTES // (layer * dtype.itemsize))
-    slope, shift = float(data.slope), float(data.inter)
     stream: Any = ImageOpener(str(file))
     with stream:
-        parsed(file, lambda _: stream.seek(data.offset), ADVICE)
-        for first in range(0, shape[2], count):
-            slices = min(count, shape[2] - first)
-            wanted = layer * slices * dtype.itemsize
+        return stream.read(size)
+
+
+def _runs(
+    file: Path, shape: tuple[int, int, int], dtype: np.dtype, offset: int, scaling: tuple[float, float]
+) -> Iterator[tuple[int, NDArray]]:
+    """(first voxel, values); the whole file is read, so that gzip's checksum is looked at."""
+    from nibabel.openers import ImageOpener
+
+    layer, total = shape[0] * shape[1], shape[0] * shape[1] * shape[2]
+    slope, shift = scaling
+    stream: Any = ImageOpener(str(file))
+    with stream:
+        parsed(file, lambda _: stream.seek(offset), ADVICE)
+        for first in range(0, total, RUN_VOXELS):
+            wanted = min(RUN_VOXELS, total - first) * dtype.itemsize
             raw = parsed(file, lambda _, size=wanted: stream.read(size), ADVICE)
             if len(raw) < wanted:
                 raise MeshError(
                     f"{file}: is cut short: its header promises {' x '.join(map(str, shape))} voxels, the data end "
-                    f"within slice {first + len(raw) // (layer * dtype.itemsize)} of {shape[2]}: {ADVICE}"
+                    f"within slice {(first + len(raw) // dtype.itemsize) // layer} of {shape[2]}: {ADVICE}"
                 )
-            values = np.frombuffer(raw, dtype=dtype).reshape((shape[0], shape[1], slices), order="F")
-            yield first, values if (slope, shift) == (1.0, 0.0) else values * slope + shift
+            values = np.frombuffer(raw, dtype=dtype)
+            yield first, values if scaling == (1.0, 0.0) else values * slope + shift
         if len(parsed(file, lambda _: stream.read(TAIL_BYTES), ADVICE)) >= TAIL_BYTES:
             raise MeshError(f"{file}: goes on far beyond the image that its header describes: {ADVICE}")

@@ -16,6 +16,7 @@ from websockets import Headers
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from surgsim_env.live.errors import LiveError
 from surgsim_env.live.gate import Gate, asks_for_socket, listening_socket, names_of, refuse
 from surgsim_env.live.hand_messages import HAND_PATH
 from surgsim_env.live.web_messages import Judge, NonsenseError
@@ -56,7 +57,7 @@ class GuardedServer:
 
         Raises:
             ValueError: an address that is not to be had, or reaches beyond this machine without `remote`.
-            RuntimeError: a version of viser that would answer beside the gate.
+            LiveError: a version of viser that would answer beside the gate.
         """
         self._listening = listening_socket(host, port, remote=remote)
         bound_port = self._listening.getsockname()[1]
@@ -68,7 +69,7 @@ class GuardedServer:
         if self._guards != 1:
             self.viser.stop()
             self._listening.close()
-            raise RuntimeError(
+            raise LiveError(
                 f"viser {viser.__version__} serves in a way that surgsim cannot guard: install viser>=1.1,<1.2"
             )
         self._forget_tunnels()

@@ -1,6 +1,7 @@
 """The page: what the picture shows of frames, what the panel asks of the session, thirty times a second."""
 
 import asyncio
+import contextlib
 import html
 import time
 from collections.abc import AsyncIterator, Callable
@@ -11,6 +12,7 @@ import numpy as np
 from websockets.asyncio.server import ServerConnection
 
 from msdm_core.mesh import FloatArray
+from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.guarded_server import GuardedServer
@@ -29,6 +31,8 @@ from surgsim_env.live.web_messages import Judge, NonsenseError
 
 # Between plots, and between words [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
+# How long the physics may take to end a recording [s].
+END_TIMEOUT = 2.0
 TITLES = {
     Phase.STARTING: "starting",
     Phase.RUNNING: "running",
@@ -110,14 +114,13 @@ class Page:
         """Make pictures until told to stop, or the physics is gone; as many as browsers come to.
 
         Raises:
-            RuntimeError: the physics died.
+            LiveError: the physics died.
         """
         due = time.monotonic()
         self._before, self._pictures_before = self.session.timing(), 0
         plot_due = status_due = due
         while not until():
-            if not self.session.alive:
-                raise RuntimeError("the physics' process died: its own message stands above")
+            self.session.require_alive()
             now = time.monotonic()
             frame = self.session.frame()
             self._attend(frame)
@@ -134,6 +137,25 @@ class Page:
             period = 1.0 / self._rate.rate
             due = max(due + period, time.monotonic() - period)
             time.sleep(max(0.0, due - time.monotonic()))
+
+    def end_recording(self) -> str:
+        """Write the recording that runs, if one does; a sentence on what came of it, or nothing.
+
+        Call it when `run` is over, in whatever way: what was recorded lies in memory that the physics does not take
+        along.
+        """
+        session, runs = self.session, self._was_recording
+        with contextlib.suppress(LiveError):
+            runs = runs or bool(session.frame()["recording"])
+        if not runs:
+            return ""
+        session.ask(Record(False))
+        with contextlib.suppress(LiveError):
+            deadline = time.monotonic() + END_TIMEOUT
+            while session.alive and session.frame()["recording"] and time.monotonic() < deadline:
+                time.sleep(0.005)
+        self._was_recording = False
+        return f"{self._out}: {write_recording(session.exchange.recorded.steps.copy(), self._out)}"
 
     def _pulled(self, arm: int, phase: str, place: FloatArray) -> None:
         """A hand's own handle is pulled to a place [m]."""

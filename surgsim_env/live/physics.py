@@ -67,12 +67,20 @@ def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
 
 
 def run_physics(setup: Setup, exchange: Exchange, requests: Connection, parent: int) -> None:
-    """The child's whole life; it ends on request, or when the process with the id `parent` is gone."""
+    """The child's whole life; it ends on request, or when the process with the id `parent` is gone.
+
+    What refuses to begin is told through `requests` as a text, and the process ends with status 1.
+    """
     # Ctrl-C is the page's to answer; it ends the physics in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _sleep_sharply()
     _go_first()
-    physics = Physics(setup, exchange, requests)
+    try:
+        physics = Physics(setup, exchange, requests)
+    except (ValueError, OSError) as error:
+        with contextlib.suppress(OSError):
+            requests.send(str(error))
+        sys.exit(1)
     # What is there by now stays; nothing that is made in a step lies in a cycle.
     gc.collect()
     gc.freeze()

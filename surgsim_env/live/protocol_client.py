@@ -59,7 +59,7 @@ class ProtocolClient:
     async def _live(self) -> None:
         import viser
         from websockets.asyncio.client import connect
-        from websockets.exceptions import ConnectionClosed
+        from websockets.exceptions import WebSocketException
 
         try:
             async with connect(
@@ -73,6 +73,9 @@ class ProtocolClient:
                 sending = asyncio.create_task(self._send(socket))
                 try:
                     while not self._stopping.is_set():
+                        if self._path is not None and sending.done():
+                            self.errors.append(f"no more poses are sent: {sending.exception()!r}")
+                            return
                         try:
                             message = await asyncio.wait_for(socket.recv(), 0.2)
                         except TimeoutError:
@@ -82,7 +85,7 @@ class ProtocolClient:
                             await asyncio.sleep(self._pause)
                 finally:
                     sending.cancel()
-        except (OSError, ConnectionClosed) as error:
+        except (OSError, WebSocketException) as error:
             self.errors.append(repr(error))
 
     async def _send(self, socket: Any) -> None:

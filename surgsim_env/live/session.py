@@ -1,5 +1,6 @@
 """A live session as its page's process sees it: hands that move, requests, and what the physics tells."""
 
+import contextlib
 import multiprocessing
 import os
 import threading
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.anatomy import load_anatomy
+from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import TRACE_LENGTH, Exchange, Phase, new_exchange
 from surgsim_env.live.hand_messages import HandMotion
 from surgsim_env.live.organ_choice import OrganChoice, lesion_kinds, live_scene
@@ -93,15 +95,29 @@ class Session:
         """Until the physics steps.
 
         Raises:
-            RuntimeError: it died, or did not begin in time.
+            LiveError: it died, and why where it said so, or did not begin in time.
         """
         deadline = time.monotonic() + timeout
         while self.frame()["phase"] == Phase.STARTING or not int(self.exchange.timing.peek["steps"]):
-            if not self.alive or time.monotonic() > deadline:
-                raise RuntimeError(
-                    f"the physics did not begin (exit code {self._process.exitcode}): its own message stands above"
-                )
+            self.require_alive()
+            if time.monotonic() > deadline:
+                raise LiveError(f"the physics did not begin within {timeout:g} s")
             time.sleep(0.02)
+
+    def require_alive(self) -> None:
+        """Check that the physics' process lives.
+
+        Raises:
+            LiveError: it died; with what it said.
+        """
+        if self.alive:
+            return
+        said = ""
+        # What it could not say, Python has printed.
+        with contextlib.suppress(EOFError, OSError):
+            said = self._pipe.recv() if self._pipe.poll() else ""
+        why = said or f"exit code {self._process.exitcode}; its own message, if any, stands above"
+        raise LiveError(f"the physics' process died: {why}")
 
     def frame(self) -> NDArray[Any]:
         """The newest frame, a copy."""

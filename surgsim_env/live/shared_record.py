@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surgsim_env.live.errors import LiveError
+
 # How often a reader tries before it says that the writer never holds still.
 TRIES_MOST = 10_000
 
@@ -41,13 +43,13 @@ class SharedRecord:
         """A copy of the record as one `writing` left it, shape ().
 
         Raises:
-            RuntimeError: its writer died, or never stops, in the middle of it.
+            LiveError: its writer died, or never stops, in the middle of it.
         """
         for _ in range(TRIES_MOST):
             copy = self.glance()
             if copy is not None:
                 return copy
-        raise RuntimeError("a shared record is never whole: the process that writes it died in the middle")
+        raise LiveError("a shared record is never whole: the process that writes it died in the middle")
 
     def glance(self) -> NDArray[Any] | None:
         """A copy of the record, or None where it is being written just now: it never waits, and never raises."""

@@ -12,6 +12,7 @@ from viser import _messages
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from surgsim_env.live.errors import LiveError
 from surgsim_env.live.guarded_server import MESSAGE_SIZE_MOST, SOCKETS_MOST, GuardedServer
 from surgsim_env.live.protocol_client import CAMERA
 from surgsim_env.live.web_messages import Judge
@@ -215,7 +216,7 @@ def test_a_viser_that_serves_beside_the_gate_is_refused(monkeypatch):
             self.stopped = True
 
     monkeypatch.setattr(guarded_server.viser, "ViserServer", OtherViser)
-    with pytest.raises(RuntimeError, match="cannot guard"):
+    with pytest.raises(LiveError, match="cannot guard"):
         GuardedServer("127.0.0.1", 0, remote=False, judge=Judge(), serve_hand=None)
 
 

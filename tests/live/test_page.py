@@ -16,9 +16,10 @@ import viser
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
+from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.hand_messages import HandMotion, write_hand
-from surgsim_env.live.organ_choice import NONE, OrganChoice
+from surgsim_env.live.organ_choice import HIDDEN, NONE, OrganChoice
 from surgsim_env.live.pacing import PaceSettings
 from surgsim_env.live.page import Page
 from surgsim_env.live.protocol_client import CAMERA, ProtocolClient, hand_message, press_path
@@ -249,6 +250,24 @@ def test_a_recording_is_written_to_its_folder_alone(served):
     wait_until(lambda: session.frame()["time"] < 0.5)
 
 
+def test_a_client_that_is_not_let_in_or_sends_no_more_says_so(served):
+    stranger = ProtocolClient(served.address + "x")
+    stranger.start()
+    wait_until(lambda: stranger.errors)
+    assert "401" in stranger.errors[0]
+
+    def path(time):
+        raise ValueError("no such place")
+
+    lame = ProtocolClient(served.address, path)
+    lame.start()
+    try:
+        wait_until(lambda: lame.errors)
+    finally:
+        lame.stop()
+    assert "no such place" in lame.errors[0]
+
+
 def test_a_place_that_is_not_finite_is_refused(served):
     with pytest.raises(ValueError, match="must be finite"):
         served.session.move_to(0, np.array([0.0, np.nan, 0.0]))
@@ -296,9 +315,22 @@ def test_a_physics_that_dies_is_said(tmp_path):
         session.wait()
         page = Page(session, host="127.0.0.1", port=0, remote=False, out=tmp_path)
         session._process.kill()
-        with pytest.raises(RuntimeError, match="physics' process died"):
+        with pytest.raises(LiveError, match="physics' process died"):
             page.run(lambda: False)
     finally:
         if page is not None:
             page.server.stop()
+        session.close()
+
+
+def test_why_the_physics_refused_is_said(monkeypatch):
+    """What only the child finds out."""
+    monkeypatch.setattr(
+        "surgsim_env.live.session.OrganChoice", lambda lesions: OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)
+    )
+    session = Session(make_scene("phantom_small"), pace=PACE)
+    try:
+        with pytest.raises(LiveError, match=r"physics' process died: .*step"):
+            session.wait()
+    finally:
         session.close()

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import RecordedSteps, said
 from surgsim_env.live.pacing import CLASS_WIDTH, TIMING, Pacer, PaceSettings, quantile, timeliness
 from surgsim_env.live.shared_record import SharedRecord
@@ -48,7 +49,7 @@ def test_a_writer_that_died_in_the_middle_is_said_and_a_glance_never_waits():
     writing = record.writing()
     writing.__enter__()
     assert record.glance() is None
-    with pytest.raises(RuntimeError, match="died in the middle"):
+    with pytest.raises(LiveError, match="died in the middle"):
         record.read()
 
 

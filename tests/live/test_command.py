@@ -1,0 +1,95 @@
+"""`surgsim view` as a process: how it ends, what it leaves behind, what it says."""
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surgsim_env import cli
+from surgsim_env.live.command import missed_targets
+from surgsim_env.live.errors import LiveError
+from surgsim_env.live.pacing import Timeliness
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+KEPT = Timeliness(
+    steps=1000,
+    skipped=0,
+    rate=1000.0,
+    real_time=1.0,
+    late_p50=1e-4,
+    late_p99=1e-3,
+    late_most=3e-3,
+    spent_p50=3e-4,
+    spent_p99=5e-4,
+)
+# A recording begins by itself once the page is served.
+CHILD = """
+import sys
+from surgsim_env import cli
+from surgsim_env.live.page import Page
+from surgsim_env.live.requests import Record
+
+class Recording(Page):
+    begun = False
+
+    def _attend(self, frame):
+        if not self.begun:
+            self.begun = True
+            self.session.ask(Record(True))
+        super()._attend(frame)
+        if self.session.exchange.recorded.count > 100:
+            print("recording", flush=True)
+
+if __name__ == "__main__":
+    import surgsim_env.live.page
+    surgsim_env.live.page.Page = Recording
+    sys.exit(cli.main(["view", "--scene", "phantom_small", "--port", "0", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130), (None, 0)])
+def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how, code):
+    script, out = tmp_path / "view.py", tmp_path / "out"
+    script.write_text(CHILD)
+    given = [sys.executable, script, "--out", out, *(["--seconds", "3"] if how is None else [])]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    run = subprocess.Popen(given, stdout=subprocess.PIPE, text=True, env=environment)
+    assert run.stdout is not None
+    if how is not None:
+        assert any(line == "recording\n" for line in run.stdout)
+        run.send_signal(how)
+    told, _ = run.communicate(timeout=120)
+    assert run.returncode == code
+    assert [path.name for path in out.iterdir()] == ["recording-1.csv"]
+    assert "out: " in told and "steps written to recording-1.csv" in told
+    table = np.genfromtxt(out / "recording-1.csv", delimiter=",", names=True)
+    assert len(table) > 100 and np.allclose(np.diff(table["time"]), 1e-3)
+
+
+def test_a_session_that_fails_is_said_in_one_line(monkeypatch, capsys):
+    def fail(*_):
+        raise LiveError("the physics' process died: why")
+
+    monkeypatch.setattr("surgsim_env.live.command.view", fail)
+    assert cli.main(["view"]) == 2
+    assert capsys.readouterr().err == "surgsim: error: the physics' process died: why\n"
+
+
+@pytest.mark.parametrize(
+    ("kept", "updates", "force", "told"),
+    [
+        (KEPT, 30.0, 0.2, None),
+        (replace(KEPT, rate=994.0), 30.0, 0.2, "994.0 steps/s of 1000"),
+        (replace(KEPT, late_p99=0.002), 30.0, 0.2, "late by up to 2.00 ms"),
+        (KEPT, 19.9, 0.2, "19.9 updates/s"),
+        (KEPT, 30.0, 0.0, "no force"),
+    ],
+)
+def test_targets_that_are_missed_are_named(kept, updates, force, told):
+    missed = missed_targets(kept, 1e-3, updates, force)
+    assert missed == [] if told is None else len(missed) == 1 and told in missed[0]

@@ -120,7 +120,8 @@ def write_patient(found: PatientScene, out: Path, command: str) -> list[Path]:
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".surgsim-part-") as part:
         write_mesh(Path(part, out.name), found.patient.mesh)
         Path(part, scene_file.name).write_text(text, encoding="utf-8", newline="\n")
-        Path(part, REPORT_NAME).write_text(page, encoding="utf-8", newline="\n")
+        # What a page cannot show, such as bytes of a file's name that are not UTF-8, becomes a question mark.
+        Path(part, REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
         load_scene(Path(part, scene_file.name))
         for target in targets:
             os.replace(Path(part, target.name), target)

@@ -45,6 +45,11 @@ def is_lesion(name: str) -> bool:
     return LESION_WORD.search(name) is not None
 
 
+def without_number(name: str) -> str:
+    """A region's name less the number that tells the parts of one label apart: "lesion" of "lesion 2"."""
+    return re.sub(r" \d+$", "", name)
+
+
 def organ_material(name: str, youngs_modulus: float | None = None) -> TissueMaterial:
     """Material of the organ of a name such as "liver" or "left kidney", or with a given modulus [Pa]."""
     if youngs_modulus is not None:
@@ -66,7 +71,7 @@ def region_material(name: str, organ_name: str, organ: Material, moduli: Mapping
         organ: its material.
         moduli: given on the command line, by name or by the name before its number [Pa].
     """
-    given = moduli.get(name, moduli.get(re.sub(r" \d+$", "", name)))
+    given = moduli.get(name, moduli.get(without_number(name)))
     if given is not None:
         return TissueMaterial(Material(given, organ.density, organ.poisson_ratio), "given on the command line")
     if not is_lesion(name):

@@ -19,7 +19,7 @@ from surgsim_env.palpation.surface_scene import (
     anchors_of,
     with_options,
 )
-from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material
+from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material, without_number
 from surgsim_env.patient.patient_mesh import PatientMesh
 from surgsim_env.scenes import LesionDraw, Limits, MeshSource, Palpation, Scene, TetFile, Vector, make_scene
 from surgsim_env.timing import substeps_needed
@@ -108,7 +108,7 @@ def patient_scene(
 
 def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
     for name in moduli:
-        if not any(one == name or one.rsplit(" ", 1)[0] == name for one in names):
+        if not any(name in (one, without_number(one)) for one in names):
             raise ValueError(f"--modulus {name}=...: there is no such region; there are {', '.join(names) or 'none'}")
 
 

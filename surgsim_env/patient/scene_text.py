@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from typing import Any
 
 from surgsim_env.patient.materials import TissueMaterial
@@ -12,6 +13,7 @@ from surgsim_env.patient.patient_scene import (
     SOFT_PER_PRESS,
     PatientScene,
 )
+from surgsim_env.scenes import LesionDraw
 
 # By this first line an earlier run's file is known, which may be replaced.
 FIRST_LINE = "# Made by surgsim from a patient's organ."
@@ -77,33 +79,14 @@ def _body(found: PatientScene) -> list[str]:
 
 
 def _touch(found: PatientScene) -> list[str]:
-    scene, palpation = found.scene, found.scene.palpation
-    tip, share = scene.instrument.tip_radius, found.anatomy.palpable_cell
-    share /= math.sqrt(tip * palpation.press_depth)
-    lines = [
+    scene = found.scene
+    return [
         "",
         "[contact]",
         _entry("stiffness", scene.contact.stiffness, "[N/m^3] chosen: 18 E / cell"),
         _entry("damping", scene.contact.damping, "[N s/m^3] as in the scene liver"),
         _entry("friction", scene.contact.friction, "as in the scene liver"),
-        "",
-        "[instrument]",
-        _entry("model", scene.instrument.model),
-        _entry(
-            "tip_radius",
-            tip,
-            f"[m] chosen for the cells: cell / contact radius {share:.2f}, asked for {CELL_PER_CONTACT_RADIUS}",
-        ),
-        _entry("approach", scene.instrument.approach, "direction of the probe, in the axes above"),
-        "",
-        "[timing]",
-        _entry("haptic_step", scene.timing.haptic_step, "[s]"),
-        _entry(
-            "substep_count",
-            scene.timing.substep_count,
-            "stable with contact, with every lesion here and the worst drawn",
-        ),
-        _entry("haptic_steps_per_control", scene.timing.haptic_steps_per_control),
+        *_instrument(found),
         "",
         f"[limits]               # [N] chosen: {SOFT_PER_PRESS:g} and {HARD_PER_PRESS:g} times a healthy press (Hertz)",
         _entry("soft_force", scene.limits.soft_force),
@@ -113,32 +96,55 @@ def _touch(found: PatientScene) -> list[str]:
         _entry("noise", scene.sensor.noise, "[N]"),
         _entry("bias", scene.sensor.bias, "[N]"),
         _entry("range", scene.sensor.range, "[N]"),
+        *_palpation(found),
+        *(_lesion(scene.lesion) if scene.lesion else []),
+    ]
+
+
+def _instrument(found: PatientScene) -> list[str]:
+    instrument, timing, depth = found.scene.instrument, found.scene.timing, found.scene.palpation.press_depth
+    share = found.anatomy.palpable_cell / math.sqrt(instrument.tip_radius * depth)
+    why = f"[m] chosen for the cells: cell / contact radius {share:.2f}, asked for {CELL_PER_CONTACT_RADIUS}"
+    return [
+        "",
+        "[instrument]",
+        _entry("model", instrument.model),
+        _entry("tip_radius", instrument.tip_radius, why),
+        _entry("approach", instrument.approach, "direction of the probe, in the axes above"),
+        "",
+        "[timing]",
+        _entry("haptic_step", timing.haptic_step, "[s]"),
+        _entry("substep_count", timing.substep_count, "stable with contact, every lesion here and the worst drawn"),
+        _entry("haptic_steps_per_control", timing.haptic_steps_per_control),
+    ]
+
+
+def _palpation(found: PatientScene) -> list[str]:
+    palpation = found.scene.palpation
+    sites = f"[m] {found.site_count} sites, at most {SITES_MOST} unless given"
+    return [
         "",
         "[palpation]",
         _entry("press_depth", palpation.press_depth, "[m] chosen: 7/12 of the tip's radius, as in the scene liver"),
         _entry("face_angle_deg", palpation.face_angle_deg),
         _entry("face_margin", palpation.face_margin, "[m]"),
         _entry("thickness_smallest", palpation.thickness_smallest, "[m] of organ below a site"),
-        _entry(
-            "site_spacing", palpation.site_spacing, f"[m] {found.site_count} sites, at most {SITES_MOST} unless given"
-        ),
+        _entry("site_spacing", palpation.site_spacing, sites),
         _entry("clearance", palpation.clearance, "[m]"),
     ]
-    if scene.lesion is not None:
-        draw = scene.lesion
-        lines += [
-            "",
-            "[lesion]               # hidden anew in each episode, in the organ without its segmented lesions",
-            _entry("radius", draw.radius, "[m] chosen in proportion to the tip, as in the scene liver"),
-            _entry("cover", draw.cover, "[m] tissue above its top"),
-            _entry(
-                "modulus_ratio",
-                draw.modulus_ratio,
-                "HCC 51, metastases 50 in 6.6 kPa liver (doi 10.1177/8756479317733713)",
-            ),
-            _entry("rim_distance", draw.rim_distance, "[m]"),
-        ]
-    return lines
+
+
+def _lesion(draw: LesionDraw) -> list[str]:
+    return [
+        "",
+        "[lesion]               # hidden anew in each episode, in the organ without its segmented lesions",
+        _entry("radius", draw.radius, "[m] chosen in proportion to the tip, as in the scene liver"),
+        _entry("cover", draw.cover, "[m] tissue above its top"),
+        _entry(
+            "modulus_ratio", draw.modulus_ratio, "HCC 51, metastases 50 in 6.6 kPa liver (doi 10.1177/8756479317733713)"
+        ),
+        _entry("rim_distance", draw.rim_distance, "[m]"),
+    ]
 
 
 def _material(what: TissueMaterial) -> list[str]:
@@ -150,10 +156,18 @@ def _material(what: TissueMaterial) -> list[str]:
 
 
 def _entry(name: str, value: Any, comment: str = "") -> str:
-    # JSON's strings, lists and booleans are TOML's, but for what a name may not hold here.
-    text = repr(value) if isinstance(value, float) else json.dumps(value)
+    text = _quoted(value) if isinstance(value, str) else repr(value) if isinstance(value, float) else json.dumps(value)
     line = f"{name} = {text}"
     return f"{line:<22} # {_comment(comment)}" if comment else line
+
+
+def _quoted(text: str) -> str:
+    """A TOML string: JSON's, but for DEL, which TOML wants escaped, and halves of surrogate pairs, which it refuses.
+
+    Such halves are how Python writes the bytes of file names that are not UTF-8; they become the replacement character.
+    """
+    whole = re.sub("[\ud800-\udfff]", "\ufffd", text)
+    return json.dumps(whole, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _comment(text: str) -> str:

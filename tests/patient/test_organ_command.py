@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,9 @@ from msdm_core.mesh_io import read_mesh
 from msdm_core.quality import mesh_quality
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.cli import main
+from surgsim_env.patient.materials import organ_material, region_material
+from surgsim_env.patient.patient_scene import _check_moduli
+from surgsim_env.patient.scene_text import _entry
 from surgsim_env.scenes import load_scene
 from tests.patient.scans import LESIONS, MIDDLE, ORGAN_VOLUME, affine_of, labels_on, scan, write_nifti
 
@@ -71,6 +75,32 @@ def test_the_scene_file_states_its_axes_and_sources(written):
     text = (written / "patient.toml").read_text(encoding="utf-8")
     assert "x to the patient's left, y to the back, z to the head (LPS" in text
     assert text.count("doi 10.1177/8756479317733713") >= 3
+
+
+@pytest.mark.parametrize(
+    "name", ["scan\U0001f600.nii.gz", 'a"b\\c\td\x7f\x1b.nii.gz', "half\ud83d.nii.gz", "byte\udc80.nii.gz"]
+)
+def test_strings_of_a_scene_are_toml_whatever_a_file_is_called(name):
+    (value,) = tomllib.loads(_entry("description", name)).values()
+    assert value == re.sub("[\ud800-\udfff]", "\ufffd", name)
+
+
+def test_a_scan_of_any_name_becomes_a_scene(tmp_path):
+    file = scan(tmp_path / "scan\U0001f600.nii.gz", spacing=(3.0, 3.0, 3.0))
+    out = tmp_path / "out\U0001f600.vtu"
+    assert main(["organ", str(file), *LABELS, "--cell-size", "0.009", "--out", str(out)]) == 0
+    assert "of scan\U0001f600.nii.gz" in load_scene(out.with_suffix(".toml")).description
+
+
+def test_a_modulus_is_for_a_region_s_name_or_the_name_before_its_number():
+    names = ["lesion 1", "lesion 2", "portal vein"]
+    organ = organ_material("liver").material
+    for given in ("lesion", "lesion 2", "portal vein"):
+        _check_moduli({given: 1.0}, names)
+        assert any(region_material(one, "liver", organ, {given: 1.0}).material.youngs_modulus == 1.0 for one in names)
+    for given in ("portal", "lesion 3", "vein"):
+        with pytest.raises(ValueError, match="no such region; there are lesion 1, lesion 2, portal vein"):
+            _check_moduli({given: 1.0}, names)
 
 
 def test_the_scene_has_what_was_segmented(anatomy):

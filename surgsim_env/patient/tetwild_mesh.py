@@ -105,7 +105,7 @@ def _smoothed(labels: CleanLabels, tag: int, cell_size: float) -> SmoothedShare:
 def _level_surface(field: SmoothedShare, volume: float) -> tuple[FloatArray, NDArray[np.int64]]:
     """The largest closed surface on which a smoothed share has the level that encloses a volume [m^3]."""
     try:
-        from skimage.measure import marching_cubes
+        from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MeshError("--mesher tetwild of labels needs scikit-image: pip install 'surgsim[tetwild]'") from None
     vertices, faces = marching_cubes(field.values, field.level_of(volume))[:2]

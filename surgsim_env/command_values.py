@@ -1,5 +1,8 @@
 """Values of command-line options that are text: lists of numbers, length units."""
 
+import shlex
+from collections.abc import Mapping, Sequence
+
 from msdm_core.length_unit import LengthUnit
 
 
@@ -30,3 +33,17 @@ def unit_of(text: str | None) -> LengthUnit | None:
         return float(text)
     except ValueError:
         return text
+
+
+def command_line(words: Sequence[str], options: Mapping[str, object]) -> str:
+    """A command that a shell reads: its words, then the options that are given, lists by repeating the option."""
+    words = list(words)
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        for one in value if isinstance(value, tuple) else (value,):
+            if one is None or one is False:
+                continue
+            # A value such as -1,0,0 would be taken for an option of its own.
+            joined = str(one).startswith("-")
+            words += [option] if one is True else [f"{option}={one}"] if joined else [option, str(one)]
+    return shlex.join(words)

@@ -49,13 +49,22 @@ dd { margin: 0 0 0 1.25rem; max-width: 60rem; }
 """
 
 
-def html_page(title: str, verdict: str, sections: Sequence[tuple[str, str, str]]) -> str:
+def page_start(generator: str) -> str:
+    """How every page of a program begins; by it a program knows its own pages."""
+    return (
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="generator" content="{escape(generator)}">\n'
+    )
+
+
+def html_page(title: str, verdict: str, sections: Sequence[tuple[str, str, str]], *, generator: str = "surgsim") -> str:
     """The page's text.
 
     Args:
         title: of the page, plain text.
         verdict: what matters most, in a paragraph of plain text.
         sections: (id, heading in plain text, content in HTML).
+        generator: the program that makes it.
     """
     links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, heading, _ in sections)
     body = "\n".join(
@@ -64,8 +73,7 @@ def html_page(title: str, verdict: str, sections: Sequence[tuple[str, str, str]]
         for name, heading, content in sections
     )
     return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        f'{page_start(generator)}<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n<style>{STYLE}</style>\n</head>\n<body>\n'
         f'<header>\n<h1>{escape(title)}</h1>\n<p class="verdict">{escape(verdict)}</p>\n'

@@ -5,12 +5,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.command_values import numbers_of, unit_of, vector_of
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.command_values import command_line, numbers_of, unit_of, vector_of
 from surgsim_env.out_folder import writable_folder
 from surgsim_env.palpation.surface_scene import SurfaceOptions, load_stable_anatomy, surface_scene, with_options
-from surgsim_env.scenes import Ball, Scene, load_scene, make_scene
+from surgsim_env.scenes import Ball, Scene, Vector, load_scene, make_scene
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,11 @@ class Request:
         )
 
     @property
+    def command(self) -> str:
+        """The command line that says the same."""
+        return command_line(["surgsim", "palpate"], vars(self))
+
+    @property
     def makes_organ(self) -> bool:
         """Whether an organ is made from a file in proportion to its size, as `surgsim organ` makes it."""
         return self.segmentation is not None or (self.surface is not None and self.cell_size is None)
@@ -73,19 +77,15 @@ def palpate(request: Request, console: Console) -> None:
     )
 
     _check(request)
+    # Before an organ is made, which takes a minute.
+    around, asked = _around(request), _asked_lesions(request)
     names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
     scene, folder = _scene(request, names, console)
     anatomy = load_anatomy(scene)
-    lesions = _lesions(request, anatomy)
+    lesions = anatomy.demonstration_lesions()
+    if asked:
+        lesions = [anatomy.lesion_at(*one, f"lesion {number}") for number, one in enumerate(asked, start=1)]
     anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-    if request.seed < 0:
-        raise ValueError(f"--seed is {request.seed}; it must be a whole number of at least 0")
-    around = None
-    if request.around is not None:
-        x, y, z, radius = numbers_of("--around", request.around, "x,y,z,radius")
-        if not 0.0 < radius < float("inf"):
-            raise ValueError(f"--around {request.around}: the radius is {radius:g} m; it must be finite and above 0")
-        around = Ball((x, y, z), radius)
     # Before the work: a place that cannot be written is better known now than after it.
     folder = folder or writable_folder(request.out or _free_folder(scene.name), names)
     found = run_palpation(
@@ -113,6 +113,28 @@ def _check(request: Request) -> None:
                 raise ValueError(f"--{name} goes with --surface; a scene states its own mesh and anchors")
     if request.surface is not None and request.length_unit is None:
         raise ValueError('--surface needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none')
+    if request.seed < 0:
+        raise ValueError(f"--seed is {request.seed}; it must be a whole number of at least 0")
+
+
+def _around(request: Request) -> Ball | None:
+    if request.around is None:
+        return None
+    x, y, z, radius = numbers_of("--around", request.around, "x,y,z,radius")
+    if not 0.0 < radius < float("inf"):
+        raise ValueError(f"--around {request.around}: the radius is {radius:g} m; it must be finite and above 0")
+    return Ball((x, y, z), radius)
+
+
+def _asked_lesions(request: Request) -> list[tuple[Vector, float, float]]:
+    """Centre [m], radius [m] and modulus ratio of each --lesion."""
+    asked = []
+    for text in request.lesion:
+        x, y, z, radius, ratio = numbers_of("--lesion", text, "x,y,z,radius,ratio")
+        if not ratio > 0.0:
+            raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
+        asked.append(((x, y, z), radius, ratio))
+    return asked
 
 
 def _scene(request: Request, names: tuple[str, ...], console: Console) -> tuple[Scene, Path | None]:
@@ -144,18 +166,6 @@ def _surface_scene(request: Request, file: Path, console: Console) -> Scene:
         highlight=False,
     )
     return scene
-
-
-def _lesions(request: Request, anatomy: Anatomy) -> list[Lesion]:
-    if not request.lesion:
-        return anatomy.demonstration_lesions()
-    lesions = []
-    for number, text in enumerate(request.lesion, start=1):
-        x, y, z, radius, ratio = numbers_of("--lesion", text, "x,y,z,radius,ratio")
-        if not ratio > 0.0:
-            raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
-        lesions.append(anatomy.lesion_at((x, y, z), radius, ratio, f"lesion {number}"))
-    return lesions
 
 
 def _stem(file: Path) -> str:

@@ -1,7 +1,7 @@
 """What `surgsim organ` does with labels, surfaces and tets, and how `surgsim palpate` begins from a scan."""
 
 import os
-import shlex
+import shutil
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from msdm_core.surface_io import SURFACE_SUFFIXES
-from surgsim_env.command_values import unit_of, vector_of
+from surgsim_env.command_values import command_line, unit_of, vector_of
 from surgsim_env.organ_report import check_target, print_organ, report_organ
 from surgsim_env.palpation.surface_scene import SurfaceOptions
 from surgsim_env.patient.label_image import IMAGE_SUFFIXES, is_image, read_label_image
@@ -50,14 +50,8 @@ class Request:
     @property
     def command(self) -> str:
         """The command line that says the same."""
-        words = ["surgsim", "organ", *map(str, self.files)]
-        for name, value in vars(self).items():
-            option = f"--{name.replace('_', '-')}"
-            if name == "files" or value in (None, (), False):
-                continue
-            for one in value if isinstance(value, tuple) else (value,):
-                words += [option] if one is True else [option, str(one)]
-        return shlex.join(words)
+        options = {name: value for name, value in vars(self).items() if name != "files"}
+        return command_line(["surgsim", "organ", *map(str, self.files)], options)
 
 
 def make_organ(request: Request, console: Console) -> None:
@@ -72,7 +66,8 @@ def make_organ(request: Request, console: Console) -> None:
     unit = unit_of(request.length_unit)
     first = request.files[0]
     if not is_image(first) and first.suffix.lower() not in SURFACE_SUFFIXES:
-        _refuse(request, ("labels", "region", "modulus", "approach", "mend", "mesher"), "a label image or surfaces")
+        unused = ("labels", "region", "cell_size", "modulus", "approach", "mend", "mesher")
+        _refuse(request, unused, "a label image or surfaces")
         if len(request.files) > 1:
             raise ValueError(f"{first}: one file of tets is taken, {len(request.files)} are given")
         report_organ(first, unit, request.youngs_modulus, request.out, console)
@@ -106,7 +101,7 @@ def palpable_patient(request: "PalpateRequest", folder: Path, console: Console) 
     _check_targets(out)
     found = patient_scene(_patient(asked), out.stem, folder, out.name, options=request.options, moduli={})
     _tell(found, console)
-    write_patient(found, out, asked.command)
+    write_patient(found, out, request.command)
     return load_scene(out.with_suffix(".toml"))
 
 
@@ -123,9 +118,28 @@ def write_patient(found: PatientScene, out: Path, command: str) -> list[Path]:
         # What a page cannot show, such as bytes of a file's name that are not UTF-8, becomes a question mark.
         Path(part, REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
         load_scene(Path(part, scene_file.name))
-        for target in targets:
-            os.replace(Path(part, target.name), target)
+        _replace(targets, Path(part))
     return targets
+
+
+def _replace(targets: Sequence[Path], part: Path) -> None:
+    """Put new files of a folder in their places; where one cannot be, all places are as before."""
+    for target in targets:
+        if target.exists():
+            shutil.copy2(target, part / f"before-{target.name}")
+    placed = []
+    try:
+        for target in targets:
+            os.replace(part / target.name, target)
+            placed.append(target)
+    except BaseException:
+        for target in placed:
+            before = part / f"before-{target.name}"
+            if before.exists():
+                os.replace(before, target)
+            else:
+                target.unlink()
+        raise
 
 
 def _patient(request: Request) -> PatientMesh:
@@ -154,7 +168,7 @@ def _patient(request: Request) -> PatientMesh:
 
 def _refuse(request: Request, names: Sequence[str], what: str) -> None:
     for name in names:
-        if getattr(request, name):
+        if getattr(request, name) not in (None, ()) and getattr(request, name) is not False:
             raise ValueError(f"--{name.replace('_', '-')} goes with {what}")
 
 
@@ -177,10 +191,15 @@ def _check_targets(out: Path) -> None:
     for path, mark in ((out.with_suffix(".toml"), FIRST_LINE), (out.with_name(REPORT_NAME), MARK)):
         if path.is_dir():
             raise ValueError(f"--out {out}: {path.name} is a folder there; choose another place or remove it")
-        if path.exists() and mark not in path.read_text(encoding="utf-8", errors="replace"):
+        if path.exists() and not _begins(path, mark):
             raise ValueError(
                 f"--out {out}: {path} is there, and not of an earlier run; choose another place or remove it"
             )
+
+
+def _begins(path: Path, mark: str) -> bool:
+    with path.open(encoding="utf-8", errors="replace") as stream:
+        return stream.read(len(mark)) == mark
 
 
 def _tell(found: PatientScene, console: Console) -> None:

@@ -8,13 +8,14 @@ from msdm_core.organ import compile_organ
 from msdm_core.quality import mesh_quality
 from msdm_core.stability import stable_dt
 from surgsim_env.cell_share import share_text
-from surgsim_env.html_page import html_page, html_picture, html_table
+from surgsim_env.html_page import html_page, html_picture, html_table, page_start
 from surgsim_env.patient.patient_mesh import DIHEDRAL_SMALLEST
 from surgsim_env.patient.patient_scene import PatientScene, material_rows
 from surgsim_env.patient.pictures import organ_picture, quality_picture
 
 # By this an earlier run's report is known, which may be replaced.
-MARK = "surgsim organ"
+GENERATOR = "surgsim organ"
+MARK = page_start(GENERATOR)
 VOLUME_ERROR_LARGEST = 0.02
 
 
@@ -43,9 +44,10 @@ def report_page(found: PatientScene, scene_text: str, scene_file: str, command: 
         ("tissue", "Tissue, masses and step", _tissue(found) + _step(found)),
         ("touch", "How it is palpated", _touch(found)),
         ("scene", f"The scene, {scene_file}", f"<pre><code>{escape(scene_text)}</code></pre>"),
-        ("command", f"The command that made this report ({MARK})", f"<pre><code>{escape(command)}</code></pre>"),
+        ("command", "The command that made this report", f"<pre><code>{escape(command)}</code></pre>"),
     ]
-    return html_page(f"Organ: {found.scene.description}", verdict(found), [one for one in sections if one[2]])
+    shown = [one for one in sections if one[2]]
+    return html_page(f"Organ: {found.scene.description}", verdict(found), shown, generator=GENERATOR)
 
 
 def verdict(found: PatientScene) -> str:

@@ -1,7 +1,10 @@
 """`surgsim organ` and `surgsim palpate` from labels and surfaces: what is written, loads, is refused and is mended."""
 
+import html
 import json
+import os
 import re
+import shlex
 import tomllib
 
 import gymnasium as gym
@@ -14,6 +17,7 @@ from msdm_core.mesh_io import read_mesh
 from msdm_core.quality import mesh_quality
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.cli import main
+from surgsim_env.patient.command import _replace
 from surgsim_env.patient.materials import organ_material, region_material
 from surgsim_env.patient.patient_scene import _check_moduli
 from surgsim_env.patient.scene_text import _entry
@@ -253,7 +257,8 @@ def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, cap
     (out / "a.toml").write_text("mine", encoding="utf-8")
     assert "is there, and not of an earlier run" in refused(capsys, *given)
     (out / "a.toml").unlink()
-    (out / "report.html").write_text("another report", encoding="utf-8")
+    others = "<!DOCTYPE html>\n<p>What I think of surgsim organ</p>"
+    (out / "report.html").write_text(others, encoding="utf-8")
     assert "report.html is there" in refused(capsys, *given)
     (out / "report.html").unlink()
     assert "approach is (0.0, 0.0, 0.0)" in refused(capsys, *given, "--approach", "0,0,0")
@@ -261,6 +266,75 @@ def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, cap
     for _ in range(2):
         assert main([str(one) for one in given]) == 0
     assert {path.name for path in out.iterdir()} == {"a.vtu", "a.toml", "report.html"}
+
+
+@pytest.mark.parametrize("there", [[], ["a.vtu", "a.toml", "report.html"], ["a.toml"]])
+@pytest.mark.parametrize("failing", [1, 2, 3])
+def test_three_files_are_replaced_or_none(there, failing, tmp_path, monkeypatch):
+    part, out = tmp_path / "part", tmp_path / "out"
+    part.mkdir()
+    out.mkdir()
+    names = ["a.vtu", "a.toml", "report.html"]
+    for name in names:
+        (part / name).write_text("new", encoding="utf-8")
+    for name in there:
+        (out / name).write_text(f"old {name}", encoding="utf-8")
+    real, calls = os.replace, []
+
+    def replace(source, target):
+        calls.append(target)
+        if len(calls) == failing:
+            raise PermissionError(13, "in use", str(target))
+        real(source, target)
+
+    monkeypatch.setattr("surgsim_env.patient.command.os.replace", replace)
+    with pytest.raises(PermissionError):
+        _replace([out / name for name in names], part)
+    assert {path.name: path.read_text(encoding="utf-8") for path in out.iterdir()} == {
+        name: f"old {name}" for name in there
+    }
+
+
+def test_the_report_shows_the_command_that_was_given(tmp_path, monkeypatch):
+    given = ["--anchors=-0.06,0.025,0.08,0.03", "--tip-radius", "0.008", "--press-depth", "0.004", "--spacing", "0.012"]
+    file = scan(tmp_path / "ct.nii.gz", spacing=(3.0, 3.0, 3.0))
+    arguments = ["palpate", "--segmentation", str(file), *LABELS, "--cell-size", "0.009", *given]
+    arguments += ["--around=-0.06,0.0,0.13,0.01", "--out", str(tmp_path / "out"), "--workers", "1"]
+    pressed = []
+    monkeypatch.setattr("surgsim_env.palpation.job.run_palpation", lambda *_, **__: pressed.append(1) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(arguments)
+    assert pressed
+    page = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    (command,) = re.findall(r"<code>(surgsim .*)</code>", page)
+    words = shlex.split(command)
+    assert words[:2] == ["surgsim", "palpate"]
+    for word in arguments:
+        assert word in words, word
+    # It is read as what was given.
+    again = []
+    monkeypatch.setattr("surgsim_env.palpation.palpate_command.palpate", lambda request, _: again.append(request))
+    assert main(words[1:]) == 0
+    assert again[0].command == command
+    assert again[0].anchors == ("-0.06,0.025,0.08,0.03",)
+    assert again[0].spacing == 0.012
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (["--seed", "-1"], "--seed is -1"),
+        (["--around", "0,0,0,-1"], "the radius is -1 m"),
+        (["--around", "0,0,0"], "the form is x,y,z,radius"),
+        (["--lesion", "0,0,0,0.01,0"], "the modulus ratio is 0"),
+    ],
+)
+def test_palpation_s_options_are_looked_at_before_an_organ_is_made(option, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("surgsim_env.patient.command.palpable_patient", lambda *_: pytest.fail("an organ was made"))
+    file = scan(tmp_path / "ct.nii.gz", spacing=(6.0, 6.0, 6.0))
+    given = ["palpate", "--segmentation", file, *LABELS, *option, "--out", tmp_path / "out"]
+    assert words in refused(capsys, *given)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -292,6 +366,8 @@ def test_options_that_do_not_fit_surfaces_or_tets(written, tmp_path, capsys):
     twice = ["--region", f"lesion={outside}", "--region", f"lesion={outside}"]
     assert "is given twice" in refused(capsys, "organ", surface, *twice, *unit)
     assert "--mend goes with" in refused(capsys, "organ", written / "patient.vtu", "--mend")
+    for size in ("0.01", "0"):
+        assert "--cell-size goes with" in refused(capsys, "organ", written / "patient.vtu", "--cell-size", size)
     assert "is no surface" in refused(capsys, "organ", surface, written / "patient.vtu", *unit)
     assert "goes with --segmentation" in refused(capsys, "palpate", "--scene", "phantom", *LABELS)
     assert "give a file" in refused(capsys, "organ")

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import html
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -27,19 +26,13 @@ from surgsim_env.live.recording import write_recording
 from surgsim_env.live.requests import Change, Pause, Record, Replay, Reset
 from surgsim_env.live.session import Session
 from surgsim_env.live.stage import ForceArrow, add_handle, light, prepare
+from surgsim_env.live.status import headline, status_rows
 from surgsim_env.live.web_messages import Judge, NonsenseError
 
 # Between plots, and between words [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
 # How long the physics may take to end a recording [s].
 END_TIMEOUT = 2.0
-TITLES = {
-    Phase.STARTING: "starting",
-    Phase.RUNNING: "running",
-    Phase.PAUSED: "paused",
-    Phase.FAULT: "stopped by a fault: press Reset",
-    Phase.ENDED: "ended",
-}
 
 
 class Page:
@@ -75,35 +68,49 @@ class Page:
         self._held: set[int] = set()
         self._shows_lesions = False
         self._was_recording = False
+        self._doing: tuple[int, bool, bool] | None = None
         self._said = ""
         viser = self.server.viser
         with viser.atomic():
             session.directions = prepare(viser, session.anatomy)
             self._organ = OrganView(viser.scene, session.anatomy)
-            model = session.instrument.model
-            self._instrument = InstrumentView(viser.scene, model, session.geoms, session.arm_count)
-            self._judge.nodes.update(self._instrument.on_drag(self._dragged))
-            size = float(np.ptp(session.anatomy.mesh.points, axis=0).max())
-            self._handles = [
-                add_handle(viser.scene, arm, place, size, session.directions, self._pulled)
-                for arm, place in enumerate(session.parked)
-            ]
-            self._judge.nodes.update(handle.name for handle in self._handles)
-            self._arrows = [ForceArrow(viser.scene, arm) for arm in range(session.arm_count)]
-            calls = {
-                "pause": lambda on: session.ask(Pause(on)),
-                "reset": self._reset,
-                "record": lambda on: session.ask(Record(on)),
-                "replay": lambda on: session.ask(Replay(on)),
-                "show_lesions": self._show_lesions,
-                "paint": self._show_paint,
-                "clear_map": self.felt.clear,
-                "close_jaw": session.close_jaw,
-                "plain": self.show_plain,
-            }
+            self._add_instrument()
             self._panel = Panel(
-                viser.gui, self._judge, session.scene, session.arm_count, session.instrument.jaw is not None, calls
+                viser.gui,
+                self._judge,
+                session.scene,
+                session.arm_count,
+                session.instrument.jaw is not None,
+                self._calls(),
             )
+
+    def _add_instrument(self) -> None:
+        """The instrument, a handle at each hand, an arrow of force at each tip."""
+        session, scene = self.session, self.server.viser.scene
+        self._instrument = InstrumentView(scene, session.instrument.model, session.geoms, session.arm_count)
+        self._judge.nodes.update(self._instrument.on_drag(self._dragged))
+        size = float(np.ptp(session.anatomy.mesh.points, axis=0).max())
+        self._handles = [
+            add_handle(scene, arm, place, size, session.directions, self._pulled)
+            for arm, place in enumerate(session.parked)
+        ]
+        self._judge.nodes.update(handle.name for handle in self._handles)
+        self._arrows = [ForceArrow(scene, arm) for arm in range(session.arm_count)]
+
+    def _calls(self) -> dict[str, Callable[..., None]]:
+        """What the panel calls; a click turns over what the physics is doing then, not what a button's name says."""
+        session = self.session
+        return {
+            "pause": lambda: session.ask(Pause(session.frame()["phase"] != Phase.PAUSED)),
+            "reset": self._reset,
+            "record": lambda: session.ask(Record(not session.frame()["recording"])),
+            "replay": lambda: session.ask(Replay(not session.frame()["replaying"])),
+            "show_lesions": self._show_lesions,
+            "paint": self._show_paint,
+            "clear_map": self.felt.clear,
+            "close_jaw": session.close_jaw,
+            "plain": self.show_plain,
+        }
 
     def show_plain(self, on: bool) -> None:
         """Leave shadows and reflections away, on every page, or draw them again."""
@@ -218,6 +225,10 @@ class Page:
         if self._was_recording and not recording:
             self._said = write_recording(session.exchange.recorded.steps.copy(), self._out)
         self._was_recording = recording
+        doing = (int(frame["phase"]), recording, bool(frame["replaying"]))
+        if doing != self._doing:
+            self._doing = doing
+            self._show_phase(frame)
 
     def _feel(self) -> None:
         """Take the trace's new rows into the map."""
@@ -250,25 +261,15 @@ class Page:
         kept = timeliness(self._before[0], now[0], wall)
         fps = (pictures - self._pictures_before) / wall
         self._before, self._pictures_before = now, pictures
-        phase, drawn = Phase(int(frame["phase"])), self._rate.slowest
-        headline = "replaying" if frame["replaying"] else "recording" if frame["recording"] else TITLES[phase]
-        rows = [
-            ("simulated time", f"{float(frame['time']):.1f} s"),
-            ("physics", f"{kept.rate:.0f} steps/s"),
-            ("real-time factor", f"{kept.real_time:.3f}"),
-            ("late, median / 99 %", f"{kept.late_p50 * 1e3:.2f} / {kept.late_p99 * 1e3:.2f} ms"),
-            ("a step takes", f"{kept.spent_p50 * 1e3:.2f} ms"),
-            ("steps skipped so far", f"{int(now[0]['skipped'])}"),
-            ("pictures", f"{fps:.0f} /s" + ("" if drawn is None else f" (browser {drawn:.0f})")),
-        ]
-        if float(frame["added_mass"]) > 0.0:
-            rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))
-        words = bytes(frame["said"]).decode("utf-8", "replace") or self._said
-        if words:
-            rows.append(("", html.escape(words)))
-        self._panel.show_status(headline, rows)
+        rows = status_rows(
+            frame, kept, skipped=int(now[0]["skipped"]), fps=fps, drawn=self._rate.slowest, said=self._said
+        )
+        self._panel.show_status(headline(frame), rows)
+        self._show_phase(frame)
+
+    def _show_phase(self, frame: np.ndarray) -> None:
         self._panel.show_phase(
-            paused=phase == Phase.PAUSED,
+            paused=frame["phase"] == Phase.PAUSED,
             recording=bool(frame["recording"]),
             replaying=bool(frame["replaying"]),
             recorded=self.session.exchange.recorded.count,

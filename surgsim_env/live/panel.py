@@ -49,8 +49,8 @@ class Panel:
             scene: of the session.
             arm_count: 1 or 2.
             has_jaw: whether the first arm has a jaw.
-            calls: what is called, by name: pause(on), reset(), record(on), replay(on), show_lesions(on), paint(on),
-                clear_map(), close_jaw(on), plain(on).
+            calls: what is called, by name: pause(), record() and replay(), which begin or end what they name;
+                reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), plain(on).
         """
         self._gui, self._judge, self._scene, self._calls = gui, judge, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
@@ -124,15 +124,15 @@ class Panel:
     def _add_buttons(self) -> None:
         calls = self._calls
         self._pause = self._button("Pause", "stand still, or go on")
-        self._pause.on_click(lambda _: calls["pause"](self._pause.label == "Pause"))
+        self._pause.on_click(lambda _: calls["pause"]())
         reset = self._button("Reset", "the same organ at rest, tips parked")
         reset.on_click(lambda _: calls["reset"]())
         self._record = self._button(
             "Record", "record hands, tips and forces a thousand times a second; written to a CSV file"
         )
-        self._record.on_click(lambda _: calls["record"](self._record.label == "Record"))
+        self._record.on_click(lambda _: calls["record"]())
         self._replay = self._button("Replay", "move as recorded, from the state that the recording began with")
-        self._replay.on_click(lambda _: calls["replay"](self._replay.label.startswith("Replay")))
+        self._replay.on_click(lambda _: calls["replay"]())
         self._replay.disabled = True
 
     def _add_tissue(self) -> None:

@@ -33,6 +33,8 @@ from surgsim_env.simulation import Simulation
 HOME_GAP = 0.015
 # A frame for the page is written once in so many steps, the parent and the page's requests looked at likewise.
 FRAME_STEPS, LOOK_STEPS = 16, 8
+# So many requests are heeded at a look; the others wait for the next.
+REQUESTS_MOST = 4
 # Unix's measure of how gladly a process lets others go first: below 0 is for administrators.
 NICENESS = -10
 # The hand may go through the air at this speed [m/s] before a tip follows no more.
@@ -112,7 +114,8 @@ class Physics:
         self._recording, self._replaying = False, False
         self._start_state: dict[str, np.ndarray] | None = None
         self._peak = np.zeros(len(self._hands))
-        self._asked = int(exchange.hand.peek["requests"])
+        # Requests that were heeded; those that came before the first step lie in the pipe.
+        self._asked = 0
         # The first steps load and compile.
         self._last = self._loop.step()
         self._begin_again()
@@ -142,17 +145,23 @@ class Physics:
         asked = int(self._exchange.hand.peek["requests"])
         if asked == self._asked:
             return True
+        took_long = False
         try:
-            while self._requests.poll():
+            for _ in range(REQUESTS_MOST):
+                if not self._requests.poll():
+                    break
                 request = self._requests.recv()
                 if isinstance(request, End):
                     return False
+                self._asked += 1
                 self._do(request)
+                took_long = took_long or isinstance(request, Change | Replay | Reset)
         except (EOFError, OSError):
             return False
-        self._asked = asked
-        # What took long was asked for: the clock starts again.
-        self._pacer.start()
+        # Making an organ, or a state, takes longer than a step, and was asked for: the clock starts again. Any other
+        # request is heeded within a step, and what it costs is lateness like any other.
+        if took_long:
+            self._pacer.start()
         return True
 
     def _do(self, request: Request) -> None:
@@ -202,6 +211,8 @@ class Physics:
             self._said = f"not that organ: {error}"
 
     def _record(self, on: bool) -> None:
+        if on and self._recording:
+            return
         if on and not self._replaying:
             self._exchange.recorded.clear()
             # From a held instrument's state and couplings that start anew, so that a replay can start the same.

@@ -80,11 +80,15 @@ def served(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def fresh(served):
+    before = int(served.session.frame()["organ"])
     served.session.park()
     served.session.ask(Change(OrganChoice(lesions=NONE)))
-    before = int(served.session.frame()["organ"])
-    wait_until(lambda: served.session.frame()["phase"] == Phase.RUNNING)
-    del before
+
+    def renewed() -> bool:
+        frame = served.session.frame()
+        return int(frame["organ"]) > before and frame["phase"] == Phase.RUNNING
+
+    wait_until(renewed)
 
 
 def wait_until(condition, seconds=SECONDS):
@@ -112,23 +116,36 @@ def test_a_client_presses_and_is_sent_a_moving_organ(served):
 
 
 def test_a_slow_client_is_not_waited_for(served):
-    """It takes a message in two seconds: the other one's pictures and the physics go on."""
+    """It takes a message in two seconds: the other one's pictures and the physics go on as without it."""
     slow = ProtocolClient(served.address, pause=2.0)
     quick = ProtocolClient(served.address)
-    slow.start()
-    wait_until(lambda: slow.updates >= 1)
+
+    def rates() -> np.ndarray:
+        """Steps, pictures and the quick client's updates a second."""
+        before = counts()
+        time.sleep(4.0)
+        made = counts() - before
+        return made[:3] / made[3]
+
+    def counts() -> np.ndarray:
+        steps, now = served.session.timing()
+        return np.array([steps["steps"], served.page.pictures, quick.updates, now])
+
     quick.start()
     try:
         wait_until(lambda: quick.updates >= 5)
-        steps, updates, pictures = served.session.timing()[0]["steps"], quick.updates, served.page.pictures
+        alone = rates()
+        slow.start()
+        wait_until(lambda: slow.updates >= 1)
         taken = slow.updates
-        time.sleep(4.0)
-        assert quick.updates - updates > 10 * (slow.updates - taken)
-        assert served.page.pictures - pictures > 20
-        assert served.session.timing()[0]["steps"] - steps > 200
+        beside = rates()
+        assert slow.updates - taken <= 4
     finally:
         quick.stop()
         slow.stop()
+    # Messages that nobody takes cost something, and a busy machine is uneven.
+    assert (beside > 0.6 * alone).all()
+    assert not quick.errors
 
 
 def test_keys_move_the_hand_and_let_go_with_the_tab(served):
@@ -209,39 +226,64 @@ def test_two_tabs_share_one_organ_and_one_may_go(served):
     assert not other.errors
 
 
+def setting(handle, value):
+    return msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}})
+
+
+async def send(served, *messages):
+    async with served.socket() as socket:
+        await socket.send(msgspec.msgpack.encode(CAMERA))
+        await asyncio.wait_for(socket.recv(), SECONDS)
+        for message in messages:
+            await socket.send(message)
+        await asyncio.sleep(0.5)
+
+
 def test_panel_settings_reach_the_physics(served):
     """A slider's own message, as a browser sends it; one beyond its range changes nothing."""
     panel, session = served.page._panel, served.session
 
-    def setting(handle, value):
-        return msgspec.msgpack.encode(
-            {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
-        )
-
-    async def send(*messages):
-        async with served.socket() as socket:
-            await socket.send(msgspec.msgpack.encode(CAMERA))
-            await asyncio.wait_for(socket.recv(), SECONDS)
-            for message in messages:
-                await socket.send(message)
-            await asyncio.sleep(0.5)
-
     organ = int(session.frame()["organ"])
-    asyncio.run(send(setting(panel._modulus, 9.0)))
+    asyncio.run(send(served, setting(panel._modulus, 9.0)))
     wait_until(lambda: int(session.frame()["organ"]) > organ)
     assert session.choice.modulus_factor == pytest.approx(9.0 / (session.scene.material.youngs_modulus / 1e3))
     ignored = served.page._judge.ignored
-    asyncio.run(send(setting(panel._modulus, 1e9), setting(panel._lesions, "all of them")))
+    asyncio.run(send(served, setting(panel._modulus, 1e9), setting(panel._lesions, "all of them")))
     assert served.page._judge.ignored == ignored + 2 and panel._modulus.value == 9.0
-    asyncio.run(send(setting(panel._pause, True)))
+    asyncio.run(send(served, setting(panel._pause, True)))
     wait_until(lambda: session.frame()["phase"] == Phase.PAUSED)
     session.ask(Pause(False))
     wait_until(lambda: session.frame()["phase"] == Phase.RUNNING)
 
 
+def test_a_click_means_what_the_physics_is_doing(served, monkeypatch, tmp_path):
+    """Whatever the button's name says: names are never renewed here."""
+    panel, session = served.page._panel, served.session
+    monkeypatch.setattr(served.page, "_out", tmp_path)
+    monkeypatch.setattr(panel, "_name", lambda *_: None)
+    for phase in (Phase.PAUSED, Phase.RUNNING):
+        asyncio.run(send(served, setting(panel._pause, True)))
+        wait_until(lambda phase=phase: session.frame()["phase"] == phase)
+    for recording in (True, False):
+        asyncio.run(send(served, setting(panel._record, True)))
+        wait_until(lambda recording=recording: bool(session.frame()["recording"]) == recording)
+    wait_until((tmp_path / "recording-1.csv").is_file)
+
+
+def test_buttons_are_renamed_with_the_next_picture(served, monkeypatch):
+    panel, session = served.page._panel, served.session
+    # They do not wait for the words that are said twice a second.
+    monkeypatch.setattr(served.page, "_say", lambda _: None)
+    session.ask(Pause(True))
+    wait_until(lambda: panel._pause.label == "Go on", 20.0)
+    session.ask(Pause(False))
+    wait_until(lambda: panel._pause.label == "Pause", 20.0)
+
+
 def test_a_recording_is_written_to_its_folder_alone(served):
     session = served.session
     session.ask(Record(True))
+    wait_until(lambda: session.frame()["recording"])
     wait_until(lambda: session.exchange.recorded.count > 100)
     session.ask(Record(False))
     wait_until(lambda: (served.out / "recording-1.csv").is_file())

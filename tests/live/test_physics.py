@@ -19,7 +19,7 @@ from surgsim_env.live.organ_choice import (
 )
 from surgsim_env.live.organ_view import COLOURS, colour_levels
 from surgsim_env.live.pacing import PaceSettings
-from surgsim_env.live.physics import Physics, Setup
+from surgsim_env.live.physics import REQUESTS_MOST, Physics, Setup
 from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Reset
 from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scenes import make_scene
@@ -190,6 +190,39 @@ def test_a_fault_stops_and_a_reset_goes_on(bench):
     bench.ask(Reset())
     bench.step(100, bench.above)
     assert bench.frame["phase"] == Phase.RUNNING and np.isfinite(bench.frame["node"]).all()
+
+
+def test_a_recording_that_runs_is_not_begun_again(bench):
+    bench.ask(Record(True))
+    bench.step(50, bench.above)
+    bench.ask(Record(True))
+    bench.step(50, bench.above)
+    bench.ask(Record(False))
+    steps = bench.exchange.recorded.steps
+    assert len(steps) == 100 and np.allclose(np.diff(steps["time"]), 1e-3)
+
+
+def test_lateness_is_forgiven_to_requests_that_take_long_alone(bench):
+    starts = []
+    bench.physics._pacer.start = lambda: starts.append(True)
+    for request in (Pause(True), Pause(False), Record(True), Record(False)):
+        bench.ask(request)
+    assert not starts
+    for request in (Reset(), Change(OrganChoice(lesions=NONE)), Replay(True)):
+        bench.ask(request)
+    assert len(starts) == 3
+
+
+def test_many_requests_wait_for_their_turn(bench):
+    for _ in range(3 * REQUESTS_MOST):
+        bench.pipe.send(Pause(True))
+    with bench.exchange.hand.writing() as hand:
+        hand["requests"] += 3 * REQUESTS_MOST
+    heeded = []
+    bench.physics._do = heeded.append
+    for looks in range(1, 5):
+        assert bench.physics._look(lambda: True)
+        assert len(heeded) == min(looks, 3) * REQUESTS_MOST
 
 
 def test_nobody_left_ends_it(bench):

@@ -2,6 +2,7 @@
 
 import csv
 import gc
+import math
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -37,8 +38,8 @@ def run_haptics(options: Haptics, console: Console) -> None:
         ValueError: an unknown scene, a bad trajectory, a coupling that the device cannot bear, two arms.
         OSError: the port is taken, or a file cannot be read.
     """
-    if options.seconds is not None and not options.seconds > 0.0:
-        raise ValueError(f"--seconds is {options.seconds:g}; it must be above 0")
+    if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0.0):
+        raise ValueError(f"--seconds is {options.seconds:g}; it must be finite and above 0")
     scene = _scene(options.scene)
     simulation = Simulation(load_anatomy(scene))
     anatomy = simulation.anatomy

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.haptics.device import DevicePose, require_positive
+from surgsim_env.haptics.motion_file import BUTTONS_RULE, are_buttons, motion_columns, read_motion
 
-COLUMNS = ("time", "x", "y", "z", "buttons")
 # A trajectory of an hour at 1 kHz.
 ROWS_LARGEST = 3_600_000
 
@@ -27,7 +27,7 @@ class TrajectoryDevice:
         self,
         time: FloatArray,
         position: FloatArray,
-        buttons: Sequence[int] | None = None,
+        buttons: Sequence[int] | IntArray | None = None,
         *,
         haptic_step: float = 1e-3,
     ) -> None:
@@ -36,7 +36,7 @@ class TrajectoryDevice:
         Args:
             time: of each row [s], growing, (n,).
             position: in the device's frame [m], (n, 3).
-            buttons: pressed from each row on, (n,); none by default.
+            buttons: pressed from each row on, from 0 to 2^31 - 1, (n,); none by default.
             haptic_step: of the loop that reads it [s].
 
         Raises:
@@ -46,14 +46,20 @@ class TrajectoryDevice:
         self._time = np.array(time, dtype=np.float64)
         self._position = np.array(position, dtype=np.float64)
         count = len(self._time)
-        self._buttons = np.zeros(count, dtype=np.int64) if buttons is None else np.array(buttons, dtype=np.int64)
+        pressed = np.zeros(count, dtype=np.int32) if buttons is None else np.asarray(buttons)
         if self._time.shape != (count,) or count < 1 or self._position.shape != (count, 3):
             raise ValueError(
                 f"a trajectory has times (n,) and positions (n, 3), n at least 1; these are {self._time.shape} and "
                 f"{self._position.shape}"
             )
-        if self._buttons.shape != (count,):
-            raise ValueError(f"a trajectory of {count} rows has buttons of shape {self._buttons.shape}; give one a row")
+        if pressed.shape != (count,):
+            raise ValueError(f"a trajectory of {count} rows has buttons of shape {pressed.shape}; give one a row")
+        wrong = [row for row, bits in enumerate(pressed.tolist()) if not are_buttons(bits)]
+        if wrong:
+            raise ValueError(
+                f"buttons of row {wrong[0]} of the trajectory are {pressed[wrong[0]]}; they must be {BUTTONS_RULE}"
+            )
+        self._buttons = pressed.astype(np.int32)
         finite = np.isfinite(self._time) & np.isfinite(self._position).all(axis=1)
         if not finite.all():
             raise ValueError(f"row {np.flatnonzero(~finite)[0]} of the trajectory has a number that is not finite")
@@ -70,32 +76,12 @@ class TrajectoryDevice:
         """Read a CSV file with a header: time [s], x, y, z [m] and, if it likes, buttons; other columns are left.
 
         Raises:
-            ValueError: a missing column, a row that is no numbers, too many rows, or what `TrajectoryDevice` refuses;
-                names file and row.
+            ValueError: what `read_motion` or `TrajectoryDevice` refuses; names the file, and the line or the row.
+            OSError: a file that cannot be read.
         """
-        rows: list[list[float]] = []
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            reader = csv.DictReader(file)
-            names = reader.fieldnames or []
-            missing = [name for name in COLUMNS[:4] if name not in names]
-            if missing:
-                raise ValueError(
-                    f"{path.name}: column {missing[0]!r} is missing; a trajectory has {', '.join(COLUMNS)}"
-                )
-            columns = [name for name in COLUMNS if name in names]
-            for number, row in enumerate(reader):
-                if number >= ROWS_LARGEST:
-                    raise ValueError(f"{path.name}: more than {ROWS_LARGEST} rows; cut it into parts")
-                try:
-                    rows.append([float(row[name]) for name in columns])
-                except (TypeError, ValueError):
-                    raise ValueError(f"{path.name}: row {number} is not {', '.join(columns)} in numbers") from None
-        if not rows:
-            raise ValueError(f"{path.name}: no rows below the header")
-        table = np.array(rows)
-        buttons = [int(number) if np.isfinite(number) else 0 for number in table[:, 4]] if len(columns) > 4 else None
+        motion = read_motion(path, rows_largest=ROWS_LARGEST)
         try:
-            return cls(table[:, 0], table[:, 1:4], buttons, haptic_step=haptic_step)
+            return cls(motion.time, motion.position[:, 0], motion.buttons[:, 0], haptic_step=haptic_step)
         except ValueError as error:
             raise ValueError(f"{path.name}: {error}") from None
 
@@ -126,6 +112,6 @@ def save_trajectory(path: Path, time: FloatArray, position: FloatArray, buttons:
     pressed = [0] * len(time) if buttons is None else buttons
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(COLUMNS)
+        writer.writerow(["time", *motion_columns()])
         for row in zip(np.asarray(time).tolist(), np.asarray(position).tolist(), pressed, strict=True):
             writer.writerow([repr(row[0]), *map(repr, row[1]), int(row[2])])

@@ -90,7 +90,9 @@ def test_bridge_feels_the_organ(capsys):
     ("more", "words"),
     [
         (["--scene", "phantom_smal"], "did you mean 'phantom_small'"),
-        (["--seconds", "0"], "--seconds is 0; it must be above 0"),
+        (["--seconds", "0"], "--seconds is 0; it must be finite and above 0"),
+        (["--seconds", "inf"], "--seconds is inf; it must be finite and above 0"),
+        (["--seconds", "nan"], "--seconds is nan; it must be finite and above 0"),
         (["--damping", "1"], "--damping is of a coupling whose --stiffness is given"),
         (["--device-damping", "0.5", "--stiffness", "2000"], "is stiffer than 800 N/m"),
         (["--device-damping", "-1"], "device damping is -1.0 N s/m"),
@@ -102,6 +104,18 @@ def test_bridge_feels_the_organ(capsys):
 def test_bad_input_is_one_line(more, words, capsys):
     arguments = ["haptics", *([] if "--scene" in more else ["--scene", "phantom_small"]), *more]
     assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1 and "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [("0,0,0,0,1e300", "line 2: buttons is 1e+300"), (f"0,0,0,0,{'1' * 200_000}", "line 2: field larger than")],
+)
+def test_bad_trajectory_is_one_line(tmp_path, row, words, capsys):
+    path = tmp_path / "way.csv"
+    path.write_text(f"time,x,y,z,buttons\n{row}\n", encoding="utf-8")
+    assert main(["haptics", "--scene", "phantom_small", "--trajectory", str(path)]) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1 and "Traceback" not in said
 

@@ -49,8 +49,8 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "no column 'time'"),
-        ("time,x,y\n0,0,0\n", "no column 'z'"),
+        ("", "column 'time' is missing"),
+        ("time,x,y\n0,0,0\n", "column 'z' is missing"),
         ("time,x,y,z\n", "no rows"),
         ("time,x,y,z\n0,0,0,zero\n", "line 2"),
         ("time,x,y,z\n0,0,0\n", "line 2"),
@@ -58,6 +58,8 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
         ("time,x,y,z\n0,0,0,inf\n", "not finite"),
         ("time,x,y,z,buttons\n0,0,0,0,one\n", "line 2"),
         ("time,x,y,z,buttons\n0,0,0,0,inf\n", "line 2"),
+        ("time,x,y,z,buttons\n0,0,0,0,1e300\n", "line 2: buttons is 1e\\+300"),
+        ("time,x,y,z\n" + "1" * 200_000 + ",0,0,0\n", "line 2: field larger"),
     ],
 )
 def test_files_that_are_none_are_refused(tmp_path, text, told):

@@ -54,7 +54,8 @@ def view(request: View, console: Console) -> int:
         if request.allow_remote:
             console.print("other machines may connect; nothing on the way is encrypted", highlight=False)
         if request.replay is not None:
-            session.exchange.recorded.fill(read_recording(request.replay, session.arm_count))
+            steps = read_recording(request.replay, session.arm_count, session.scene.timing.haptic_step)
+            session.exchange.recorded.fill(steps)
             session.ask(Replay(True, given=True))
         watching = Measurement(page) if request.measure else contextlib.nullcontext()
         with watching, _stopping() as stop:

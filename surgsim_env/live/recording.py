@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.haptics.motion_file import motion_columns, read_motion
+from surgsim_env.haptics.motion_file import Motion, motion_columns, read_motion
 from surgsim_env.live.exchange_records import RECORDING_MOST, recording_type
+
+# Rows whose times differ from a haptic step by less than this share of it lie one apart.
+STEP_TOLERANCE = 0.01
 
 
 def columns(arm_count: int) -> list[str]:
@@ -42,20 +45,47 @@ def write_recording(steps: NDArray[Any], folder: Path) -> str:
     return f"{len(steps)} steps written to {path.name}"
 
 
-def read_recording(path: Path, arm_count: int) -> NDArray[Any]:
+def read_recording(path: Path, arm_count: int, haptic_step: float) -> NDArray[Any]:
     """The steps of a file that `write_recording` wrote, or of a trajectory with columns time, x, y, z.
 
+    Rows that lie a haptic step [s] apart are taken as they are. All others are a trajectory over time: between two of
+    its rows a hand moves evenly, and has the buttons of the first; beside a row without a place (nan) there is none.
+
     Raises:
-        ValueError: names the file, the line and what is wrong with it.
+        ValueError: names the file, the line and what is wrong with it: no number, not finite, a time that does not
+            grow, more steps than a recording has room for.
         OSError: a file that cannot be read.
     """
     motion = read_motion(path, [_mark(arm) for arm in range(arm_count)], rows_largest=RECORDING_MOST)
+    time = motion.time
     # A step in which a hand said nothing is nan, nan, nan; its time is always a number.
-    if not np.isfinite(motion.time).all() or np.isinf(motion.position).any():
+    if not np.isfinite(time).all() or np.isinf(motion.position).any():
         raise ValueError(f"{path.name} has a time or a place that is not finite")
+    backward = np.flatnonzero(np.diff(time) <= 0.0)
+    if len(backward):
+        row = int(backward[0]) + 1
+        raise ValueError(f"{path.name}, row {row}: time {time[row]:g} s is not after that of the row before")
+    # Written times are rounded.
+    if (np.abs(np.diff(time) - haptic_step) > STEP_TOLERANCE * haptic_step).any():
+        motion = _resampled(path, motion, haptic_step)
     steps = np.zeros(len(motion.time), dtype=recording_type(arm_count))
     steps["time"], steps["hand"], steps["buttons"] = motion
     return steps
+
+
+def _resampled(path: Path, motion: Motion, haptic_step: float) -> Motion:
+    """A motion's rows a haptic step apart, from its first time to its last."""
+    time, places = motion.time, motion.position.reshape(len(motion.time), -1)
+    span = float(time[-1] - time[0])
+    if not span / haptic_step < RECORDING_MOST:
+        raise ValueError(
+            f"{path.name} lasts {span:g} s; a recording holds {RECORDING_MOST} steps of {haptic_step:g} s: cut it"
+        )
+    count = int(span / haptic_step + STEP_TOLERANCE) + 1
+    now = np.minimum(time[0] + haptic_step * np.arange(count), time[-1])
+    row = np.searchsorted(time, now + STEP_TOLERANCE * haptic_step, side="right") - 1
+    hand = np.column_stack([np.interp(now, time, place) for place in places.T])
+    return Motion(now, hand.reshape(count, -1, 3), motion.buttons[row])
 
 
 def _mark(arm: int) -> str:

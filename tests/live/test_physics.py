@@ -20,6 +20,7 @@ from surgsim_env.live.organ_choice import (
 from surgsim_env.live.organ_view import COLOURS, colour_levels
 from surgsim_env.live.pacing import PaceSettings
 from surgsim_env.live.physics import REQUESTS_MOST, Physics, Setup
+from surgsim_env.live.recording import read_recording
 from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Reset
 from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scenes import make_scene
@@ -141,6 +142,22 @@ def test_a_recording_from_elsewhere_starts_at_rest(bench):
     bench.ask(Replay(True, given=True))
     bench.step(501)
     assert bench.frame["time"] == pytest.approx(0.501) and not bench.frame["replaying"]
+
+
+def test_a_slow_trajectory_is_played_in_its_own_time(bench, tmp_path):
+    """Three rows in a second: the tip is where they lead it, when they lead it there."""
+    home = np.asarray(bench.physics._home)
+    path = tmp_path / "slow.csv"
+    rows = [",".join(map(repr, (0.5 * row, *(home + 0.01 * row * ASIDE).tolist()))) for row in range(3)]
+    path.write_text("time,x,y,z\n" + "\n".join(rows) + "\n")
+    bench.exchange.recorded.fill(read_recording(path, 1, bench.scene.timing.haptic_step))
+    bench.ask(Replay(True, given=True))
+    for half in (1, 2):
+        bench.step(500)
+        # A hand at 20 mm/s leads its tip by some tenths of a millimetre.
+        assert np.linalg.norm(bench.frame["tip"][0] - home - 0.01 * half * ASIDE) < 0.002
+    bench.step(2)
+    assert not bench.frame["replaying"]
 
 
 def test_pause_and_reset(bench):

@@ -7,6 +7,8 @@ from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.live.exchange_records import recording_type
 from surgsim_env.live.recording import read_recording, write_recording
 
+STEP = 1e-3
+
 
 def made_steps(arm_count=1, count=50):
     rng = np.random.default_rng(1)
@@ -24,7 +26,7 @@ def test_what_is_written_is_read(tmp_path, arm_count):
     assert "recording-1.csv" in write_recording(steps, tmp_path / "new")
     assert "recording-2.csv" in write_recording(steps, tmp_path / "new")
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["recording-1.csv", "recording-2.csv"]
-    read = read_recording(tmp_path / "new" / "recording-1.csv", arm_count)
+    read = read_recording(tmp_path / "new" / "recording-1.csv", arm_count, STEP)
     for name in ("time", "hand", "buttons"):
         np.testing.assert_allclose(read[name], steps[name], rtol=1e-8)
 
@@ -34,6 +36,38 @@ def test_the_haptic_package_plays_it(tmp_path):
     write_recording(steps, tmp_path)
     device = TrajectoryDevice.load(tmp_path / "recording-1.csv")
     np.testing.assert_allclose(device.read().position, steps["hand"][0, 0], rtol=1e-8)
+
+
+def test_a_slow_trajectory_keeps_its_own_time(tmp_path):
+    """Ten rows a second, as a tracker tells: a millimetre from each to the next, the button from the third on."""
+    path = tmp_path / "slow.csv"
+    rows = [f"{2.0 + 0.1 * row:.1f},{1e-3 * row},0,{-1e-3 * row},{int(row >= 2)}" for row in range(6)]
+    path.write_text("time,x,y,z,buttons\n" + "\n".join(rows) + "\n")
+    read = read_recording(path, 1, STEP)
+    assert len(read) == 501
+    np.testing.assert_allclose(read["time"], 2.0 + STEP * np.arange(501), atol=1e-12)
+    np.testing.assert_allclose(read["hand"][:, 0, 0], np.linspace(0.0, 5e-3, 501), atol=1e-12)
+    np.testing.assert_allclose(read["hand"][:, 0, 2], -read["hand"][:, 0, 0])
+    np.testing.assert_array_equal(read["buttons"][:, 0], np.arange(501) >= 200)
+
+
+def test_a_gap_in_a_slow_trajectory_stays_one(tmp_path):
+    path = tmp_path / "gap.csv"
+    path.write_text("time,x,y,z\n0,0,0,0\n0.01,1,0,0\n0.02,nan,nan,nan\n0.03,3,0,0\n0.04,4,0,0\n")
+    places = read_recording(path, 1, STEP)["hand"][:, 0, 0]
+    assert np.isnan(places[11:30]).all() and np.isfinite(places[:10]).all() and np.isfinite(places[31:]).all()
+
+
+def test_a_native_recording_is_taken_as_it_is(tmp_path):
+    """To the bit of what is written, with steps in which the hand said nothing, and late enough for rounded times."""
+    steps = made_steps(count=200)
+    steps["time"] += 290.0
+    steps["hand"][50:60] = np.nan
+    write_recording(steps, tmp_path)
+    read = read_recording(tmp_path / "recording-1.csv", 1, STEP)
+    written = np.genfromtxt(tmp_path / "recording-1.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(read["hand"][:, 0], np.column_stack([written[axis] for axis in "xyz"]))
+    np.testing.assert_array_equal(read["buttons"], steps["buttons"])
 
 
 def test_nothing_recorded_writes_nothing(tmp_path):
@@ -56,6 +90,9 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
         ("time,x,y,z\n0,0,0\n", "line 2"),
         ("time,x,y,z\nnan,0,0,0\n", "not finite"),
         ("time,x,y,z\n0,0,0,inf\n", "not finite"),
+        ("time,x,y,z\n0,0,0,0\n1,0,0,0\n1,0,0,0\n", "row 2: time 1 s is not after"),
+        ("time,x,y,z\n0,0,0,0\n301,0,0,0\n", "lasts 301 s"),
+        ("time,x,y,z\n0,0,0,0\n1e300,0,0,0\n", "lasts 1e.300 s"),
         ("time,x,y,z,buttons\n0,0,0,0,one\n", "line 2"),
         ("time,x,y,z,buttons\n0,0,0,0,inf\n", "line 2"),
         ("time,x,y,z,buttons\n0,0,0,0,1e300\n", "line 2: buttons is 1e\\+300"),
@@ -66,4 +103,4 @@ def test_files_that_are_none_are_refused(tmp_path, text, told):
     path = tmp_path / "made.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=told):
-        read_recording(path, 1)
+        read_recording(path, 1, STEP)

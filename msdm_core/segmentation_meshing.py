@@ -178,7 +178,8 @@ def largest_part(image: NDArray, tags: list[int]) -> tuple[NDArray[np.bool_], ND
     part, count = parts_of(mask)
     sizes = np.bincount(part.ravel(), minlength=count + 1)[1:]
     kept = int(np.argmax(sizes))
-    box = ndimage.find_objects(part)[kept]
+    # The box of this part alone: noise has millions of parts, and a list of their boxes is larger than the image.
+    box = ndimage.find_objects((part == kept + 1).view(np.uint8))[0]
     corner = np.array([one.start for one in box], dtype=np.int64)
     rest = np.sort(np.delete(sizes, kept))[::-1]
     return part[box] == kept + 1, corner, tuple(int(size) for size in rest)

@@ -62,9 +62,10 @@ def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLab
         parts = _parts(chosen, smallest / image.voxel_volume, split=is_lesion(name))
         if parts.left_count:
             millilitres = parts.left_voxels * image.voxel_volume * 1e6
+            beyond = f"beyond the {PARTS_MOST} largest or " if parts.count == PARTS_MOST else ""
             notes.append(
-                f"{name}: {parts.left_count} part(s), {millilitres:.3g} ml together, are smaller than what cells of "
-                f"{cell_size * 1e3:.3g} mm can show ({smallest * 1e6:.2g} ml) and became {image.names[0]}"
+                f"{name}: {parts.left_count} part(s), {millilitres:.3g} ml together, are {beyond}smaller than what "
+                f"cells of {cell_size * 1e3:.3g} mm can show ({smallest * 1e6:.2g} ml) and became {image.names[0]}"
             )
         added = [name if parts.count == 1 else f"{name} {number}" for number in range(1, parts.count + 1)]
         _check_names(names, added, name)

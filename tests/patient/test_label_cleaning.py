@@ -62,5 +62,19 @@ def test_many_parts_take_no_masks_of_the_whole_image():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(clean.names) == 25
+    assert "lesion: 3 part(s), 0.192 ml together, are beyond the 24 largest or smaller than" in clean.notes[-1]
     # Tags of a byte, parts of four bytes, and what numpy's count of them takes, eight; masks of 24 parts would be 24.
     assert peak < 20 * image.tags.size
+
+
+def test_noise_of_many_parts_takes_no_list_of_their_boxes():
+    tags = np.zeros((90, 90, 90), dtype=np.uint8)
+    tags[::2, ::2, ::2] = 1
+    tags[40:49, 40:49, 40:49] = 1
+    tracemalloc.start()
+    clean = clean_labels(image_of(tags, ["liver"]), cell_size=0.004, mend=False)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert clean.notes[0].startswith(f"{45**3 - 125} part(s) apart from the largest were left out")
+    # Parts of four bytes, numpy's copy of eight to count them, masks; boxes of 91000 parts would be some 45 a voxel.
+    assert peak < 24 * tags.size

@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 
 from surgsim_env.live.command import report_lines
-from surgsim_env.live.pacing import timeliness
 from surgsim_env.live.page import Page
 from surgsim_env.live.protocol_client import press_path
 from surgsim_env.live.session import Session
+from surgsim_env.pacing import timeliness
 from surgsim_env.scenes import make_scene
 from tests.live.chromium import Browser
 

@@ -3,10 +3,12 @@
 import csv
 import gc
 import math
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from surgsim_env.anatomy import load_anatomy
@@ -16,12 +18,12 @@ from surgsim_env.haptics.device import DeviceDynamics, HapticDevice
 from surgsim_env.haptics.limits import ForceLimits
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.options import Haptics
-from surgsim_env.haptics.pace import Pace
 from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.telemetry import HapticTelemetry
 from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.haptics.udp import UdpDevice
 from surgsim_env.out_folder import writable_folder
+from surgsim_env.pacing import TIMING, Pacer, PaceSettings, timeliness
 from surgsim_env.scenes import Scene, load_scene, make_scene, pair_names
 from surgsim_env.simulation import Simulation
 
@@ -59,24 +61,28 @@ def run_haptics(options: Haptics, console: Console) -> None:
         # What is there by now stays, and nothing that a step makes lies in a cycle: no collection delays a step.
         gc.collect()
         gc.freeze()
-        pace = Pace(simulation.haptic_dt)
+        timing = np.zeros((), dtype=TIMING)
+        begin = time.perf_counter()
+        pacer = Pacer(PaceSettings(simulation.haptic_dt), timing)
         try:
-            _hold(options, loop, device, pace, note, console)
+            _hold(options, loop, device, pacer, note, console)
         finally:
+            kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
             console.print(
-                f"{pace.rate:.1f} haptic steps a second; late by {pace.lateness(0.5) * 1e3:.2f} ms (half), "
-                f"{pace.lateness(0.99) * 1e3:.2f} ms (99 %), {pace.lateness(1.0) * 1e3:.2f} ms (all); "
-                f"{pace.skipped} steps given up"
+                f"{kept.rate:.1f} haptic steps a second; late by {kept.late_p50 * 1e3:.2f} ms (half), "
+                f"{kept.late_p99 * 1e3:.2f} ms (99 %), {kept.late_most * 1e3:.2f} ms (all); "
+                f"{kept.skipped} steps given up"
             )
             if isinstance(device, UdpDevice):
                 console.print(f"packets: {device.counts}")
 
 
-def _hold(options: Haptics, loop: HapticLoop, device: HapticDevice, pace: Pace, note, console: Console) -> None:
+def _hold(options: Haptics, loop: HapticLoop, device: HapticDevice, pacer: Pacer, note, console: Console) -> None:
     every = round(1.0 / loop.simulation.haptic_dt)
     count = None if options.seconds is None else round(options.seconds / loop.simulation.haptic_dt)
     step = 0
     while count is None or step < count:
+        pacer.wait()
         told = loop.step()
         note(told)
         step += 1
@@ -87,9 +93,9 @@ def _hold(options: Haptics, loop: HapticLoop, device: HapticDevice, pace: Pace, 
         if told.fault:
             console.print(f"the organ came to grief and is reset: {told.fault}")
             loop.reset(tip_position=parked_place(loop.simulation.anatomy))
+        pacer.done(loop.simulation.haptic_dt)
         if options.seconds is None and isinstance(device, TrajectoryDevice) and device.over:
             break
-        pace.wait()
 
 
 def _scene(name: str) -> Scene:

@@ -14,7 +14,8 @@ class DevicePose(NamedTuple):
         position: in the device's own frame [m], shape (3,)
         time: when it was read, on a clock that never goes back [s]
         buttons: one bit each, the first is 1
-        rotation: unit quaternion (w, x, y, z) from the handle's axes to the device's frame; None where not measured
+        rotation: unit quaternion (w, x, y, z) from the handle's axes to the device's frame; None where not measured.
+            Not used in this version: a device moves a tip and does not turn it.
     """
 
     position: FloatArray

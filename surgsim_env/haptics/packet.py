@@ -31,7 +31,7 @@ class PosePacket(NamedTuple):
         time: on the sender's clock [s]; the answer brings it back
         position: [m], (3,)
         buttons: one bit each, 16 of them
-        rotation: unit quaternion (w, x, y, z), or None
+        rotation: unit quaternion (w, x, y, z), or None; checked, and not used in this version
     """
 
     sequence: int

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.options import View
-from surgsim_env.live.pacing import Timeliness, timeliness
+from surgsim_env.pacing import Timeliness, timeliness
 from surgsim_env.scenes import make_scene, with_instrument
 
 # The scene that has ports for two arms, and the two that work there.

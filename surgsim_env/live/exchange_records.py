@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.live.pacing import TIMING
 from surgsim_env.live.shared_record import SharedRecord
+from surgsim_env.pacing import TIMING
 
 # One row of the trace covers this many haptic steps, and so many rows are kept: 20 s at 1 kHz.
 TRACE_STEPS, TRACE_LENGTH = 10, 2048

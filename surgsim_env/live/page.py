@@ -19,7 +19,6 @@ from surgsim_env.live.hand_messages import read_hand, read_rate
 from surgsim_env.live.instrument_view import SCALE, InstrumentView
 from surgsim_env.live.organ_choice import chosen_lesions
 from surgsim_env.live.organ_view import OrganView
-from surgsim_env.live.pacing import timeliness
 from surgsim_env.live.panel import Panel
 from surgsim_env.live.picture_rate import PictureRate
 from surgsim_env.live.recording import write_recording
@@ -28,6 +27,7 @@ from surgsim_env.live.session import Session
 from surgsim_env.live.stage import ForceArrow, add_handle, light, prepare
 from surgsim_env.live.status import headline, status_rows
 from surgsim_env.live.web_messages import Judge, NonsenseError
+from surgsim_env.pacing import timeliness
 
 # Between plots, and between words [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5

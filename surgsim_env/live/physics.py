@@ -23,8 +23,8 @@ from surgsim_env.instrument import Instrument, Probe
 from surgsim_env.live.browser_device import BrowserDevice, Hands, RecordedHand
 from surgsim_env.live.exchange_records import TRACE_LENGTH, TRACE_STEPS, Exchange, Phase, said
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
-from surgsim_env.live.pacing import Pacer, PaceSettings
 from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Request, Reset
+from surgsim_env.pacing import Pacer, PaceSettings
 from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scenes import Scene
 from surgsim_env.simulation import Simulation

@@ -16,9 +16,9 @@ from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import TRACE_LENGTH, Exchange, Phase, new_exchange
 from surgsim_env.live.hand_messages import HandMotion
 from surgsim_env.live.organ_choice import OrganChoice, lesion_kinds, live_scene
-from surgsim_env.live.pacing import PaceSettings
 from surgsim_env.live.physics import Setup, home_of, run_physics
 from surgsim_env.live.requests import Change, End, Request
+from surgsim_env.pacing import PaceSettings
 from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scenes import Scene
 from surgsim_env.simulation import Simulation

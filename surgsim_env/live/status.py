@@ -6,7 +6,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from surgsim_env.live.exchange_records import Phase
-from surgsim_env.live.pacing import Timeliness
+from surgsim_env.pacing import Timeliness
 
 TITLES = {
     Phase.STARTING: "starting",

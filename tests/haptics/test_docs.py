@@ -11,11 +11,11 @@ from surgsim_env.haptics.coupling import TipDynamics, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.limits import ForceLimits
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.pace import Pace
 from surgsim_env.haptics.packet import FORCE, POSE
 from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.udp import UdpDevice
 from surgsim_env.haptics.watchdog import WatchdogTimes
+from surgsim_env.pacing import TIMING, Pacer, PaceSettings
 from tests.haptics.bench_hand import DT, touching_simulation
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "haptics.md").read_text(encoding="utf-8")
@@ -41,10 +41,11 @@ def test_the_bridge_feels_the_press():
     arguments = (lambda: (0.0, 0.0, -next(way, 0.006)), felt.append, device.address[1], 1.5)
     bridge = threading.Thread(target=names["bridge"], args=arguments)
     bridge.start()
-    pace = Pace(DT)
+    pacer = Pacer(PaceSettings(DT), np.zeros((), dtype=TIMING))
     while bridge.is_alive():
+        pacer.wait()
         assert not loop.step().fault
-        pace.wait()
+        pacer.done(DT)
     bridge.join()
     device.close()
     assert max(force[2] for force in felt) > 0.1

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from surgsim_env.live.pacing import PaceSettings
 from surgsim_env.live.page import Page
 from surgsim_env.live.session import Session
 from surgsim_env.live.stage import page_camera
+from surgsim_env.pacing import PaceSettings
 from surgsim_env.scenes import make_scene
 from tests.live.chromium import CHROMIUM, Browser
 

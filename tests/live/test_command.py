@@ -13,7 +13,7 @@ import pytest
 from surgsim_env import cli
 from surgsim_env.live.command import missed_targets
 from surgsim_env.live.errors import LiveError
-from surgsim_env.live.pacing import Timeliness
+from surgsim_env.pacing import Timeliness
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 KEPT = Timeliness(

@@ -20,11 +20,11 @@ from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.hand_messages import HandMotion, write_hand
 from surgsim_env.live.organ_choice import HIDDEN, NONE, OrganChoice
-from surgsim_env.live.pacing import PaceSettings
 from surgsim_env.live.page import Page
 from surgsim_env.live.protocol_client import CAMERA, ProtocolClient, hand_message, press_path
 from surgsim_env.live.requests import Change, Pause, Record, Reset
 from surgsim_env.live.session import Session
+from surgsim_env.pacing import PaceSettings
 from surgsim_env.scenes import make_scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -320,7 +320,7 @@ def test_a_place_that_is_not_finite_is_refused(served):
 CHILD = """
 import sys, time
 from surgsim_env.live.session import Session
-from surgsim_env.live.pacing import PaceSettings
+from surgsim_env.pacing import PaceSettings
 from surgsim_env.scenes import make_scene
 if __name__ == "__main__":
     session = Session(make_scene("phantom_small"), pace=PaceSettings(period=0.01))

@@ -18,10 +18,10 @@ from surgsim_env.live.organ_choice import (
     live_scene,
 )
 from surgsim_env.live.organ_view import COLOURS, colour_levels
-from surgsim_env.live.pacing import PaceSettings
 from surgsim_env.live.physics import REQUESTS_MOST, Physics, Setup
 from surgsim_env.live.recording import read_recording
 from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Reset
+from surgsim_env.pacing import PaceSettings
 from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scenes import make_scene
 from surgsim_env.simulation import Simulation

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import RecordedSteps, said
-from surgsim_env.live.pacing import CLASS_WIDTH, TIMING, Pacer, PaceSettings, quantile, timeliness
 from surgsim_env.live.shared_record import SharedRecord
+from surgsim_env.pacing import CLASS_WIDTH, TIMING, Pacer, PaceSettings, quantile, timeliness
 
 PAIR = np.dtype([("one", "f8", (500,)), ("other", "f8", (500,))])
 

@@ -209,3 +209,40 @@ def test_clamped_coupling_takes_energy_too():
         assert -device.work >= -ROUNDING
     assert told.tip.clamped
     assert np.linalg.norm(told.tip.force) == pytest.approx(1.0)
+
+
+def tapped_with_a_cut(settings: HapticSettings) -> tuple[np.ndarray, np.ndarray, float]:
+    """A hand taps once a second, its link is cut for 0.2 s: energy held, energy of the hand, bound [J]."""
+    device = held_device(
+        hand=Hand(stiffness=300.0, damping=1.0),
+        path=lambda time: START - np.array([0.0, 0.0, 2.5e-3 * (1.0 - np.cos(2.0 * np.pi * time))]),
+    )
+    loop = HapticLoop(touching_simulation(), device, settings)
+    held, hand, force, acted = [], [], 0.0, set()
+    for step, told in enumerate(run(loop, device, 5000)):
+        assert not told.fault
+        device.linked = not 1900 <= step < 2100
+        held.append(-device.work)
+        hand.append(device.energy())
+        force = max(force, float(np.linalg.norm(told.tip.coupling_force)))
+        acted |= {name for name in ("faded", "approaching") if getattr(told.tip, name)}
+    assert acted == {"faded", "approaching"}
+    return np.array(held), np.array(hand), force**2 / (2.0 * loop.held[0].coupling.stiffness)
+
+
+def test_contact_as_shipped_gives_at_most_what_the_spring_holds():
+    """Coupling, slew limit, watchdog and slow approach as shipped: K e^2 / 2 = F^2 / 2 K each time that one acts."""
+    held, hand, bound = tapped_with_a_cut(HapticSettings())
+    # The start alone has acted, then the cut and the return too.
+    assert held[:1900].min() >= -bound
+    assert held.min() >= -3.0 * bound
+    # Beyond them each tap takes energy, and none is harder than the one before the cut.
+    peaks = hand.reshape(5, 1000).max(axis=1)
+    assert peaks[3:].max() < 1.01 * peaks[1]
+    assert held[4999] > held[3999] > held[2999]
+
+
+def test_a_slew_limit_that_always_acts_gives_more():
+    """The bound of the test above can be missed."""
+    held, _, bound = tapped_with_a_cut(HapticSettings(limits=ForceLimits(slew_largest=0.5)))
+    assert held.min() < -10.0 * bound

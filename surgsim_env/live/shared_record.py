@@ -1,6 +1,7 @@
 """A record in memory that two processes share: one writes and never waits, others read whole copies."""
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.sharedctypes import RawArray
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 
 from surgsim_env.live.errors import LiveError
 
-# How often a reader tries before it says that the writer never holds still.
-TRIES_MOST = 10_000
+# How long a reader tries before it says that the writer never holds still [s]: a writer may be put aside by other
+# processes in the middle of it. Between tries it lets others run for so long.
+PATIENCE, PAUSE = 1.0, 50e-6
 
 
 class SharedRecord:
@@ -45,10 +47,12 @@ class SharedRecord:
         Raises:
             LiveError: its writer died, or never stops, in the middle of it.
         """
-        for _ in range(TRIES_MOST):
+        begin = time.monotonic()
+        while time.monotonic() - begin < PATIENCE:
             copy = self.glance()
             if copy is not None:
                 return copy
+            time.sleep(PAUSE)
         raise LiveError("a shared record is never whole: the process that writes it died in the middle")
 
     def glance(self) -> NDArray[Any] | None:

@@ -47,7 +47,10 @@ def resolved(name: str) -> object:
     for count in range(len(parts), 0, -1):
         try:
             found: object = importlib.import_module(".".join(parts[:count]))
-        except ModuleNotFoundError:
+        except ModuleNotFoundError as error:
+            if error.name is not None and not name.startswith(error.name.partition(".")[0]):
+                # It is there, and asks for an extra that is not.
+                return error.name
             continue
         for attribute in parts[count:]:
             # A dataclass's field without a default is no attribute of the class.

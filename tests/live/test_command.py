@@ -52,13 +52,24 @@ if __name__ == "__main__":
 """
 
 
+def hear_ctrl_c() -> None:
+    """What runs in the background of a shell, as tests may, is started deaf to it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130), (None, 0)])
 def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how, code):
     script, out = tmp_path / "view.py", tmp_path / "out"
     script.write_text(CHILD)
     given = [sys.executable, script, "--out", out, *(["--seconds", "3"] if how is None else [])]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    run = subprocess.Popen(given, stdout=subprocess.PIPE, text=True, env=environment)
+    run = subprocess.Popen(
+        given,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, PLAIN),
+    )
     assert run.stdout is not None
     if how is not None:
         assert any(line == "recording\n" for line in run.stdout)

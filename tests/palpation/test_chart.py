@@ -1,5 +1,7 @@
 """The chart of a palpable face: places, points and sites belong together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,6 @@ def test_places_points_and_sites_are_each_others_inverse(scene: str):
 
 def test_a_margin_that_leaves_nothing_is_refused():
     anatomy = load_anatomy(make_scene("phantom"))
-    wide = anatomy.face.__class__(**{**vars(anatomy.face), "margin": 0.031})
+    wide = replace(anatomy.face, margin=0.031)
     with pytest.raises(ValueError, match=r"face_margin of 31 mm leaves nothing of a palpable face of 60 x 60 mm"):
         make_chart(wide, 0.008)

@@ -63,13 +63,7 @@ def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how, code):
     script.write_text(CHILD)
     given = [sys.executable, script, "--out", out, *(["--seconds", "3"] if how is None else [])]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    run = subprocess.Popen(
-        given,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=environment,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, PLAIN),
-    )
+    run = subprocess.Popen(given, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=hear_ctrl_c)
     assert run.stdout is not None
     if how is not None:
         assert any(line == "recording\n" for line in run.stdout)

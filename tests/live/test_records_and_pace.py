@@ -17,12 +17,14 @@ PAIR = np.dtype([("one", "f8", (500,)), ("other", "f8", (500,))])
 
 
 def write_forever(record: SharedRecord) -> None:
+    """Ten times as often as the physics; one that never pauses would leave a reader on another core no whole copy."""
     value = 0.0
     while True:
         value += 1.0
         with record.writing() as now:
             now["one"] = value
             now["other"] = value
+        time.sleep(50e-6)
 
 
 def test_a_reader_never_sees_half_a_record():

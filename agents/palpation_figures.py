@@ -3,6 +3,8 @@
 python -m agents.palpation_figures
 """
 
+import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +18,15 @@ from agents.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episo
 from agents.results_files import Result, load_results
 from agents.roster import POLICIES, WORDS, find_agent
 from agents.site_agent import site_facts
+from msdm_core.mesh import FloatArray
 from surgsim_env.evaluation.palpation import ERROR_LINE
 
 matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+# Of the methods in alphabetical order (Okabe & Ito 2008, their yellow darkened).
+LINE_COLOURS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#999999", "#0072B2", "#D55E00", "#CC79A7")
 # An organ that no evaluation uses, with two lesions, and when it is shown.
 SHOWN_SEED, SHOWN_PRESSES = 3_000_003, (4, 9, 16)
 # The trained agent that is shown, an organ with two lesions that neither its training nor an evaluation uses, and when.
@@ -29,22 +34,50 @@ SHOWN_POLICY, AGENT_SEED, AGENT_PRESSES = "sites_ppo_seed0.zip", 4_000_009, (4, 
 
 
 def draw_errors(results: list[Result], path: Path) -> None:
-    """Median OSPA over organs with lesions after each press, one panel a place, one line a method."""
-    places = sorted({result.place for result in results if result.env_id == SITES and result.method not in WORDS})
-    figure = Figure(figsize=(5.2 * len(places), 4.0), dpi=110, layout="constrained")
-    for axes, place in zip(np.atleast_1d(figure.subplots(1, len(places))), places, strict=True):
-        rows = best_raster_alone([row for row in results if row.place == place and row.method not in WORDS])
-        for row in sorted(rows, key=lambda row: row.method):
-            errors = np.array(row.errors_mm)[np.array(row.lesion_counts) > 0]
-            name = row.method.replace("raster_", "raster ")
-            axes.plot(np.arange(1, errors.shape[1] + 1), np.median(errors, axis=0), label=name, linewidth=1.5)
+    """Median OSPA over organs with lesions after each press: a panel a place, a line a method, seeds as a band."""
+    rows = [row for row in results if row.env_id == SITES and row.method not in WORDS]
+    places = sorted({row.place for row in rows}, key=lambda place: ("standard" not in place, place))
+    methods = sorted({family(row.method) for row in rows})
+    figure = Figure(figsize=(10.4, 3.6 * math.ceil(len(places) / 2)), dpi=110, layout="constrained")
+    panels = np.atleast_1d(figure.subplots(math.ceil(len(places) / 2), 2, squeeze=False)).ravel()
+    for axes, place in zip(panels, places, strict=False):
+        shown = best_raster_alone([row for row in rows if row.place == place])
+        for method in {family(row.method) for row in shown}:
+            medians = np.array([median_errors(row) for row in shown if family(row.method) == method])
+            draw_medians(axes, medians, method, LINE_COLOURS[methods.index(method) % len(LINE_COLOURS)])
         axes.axhline(1000.0 * ERROR_LINE, color="black", linewidth=0.8, linestyle="--")
-        axes.set_title(place.removeprefix("PalpateSites_").replace("_", " "))
+        scene, _, level = place.removeprefix("PalpateSites_").rpartition("_")
+        axes.set_title(f"{scene}, {level}")
         axes.set_xlabel("press")
         axes.set_ylabel("median error (OSPA) [mm]")
         axes.set_ylim(0.0, 21.0)
-        axes.legend(fontsize=8)
+        axes.grid(alpha=0.25)
+    for axes in panels[len(places) :]:
+        axes.remove()
+    lines = {str(line.get_label()): line for axes in panels[: len(places)] for line in axes.get_lines()[:-1]}
+    names = sorted(lines)
+    figure.legend([lines[name] for name in names], names, loc="outside lower center", ncols=len(names), frameon=False)
     figure.savefig(path)
+
+
+def family(method: str) -> str:
+    """What a line is called: seeds of one policy, and rasters of all sides, share a name."""
+    if method.startswith("raster_"):
+        return "best raster"
+    return re.sub(r"_seed\d+$", "", method)
+
+
+def median_errors(row: Result) -> FloatArray:
+    """Median over the organs with lesions after each press [mm], (n_press,)."""
+    return np.median(np.array(row.errors_mm)[np.array(row.lesion_counts) > 0], axis=0)
+
+
+def draw_medians(axes: Any, medians: FloatArray, name: str, colour: str) -> None:
+    """The mean of the seeds' medians (n_seed, n_press) [mm] as a line, from the lowest to the highest as a band."""
+    presses = np.arange(1, medians.shape[1] + 1)
+    axes.plot(presses, medians.mean(axis=0), label=name, color=colour, linewidth=1.6)
+    if len(medians) > 1:
+        axes.fill_between(presses, medians.min(axis=0), medians.max(axis=0), color=colour, alpha=0.25, linewidth=0.0)
 
 
 def draw_search(path: Path) -> None:

@@ -11,6 +11,8 @@ LESIONS = ((np.array([18.0, -17.0, 8.0]), 9.0), (np.array([-16.0, -14.0, 12.0]),
 # The organ's middle in the patient, LPS [mm].
 MIDDLE = np.array([-60.0, 25.0, 110.0])
 ORGAN_VOLUME = 4.0 / 3.0 * np.pi * np.prod(AXES) * 1e-9  # [m^3]
+# What the command line calls them.
+LABELS = ("--labels", "liver=1,lesion=2")
 
 
 def labels_on(affine: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,0 +1,92 @@
+"""What `surgsim organ` refuses, and that it then leaves an output folder as it was."""
+
+import os
+
+import pytest
+
+from surgsim_env.cli import main
+from surgsim_env.patient.command import _replace
+from tests.patient.scans import LABELS, scan
+from tests.patient.surfaces import ball
+
+
+def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, refusal):
+    file = scan(tmp_path / "ct.nii.gz", spacing=(3.0, 3.0, 3.0))
+    out = tmp_path / "out"
+    out.mkdir()
+    given = ["organ", file, *LABELS, "--cell-size", "0.009", "--out", out / "a.vtu"]
+    (out / "a.toml").write_text("mine", encoding="utf-8")
+    assert "is there, and not of an earlier run" in refusal(*given)
+    (out / "a.toml").unlink()
+    others = "<!DOCTYPE html>\n<p>What I think of surgsim organ</p>"
+    (out / "report.html").write_text(others, encoding="utf-8")
+    assert "report.html is there" in refusal(*given)
+    (out / "report.html").unlink()
+    assert "approach is (0.0, 0.0, 0.0)" in refusal(*given, "--approach", "0,0,0")
+    assert not list(out.iterdir())
+    for _ in range(2):
+        assert main([str(one) for one in given]) == 0
+    assert {path.name for path in out.iterdir()} == {"a.vtu", "a.toml", "report.html"}
+
+
+@pytest.mark.parametrize("there", [[], ["a.vtu", "a.toml", "report.html"], ["a.toml"]])
+@pytest.mark.parametrize("failing", [1, 2, 3])
+def test_three_files_are_replaced_or_none(there, failing, tmp_path, monkeypatch):
+    part, out = tmp_path / "part", tmp_path / "out"
+    part.mkdir()
+    out.mkdir()
+    names = ["a.vtu", "a.toml", "report.html"]
+    for name in names:
+        (part / name).write_text("new", encoding="utf-8")
+    for name in there:
+        (out / name).write_text(f"old {name}", encoding="utf-8")
+    real, calls = os.replace, []
+
+    def replace(source, target):
+        calls.append(target)
+        if len(calls) == failing:
+            raise PermissionError(13, "in use", str(target))
+        real(source, target)
+
+    monkeypatch.setattr("surgsim_env.patient.command.os.replace", replace)
+    with pytest.raises(PermissionError):
+        _replace([out / name for name in names], part)
+    assert {path.name: path.read_text(encoding="utf-8") for path in out.iterdir()} == {
+        name: f"old {name}" for name in there
+    }
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--labels", "liver=1", "--region", "a=b.stl"], "--region goes with surfaces"),
+        (["--labels", "liver=1", "--length-unit", "mm"], "--length-unit goes with surfaces"),
+        ([], "which labels are the organ?"),
+        (["--labels", "liver=1", "--mesher", "cgal"], "must be lattice or tetwild"),
+        (["--labels", "liver=1", "--modulus", "lesion=5"], "there is no such region"),
+        (["--labels", "liver=1", "--modulus", "lesion"], "the form is NAME=PASCAL"),
+        (["--labels", "liver=1", "--cell-size", "0.05"], "too coarse"),
+        (["--labels", "liver=1", "--cell-size", "-1"], "cell_size is -1"),
+        (["--labels", "liver=1", "--youngs-modulus", "0"], "must be finite and above 0"),
+    ],
+)
+def test_options_that_do_not_fit_a_scan(extra, words, tmp_path, refusal):
+    file = scan(tmp_path / "ct.nii.gz", spacing=(4.0, 4.0, 4.0))
+    assert words in refusal("organ", file, *extra)
+
+
+def test_options_that_do_not_fit_surfaces_or_tets(written, tmp_path, refusal):
+    surface = ball(tmp_path / "liver.stl")
+    unit = ["--length-unit", "mm"]
+    assert "--labels goes with a label image" in refusal("organ", surface, *unit, "--labels", "a=1")
+    assert "is no NAME=FILE" in refusal("organ", surface, *unit, "--region", "lesion")
+    outside = ball(tmp_path / "lesion.stl", 5.0, (40.0, 0.0, 0.0))
+    assert "only 0% of it lies inside" in refusal("organ", surface, outside, *unit, "--cell-size", "0.01")
+    twice = ["--region", f"lesion={outside}", "--region", f"lesion={outside}"]
+    assert "is given twice" in refusal("organ", surface, *twice, *unit)
+    assert "--mend goes with" in refusal("organ", written / "patient.vtu", "--mend")
+    for size in ("0.01", "0"):
+        assert "--cell-size goes with" in refusal("organ", written / "patient.vtu", "--cell-size", size)
+    assert "is no surface" in refusal("organ", surface, written / "patient.vtu", *unit)
+    assert "goes with --segmentation" in refusal("palpate", "--scene", "phantom", *LABELS)
+    assert "give a file" in refusal("organ")

@@ -1,0 +1,101 @@
+"""`surgsim palpate` from a scan or a surface: from file to map in one command."""
+
+import html
+import json
+import re
+import shlex
+
+import numpy as np
+import pytest
+
+from msdm_core.mesh_io import read_mesh
+from msdm_core.quality import mesh_quality
+from surgsim_env.cli import main
+from tests.patient.scans import LABELS, LESIONS, MIDDLE, scan
+
+
+def test_palpate_goes_from_a_scan_to_a_map_in_one_command(tmp_path, capsys):
+    file = scan(tmp_path / "ct.nii.gz", spacing=(2.0, 2.0, 2.0))
+    out = tmp_path / "out"
+    # Around the larger lesion, 9 mm.
+    centre = ",".join(f"{one:.4f}" for one in 1e-3 * (MIDDLE + LESIONS[0][0] + [0.0, -9.0, 5.0]))
+    arguments = ["palpate", "--segmentation", str(file), *LABELS, "--cell-size", "0.007", "--around", f"{centre},0.017"]
+    assert main([*arguments, "--out", str(out), "--workers", "1"]) == 0
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert [one["name"] for one in summary["truth"]] == ["lesion 1", "lesion 2"]
+    assert summary["truth"][0]["radius_m"] == pytest.approx(0.009, rel=0.1)
+    np.testing.assert_allclose(summary["truth"][0]["centre_m"], 1e-3 * (MIDDLE + LESIONS[0][0]), atol=1.5e-3)
+    assert summary["volume_ratio_smallest"] > 0.0
+    expected = {"ct.vtu", "ct.toml", "report.html", "palpation.csv", "summary.json", "stiffness_map.png"}
+    assert {path.name for path in out.iterdir()} == expected
+    # Healthy sites would be felt as 1.
+    assert summary["maps"]["pre-operative model"]["lesions"][0]["contrast"] > 1.1
+    assert "written" in capsys.readouterr().out
+
+
+def test_the_report_shows_the_command_that_was_given(tmp_path, monkeypatch):
+    given = ["--anchors=-0.06,0.025,0.08,0.03", "--tip-radius", "0.008", "--press-depth", "0.004", "--spacing", "0.012"]
+    file = scan(tmp_path / "ct.nii.gz", spacing=(3.0, 3.0, 3.0))
+    arguments = ["palpate", "--segmentation", str(file), *LABELS, "--cell-size", "0.009", *given]
+    arguments += ["--around=-0.06,0.0,0.13,0.01", "--out", str(tmp_path / "out"), "--workers", "1"]
+    pressed = []
+    monkeypatch.setattr("surgsim_env.palpation.job.run_palpation", lambda *_, **__: pressed.append(1) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(arguments)
+    assert pressed
+    page = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    (command,) = re.findall(r"<code>(surgsim .*)</code>", page)
+    words = shlex.split(command)
+    assert words[:2] == ["surgsim", "palpate"]
+    for word in arguments:
+        assert word in words, word
+    # It is read as what was given.
+    again = []
+    monkeypatch.setattr("surgsim_env.palpation.palpate_command.palpate", lambda request, _: again.append(request))
+    assert main(words[1:]) == 0
+    assert again[0].command == command
+    assert again[0].anchors == ("-0.06,0.025,0.08,0.03",)
+    assert again[0].spacing == 0.012
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (["--seed", "-1"], "--seed is -1"),
+        (["--around", "0,0,0,-1"], "the radius is -1 m"),
+        (["--around", "0,0,0"], "the form is x,y,z,radius"),
+        (["--lesion", "0,0,0,0.01,0"], "the modulus ratio is 0"),
+    ],
+)
+def test_palpation_s_options_are_looked_at_before_an_organ_is_made(option, words, tmp_path, refusal, monkeypatch):
+    monkeypatch.setattr("surgsim_env.patient.command.palpable_patient", lambda *_: pytest.fail("an organ was made"))
+    file = scan(tmp_path / "ct.nii.gz", spacing=(6.0, 6.0, 6.0))
+    given = ["palpate", "--segmentation", file, *LABELS, *option, "--out", tmp_path / "out"]
+    assert words in refusal(*given)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["openhelp_kidney_left", "openhelp_stomach"])
+def test_real_organs_in_one_command(name, anatomy_folder, tmp_path):
+    file = anatomy_folder / f"{name}.stl"
+    assert main(["palpate", "--surface", str(file), "--length-unit", "mm", "--out", str(tmp_path)]) == 0
+    check_run(tmp_path, name)
+
+
+@pytest.mark.slow
+def test_a_scan_in_one_command(tmp_path):
+    file = scan(tmp_path / "ct.nii.gz", spacing=(1.0, 1.0, 3.0))
+    assert main(["palpate", "--segmentation", str(file), *LABELS, "--out", str(tmp_path / "out")]) == 0
+    check_run(tmp_path / "out", "ct")
+
+
+def check_run(folder, name):
+    """What issue 8 asks of a run: volume, angles, no inverted tet, some sites."""
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    (error,) = re.findall(r"ml, ([+-][\d.]+)% of what the file has", page)
+    assert abs(float(error)) < 2.0
+    assert mesh_quality(read_mesh(folder / f"{name}.vtu")).dihedral_smallest_deg > 10
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary["volume_ratio_smallest"] > 0.0
+    assert summary["sites"]["in_maps"] >= 10

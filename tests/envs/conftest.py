@@ -1,0 +1,17 @@
+"""Environments of retraction that a module's tests share."""
+
+import pytest
+
+from surgsim_env.env import RetractEnv
+
+
+@pytest.fixture(scope="module")
+def shared_retract():
+    """One environment for tests that leave nothing behind but an episode."""
+    return RetractEnv()
+
+
+@pytest.fixture
+def retract_env(shared_retract):
+    shared_retract.reset(seed=1)
+    return shared_retract

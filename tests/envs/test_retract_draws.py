@@ -1,0 +1,81 @@
+"""SurgSim/Retract-v0: what it draws, and draws that cannot be."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surgsim_env.scenes import make_scene
+from surgsim_env.tasks.retract import HIDDEN_SHARE
+
+
+def check_draws(env, seeds):
+    """Everything in its range and nothing of the target in view; returns the draws."""
+    table, endoscope = env.scene.retract, env.scene.endoscope
+    drawn = []
+    for seed in seeds:
+        _, info = env.reset(seed=seed)
+        one = env.task.drawn
+        assert info["visible"] <= HIDDEN_SHARE
+        assert table.scale[0] <= one.scale <= table.scale[1]
+        assert table.youngs_modulus[0] <= one.youngs_modulus <= table.youngs_modulus[1]
+        assert np.linalg.norm(np.subtract(one.eye, endoscope.position)) <= 0.005
+        views = np.subtract(one.looks_at, one.eye), np.subtract(endoscope.target, endoscope.position)
+        cosine = views[0] @ views[1] / np.linalg.norm(views[0]) / np.linalg.norm(views[1])
+        assert math.degrees(math.acos(min(cosine, 1.0))) <= 5.0
+        assert 0.015 <= one.target[1] <= 0.030
+        points = env.simulation.organ_state.node_position
+        top = points[env.task.tracked_nodes[:5]]
+        np.testing.assert_allclose(top[:, 1], 0.052 * one.scale, atol=0.002)
+        drawn.append(one)
+    return drawn
+
+
+def test_draws_are_in_their_ranges_and_hide_the_target(shared_retract):
+    drawn = check_draws(shared_retract, range(15))
+    assert len({one.to_json() for one in drawn}) == 15
+    capsules = [one.capsule_stiffness > 0.0 for one in drawn]
+    assert any(capsules) and not all(capsules)
+
+
+@pytest.mark.slow
+def test_a_hundred_draws_hide_the_target(shared_retract):
+    check_draws(shared_retract, range(100))
+
+
+def test_the_organ_is_the_one_that_was_drawn(shared_retract):
+    shared_retract.reset(seed=3)
+    drawn, model = shared_retract.task.drawn, shared_retract.simulation.organ_model
+    extent = np.ptp(model.node_rest_position, axis=0)
+    np.testing.assert_allclose(extent, np.array([0.08, 0.052, 0.012]) * drawn.scale, rtol=1e-12)
+    held = model.node_inverse_mass == 0.0
+    assert held.any() and (model.node_rest_position[held, 1] <= 1e-9).all()
+    along = model.node_rest_position[held, 0]
+    assert np.ptp(along) <= drawn.held_share * extent[0] * (1.0 + 1e-6)
+
+
+def test_a_target_in_plain_view_is_drawn_again(shared_retract, monkeypatch):
+    seen = iter([0.5, 0.11, 0.02])
+    monkeypatch.setattr(shared_retract.task, "_look", lambda _: next(seen, 0.02))
+    _, info = shared_retract.reset(seed=4)
+    assert info["visible"] == 0.02 and next(seen, None) is None
+    monkeypatch.setattr(shared_retract.task, "_look", lambda _: 1.0)
+    with pytest.raises(ValueError, match="none of 20 draws"):
+        shared_retract.reset(seed=4)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"target_distance": (0.03, 0.02)}, r"retract.target_distance = \[0.03, 0.02\]"),
+        ({"held_share": (0.5, 1.2)}, "no more than 1 can be held"),
+        ({"target_radius": 0.0}, "target_radius is 0 m"),
+        ({"capsule_share": 1.5}, "capsule_share is 1.5"),
+        ({"start_lower": (1.0, 0.0, 0.0)}, "starts from x = 1"),
+    ],
+)
+def test_impossible_draws_are_refused(change, words):
+    table = make_scene("lobe").retract
+    with pytest.raises(ValueError, match=words):
+        replace(table, **change)

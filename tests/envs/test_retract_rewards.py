@@ -1,0 +1,167 @@
+"""SurgSim/Retract-v0: what it pays, and what ends it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surgsim_env.rewards import RETRACT_WEIGHTS
+from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE, SPEED_FULL_SCALE, SUCCESS_SHARE
+from tests.envs.retract_steps import EMPTY, HELD, STEP, act
+
+
+class Told:
+    """A task's verdicts on what it is told was seen and grasped; nothing moves."""
+
+    def __init__(self, env, monkeypatch):
+        self.task, self.simulation = env.task, env.simulation
+        self.returned, self.verdict = 0.0, None
+        monkeypatch.setattr(self.task, "_grasp", lambda _: HELD if self.holds else EMPTY)
+        self.holds = False
+
+    def step(self, visible=0.0, holds=False, force=0.0, pull=0.0, fault=""):
+        self.holds, self.simulation.pull_peak = holds, pull
+        self.task.begin(np.zeros(self.task.action_size))
+        if not fault:
+            self.task.visible_share = visible
+        self.verdict = self.task.judge(self.simulation, force, fault)
+        self.returned += sum(self.verdict.rewards.values())
+        return self.verdict
+
+
+@pytest.fixture
+def told(retract_env, monkeypatch):
+    return Told(retract_env, monkeypatch)
+
+
+# ---- what it pays -----------------------------------------------------------------------------------------------
+
+
+def test_the_weights_put_every_failure_below_every_full_episode():
+    """The inequality of the table's comment."""
+    w = RETRACT_WEIGHTS
+    assert w["forgone"] == pytest.approx(w["time"] + w["soft_force"])
+    for failure in ("torn", "hard_force", "fault"):
+        margin = -HIDDEN_SHARE * w["visible"] + EPISODE_STEPS * w["soft_force"] - w["visible"] - w["grasped"]
+        assert margin - w[failure] > 0.5
+
+
+FAILURES = {"torn": {"pull": 1e9}, "hard_force": {"force": 1e9}, "fault": {"fault": "told so"}}
+
+
+def worst_full_return(told):
+    """A full episode that presses as hard as it may all the time and loses at its end what was seen at its start."""
+    told.task._reached = {"visible": HIDDEN_SHARE, "grasped": 0.0}
+    for _ in range(EPISODE_STEPS):
+        verdict = told.step(force=told.task.force_limit)
+    assert verdict.truncated and not verdict.terminated
+    return told.returned
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_no_failed_episode_returns_more_than_the_worst_full_one(told, failure):
+    """The best way to fail: all seen but never for long, grasped, without pressing; then, sooner or later, harm."""
+    worst = worst_full_return(told)
+    for step in (1, 2, 9, 100, 333, 599, 600):
+        told.task.reset(np.random.default_rng(0))
+        told.task._reached = {"visible": 0.0, "grasped": 0.0}
+        told.returned = 0.0
+        for before in range(1, step):
+            # Never for SUCCESS_TIME on end.
+            assert not told.step(visible=float(before % 10 > 0), holds=True).terminated
+        verdict = told.step(visible=1.0, holds=True, **FAILURES[failure])
+        assert verdict.terminated and verdict.rewards[failure] == RETRACT_WEIGHTS[failure]
+        assert told.returned < worst
+
+
+def test_seen_and_grasped_pay_once_however_often_they_come_and_go(told):
+    for _ in range(40):
+        told.step(visible=0.7, holds=True)
+        told.step(visible=0.1, holds=False)
+    assert told.returned == pytest.approx(80 * RETRACT_WEIGHTS["time"] + 0.1 * RETRACT_WEIGHTS["visible"])
+    told.step(visible=0.7, holds=True)
+    assert told.verdict.rewards["visible"] == pytest.approx(0.6 * RETRACT_WEIGHTS["visible"])
+    assert told.verdict.rewards["grasped"] == RETRACT_WEIGHTS["grasped"]
+
+
+def test_success_is_a_half_second_on_end(told):
+    for _ in range(9):
+        assert not told.step(visible=SUCCESS_SHARE).terminated
+    assert not told.step(visible=SUCCESS_SHARE - 1e-6).terminated
+    for _ in range(9):
+        assert not told.step(visible=1.0).terminated
+    verdict = told.step(visible=1.0)
+    assert verdict.terminated and verdict.info["success"] and verdict.rewards["success"] == 10.0
+    assert verdict.rewards["forgone"] == 0.0
+    assert (SUCCESS_SHARE, HIDDEN_SHARE) == (0.8, 0.1)
+
+
+def test_soft_force_costs_by_its_share_of_the_way_to_the_hard_limit(told):
+    limits = told.task.limits
+    middle = 0.5 * (limits.soft_force + limits.hard_force)
+    for force, share in ((limits.soft_force, 0.0), (middle, 0.5), (limits.hard_force, 1.0)):
+        assert told.step(force=force).rewards["soft_force"] == pytest.approx(share * RETRACT_WEIGHTS["soft_force"])
+
+
+def test_time_runs_out_after_600_steps(told):
+    for step in range(1, EPISODE_STEPS + 1):
+        verdict = told.step()
+        assert verdict.truncated == (step == EPISODE_STEPS)
+    assert told.returned == pytest.approx(EPISODE_STEPS * RETRACT_WEIGHTS["time"], abs=0.5)
+
+
+# ---- what ends it -----------------------------------------------------------------------------------------------
+
+
+def test_a_step_that_tears_ends_in_its_very_haptic_step(shared_retract):
+    """Grasp the edge and pull it away, with tissue that bears less than the grip does."""
+    shared_retract.reset(seed=2)
+    task, limits = shared_retract.task, shared_retract.task.limits
+    task.limits = replace(limits, tear_force=0.08)
+    try:
+        info = grasp_and_pull(shared_retract)
+    finally:
+        task.limits = limits
+    assert info["torn"] and not info["hard_limit"] and not info["success"]
+    assert info["reward_torn"] == RETRACT_WEIGHTS["torn"]
+    assert 0.08 < info["pull_force_peak"] < 0.085
+    steps = shared_retract.simulation.time / STEP
+    assert abs(steps - round(steps)) > 0.01
+
+
+def test_the_hard_limit_ends_it(shared_retract):
+    shared_retract.reset(seed=2)
+    task, limits = shared_retract.task, shared_retract.task.limits
+    task.limits = replace(limits, soft_force=0.02, hard_force=0.05)
+    try:
+        info = grasp_and_pull(shared_retract)
+    finally:
+        task.limits = limits
+    assert info["hard_limit"] and not info["torn"]
+    assert 0.05 < info["force_peak"] < 0.055
+
+
+def grasp_and_pull(env):
+    """Close the jaw about the free edge and pull it up and away till the episode ends; the last info."""
+    tip, edge = env.simulation.instrument.tip_position, env.simulation.organ_state.node_position[:, 1].max()
+    middle = env.simulation.organ_state.node_position[:, 2][env.task.tracked_nodes[:5]].mean() - 0.006
+    for target in ((tip[0], tip[1], middle), (tip[0], edge - 0.004, middle)):
+        for _ in range(60):
+            way = np.array(target) - env.simulation.instrument.tip_position
+            info = act(env, way / max(np.abs(way).max() / SPEED_FULL_SCALE, STEP), jaw=1.0)[-1]
+    for velocity in [(0.0, 0.0, 0.0)] * 16 + [(0.0, 0.01, 0.015)] * 60:
+        _, _, terminated, _, info = act(env, velocity, jaw=-1.0)
+        if terminated:
+            return info
+    raise AssertionError(f"nothing ended it: {info}")
+
+
+def test_a_fault_ends_it_with_the_last_finite_observation_and_a_clean_reset(retract_env):
+    expected = retract_env.reset(seed=6)[0]
+    before = act(retract_env)[0]
+    retract_env.simulation.organ_state.node_velocity[-1, 1] = np.nan
+    observation, reward, terminated, _, info = act(retract_env)
+    assert terminated and "no longer finite" in info["sim_fault"]
+    np.testing.assert_array_equal(observation, before)
+    assert reward < RETRACT_WEIGHTS["fault"] + 598 * RETRACT_WEIGHTS["forgone"] + 1e-9
+    np.testing.assert_array_equal(retract_env.reset(seed=6)[0], expected)

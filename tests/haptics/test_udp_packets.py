@@ -1,0 +1,152 @@
+"""The UDP device's packets: what they hold to the bit, and those that are dropped."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from surgsim_env.haptics.packet import (
+    MAGIC,
+    POSE,
+    POSITION_LARGEST,
+    ForcePacket,
+    PosePacket,
+    newer,
+    pack_force,
+    pack_pose,
+    unpack_force,
+    unpack_pose,
+)
+from surgsim_env.haptics.udp import UdpDevice
+from tests.haptics.udp_link import Sender, arrived, drained
+
+coordinate = st.floats(-POSITION_LARGEST, POSITION_LARGEST)
+places = st.tuples(coordinate, coordinate, coordinate)
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), finite, places, st.integers(0, 2**16 - 1))
+def test_pose_travels_to_the_bit(sequence, sent, place, buttons):
+    data = pack_pose(PosePacket(sequence, sent, np.array(place), buttons))
+    back = unpack_pose(data)
+    assert back is not None
+    assert (back.sequence, back.time, back.buttons, back.rotation) == (sequence, sent, buttons, None)
+    np.testing.assert_array_equal(back.position, place)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), finite, st.tuples(finite, finite, finite))
+def test_force_travels_to_the_bit(sequence, sent, force):
+    back = unpack_force(pack_force(ForcePacket(sequence, sent, np.array(force))))
+    assert back is not None
+    assert (back.sequence, back.time) == (sequence, sent)
+    np.testing.assert_array_equal(back.force, force)
+
+
+def test_layout_is_the_documented_one():
+    """Byte by byte as docs/haptics.md says, little-endian, for whoever writes a bridge in another language."""
+    data = pack_pose(PosePacket(7, 2.5, np.array((0.1, -0.2, 0.3)), 5, np.array((0.6, 0.0, 0.8, 0.0))))
+    assert len(data) == 76
+    assert data[:4] == b"SSHP" and data[4] == 1 and data[5] == 1
+    assert int.from_bytes(data[6:8], "little") == 5
+    assert int.from_bytes(data[8:12], "little") == 7
+    assert struct.unpack_from("<8d", data, 12) == (2.5, 0.1, -0.2, 0.3, 0.6, 0.0, 0.8, 0.0)
+    answer = pack_force(ForcePacket(7, 2.5, np.array((1.0, 2.0, 3.0))))
+    assert len(answer) == 44
+    assert answer[:4] == b"SSHP" and answer[4] == 1 and answer[5] == 2 and answer[6:8] == b"\0\0"
+    assert int.from_bytes(answer[8:12], "little") == 7
+    assert struct.unpack_from("<4d", answer, 12) == (2.5, 1.0, 2.0, 3.0)
+
+
+def changed(offset: int, form: str, value) -> bytes:
+    data = bytearray(pack_pose(PosePacket(1, 0.0, np.zeros(3), 0, np.array((1.0, 0.0, 0.0, 0.0)))))
+    struct.pack_into(form, data, offset, value)
+    return bytes(data)
+
+
+HOSTILE = {
+    "empty": b"",
+    "short": changed(0, "<4s", MAGIC)[:-1],
+    "long": changed(0, "<4s", MAGIC) + b"\0",
+    "very long": changed(0, "<4s", MAGIC) + bytes(60_000),
+    "magic": changed(0, "<4s", b"SSHQ"),
+    "version": changed(4, "<B", 2),
+    "kind of a force": changed(5, "<B", 2),
+    "time not a number": changed(12, "<d", math.nan),
+    "time without end": changed(12, "<d", math.inf),
+    "place not a number": changed(20, "<d", math.nan),
+    "place without end": changed(28, "<d", -math.inf),
+    "place far away": changed(36, "<d", 10.001),
+    "place very far away": changed(36, "<d", 1e308),
+    "rotation not a number": changed(44, "<d", math.nan),
+    "rotation without end": changed(44, "<d", math.inf),
+    "rotation too short": changed(44, "<d", 0.99),
+    "rotation too long": changed(52, "<d", 1e200),
+    "our own answer": pack_force(ForcePacket(1, 0.0, np.ones(3))),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_packet_is_dropped_counted_and_not_answered(name, device, sender):
+    sender.raw(HOSTILE[name])
+    drained(device, 1)
+    assert device.counts.malformed == 1
+    assert device.peer is None
+    device.write(np.ones(3))
+    assert sender.silent()
+    # And the port works on.
+    sender.pose(1)
+    assert arrived(device) is not None
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=200))
+def test_bytes_are_no_pose_or_a_good_one(data):
+    pose = unpack_pose(data)
+    if pose is not None:
+        assert np.abs(pose.position).max() <= POSITION_LARGEST and math.isfinite(pose.time)
+    answer = unpack_force(data)
+    if answer is not None:
+        assert np.isfinite(answer.force).all()
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=300)
+@given(st.binary(min_size=POSE.size - 12, max_size=POSE.size - 12), st.integers(0, 2**16 - 1))
+def test_bytes_behind_a_good_header_are_no_pose_or_a_good_one(body, buttons):
+    data = MAGIC + bytes((1, 1)) + buttons.to_bytes(2, "little") + bytes(4) + body
+    pose = unpack_pose(data)
+    if pose is not None:
+        assert np.abs(pose.position).max() <= POSITION_LARGEST and math.isfinite(pose.time)
+        assert pose.rotation is None or abs(np.linalg.norm(pose.rotation) - 1.0) <= 2e-3
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.one_of(st.binary(max_size=100), st.sampled_from(list(HOSTILE.values()))), max_size=30))
+def test_device_survives_any_packets(packets):
+    """Whatever comes, `read` returns a good pose or none, and the next good pose is read."""
+    device = UdpDevice()
+    sender = Sender(device)
+    try:
+        for data in packets:
+            sender.raw(data)
+            device.read()
+            device.write(np.zeros(3))
+        sender.pose(2**31)
+        pose = arrived(device)
+        assert pose is not None and np.isfinite(pose.position).all()
+    finally:
+        device.close()
+        sender.socket.close()
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 2**31 - 1))
+def test_sequence_goes_round(last, ahead):
+    after = (last + ahead) % 2**32
+    assert newer(after, last)
+    assert not newer(last, after)
+    assert not newer(last, last)

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from multiprocessing.sharedctypes import RawArray
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_env.live.shared_record import SharedRecord
+from surgsim_env.live.shared_rows import SharedRows
 from surgsim_env.pacing import TIMING
 
 # One row of the trace covers this many haptic steps, and so many rows are kept: 20 s at 1 kHz.
@@ -84,38 +84,36 @@ def recording_type(arm_count: int) -> np.dtype:
 
 
 class RecordedSteps:
-    """Room for a recording that both processes see; `count` is written last, by one of them at a time."""
+    """Room for a recording that both processes see; its count is written last, by one of them at a time."""
 
     def __init__(self, arm_count: int, most: int = RECORDING_MOST) -> None:
-        """Nothing recorded; pages of memory are taken as they are filled."""
-        self.dtype = recording_type(arm_count)
-        self._memory = RawArray("B", 8 + most * self.dtype.itemsize)
-        self._view()
+        """Nothing recorded."""
+        self._shared = SharedRows(recording_type(arm_count), most)
 
     @property
     def count(self) -> int:
         """How many steps there are."""
-        return int(self._count[0])
+        return int(self._shared.counter[0])
 
     @property
     def full(self) -> bool:
         """Whether there is no room for another."""
-        return self.count >= len(self._steps)
+        return self.count >= len(self._shared.rows)
 
     @property
     def steps(self) -> NDArray[Any]:
         """The recorded steps themselves, (count,)."""
-        return self._steps[: self.count]
+        return self._shared.rows[: self.count]
 
     def clear(self) -> None:
         """Forget them."""
-        self._count[0] = 0
+        self._shared.counter[0] = 0
 
     def append(self, time: float, hand: NDArray, buttons: list[int], tip: NDArray, force: NDArray) -> None:
         """Add a step; there must be room."""
-        step = self._steps[self._count[0]]
+        step = self._shared.rows[self.count]
         step["time"], step["hand"], step["buttons"], step["tip"], step["force"] = time, hand, buttons, tip, force
-        self._count[0] += 1
+        self._shared.counter[0] += 1
 
     def fill(self, steps: NDArray[Any]) -> None:
         """Take steps from elsewhere.
@@ -123,22 +121,12 @@ class RecordedSteps:
         Raises:
             ValueError: more of them than there is room for.
         """
-        if len(steps) > len(self._steps):
-            raise ValueError(f"a recording of {len(steps)} steps is longer than {len(self._steps)}: cut it")
+        most = len(self._shared.rows)
+        if len(steps) > most:
+            raise ValueError(f"a recording of {len(steps)} steps is longer than {most}: cut it")
         self.clear()
-        self._steps[: len(steps)] = steps
-        self._count[0] = len(steps)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"dtype": self.dtype, "_memory": self._memory}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._view()
-
-    def _view(self) -> None:
-        whole = np.frombuffer(self._memory, dtype=np.uint8)
-        self._count, self._steps = whole[:8].view(np.int64), whole[8:].view(self.dtype)
+        self._shared.rows[: len(steps)] = steps
+        self._shared.counter[0] = len(steps)
 
 
 @dataclass(frozen=True)

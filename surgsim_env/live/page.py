@@ -95,7 +95,7 @@ class Page:
             for arm, place in enumerate(session.parked)
         ]
         self._judge.nodes.update(handle.name for handle in self._handles)
-        self._arrows = [ForceArrow(scene, arm) for arm in range(session.arm_count)]
+        self._arrows = [ForceArrow(scene, arm, size) for arm in range(session.arm_count)]
 
     def _calls(self) -> dict[str, Callable[..., None]]:
         """What the panel calls; a click turns over what the physics is doing then, not what a button's name says."""

@@ -232,6 +232,9 @@ def _status_html(headline: str, rows: list[tuple[str, str]]) -> str:
     cells = "".join(
         f'<tr><td style="opacity:.65;padding-right:.8em">{name}</td>'
         f'<td style="text-align:right;font-variant-numeric:tabular-nums">{value}</td></tr>'
+        # Words without a name take the whole width.
+        if name
+        else f'<tr><td colspan="2" style="color:{ARM_COLOURS[0]}">{value}</td></tr>'
         for name, value in rows
     )
     return (

@@ -1,27 +1,19 @@
-"""The physics of a live session: a process of its own that makes a haptic step whenever one is due."""
+"""The physics of a live session: a haptic step whenever one is due, and what the page asks for in between."""
 
-import contextlib
-import ctypes
-import gc
-import os
-import signal
-import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy, load_anatomy
+from surgsim_env.anatomy import load_anatomy
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.telemetry import HapticTelemetry
-from surgsim_env.instrument import Instrument, Probe
 from surgsim_env.live.browser_device import BrowserDevice, Hands, RecordedHand
 from surgsim_env.live.exchange_records import TRACE_LENGTH, TRACE_STEPS, Exchange, Phase, said
+from surgsim_env.live.home import home_of
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
 from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Request, Reset
 from surgsim_env.pacing import Pacer, PaceSettings
@@ -29,14 +21,10 @@ from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scenes import Scene
 from surgsim_env.simulation import Simulation
 
-# A probe begins this far from the organ [m].
-HOME_GAP = 0.015
 # A frame for the page is written once in so many steps, the parent and the page's requests looked at likewise.
 FRAME_STEPS, LOOK_STEPS = 16, 8
 # So many requests are heeded at a look; the others wait for the next.
 REQUESTS_MOST = 4
-# Unix's measure of how gladly a process lets others go first: below 0 is for administrators.
-NICENESS = -10
 # The hand may go through the air at this speed [m/s] before a tip follows no more.
 SPEED_LARGEST, APPROACH_SPEED = 0.25, 0.05
 
@@ -54,40 +42,6 @@ class Setup:
     scene: Scene
     choice: OrganChoice
     pace: PaceSettings
-
-
-def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
-    """Where tips begin: before the middle of the palpable face, in sight; arms where they park. [m], (3,) or (2, 3)."""
-    if type(instrument) is not Probe:
-        return instrument.parked
-    face = anatomy.face
-    corners = face.points[face.triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    point, normal = face.project(np.average(corners.mean(axis=1), axis=0, weights=area))
-    place = point + normal * (anatomy.scene.instrument.tip_radius + HOME_GAP)
-    return np.clip(place, instrument.lower, instrument.upper)
-
-
-def run_physics(setup: Setup, exchange: Exchange, requests: Connection, parent: int) -> None:
-    """The child's whole life; it ends on request, or when the process with the id `parent` is gone.
-
-    What refuses to begin is told through `requests` as a text, and the process ends with status 1.
-    """
-    # Ctrl-C is the page's to answer; it ends the physics in order.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _sleep_sharply()
-    _go_first()
-    try:
-        physics = Physics(setup, exchange, requests)
-    except (ValueError, OSError) as error:
-        with contextlib.suppress(OSError):
-            requests.send(str(error))
-        sys.exit(1)
-    # What is there by now stays; nothing that is made in a step lies in a cycle.
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    physics.run(lambda: os.getppid() == parent)
 
 
 class Physics:
@@ -292,23 +246,3 @@ class Physics:
                 frame["limited"][arm] = tip.clamped or tip.workspace_limited
             frame["node"] = simulation.organ_state.node_position[:, :3]
             frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
-
-
-def _go_first() -> None:
-    """Ask for the processor before pictures and browsers; where that is not allowed, all wait in line.
-
-    Linux shares it first between sessions and then within each, by niceness: so the physics is a session of its own.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        os.setsid()
-    with contextlib.suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-    with contextlib.suppress(OSError):
-        Path("/proc/self/autogroup").write_text(str(NICENESS))
-
-
-def _sleep_sharply() -> None:
-    """Ask Linux to end sleeps when they are over, not up to 50 us later; elsewhere nothing is done."""
-    if sys.platform == "linux":
-        set_timer_slack = 29
-        ctypes.CDLL(None).prctl(set_timer_slack, 1, 0, 0, 0)

@@ -15,8 +15,10 @@ from surgsim_env.anatomy import load_anatomy
 from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import TRACE_LENGTH, Exchange, Phase, new_exchange
 from surgsim_env.live.hand_messages import HandMotion
+from surgsim_env.live.home import home_of
 from surgsim_env.live.organ_choice import OrganChoice, lesion_kinds, live_scene
-from surgsim_env.live.physics import Setup, home_of, run_physics
+from surgsim_env.live.physics import Setup
+from surgsim_env.live.physics_process import run_physics
 from surgsim_env.live.requests import Change, End, Request
 from surgsim_env.pacing import PaceSettings
 from surgsim_env.rendering.instrument_geoms import shown_geoms
@@ -163,13 +165,15 @@ class Session:
             self._targets[:] = self.parked
 
     def push(self, motion: HandMotion) -> None:
-        """Let a key or a stick move a hand; it is held until it is not heard of for a while."""
-        if motion.arm >= self.arm_count:
-            return
+        """Let a key or a stick move a hand; it is held until it is not heard of for a while.
+
+        A page does not know how many arms there are: the other arm of one is the same.
+        """
+        arm = motion.arm % self.arm_count
         with self._lock:
-            self._motions[motion.arm] = (np.array(motion.axes), time.monotonic())
+            self._motions[arm] = (np.array(motion.axes), time.monotonic())
             if motion.turns_jaw:
-                self._buttons[motion.arm] ^= JAW_BUTTON
+                self._buttons[arm] ^= JAW_BUTTON
 
     def close_jaw(self, closed: bool) -> None:
         """Close or open the first arm's jaw."""

@@ -23,8 +23,8 @@ AMBIENT = 0.9
 # In the page's own decimetres; the handle is not larger than this share of the organ.
 HANDLE_SIZE, HANDLE_SHARE, BALL_RADIUS = 0.35, 0.45, 0.03
 SHAFT_RADIUS, HEAD_RADIUS, HEAD_LENGTH = 0.012, 0.035, 0.07
-# Of an arrow [m/N], and the force below which there is none [N].
-FORCE_LENGTH, FORCE_LEAST = 0.06, 0.005
+# Of an arrow: sizes of the organ for each newton, but at most so much [m/N]; the force below which there is none [N].
+FORCE_SHARE, FORCE_LENGTH, FORCE_LEAST = 0.4, 0.06, 0.005
 
 
 def page_camera(anatomy: Anatomy) -> Camera:
@@ -99,8 +99,8 @@ def add_handle(
 class ForceArrow:
     """The tissue's force on a tip, as an arrow from the tip; a mesh like all others, which browsers have compiled."""
 
-    def __init__(self, scene: Any, arm: int) -> None:
-        """Add it, of no length."""
+    def __init__(self, scene: Any, arm: int, size: float) -> None:
+        """Add it, of no length, to a scene with an organ of some size [m]."""
         import trimesh
 
         shaft = trimesh.creation.cylinder(radius=SHAFT_RADIUS, height=1.0, sections=12)
@@ -113,6 +113,7 @@ class ForceArrow:
             f"/force/{arm}", hidden, faces, color=FORCE_COLOUR, flat_shading=False, cast_shadow=False
         )
         self._hidden, self._shows = hidden, False
+        self._length = min(FORCE_SHARE * size, FORCE_LENGTH)
 
     def follow(self, tip: FloatArray, force: FloatArray) -> None:
         """Point from a tip [m] (3,) along a force [N] (3,)."""
@@ -123,7 +124,7 @@ class ForceArrow:
                 self._node.vertices, self._shows = self._hidden, False
             return
         self._shows = True
-        length = FORCE_LENGTH * size * SCALE
+        length = self._length * size * SCALE
         up = force / size
         across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
         across /= np.linalg.norm(across)

@@ -3,6 +3,7 @@
 import html
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_env.live.exchange_records import Phase
@@ -37,7 +38,9 @@ def status_rows(
         drawn: pictures that the slowest browser draws [1/s], where one says so.
         said: the page's own words, shown where the physics has none.
     """
+    force = " / ".join(f"{float(np.linalg.norm(one)):.2f}" for one in frame["force"])
     rows = [
+        ("force, left / right arm" if len(frame["force"]) > 1 else "force", f"{force} N"),
         ("simulated time", f"{float(frame['time']):.1f} s"),
         ("physics", f"{kept.rate:.0f} steps/s"),
         ("real-time factor", f"{kept.real_time:.3f}"),

@@ -88,6 +88,10 @@ class Browser:
                 return answer["result"]
             self.events.append(answer)
 
+    def before_pages(self, script: str) -> None:
+        """Run a script in every page that is opened from now on, before the page's own."""
+        self.do("Page.addScriptToEvaluateOnNewDocument", source=script)
+
     def open(self, address: str) -> None:
         self.do("Page.navigate", url=address)
 

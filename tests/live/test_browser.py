@@ -1,17 +1,24 @@
 """The page in a real browser, drawn in software: opened, its probe dragged, organ and force trace seen to follow."""
 
+import contextlib
 import io
+import re
 import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.page import Page
+from surgsim_env.live.requests import Reset
 from surgsim_env.live.session import Session
 from surgsim_env.live.stage import page_camera
 from surgsim_env.pacing import PaceSettings
-from surgsim_env.scenes import make_scene
+from surgsim_env.scenes import Scene, make_scene, with_instrument
 from tests.live.chromium import CHROMIUM, Browser
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium (.ci/run does)")
@@ -21,14 +28,14 @@ PACE = PaceSettings(period=0.010)
 CANVAS = "document.querySelector('canvas').getBoundingClientRect()"
 
 
-@pytest.fixture
-def served(tmp_path):
-    session = Session(make_scene("phantom_small"), pace=PACE)
+@contextlib.contextmanager
+def serving(scene: Scene, folder: Path) -> Iterator[Page]:
+    session = Session(scene, pace=PACE)
     page, stop = None, threading.Event()
     thread = None
     try:
         session.wait()
-        page = Page(session, host="127.0.0.1", port=0, remote=False, out=tmp_path / "out")
+        page = Page(session, host="127.0.0.1", port=0, remote=False, out=folder / "out")
         page.show_plain(True)
         thread = threading.Thread(target=page.run, args=(stop.is_set,))
         thread.start()
@@ -40,6 +47,28 @@ def served(tmp_path):
         if page is not None:
             page.server.stop()
         session.close()
+
+
+@pytest.fixture
+def served(tmp_path) -> Iterator[Page]:
+    with serving(make_scene("phantom_small"), tmp_path) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def two_arms(tmp_path_factory) -> Iterator[Page]:
+    with serving(with_instrument(make_scene("lobe"), "psm_pair"), tmp_path_factory.mktemp("two_arms")) as page:
+        yield page
+
+
+def opened(browser, page) -> None:
+    """The page is there, its physics runs, and pictures come."""
+    browser.open(page.server.address)
+    browser.wait_for("!!document.body && document.body.innerText.includes('Force and depth')", 120)
+    browser.wait_for("document.body.innerText.includes('steps/s')", 120)
+    made = page.pictures
+    wait_until(browser, lambda: page.pictures > made + 10)
+    browser.run("document.querySelector('.mantine-Notification-closeButton')?.click()")
 
 
 def picture(browser, tmp_path) -> np.ndarray:
@@ -68,11 +97,8 @@ def wait_until(browser, condition, seconds=120.0):
 def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, tmp_path):
     session = served.session
     with Browser(tmp_path, WIDTH, HEIGHT) as browser:
-        browser.open(served.server.address)
-        browser.wait_for("!!document.body && document.body.innerText.includes('Force and depth')", 120)
-        browser.wait_for("document.body.innerText.includes('steps/s')", 120)
+        opened(browser, served)
         assert browser.run("location.search") == ""
-        wait_until(browser, lambda: served.pictures > 10)
         before = picture(browser, tmp_path)
         rest = session.frame()["node"].copy()
         plot_before = browser.run(PLOT)
@@ -80,7 +106,6 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, tmp_path
         start = session.targets[0]
         grip = start + 0.02 * session.directions[2]
         down = start - 0.030 * session.directions[2]
-        browser.run("document.querySelector('.mantine-Notification-closeButton')?.click()")
         x, y = seen_at(browser, served, grip)
         to_x, to_y = seen_at(browser, served, down + 0.02 * session.directions[2])
         browser.drag((x, y), (to_x, to_y))
@@ -104,6 +129,107 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, tmp_path
         # viser's camera complains of its own way to hear the wheel.
         assert [one for one in browser.complaints() if "passive event listener" not in one] == []
     assert served._judge.dropped == 0 and served._judge.ignored == 0
+
+
+def test_both_arms_are_dragged_and_both_forces_shown(two_arms, tmp_path):
+    session = two_arms.session
+    out = session.directions[2]
+    session.park()
+    session.ask(Reset())
+    wait_for_rest(session)
+    with Browser(tmp_path, WIDTH, HEIGHT) as browser:
+        opened(browser, two_arms)
+        assert not session.frame()["force"].any()
+        assert forces_shown(browser) == [0.0, 0.0]
+        # Down by the arrow of each handle: a pad of the open jaw is 4 mm above the lobe, the ball 15 mm.
+        for arm, way in enumerate((0.008, 0.018)):
+            tip, start = session.frame()["tip"].copy(), session.targets.copy()
+            grip = start[arm] + 0.06 * two_arms._handles[arm].scale * out
+            browser.drag(seen_at(browser, two_arms, grip), seen_at(browser, two_arms, grip - way * out))
+            moved = session.targets - start
+            np.testing.assert_allclose(moved[arm], -way * out, atol=0.15 * way)
+            assert not moved[1 - arm].any()
+            wait_until(browser, lambda arm=arm: np.linalg.norm(session.frame()["force"][arm]) > 0.02)
+            went = session.frame()["tip"][arm] - tip[arm]
+            assert -went @ out > 0.5 * way
+        wait_until(browser, lambda: min(forces_shown(browser)) > 0.01)
+        assert session.frame()["phase"] == Phase.RUNNING
+        # Each is drawn in its colour, too.
+        wait_until(browser, lambda: min(curve_heights(browser, 0)) > 1)
+        assert [one for one in browser.complaints() if "passive event listener" not in one] == []
+    assert two_arms._judge.dropped == 0 and two_arms._judge.ignored == 0
+
+
+# Of the plot with some number, in each arm's colour: the rows of pixels that its curve takes.
+CURVES = """(() => { const one = document.querySelectorAll('.uplot canvas')[%d];
+  const d = one.getContext('2d').getImageData(0, 0, one.width, one.height).data;
+  const near = (at, colour) => colour.every((part, k) => Math.abs(d[at + k] - part) < 40) && d[at + 3] > 128;
+  return [[232, 89, 12], [25, 113, 194]].map(colour => { const rows = new Set();
+    for (let at = 0; at < d.length; at += 4) if (near(at, colour)) rows.add(Math.floor(at / 4 / one.width));
+    return rows.size; }); })()"""
+
+
+def curve_heights(browser, plot) -> list[int]:
+    return browser.run(CURVES % plot)
+
+
+def forces_shown(browser) -> list[float]:
+    """The figures beside "force, left / right arm"."""
+    found = re.search(r"force, left / right arm\s+([\d.]+) / ([\d.]+) N", browser.text())
+    assert found, browser.text()
+    return [float(one) for one in found.groups()]
+
+
+def wait_for_rest(session) -> None:
+    deadline = time.monotonic() + 60.0
+    while session.frame()["force"].any() or session.frame()["time"] > 1.0:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+PAD = """window.pad = {connected: true, axes: [0, 0, 0, 0], buttons: Array.from({length: 17}, () => ({value: 0}))};
+navigator.getGamepads = () => [null, window.pad];"""
+
+
+def test_a_gamepad_moves_either_tip_and_its_jaw(two_arms, tmp_path):
+    session = two_arms.session
+    right, away, out = session.directions
+    session.park()
+    session.ask(Reset())
+    wait_for_rest(session)
+    with Browser(tmp_path, WIDTH, HEIGHT) as browser:
+        browser.before_pages(PAD)
+        opened(browser, two_arms)
+
+        def hold(control: str, value: float, arm: int) -> np.ndarray:
+            """How an arm's tip goes while a stick or a trigger is held; the other one stays."""
+            hands, tips = session.targets, session.frame()["tip"].copy()
+            browser.run(f"void (window.pad.{control} = {value})")
+            wait_until(browser, lambda: np.linalg.norm(session.targets[arm] - hands[arm]) > 0.003)
+            browser.run(f"void (window.pad.{control} = 0)")
+            wait_until(browser, lambda: not session._motions)
+            moved = session.targets - hands
+            wait_until(browser, lambda: np.linalg.norm(session.frame()["tip"][arm] - tips[arm] - moved[arm]) < 0.001)
+            assert not moved[1 - arm].any()
+            return moved[arm] / np.linalg.norm(moved[arm])
+
+        # A worn stick that does not come back to its middle moves nothing.
+        hands = session.targets
+        browser.run("new Promise(done => { window.pad.axes[0] = 0.1; setTimeout(done, 500); })")
+        assert np.array_equal(session.targets, hands)
+        np.testing.assert_allclose(hold("axes[0]", 1.0, 0), right, atol=1e-9)
+        np.testing.assert_allclose(hold("axes[1]", 1.0, 0), -away, atol=1e-9)
+        np.testing.assert_allclose(hold("buttons[6].value", 1.0, 0), out, atol=1e-9)
+        np.testing.assert_allclose(hold("axes[3]", -1.0, 0), out, atol=1e-9)
+        browser.run("void (window.pad.buttons[0].value = 1)")
+        wait_until(browser, lambda: session.jaw_closed)
+        browser.run("void (window.pad.buttons[0].value = 0)")
+        browser.run("new Promise(done => { window.pad.buttons[5].value = 1; setTimeout(done, 300); })")
+        browser.run("void (window.pad.buttons[5].value = 0)")
+        np.testing.assert_allclose(hold("axes[0]", -1.0, 1), -right, atol=1e-9)
+        np.testing.assert_allclose(hold("buttons[7].value", 1.0, 1), -out, atol=1e-9)
+    assert session.jaw_closed and two_arms._judge.dropped == 0
+    session.close_jaw(False)
 
 
 # The plots' own canvases, as one number.

@@ -166,6 +166,14 @@ def test_keys_move_the_hand_and_let_go_with_the_tab(served):
     assert np.array_equal(served.session.targets[0], still)
 
 
+def test_the_other_arm_of_one_is_the_same(served):
+    """Keys go on moving the only tip after X was pressed, which a page of one arm does not know to leave alone."""
+    before = served.session.targets
+    served.session.push(HandMotion((0.0, 0.0, 1.0), 1))
+    wait_until(lambda: not served.session._motions)
+    assert (served.session.targets - before)[0] @ served.session.directions[2] > 0.002
+
+
 NONSENSE = {
     "bytes": b"\xc1",
     "huge": bytes(100_000),

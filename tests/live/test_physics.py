@@ -135,7 +135,7 @@ def test_a_replay_repeats_every_bit(bench):
 
 
 def test_a_recording_from_elsewhere_starts_at_rest(bench):
-    steps = np.zeros(500, dtype=bench.exchange.recorded.dtype)
+    steps = np.zeros(500, dtype=bench.exchange.recorded.steps.dtype)
     steps["time"], steps["hand"] = 1e-3 * np.arange(500), bench.above
     bench.exchange.recorded.fill(steps)
     bench.step(100, bench.pressed)

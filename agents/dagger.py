@@ -46,6 +46,7 @@ def dagger(
     rounds: int,
     steps: int,
     expert_share: Callable[[int], float] = halving,
+    disturbance: float = 0.0,
     normalisation: VecNormalize | None = None,
     action_weight: ArrayLike = 1.0,
     options: CloningOptions | None = None,
@@ -60,6 +61,8 @@ def dagger(
         rounds: how many.
         steps: of each environment in a round.
         expert_share: the share of steps in which the expert's action is played, from the round's index on.
+        disturbance: standard deviation of noise on what is played, not on what is learned (Laskey et al. 2017, DART): a
+            policy that has only seen calm episodes cannot bear the noise that reinforcement learning explores with.
         normalisation: begins anew each round from all observations so far.
         action_weight: shape (n_action,), as `clone` takes it.
         options: of each fit.
@@ -88,7 +91,7 @@ def dagger(
             if share < 1.0:
                 by_expert = rng.random(envs.num_envs) < share
                 taken = np.where(by_expert[:, None], taken, _of_policy(model, normalisation, play.observation))
-            endings += play.step(taken)
+            endings += play.step(disturbed(taken, disturbance, rng))
         observations, actions = np.concatenate(seen), np.concatenate(told)
         if normalisation is not None:
             normalise_by(normalisation, observations)
@@ -98,6 +101,13 @@ def dagger(
         won = [float(info["success"]) for info in endings if "success" in info]
         success = float(np.mean(won)) if won else float("nan")
         yield DaggerRound(index, share, len(actions), len(endings), success, curve.validation[curve.best])
+
+
+def disturbed(actions: NDArray[np.float32], disturbance: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Actions with normal noise, within the bounds."""
+    if disturbance == 0.0:
+        return actions
+    return np.clip(actions + rng.normal(scale=disturbance, size=actions.shape), -1.0, 1.0).astype(np.float32)
 
 
 def _of_policy(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: NDArray) -> NDArray[np.float32]:

@@ -96,6 +96,7 @@ def learn(arguments: argparse.Namespace) -> None:
         rounds=arguments.rounds,
         steps=arguments.steps,
         expert_share=lambda index: 1.0 if index == 0 else 0.3 if index == 1 else 0.0,
+        disturbance=arguments.disturbance,
         normalisation=normalisation,
         options=options,
         seed=FIRST_SEED + 10_000 * arguments.seed,
@@ -123,6 +124,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=170, help="control steps of each environment in a round")
     parser.add_argument("--envs", type=int, default=16)
     parser.add_argument("--epochs", type=int, default=200, help="of each fit, at most")
+    parser.add_argument("--disturbance", type=float, default=0.06, help="noise on actions while it plays, full scale 1")
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float32")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)

@@ -227,3 +227,15 @@ def test_dagger_learns_from_its_own_places():
     assert missed(model, normalisation) < 0.06
     with pytest.raises(ValueError, match="'NextStep'; DAgger needs"):
         next(dagger(gym.vector.SyncVectorEnv([Steering]), expert, model, rounds=1, steps=1))
+
+
+def test_a_disturbance_is_played_and_not_learned():
+    """The expert alone plays, and fails by what is added; its words are learned as ever."""
+    from agents.dagger import dagger
+
+    envs = gym.vector.SyncVectorEnv([Steering] * 4, autoreset_mode="SameStep")
+    model, normalisation = made()
+    settings = {"rounds": 1, "steps": 200, "disturbance": 0.3}
+    (only,) = dagger(envs, lambda seen, begun: best(seen), model, normalisation=normalisation, **settings)
+    assert only.expert_share == 1.0 and only.success_share < 0.3
+    assert missed(model, normalisation) < 0.06

@@ -80,7 +80,16 @@ def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypa
     act = learn_retract.RetractExpert.act
     monkeypatch.setattr(learn_retract.RetractExpert, "act", lambda self, seen: (asked.append(seen), act(self, seen))[1])
     out = tmp_path / "policy.zip"
-    settings = {"envs": 2, "dtype": "float64", "threads": 1, "rounds": 2, "steps": 4, "epochs": 2, "seed": 0}
+    settings = {
+        "envs": 2,
+        "dtype": "float64",
+        "threads": 1,
+        "rounds": 2,
+        "steps": 4,
+        "epochs": 2,
+        "disturbance": 0.05,
+        "seed": 0,
+    }
     learn_retract.learn(Namespace(out=out, without_force=blind, **settings))
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
     assert [line["sample_count"] for line in lines] == [8, 16]

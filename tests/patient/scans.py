@@ -1,4 +1,4 @@
-"""Label images that tests make: an ellipsoid of an organ with two lesions, as a CT's segmentation would show it."""
+"""Label images that tests make and know again: an ellipsoid of an organ with two lesions, as a CT's would be."""
 
 from pathlib import Path
 
@@ -49,3 +49,21 @@ def scan(path: Path, **geometry) -> Path:
     """The organ as a NIfTI file."""
     affine, shape = affine_of(**geometry)
     return write_nifti(path, labels_on(affine, shape), affine)
+
+
+def _places(image, tag):
+    """LPS places of a tag's voxels [mm], (n, 3)."""
+    return 1e3 * image.geometry.places(np.argwhere(image.tags == tag) * image.geometry.spacing)
+
+
+def check_organ(image, spacing):
+    """The organ lies where it is in the patient, whatever the image's axes."""
+    both = np.concatenate([_places(image, 1), _places(image, 2)])
+    # Means over some thousand voxels, extents to two voxels.
+    np.testing.assert_allclose(both.mean(axis=0), MIDDLE, atol=0.3)
+    np.testing.assert_allclose(np.ptp(both, axis=0), 2 * AXES, atol=2 * max(spacing))
+    lesions = _places(image, 2).mean(axis=0) - MIDDLE
+    # Both lesions lie to the front and the head, the larger to the left.
+    assert lesions[0] > 2.0
+    assert lesions[1] < -12.0
+    assert lesions[2] > 6.0

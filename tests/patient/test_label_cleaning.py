@@ -35,6 +35,36 @@ def test_parts_of_a_lesion_are_numbered_by_size():
     assert np.bincount(clean.tags.ravel()).tolist() == [0, 27000 - 64 - 80, 80, 64]
 
 
+@pytest.mark.parametrize(("side", "kept"), [(4, False), (5, True)])
+def test_a_region_that_is_no_lesion_is_whole_and_dropped_where_cells_cannot_show_it(side, kept):
+    """Cells of 6 mm show a ball of half a cell's radius, 113 voxels: not two of 4 x 4 x 3, but two of 5 x 4 x 3."""
+    tags = np.ones((30, 30, 30), dtype=np.uint8)
+    tags[2 : 2 + side, 2:6, 2:5] = tags[20 : 20 + side, 20:24, 20:23] = 2
+    count = 2 * side * 4 * 3
+    clean = clean_labels(image_of(tags, ["liver", "vessel"]), cell_size=0.006, mend=False)
+    assert clean.lesions == ()
+    if kept:
+        assert (clean.names, clean.notes) == (("liver", "vessel"), ())
+        assert np.array_equal(clean.tags == 2, tags == 2)
+    else:
+        assert clean.names == ("liver",)
+        assert np.array_equal(clean.tags, np.ones_like(tags))
+        (note,) = clean.notes
+        assert note.startswith(
+            f"vessel: 1 part(s), {count / 1000:.3g} ml together, are smaller than what cells of 6 mm"
+        )
+        assert note.endswith("and became liver")
+
+
+def test_a_label_apart_from_the_organ_is_left_out_and_said():
+    tags = np.zeros((30, 30, 30), dtype=np.uint8)
+    tags[2:20, 2:20, 2:20], tags[24:28, 24:28, 24:28] = 1, 2
+    clean = clean_labels(image_of(tags, ["liver", "lesion"]), cell_size=0.004, mend=False)
+    assert (clean.names, clean.lesions) == (("liver",), ())
+    assert clean.tags.max() == 1
+    assert clean.notes[-1] == "lesion: none of it lies in the largest part; left out"
+
+
 @pytest.mark.parametrize("names", [["liver", "lesion", "lesion 1"], ["liver", "lesion 1", "lesion"]])
 def test_a_number_that_makes_a_name_of_another_label_is_refused(names):
     tags = with_blocks(30, [(2, 2, 2), (12, 12, 12)], tag=names.index("lesion") + 1)

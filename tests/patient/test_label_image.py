@@ -12,8 +12,7 @@ import SimpleITK
 from msdm_core.errors import MeshError
 from surgsim_env.patient.label_image import RUN_VOXELS, VOXELS_MOST, read_label_image
 from surgsim_env.patient.label_names import parse_labels
-from tests.patient.scans import AXES, MIDDLE, affine_of, labels_on, write_nifti
-from tests.patient.segmentation_object import write_segmentation
+from tests.patient.scans import affine_of, check_organ, labels_on, write_nifti
 
 BOTH = parse_labels("liver=1,lesion=2")
 
@@ -34,24 +33,6 @@ TURNS = {
     "LAS, left-handed": np.diag([-1.0, 1.0, 1.0]),
     "oblique": turned([0.4, -0.3, 0.2]),
 }
-
-
-def places(image, tag):
-    """LPS places of a tag's voxels [mm], (n, 3)."""
-    return 1e3 * image.geometry.places(np.argwhere(image.tags == tag) * image.geometry.spacing)
-
-
-def check_organ(image, spacing):
-    """The organ lies where `tests.patient.scans` has it in the patient, whatever the image's axes."""
-    both = np.concatenate([places(image, 1), places(image, 2)])
-    # Means over some thousand voxels, extents to two voxels.
-    np.testing.assert_allclose(both.mean(axis=0), MIDDLE, atol=0.3)
-    np.testing.assert_allclose(np.ptp(both, axis=0), 2 * AXES, atol=2 * max(spacing))
-    lesions = places(image, 2).mean(axis=0) - MIDDLE
-    # Both lesions lie to the front and the head, the larger to the left.
-    assert lesions[0] > 2.0
-    assert lesions[1] < -12.0
-    assert lesions[2] > 6.0
 
 
 @pytest.mark.parametrize("name", TURNS)
@@ -106,40 +87,6 @@ def test_nrrd_without_a_space_says_what_is_taken(tmp_path):
     )
     image = read_label_image(tmp_path / "a.nrrd", parse_labels("liver=1"))
     assert "names no anatomical space" in " ".join(image.notes)
-
-
-def segmentation(tmp_path, **options):
-    shape, spacing = (40, 36, 20), (2.5, 2.25, 3.5)
-    labels = labels_on(np.diag([-1.0, -1.0, 1.0, 1.0]) @ _lps_affine(shape, spacing), shape)
-    masks = {"Liver": labels > 0, "Vessel": np.roll(labels == 2, 3, axis=0), "Tumor": labels == 2}
-    origin = MIDDLE - (np.array(shape) - 1) / 2 * spacing
-    return write_segmentation(tmp_path / "seg.dcm", masks, spacing, origin, **options), labels
-
-
-def _lps_affine(shape, spacing):
-    affine = np.diag([*spacing, 1.0])
-    affine[:3, 3] = MIDDLE - (np.array(shape) - 1) / 2 * spacing
-    return affine
-
-
-def test_dicom_segmentation_with_segments_that_overlap(tmp_path):
-    file, labels = segmentation(tmp_path)
-    image = read_label_image(file, parse_labels("liver=1,lesion=3"))
-    assert np.count_nonzero(image.tags == 2) == np.count_nonzero(labels == 2)
-    assert np.count_nonzero(image.tags) == np.count_nonzero(labels)
-    check_organ(image, (2.5, 2.25, 3.5))
-
-
-def test_dicom_segmentation_names_its_segments(tmp_path):
-    file, _ = segmentation(tmp_path)
-    with pytest.raises(MeshError, match=r"segment 7 is nowhere in it; there are 1 \('Liver'\), 2 \('Vessel'\), 3"):
-        read_label_image(file, parse_labels("liver=7"))
-
-
-def test_sheared_stack_of_dicom_frames_is_refused(tmp_path):
-    file, _ = segmentation(tmp_path, shift=0.5)
-    with pytest.raises(MeshError, match=r"off an even stack of 3\.5 mm slices: sheared"):
-        read_label_image(file, BOTH)
 
 
 # ---- files that are wrong ---------------------------------------------------------------------------------------
@@ -223,6 +170,14 @@ def test_no_file_and_a_folder(tmp_path):
     refused(tmp_path / "none.nii", "no such file")
     (tmp_path / "folder.nii").mkdir()
     refused(tmp_path / "folder.nii", "is a directory")
+
+
+def test_voxels_of_several_numbers_and_too_many_bytes_for_itk(tmp_path, monkeypatch):
+    SimpleITK.WriteImage(SimpleITK.Image([4, 4, 4], SimpleITK.sitkVectorUInt8, 3), str(tmp_path / "rgb.nrrd"))
+    refused(tmp_path / "rgb.nrrd", "each voxel has 3 numbers; the rule is one label")
+    SimpleITK.WriteImage(SimpleITK.Image([4, 5, 6], SimpleITK.sitkInt16), str(tmp_path / "big.nrrd"))
+    monkeypatch.setattr("surgsim_env.patient.itk_labels.BYTES_MOST", 2 * 4 * 5 * 6 - 1)
+    refused(tmp_path / "big.nrrd", r"holds 4 x 5 x 6 voxels of 2 bytes; at most .* of this format are read at once")
 
 
 def test_a_huge_image_is_refused_by_its_header(tmp_path):

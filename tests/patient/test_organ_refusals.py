@@ -3,6 +3,7 @@
 import os
 
 import pytest
+import trimesh
 
 from surgsim_env.cli import main
 from surgsim_env.patient.command import _replace
@@ -18,6 +19,9 @@ def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, ref
     (out / "a.toml").write_text("mine", encoding="utf-8")
     assert "is there, and not of an earlier run" in refusal(*given)
     (out / "a.toml").unlink()
+    (out / "report.html").mkdir()
+    assert "report.html is a folder there" in refusal(*given)
+    (out / "report.html").rmdir()
     others = "<!DOCTYPE html>\n<p>What I think of surgsim organ</p>"
     (out / "report.html").write_text(others, encoding="utf-8")
     assert "report.html is there" in refusal(*given)
@@ -75,9 +79,33 @@ def test_options_that_do_not_fit_a_scan(extra, words, tmp_path, refusal):
     assert words in refusal("organ", file, *extra)
 
 
+def test_two_scans_and_moduli_that_no_step_bears(tmp_path, refusal):
+    file = scan(tmp_path / "ct.nii.gz", spacing=(4.0, 4.0, 4.0))
+    assert "one image is taken, 2 files are given" in refusal("organ", file, file, *LABELS)
+    stiff = refusal("organ", file, *LABELS, "--cell-size", "0.009", "--youngs-modulus", "5e9")
+    assert "substeps in 0.001 s" in stiff and "are the moduli in pascals?" in stiff
+
+
+def test_surfaces_of_regions_that_are_no_one_body(tmp_path, refusal):
+    """A stone in two parts, of which one would have to be taken; a lesion's surface with a hole; sheets."""
+    organ, given = ball(tmp_path / "liver.stl"), ["--length-unit", "mm", "--cell-size", "0.01"]
+    two = trimesh.util.concatenate(
+        [trimesh.creation.icosphere(2, 5.0).apply_translation([x, 0.0, 0.0]) for x in (-12.0, 12.0)]
+    )
+    two.export(tmp_path / "stone.stl")
+    assert "region 'stone' has 2 surfaces, and one is taken" in refusal("organ", organ, tmp_path / "stone.stl", *given)
+    torn = ball(tmp_path / "lesion.stl", 9.0, drop=4)
+    said = refusal("organ", organ, torn, *given)
+    assert "lesion.stl" in said and "the surface is open" in said
+    sheets = trimesh.creation.box((60.0, 60.0, 60.0))
+    trimesh.Trimesh(sheets.vertices, sheets.faces[:1]).export(tmp_path / "sheet.stl")
+    assert "encloses nothing, also when mended" in refusal("organ", tmp_path / "sheet.stl", "--mend", *given)
+
+
 def test_options_that_do_not_fit_surfaces_or_tets(written, tmp_path, refusal):
     surface = ball(tmp_path / "liver.stl")
     unit = ["--length-unit", "mm"]
+    assert "needs --length-unit" in refusal("organ", surface)
     assert "--labels goes with a label image" in refusal("organ", surface, *unit, "--labels", "a=1")
     assert "is no NAME=FILE" in refusal("organ", surface, *unit, "--region", "lesion")
     outside = ball(tmp_path / "lesion.stl", 5.0, (40.0, 0.0, 0.0))
@@ -87,6 +115,8 @@ def test_options_that_do_not_fit_surfaces_or_tets(written, tmp_path, refusal):
     assert "--mend goes with" in refusal("organ", written / "patient.vtu", "--mend")
     for size in ("0.01", "0"):
         assert "--cell-size goes with" in refusal("organ", written / "patient.vtu", "--cell-size", size)
+    tets = [written / "patient.vtu"] * 2
+    assert "one file of tets is taken, 2 are given" in refusal("organ", *tets)
     assert "is no surface" in refusal("organ", surface, written / "patient.vtu", *unit)
     assert "goes with --segmentation" in refusal("palpate", "--scene", "phantom", *LABELS)
     assert "give a file" in refusal("organ")

@@ -1,0 +1,70 @@
+"""What a patient's scene is made of: materials by names, sites, and what an organ has no room for."""
+
+import pytest
+import trimesh
+
+from surgsim_env.anatomy import load_anatomy
+from surgsim_env.cli import main
+from surgsim_env.env import PalpateEnv
+from surgsim_env.palpation.job import plan_sites
+from surgsim_env.patient.materials import is_lesion, organ_material, region_material
+from surgsim_env.scenes import load_scene
+from tests.patient.scans import LABELS, scan
+
+
+@pytest.mark.parametrize(
+    ("region", "organ", "lesion", "modulus", "source"),
+    [
+        ("lesion 2", "liver", True, 8 * 5000.0, "doi 10.1177/8756479317733713"),
+        ("Tumour", "liver", True, 8 * 5000.0, "doi 10.1177/8756479317733713"),
+        ("hepatic adenoma", "liver", True, 1.9 * 5000.0, "PMID 26299323"),
+        ("FNH 1", "liver", True, 7.9 * 5000.0, "PMID 26299323"),
+        ("tumor", "left kidney", True, 4 * 8000.0, "PMID 26880174"),
+        ("stomach", "liver", False, 5000.0, "no source was looked up"),
+        ("kidney", "liver", False, 8000.0, "PMC10403462"),
+        ("portal vein", "left kidney", False, 8000.0, "nothing is known of 'portal vein' here"),
+        ("lesion", "pancreas", True, 8 * 5000.0, "doi 10.1177/8756479317733713"),
+    ],
+)
+def test_materials_go_by_names(region, organ, lesion, modulus, source):
+    healthy = organ_material(organ)
+    found = region_material(region, organ, healthy.material, {})
+    assert is_lesion(region) == lesion
+    assert found.material.youngs_modulus == pytest.approx(modulus)
+    assert source in found.source
+    assert (found.material.density, found.material.poisson_ratio) == (1060.0, 0.45)
+
+
+def test_an_organ_nobody_knows_takes_the_liver_s_modulus_and_says_so():
+    assert organ_material("pancreas").material == organ_material("liver").material
+    assert "the liver's: nothing is known of 'pancreas' here" in organ_material("pancreas").source
+
+
+def test_a_raster_of_too_many_sites_is_made_wider(tmp_path, monkeypatch):
+    monkeypatch.setattr("surgsim_env.patient.patient_scene.SITES_MOST", 6)
+    file = scan(tmp_path / "ct.nii.gz", spacing=(4.0, 4.0, 4.0))
+    out = tmp_path / "a.vtu"
+    assert main(["organ", str(file), *LABELS, "--cell-size", "0.009", "--out", str(out)]) == 0
+    scene = load_scene(out.with_suffix(".toml"))
+    assert 1 <= len(plan_sites(load_anatomy(scene))[0]) <= 6
+    # Before, as in the scene liver: 13/12 of the tip's radius.
+    assert scene.palpation.site_spacing > 13 / 12 * scene.instrument.tip_radius + 1e-3
+
+
+def test_a_thin_organ_is_pressed_all_over_and_may_have_no_room_for_hidden_lesions(tmp_path, capsys, monkeypatch):
+    """A plate of 16 mm, pressed 3.8 mm deep: less than five depths, more than three; lesions of 29 mm and more."""
+    monkeypatch.setattr("surgsim_env.patient.patient_scene.LESION_SHRINKS", (1.5,))
+    trimesh.creation.box((50.0, 40.0, 16.0)).export(tmp_path / "liver.stl")
+    out = tmp_path / "a.vtu"
+    given = ["organ", str(tmp_path / "liver.stl"), "--length-unit", "mm", "--cell-size", "0.004"]
+    assert main([*given, "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "the organ is thin: sites with 3 instead of 5 press depths of organ are pressed" in said
+    assert "the organ has no room for hidden lesions: there is no [lesion] table" in said
+    scene = load_scene(out.with_suffix(".toml"))
+    assert scene.lesion is None
+    assert scene.palpation.press_depth == pytest.approx(0.0038)
+    assert scene.palpation.thickness_smallest == pytest.approx(3 * 0.0038)
+    assert len(plan_sites(load_anatomy(scene))[0]) >= 1
+    with pytest.raises(ValueError, match=r"has no \[lesion\] table"):
+        PalpateEnv(scene=str(out.with_suffix(".toml")))

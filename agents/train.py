@@ -1,6 +1,6 @@
 """Train an agent as a configuration file says; go on with a run that was stopped, or killed, by starting it again.
 
-    python -m agents.train agents/configs/palpate_small_ppo.yaml
+    python -m agents.train agents/configs/palpate_phantom_small_ppo.yaml
     python -m agents.train agents/configs/sites_ppo.yaml --seed 3     # the same with another seed
     tensorboard --logdir runs
 

@@ -1,5 +1,6 @@
 """The README's Python runs as printed, and what it names is there."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -47,6 +48,22 @@ PLACES = sorted(set(re.findall(r"`((?:scenes|msdm_core|surgsim_env|agents|docs)/
 @pytest.mark.parametrize("place", PLACES)
 def test_places_in_the_map_exist(place):
     assert (ROOT / place).exists()
+
+
+# A file of the checkout by its whole path; NAME and SEED stand for what a user puts there.
+FILE = re.compile(r"(?<![\w./-])(?:agents|docs|scenes|tests|surgsim_env|msdm_core)/[\w./-]*?\.[a-z]{2,4}\b")
+NAMING = [ROOT / "README.md", ROOT / "agents" / "README.md", *sorted((ROOT / "agents").glob("*.py"))]
+
+
+@pytest.mark.parametrize("file", NAMING, ids=lambda file: str(file.relative_to(ROOT)))
+def test_files_named_in_full_exist(file):
+    text = file.read_text(encoding="utf-8")
+    if file.suffix == ".py":
+        text = ast.get_docstring(ast.parse(text)) or ""
+    for path in FILE.findall(text):
+        assert "NAME" in path or (ROOT / path).exists(), path
+    for module in re.findall(r"python -m (agents\.\w+)", text):
+        assert (ROOT / module.replace(".", "/")).with_suffix(".py").is_file(), module
 
 
 def test_pictures_exist_and_are_small():

@@ -2,6 +2,7 @@
 
 import math
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -172,6 +173,18 @@ def test_numbers_that_are_not_finite_in_the_organ_let_go():
     np.testing.assert_array_equal(device._forces[-1], 0.0)
 
 
+def test_a_warning_of_mujoco_lets_go():
+    loop, device = pressed()
+    assert np.linalg.norm(device.force) > 0.1
+    loop.simulation.instrument.data.warning[mujoco.mjtWarning.mjWARN_BADQVEL].number += 1
+    told = loop.step()
+    assert told.fault == "MuJoCo warning mjWARN_BADQVEL"
+    np.testing.assert_array_equal(told.tip.force, 0.0)
+    np.testing.assert_array_equal(device.force, 0.0)
+    loop.reset(tip_position=START)
+    assert not loop.step().fault
+
+
 def test_reset_takes_another_organ():
     loop, device = pressed()
     healthy = loop.simulation.anatomy.organ()
@@ -339,6 +352,8 @@ def test_smoothing_counts_as_lag():
         (lambda: DeviceFrame(rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))), "reflection"),
         (lambda: Hand(stiffness=-1.0), "hand stiffness is -1.0"),
         (lambda: held_device(pose_delay=-1), "pose_delay -1"),
+        (lambda: held_device(force_delay=-1), "force_delay -1"),
+        (lambda: held_device(encoder=math.nan), "encoder nan must not be negative"),
     ],
 )
 def test_bad_settings_are_refused(make, words):

@@ -155,6 +155,30 @@ def test_peer_that_has_gone_is_no_fault(device, sender):
         assert device.read() is None
 
 
+class FullSocket:
+    """Takes nothing, as a system whose buffers are full."""
+
+    def sendto(self, data, address):
+        raise OSError(105, "No buffer space available")
+
+
+def test_an_answer_that_the_socket_does_not_take_is_counted(device, sender, monkeypatch):
+    sender.pose(1)
+    assert arrived(device) is not None
+    with monkeypatch.context() as patched:
+        patched.setattr(device, "_socket", FullSocket())
+        device.write(np.ones(3))
+    assert (device.counts.unsent, device.counts.answered) == (1, 0)
+    # It is not sent again; the next pose has its own.
+    device.write(np.ones(3))
+    assert sender.silent()
+    sender.pose(2)
+    assert arrived(device) is not None
+    device.write(np.ones(3))
+    answer = unpack_force(sender.answer())
+    assert answer is not None and answer.sequence == 2
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "::", "example.org", ""])
 def test_other_hosts_than_loopback_are_refused(host):
     with pytest.raises(ValueError, match=r"loopback address such as 127\.0\.0\.1 alone"):

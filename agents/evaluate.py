@@ -138,20 +138,18 @@ def _evaluate_sites(
     records = play(chooser, envs, seeds, progress=_Progress(name))
     taken = time.perf_counter() - start
     envs.close()
-    result = Result(
+    return _saved(
+        options,
+        command,
+        taken,
         method=name,
         env_id=SITES,
         env_kwargs=kwargs,
-        seeds=(seeds[0], seeds[-1]),
         budget=budget,
         figures=score(records, budget, np.random.default_rng(BOOTSTRAP_SEED)),
-        command=_with_options(command, options),
-        wall_time=round(taken, 1),
-        date=_today(),
         errors_mm=[np.round(1000.0 * press_errors(record, budget), 2).tolist() for record in records],
         lesion_counts=[len(record.truth) for record in records],
     )
-    return _saved(result, options)
 
 
 def _evaluate_task(
@@ -165,18 +163,16 @@ def _evaluate_task(
     taken = time.perf_counter() - start
     control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
     envs.close()
-    result = Result(
+    return _saved(
+        options,
+        command,
+        taken,
         method=name,
         env_id=env_id,
         env_kwargs=kwargs,
-        seeds=(seeds[0], seeds[-1]),
         budget=gym.spec(env_id).max_episode_steps or 0,
         figures=task_figures(records, control_step, soft_force, np.random.default_rng(BOOTSTRAP_SEED)),
-        command=_with_options(command, options),
-        wall_time=round(taken, 1),
-        date=_today(),
     )
-    return _saved(result, options)
 
 
 def write_reach(options: argparse.Namespace) -> None:
@@ -218,7 +214,15 @@ def _environments(
     )
 
 
-def _saved(result: Result, options: argparse.Namespace) -> Result:
+def _saved(options: argparse.Namespace, command: str, taken: float, **scored: Any) -> Result:
+    """The result of what was played on the evaluation seeds in so many seconds, kept in its file and told."""
+    result = Result(
+        seeds=(EVALUATION_SEEDS[0], EVALUATION_SEEDS[options.episodes - 1]),
+        command=_with_options(command, options),
+        wall_time=round(taken, 1),
+        date=_today(),
+        **scored,
+    )
     path = result.save(options.results)
     shown = {name: figure.value for name, figure in result.figures.items()}
     told = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")

@@ -14,7 +14,7 @@ import_mujoco()
 from surgsim_env.arms.arm import load_arm  # noqa: E402
 from surgsim_env.arms.description import list_arms  # noqa: E402
 from surgsim_env.arms.port import Port  # noqa: E402
-from surgsim_env.env import register  # noqa: E402
+from surgsim_env.registration import register  # noqa: E402
 from surgsim_env.scenes import list_scenes, make_scene  # noqa: E402
 
 __all__ = ["Port", "list_arms", "list_scenes", "load_arm", "make_scene", "register"]

@@ -1,15 +1,12 @@
-"""The environments: one class an id, with its documentation, its arguments and its task; `register` names them."""
+"""The environments: one class an id, with its documentation, its arguments and its task."""
 
 from typing import Any
-
-import gymnasium as gym
 
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.levels import find_level
 from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.surgical_env import SurgicalEnv
-from surgsim_env.tasks import palpate, retract
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.retract import RetractTask
@@ -273,31 +270,3 @@ class BimanualRetractEnv(SurgicalEnv):
         simulation = Simulation(anatomy)
         task = BimanualRetractTask(anatomy, simulation.instrument)
         super().__init__(simulation, task, render_mode=render_mode, pictures=pictures, obs_mode=obs_mode)
-
-
-def register() -> None:
-    """Register the environment ids with Gymnasium; importing `surgsim_env` does it."""
-    if "SurgSim/Palpate-v0" in gym.registry:
-        return
-    gym.register(
-        id="SurgSim/Palpate-v0",
-        entry_point="surgsim_env.env:PalpateEnv",
-        vector_entry_point="surgsim_env.vector_env:PalpateVectorEnv",
-        max_episode_steps=palpate.EPISODE_STEPS,
-    )
-    gym.register(
-        id="SurgSim/PalpateSites-v0",
-        entry_point="surgsim_env.palpate_sites_env:PalpateSitesEnv",
-        vector_entry_point="surgsim_env.palpate_sites_env:PalpateSitesVectorEnv",
-    )
-    gym.register(
-        id="SurgSim/Retract-v0",
-        entry_point="surgsim_env.env:RetractEnv",
-        vector_entry_point="surgsim_env.vector_env:RetractVectorEnv",
-        max_episode_steps=retract.EPISODE_STEPS,
-    )
-    gym.register(
-        id="SurgSim/BimanualRetract-v0",
-        entry_point="surgsim_env.env:BimanualRetractEnv",
-        max_episode_steps=retract.EPISODE_STEPS,
-    )

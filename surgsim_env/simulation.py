@@ -1,11 +1,8 @@
 """Both states and the clock: an organ and an instrument that exchange forces at haptic rate."""
 
 import math
-import os
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 
 import numpy as np
 
@@ -15,13 +12,13 @@ from msdm_core.kernels import SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.mesh import FloatArray
 from msdm_core.organ import blank_state, rest_state
 from msdm_core.stability import stable_dt
-from surgsim_env import mujoco_library
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.exchange import StepsTaken, compiled_steps, haptic_step
 from surgsim_env.grasp import Grasp, read_grasp
 from surgsim_env.haptic_kernels import pull_force
 from surgsim_env.haptic_record import HapticRecord
 from surgsim_env.instrument import Instrument
+from surgsim_env.loop_choice import runs_compiled
 from surgsim_env.scene_instrument import make_instrument
 from surgsim_env.timing import substeps_needed
 from surgsim_env.tool_mass import check_tool_masses
@@ -30,8 +27,6 @@ from surgsim_env.tool_mass import check_tool_masses
 KEPT_FIELDS = tuple(name for name in OrganState._fields if name not in SCRATCH_FIELDS)
 # How far beyond the organ's bounding box the tip may travel [m].
 WORKSPACE_MARGIN = 0.04
-# "python": control steps run in the plain loop, as they do by themselves where MuJoCo's functions cannot be linked.
-LOOP_VARIABLE = "SURGSIM_LOOP"
 
 
 class Simulation:
@@ -63,7 +58,7 @@ class Simulation:
         self._wrench = np.zeros((self.instrument.tool_count, 6))
         self._step = 0
         self.fault = ""
-        self.compiled = _runs_compiled(os.environ.get(LOOP_VARIABLE, "compiled"))
+        self.compiled = runs_compiled()
         self.pull_peak = 0.0
         self._taken: StepsTaken | None = None
         self._record: HapticRecord | None = None
@@ -296,17 +291,3 @@ class Simulation:
                 f"are too long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: "
                 f"set timing.substep_count = {needed}, timing.mass_scaling = true, or use softer lesions"
             )
-
-
-def _runs_compiled(loop: str) -> bool:
-    if loop not in ("compiled", "python"):
-        raise ValueError(f'{LOOP_VARIABLE} is {loop!r}; it is "compiled" or "python"')
-    return loop == "compiled" and not _warn_of_missing_library(mujoco_library.missing())
-
-
-@cache
-def _warn_of_missing_library(missing: str) -> bool:
-    """Say once that, and why, control steps run in the plain loop; False where nothing is missing."""
-    if missing:
-        warnings.warn(f"control steps run in the plain Python loop, more slowly: {missing}", RuntimeWarning, 2)
-    return bool(missing)

@@ -1,11 +1,6 @@
 """An environment in general: a simulation and a task put together; no physics and no reward is computed here."""
 
-import io
 import json
-import zipfile
-import zlib
-from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -16,6 +11,7 @@ from msdm_core.mesh import FloatArray
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.rendering.window import Window
+from surgsim_env.saved_state import check_entries, fingerprint, packed, unpacked
 from surgsim_env.simulation import Simulation
 from surgsim_env.tasks.task import Task
 
@@ -189,14 +185,12 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
         arrays = self.simulation.get_state()
-        arrays["made_by"] = np.array(self._fingerprint())
+        arrays["made_by"] = np.array(self._maker())
         arrays["task"] = np.array(self.task.get_state())
         arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
         arrays["observation"] = self._observation.copy()
         arrays["running"] = np.array(self._running)
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
-        return buffer.getvalue()
+        return packed(arrays)
 
     def load_state(self, state: bytes) -> None:
         """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene.
@@ -204,20 +198,13 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         Raises:
             ValueError: bytes that are no saved state, or one of another scene or mesh (names both).
         """
-        try:
-            with np.load(io.BytesIO(state), allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            made_by = str(arrays["made_by"])
-        except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"not a saved state of this kind of environment: {error}") from None
-        if made_by != self._fingerprint():
-            raise ValueError(f"the state was saved by {made_by}, this is {self._fingerprint()}: use the same scene")
+        arrays = unpacked(state, made_by=self._maker())
         shapes = {"task": (), "random": (), "running": (), "observation": self._observation.shape}
-        _check_entries(arrays, shapes)
+        check_entries(arrays, shapes)
         before = self.task.get_state() if self._begun else None
         organ = self.task.set_state(str(arrays["task"]))
         try:
-            _check_entries(arrays, self.simulation.state_shapes(organ))
+            check_entries(arrays, self.simulation.state_shapes(organ))
         except ValueError:
             # Nothing is changed by what is refused.
             if before is not None:
@@ -266,15 +253,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if self.render_mode == "human":
             self._view.show(self._shown())
 
-    def _fingerprint(self) -> str:
-        """What a saved state must agree with: the environment, its scene and mesh, the rates."""
-        mesh, timing = self.simulation.anatomy.mesh, self.scene.timing
-        digest = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
-        digest = zlib.crc32(repr(replace(self.scene, folder=Path())).encode(), digest)
-        return (
-            f"{type(self).__name__} of scene {self.scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
-            f"{timing.substep_count} substeps in {timing.haptic_step:g} s, digest {digest:08x})"
-        )
+    def _maker(self) -> str:
+        return fingerprint(type(self).__name__, self.simulation)
 
     def _checked(self, action: Action | FloatArray) -> FloatArray:
         values = np.asarray(action, dtype=np.float64)
@@ -304,11 +284,3 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }
-
-
-def _check_entries(arrays: dict[str, np.ndarray], shapes: dict[str, tuple[int, ...]]) -> None:
-    """Refuse an archive that lacks an entry or has one of another shape."""
-    for name, shape in shapes.items():
-        if name not in arrays or arrays[name].shape != shape:
-            found = arrays[name].shape if name in arrays else "nothing"
-            raise ValueError(f"not a saved state of this environment: {name} has shape {shape}, found {found}")

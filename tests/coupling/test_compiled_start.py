@@ -14,7 +14,7 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys
 
 from msdm_core.kernels import FAULT_NONE
-from surgsim_env import mujoco_library, simulation
+from surgsim_env import loop_choice, mujoco_library
 from surgsim_env.exchange import compiled_steps
 from surgsim_env.haptic_kernels import MUJOCO_FUNCTIONS, advance_haptic_steps
 from surgsim_env.tool_bodies import ToolBodies
@@ -96,7 +96,7 @@ def test_functions_are_asked_for_before_any_is_called(monkeypatch):
 def test_without_the_library_the_plain_loop_runs_and_says_so_once(monkeypatch):
     reason = "no library of MuJoCo in /nowhere"
     monkeypatch.setattr(mujoco_library, "_missing", reason)
-    simulation._warn_of_missing_library.cache_clear()
+    loop_choice._warn_of_missing_library.cache_clear()
     with pytest.warns(RuntimeWarning, match=f"plain Python loop, more slowly: {reason}"):
         env = gym.make("SurgSim/Palpate-v0").unwrapped
     assert env.simulation.compiled is False
@@ -128,11 +128,11 @@ def test_tools_that_drive_themselves_are_refused():
 
 
 def test_the_loop_can_be_chosen(monkeypatch):
-    monkeypatch.setenv(simulation.LOOP_VARIABLE, "python")
+    monkeypatch.setenv(loop_choice.LOOP_VARIABLE, "python")
     assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is False
-    monkeypatch.setenv(simulation.LOOP_VARIABLE, "compiled")
+    monkeypatch.setenv(loop_choice.LOOP_VARIABLE, "compiled")
     assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is True
-    monkeypatch.setenv(simulation.LOOP_VARIABLE, "fast")
+    monkeypatch.setenv(loop_choice.LOOP_VARIABLE, "fast")
     with pytest.raises(ValueError, match="SURGSIM_LOOP is 'fast'"):
         gym.make("SurgSim/Palpate-v0")
 

@@ -18,6 +18,11 @@ from surgsim_env.pacing import timeliness
 from surgsim_env.scenes import make_scene
 from tests.live.chromium import Browser
 
+# Pictures are frames with something new in them.
+COUNTED = "[window.pictures, window.frames_drawn]"
+# viser draws fewer pixels than the window has where a browser is slow.
+CANVAS_SIZE = "(() => { const c = document.querySelector('canvas[data-engine]'); return [c.width, c.height]; })()"
+
 
 def press_around(session: Session, stop: threading.Event) -> None:
     """Press in and out at one place, moving the hand 30 times a second."""
@@ -66,10 +71,10 @@ def main() -> None:
         threads.append(threading.Thread(target=page.run, args=(stop.is_set,)))
         threads[0].start()
         with Browser(folder, *given.size) as browser:
+            browser.count_pictures()
             browser.open(page.server.address)
             browser.wait_for("!!document.body && document.body.innerText.includes('steps/s')", 300)
             browser.run("document.querySelector('.mantine-Notification-closeButton')?.click()")
-            browser.count_pictures()
             if given.out is not None:
                 press_raster(session, session.scene.palpation.site_spacing, session.scene.palpation.press_depth)
                 browser.wait_for("window.pictures > 8", 300)
@@ -90,11 +95,14 @@ def main() -> None:
 
 def measure(session: Session, browser: Browser, seconds: float) -> None:
     """Print what was kept up for some seconds."""
-    before, drawn, start = session.timing(), browser.run("window.pictures"), time.monotonic()
+    before, counted, start = session.timing(), browser.run(COUNTED), time.monotonic()
     time.sleep(seconds)
-    after = session.timing()
-    drawn, wall = browser.run("window.pictures") - drawn, time.monotonic() - start
-    print(f"browser_pictures {drawn / wall:.1f} 1/s")
+    after, wall = session.timing(), time.monotonic() - start
+    pictures, frames = (now - then for now, then in zip(browser.run(COUNTED), counted, strict=True))
+    print(f"browser_pictures {pictures / wall:.1f} 1/s")
+    print(f"browser_frames {frames / wall:.1f} 1/s")
+    width, height = browser.run(CANVAS_SIZE)
+    print(f"canvas {width} x {height} pixels")
     print("\n".join(report_lines(timeliness(before[0], after[0], after[1] - before[1]), wall)))
 
 

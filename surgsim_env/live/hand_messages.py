@@ -1,4 +1,4 @@
-"""What `hand.js` sends: how fast keys and gamepads move a tip, in 16 bytes, and how fast the browser draws, in 4."""
+"""What `hand.js` sends: how fast keys and gamepads move a tip, in 16 bytes, and how the browser draws, in 8."""
 
 import math
 import struct
@@ -11,8 +11,8 @@ HAND_PATH = "/hand"
 # turn its jaw from open to closed or back, else 0.
 _PACKET = struct.Struct("<3fHH")
 PACKET_SIZE = _PACKET.size
-# Frames a second that the browser comes to.
-_RATE = struct.Struct("<f")
+# Frames a second that the browser comes to; 1 where it has counted them; 1 where it has no graphics card; else 0.
+_REPORT = struct.Struct("<fHH")
 RATE_MOST = 1000.0
 AXIS_SLACK = 1e-6
 
@@ -24,6 +24,14 @@ class HandMotion:
     axes: tuple[float, float, float]
     arm: int
     turns_jaw: bool = False
+
+
+@dataclass(frozen=True)
+class DrawingReport:
+    """Frames a second that a browser comes to, None while it does not know; whether it has no graphics card."""
+
+    rate: float | None
+    software: bool
 
 
 def read_hand(message: object, *, arm_count: int) -> HandMotion:
@@ -43,23 +51,23 @@ def read_hand(message: object, *, arm_count: int) -> HandMotion:
     return HandMotion((right, away, out), arm, bool(turns_jaw))
 
 
-def read_rate(message: object) -> float | None:
-    """Frames a second that a browser comes to; None where the message is another.
+def read_report(message: object) -> DrawingReport | None:
+    """How a browser draws; None where the message is another.
 
     Raises:
-        NonsenseError: a rate that is none.
+        NonsenseError: a rate that is none, a flag that is none.
     """
-    if not isinstance(message, bytes) or len(message) != _RATE.size:
+    if not isinstance(message, bytes) or len(message) != _REPORT.size:
         return None
-    (rate,) = _RATE.unpack(message)
-    if not 0.0 <= rate <= RATE_MOST:
-        raise NonsenseError(f"a browser that draws {rate} frames a second")
-    return rate
+    rate, counted, software = _REPORT.unpack(message)
+    if not 0.0 <= rate <= RATE_MOST or counted > 1 or software > 1:
+        raise NonsenseError(f"a browser that draws {rate} frames a second, counted {counted}, software {software}")
+    return DrawingReport(rate if counted else None, bool(software))
 
 
-def write_rate(rate: float) -> bytes:
-    """The packet that says a rate."""
-    return _RATE.pack(rate)
+def write_report(report: DrawingReport) -> bytes:
+    """The packet that says how a browser draws."""
+    return _REPORT.pack(report.rate or 0.0, report.rate is not None, report.software)
 
 
 def write_hand(motion: HandMotion) -> bytes:

@@ -10,7 +10,7 @@ from msdm_core.regions import Lesion
 from surgsim_env.anatomy import Anatomy
 from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.instrument_view import SCALE, STILL
-from surgsim_env.rendering.surface import drawn_surface
+from surgsim_env.rendering.surface import TRIANGLES_MOST, drawn_surface
 from surgsim_env.rendering.tissue import lesion_ball
 
 ORGAN_COLOUR, LESION_COLOUR = (158, 58, 50), (250, 214, 120)
@@ -26,28 +26,40 @@ COLOURS = (
     (240, 117, 48),
     (205, 46, 46),
 )
+# What is drawn plainly has no more triangles than this, where the simulation has no more itself.
+PLAIN_TRIANGLES_MOST = 5_000
 # The paint lies this far above the surface [m].
 PAINT_ABOVE = 0.0004
+NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
 class OrganView:
-    """Nodes of a viser scene for an organ, its paint, and its lesions."""
+    """Nodes of a viser scene for an organ, its paint, and its lesions.
+
+    Fields:
+        paints: whether what was felt is shown
+        plain: whether it is drawn with fewer triangles, from the next picture on
+    """
 
     def __init__(self, scene: Any, anatomy: Anatomy) -> None:
         """Add the organ at rest."""
         self._scene, self._mesh, self._points = scene, anatomy.mesh, anatomy.mesh.points
-        self._surface = drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
-        vertices, _ = self._surface.follow(anatomy.mesh.points)
-        self._organ = scene.add_mesh_simple(
-            "/organ", _scaled(vertices), self._surface.faces.astype(np.uint32), color=ORGAN_COLOUR
-        )
+        self._surfaces = {
+            plain: drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles, most)
+            for plain, most in ((False, TRIANGLES_MOST), (True, PLAIN_TRIANGLES_MOST))
+        }
+        self.plain = self._drawn_plain = False
+        self._opacity: float | None = None
+        self._shown = anatomy.mesh.points
+        self._add_organ()
         self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(COLOURS)]
-        self._painted, self._fresh, self._shown = -1, 1, anatomy.mesh.points
+        self._painted, self._fresh = -1, 1
         self.paints = True
         self._lesions: list[tuple[Any, Any]] = []
 
     def follow(self, node_position: FloatArray) -> None:
         """Take the surface where the nodes are [m], (n_node, 3)."""
+        self._choose_surface()
         if self._fresh == 0 and np.abs(node_position - self._shown).max() < STILL:
             return
         self._fresh, self._shown = 0, node_position
@@ -60,8 +72,27 @@ class OrganView:
         for ball, node in self._lesions:
             node.position = ball.centre_now(self._points, node_position) * SCALE
 
+    def _choose_surface(self) -> None:
+        """Draw the other surface from now on, where that is wanted."""
+        if self.plain == self._drawn_plain:
+            return
+        self._drawn_plain = self.plain
+        self._add_organ()
+        for paint in self._paint:
+            paint.cover(NO_FACES)
+        self._painted, self._fresh = -1, 1
+
+    def _add_organ(self) -> None:
+        self._surface = self._surfaces[self._drawn_plain]
+        vertices, _ = self._surface.follow(self._shown)
+        faces = self._surface.faces.astype(np.uint32)
+        self._organ = self._scene.add_mesh_simple(
+            "/organ", _scaled(vertices), faces, color=ORGAN_COLOUR, opacity=self._opacity
+        )
+
     def paint(self, felt: FeltMap) -> None:
         """Colour what was felt since the last time; the softest of it is blue."""
+        self._choose_surface()
         if not self.paints or felt.version == self._painted:
             return
         self._painted, self._fresh = felt.version, 1
@@ -81,7 +112,7 @@ class OrganView:
         self.paints, self._painted, self._fresh = on, -1, 1
         if not on:
             for paint in self._paint:
-                paint.cover(np.zeros((0, 3), dtype=np.int32))
+                paint.cover(NO_FACES)
                 paint.follow(np.zeros((0, 3), dtype=np.float32))
 
     def show_lesions(self, lesions: Sequence[Lesion]) -> None:
@@ -89,7 +120,8 @@ class OrganView:
         for _, node in self._lesions:
             node.remove()
         self._lesions = []
-        self._organ.opacity = 0.45 if lesions else None
+        self._opacity = 0.45 if lesions else None
+        self._organ.opacity = self._opacity
         for index, lesion in enumerate(lesions):
             ball = lesion_ball(self._mesh, lesion)
             node = self._scene.add_icosphere(

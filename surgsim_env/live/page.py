@@ -1,32 +1,28 @@
 """The page: what the picture shows of frames, what the panel asks of the session, thirty times a second."""
 
-import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from websockets.asyncio.server import ServerConnection
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.live.errors import LiveError
 from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.guarded_server import GuardedServer
-from surgsim_env.live.hand_messages import read_hand, read_rate
+from surgsim_env.live.hand_sockets import HandSockets
 from surgsim_env.live.instrument_view import SCALE, InstrumentView
 from surgsim_env.live.organ_choice import chosen_lesions
 from surgsim_env.live.organ_view import OrganView
 from surgsim_env.live.panel import Panel
-from surgsim_env.live.picture_rate import PictureRate
 from surgsim_env.live.recording import write_recording
 from surgsim_env.live.requests import Change, Pause, Record, Replay, Reset
 from surgsim_env.live.session import Session
-from surgsim_env.live.stage import ForceArrow, add_handle, light, prepare
+from surgsim_env.live.stage import ForceArrow, Surroundings, add_handle
 from surgsim_env.live.status import headline, status_rows
-from surgsim_env.live.web_messages import Judge, NonsenseError
+from surgsim_env.live.web_messages import Judge
 from surgsim_env.pacing import timeliness
 
 # Between plots, and between words [s].
@@ -59,10 +55,10 @@ class Page:
         """
         self.session, self._out = session, out
         self._judge = Judge()
-        self.server = GuardedServer(host, port, remote=remote, judge=self._judge, serve_hand=self._serve_hand)
+        self._tabs = HandSockets(session, self._judge)
+        self.server = GuardedServer(host, port, remote=remote, judge=self._judge, serve_hand=self._tabs.serve)
         self.felt = FeltMap(session.anatomy)
         self.pictures = 0
-        self._rate = PictureRate()
         self._organ_number, self._traced = 1, 0
         self._grabs: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._held: set[int] = set()
@@ -70,9 +66,12 @@ class Page:
         self._was_recording = False
         self._doing: tuple[int, bool, bool] | None = None
         self._said = ""
+        # None: nobody has said yet how to draw.
+        self._plain: bool | None = None
         viser = self.server.viser
         with viser.atomic():
-            session.directions = prepare(viser, session.anatomy)
+            self._surroundings = Surroundings(viser, session.anatomy)
+            session.directions = self._surroundings.directions
             self._organ = OrganView(viser.scene, session.anatomy)
             self._add_instrument()
             self._panel = Panel(
@@ -113,8 +112,9 @@ class Page:
         }
 
     def show_plain(self, on: bool) -> None:
-        """Leave shadows and reflections away, on every page, or draw them again."""
-        light(self.server.viser, plain=on)
+        """Leave shadows, reflections and the finest triangles away, on every page, or draw them again."""
+        self._plain = self._organ.plain = on
+        self._surroundings.show_plain(on)
         self._panel.show_plain(on)
 
     def run(self, until: Callable[[], bool]) -> None:
@@ -141,7 +141,7 @@ class Page:
             if now >= status_due:
                 status_due = now + STATUS_PERIOD
                 self._say(frame)
-            period = 1.0 / self._rate.rate
+            period = 1.0 / self._tabs.rate.rate
             due = max(due + period, time.monotonic() - period)
             time.sleep(max(0.0, due - time.monotonic()))
 
@@ -181,21 +181,6 @@ class Page:
         if phase == "end":
             del self._grabs[arm]
 
-    async def _serve_hand(self, connection: ServerConnection) -> None:
-        """Keys and sticks of one tab."""
-        tab = id(connection)
-        async for message in _messages(connection):
-            try:
-                rate = read_rate(message)
-                if rate is not None:
-                    self._rate.report(tab, rate)
-                    continue
-                self.session.push(read_hand(message, arm_count=max(2, self.session.arm_count)))
-            except NonsenseError as error:
-                self._judge.dropped += 1
-                await connection.close(1008, str(error)[:100])
-        self._rate.forget(tab)
-
     def _reset(self) -> None:
         self.session.park()
         self.session.ask(Reset())
@@ -211,6 +196,8 @@ class Page:
     def _attend(self, frame: np.ndarray) -> None:
         """What is to be done whether anybody looks or not: touches felt, sliders heeded, recordings written."""
         session = self.session
+        if self._plain is None and self._tabs.software:
+            self.show_plain(True)
         choice = self._panel.settled_choice()
         if choice is not None and choice != session.choice:
             session.park()
@@ -262,7 +249,7 @@ class Page:
         fps = (pictures - self._pictures_before) / wall
         self._before, self._pictures_before = now, pictures
         rows = status_rows(
-            frame, kept, skipped=int(now[0]["skipped"]), fps=fps, drawn=self._rate.slowest, said=self._said
+            frame, kept, skipped=int(now[0]["skipped"]), fps=fps, drawn=self._tabs.rate.slowest, said=self._said
         )
         self._panel.show_status(headline(frame), rows)
         self._show_phase(frame)
@@ -276,13 +263,3 @@ class Page:
             step=self.session.scene.timing.haptic_step,
             jaw_closed=self.session.jaw_closed,
         )
-
-
-async def _messages(connection: ServerConnection) -> AsyncIterator[Any]:
-    from websockets.exceptions import ConnectionClosed
-
-    while True:
-        try:
-            yield await connection.recv()
-        except (ConnectionClosed, asyncio.CancelledError):
-            return

@@ -1,4 +1,4 @@
-"""What stands around the organ on the page: camera, ground, handles of the hands, arrows of force."""
+"""What stands around the organ on the page: camera, light, ground, handles of the hands, arrows of force."""
 
 import math
 from collections.abc import Callable
@@ -36,21 +36,35 @@ def page_camera(anatomy: Anatomy) -> Camera:
     return Camera.looking(target + distance * near.rotation[:, 2], target, near.up, near.fov)
 
 
-def prepare(viser: Any, anatomy: Anatomy) -> FloatArray:
-    """Set camera, light and ground; unit vectors right, away and out of the organ for whoever looks, (3, 3)."""
-    camera = page_camera(anatomy)
-    viser.scene.set_up_direction(camera.up)
-    first = viser.initial_camera
-    first.position, first.look_at, first.up = camera.position * SCALE, camera.target * SCALE, camera.up
-    first.fov, first.near = math.radians(camera.fov), 0.05
-    viser.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False, brand_color=BRAND_COLOUR)
-    viser.scene.world_axes.visible = False
-    light(viser, plain=False)
-    right, ahead = camera.rotation[:, 0], -camera.rotation[:, 2]
-    level = ahead - (ahead @ camera.up) * camera.up
-    directions = np.stack([right, level / np.linalg.norm(level), -anatomy.face.approach])
-    _add_ground(viser.scene, anatomy.mesh.points, camera.up, right)
-    return directions
+class Surroundings:
+    """Camera, light and ground.
+
+    Fields:
+        directions: unit vectors right, away and out of the organ for whoever looks, as rows (3, 3)
+    """
+
+    def __init__(self, viser: Any, anatomy: Anatomy) -> None:
+        """Set them up on a viser server."""
+        camera = page_camera(anatomy)
+        viser.scene.set_up_direction(camera.up)
+        first = viser.initial_camera
+        first.position, first.look_at, first.up = camera.position * SCALE, camera.target * SCALE, camera.up
+        first.fov, first.near = math.radians(camera.fov), 0.05
+        viser.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False, brand_color=BRAND_COLOUR)
+        viser.scene.world_axes.visible = False
+        right, ahead = camera.rotation[:, 0], -camera.rotation[:, 2]
+        level = ahead - (ahead @ camera.up) * camera.up
+        self.directions = np.stack([right, level / np.linalg.norm(level), -anatomy.face.approach])
+        self._scene = viser.scene
+        self._ground = _add_ground(viser.scene, anatomy.mesh.points, camera.up, right)
+        self.show_plain(False)
+
+    def show_plain(self, on: bool) -> None:
+        """Leave away what takes most of a software renderer's time: shadows, reflections, a ground that shines."""
+        self._scene.configure_default_lights(enabled=True, cast_shadow=not on)
+        self._scene.configure_environment_map(None if on else "warehouse", environment_intensity=0.6)
+        self._scene.add_light_ambient("/ambient", intensity=AMBIENT if on else 0.0)
+        self._ground.material = "toon3" if on else "standard"
 
 
 def add_handle(
@@ -68,7 +82,7 @@ def add_handle(
         arm: whose hand it is.
         place: where it begins [m], (3,).
         size: of the organ [m].
-        directions: see `prepare`.
+        directions: see `Surroundings`.
         pulled: called with the arm, the drag's phase and the place [m].
     """
     out = directions[2]
@@ -133,21 +147,14 @@ class ForceArrow:
         self._node.vertices = (points @ turn + tip * SCALE).astype(np.float32)
 
 
-def light(viser: Any, *, plain: bool) -> None:
-    """Light the scene; plain: without shadows and reflections, which take most of a software renderer's time."""
-    viser.scene.configure_default_lights(enabled=True, cast_shadow=not plain)
-    viser.scene.configure_environment_map(None if plain else "warehouse", environment_intensity=0.6)
-    viser.scene.add_light_ambient("/ambient", intensity=AMBIENT if plain else 0.0)
-
-
-def _add_ground(scene: Any, points: FloatArray, up: FloatArray, right: FloatArray) -> None:
+def _add_ground(scene: Any, points: FloatArray, up: FloatArray, right: FloatArray) -> Any:
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     low = float((points @ up).min()) - GROUND_GAP
     ground = middle + up * (low - middle @ up)
     half = GROUND_REACH * float(np.ptp(points, axis=0).max())
     along = np.cross(up, right)
     corners = [ground + half * (x * right + y * along) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    scene.add_mesh_simple(
+    return scene.add_mesh_simple(
         "/ground",
         (np.array(corners) * SCALE).astype(np.float32),
         np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),

@@ -10,7 +10,7 @@ from msdm_core.mesh import FloatArray, IntArray
 
 # Neighbours whose resting normals differ by more than this meet at a crease, as the faces of a block do [degrees].
 CREASE_ANGLE = 50.0
-# Each triangle is drawn as splits^2 smaller ones; as many as stay below this number of triangles.
+# Each triangle is drawn as splits^2 smaller ones; as many as stay below this number of triangles, or what is asked for.
 TRIANGLES_MOST = 15_000
 SPLITS_MOST = 4
 # How far the small triangles are bent towards the tangent planes of their corners (Boubekeur & Alexa 2008).
@@ -65,10 +65,16 @@ class DrawnSurface:
         return flat - out, _unit(mixed[:, 12:])
 
 
-def drawn_surface(points: FloatArray, triangles: IntArray) -> DrawnSurface:
-    """The drawn surface of a closed one: node positions at rest [m] (n_node, 3), outward triangles (n_triangle, 3)."""
+def drawn_surface(points: FloatArray, triangles: IntArray, triangles_most: int = TRIANGLES_MOST) -> DrawnSurface:
+    """The drawn surface of a closed one.
+
+    Args:
+        points: node positions at rest [m], (n_node, 3).
+        triangles: outward, (n_triangle, 3).
+        triangles_most: that splitting may lead to.
+    """
     corner_of, corner_node = _corners(points, triangles)
-    splits = max(k for k in range(1, SPLITS_MOST + 1) if k == 1 or len(triangles) * k * k <= TRIANGLES_MOST)
+    splits = max(k for k in range(1, SPLITS_MOST + 1) if k == 1 or len(triangles) * k * k <= triangles_most)
     weights, faces = _split(corner_of, len(corner_node), splits)
     seam = _seam_vertices(corner_of, weights)
     faces_at = (np.ones(corner_of.size), (corner_of.ravel(), np.repeat(np.arange(len(triangles)), 3)))

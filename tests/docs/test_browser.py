@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from tests.live.chromium import Browser
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium (.ci/run does)")
 # Puts into the page's title what the browser made of it, in a copy beside the page.
@@ -88,3 +90,19 @@ def test_the_home_page_is_painted(address, tmp_path):
     np.testing.assert_allclose(image[5, 640], np.array([0x12, 0x34, 0x3B]) / 255, atol=0.02)
     for part in np.split(image, 4):
         assert len(np.unique((part * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 60
+
+
+def test_a_word_that_is_typed_is_found(address, tmp_path):
+    """Material's search fetches its index and works in a worker: neither shows in pages that are only looked at."""
+    with Browser(tmp_path, 1280, 900) as browser:
+        browser.open(f"{address}/index.html")
+        browser.wait_for("document.readyState === 'complete' && !!document.querySelector('input.md-search__input')")
+        browser.run("document.querySelector('input.md-search__input').focus()")
+        browser.do("Input.insertText", text="watchdog")
+        browser.wait_for(f"{FOUND}.length > 0")
+        found = browser.run(f"{FOUND}.map(one => [one.href, one.textContent])")
+        assert any("haptics.html" in link and "watchdog" in text.lower() for link, text in found), found
+        assert browser.complaints() == []
+
+
+FOUND = "[...document.querySelectorAll('a.md-search-result__link')]"

@@ -14,13 +14,21 @@ from websockets.sync.client import connect
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 COUNT_PICTURES = """(() => {
-  window.pictures = 0;
-  let drawn = false;
+  window.frames_drawn = window.pictures = 0;
+  let drawn = false, heard = false;
+  const Real = window.Worker;
+  window.Worker = class extends Real {
+    constructor(...given) { super(...given); this.addEventListener("message", () => { heard = true; }); }
+  };
   for (const name of ["drawElements", "drawArrays", "drawElementsInstanced"]) {
     const real = WebGL2RenderingContext.prototype[name];
     WebGL2RenderingContext.prototype[name] = function (...given) { drawn = true; return real.apply(this, given); };
   }
-  const tick = () => { if (drawn) window.pictures += 1; drawn = false; requestAnimationFrame(tick); };
+  const tick = () => {
+    if (drawn) { window.frames_drawn += 1; if (heard) window.pictures += 1; heard = false; }
+    drawn = false;
+    requestAnimationFrame(tick);
+  };
   requestAnimationFrame(tick);
 })()"""
 
@@ -148,8 +156,11 @@ class Browser:
         return self.run("document.body?.innerText")
 
     def count_pictures(self) -> None:
-        """Count from now on, in `window.pictures`, the frames in which something was drawn in three dimensions."""
-        self.run(COUNT_PICTURES)
+        """Count, in pages that are opened from now on, frames that are drawn in three dimensions.
+
+        All in `window.frames_drawn`; in `window.pictures` those before which viser's worker handed something new over.
+        """
+        self.before_pages(COUNT_PICTURES)
 
     def shot(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.do("Page.captureScreenshot", format="png")["data"]))

@@ -36,7 +36,6 @@ def serving(scene: Scene, folder: Path) -> Iterator[Page]:
     try:
         session.wait()
         page = Page(session, host="127.0.0.1", port=0, remote=False, out=folder / "out")
-        page.show_plain(True)
         thread = threading.Thread(target=page.run, args=(stop.is_set,))
         thread.start()
         yield page
@@ -99,6 +98,9 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, tmp_path
     with Browser(tmp_path, WIDTH, HEIGHT) as browser:
         opened(browser, served)
         assert browser.run("location.search") == ""
+        # It draws in software, and has said so.
+        assert served._plain and served._panel._plain.value
+        assert not browser.run(SMOOTH_EDGES)
         before = picture(browser, tmp_path)
         rest = session.frame()["node"].copy()
         plot_before = browser.run(PLOT)
@@ -232,6 +234,7 @@ def test_a_gamepad_moves_either_tip_and_its_jaw(two_arms, tmp_path):
     session.close_jaw(False)
 
 
+SMOOTH_EDGES = "document.querySelector('canvas[data-engine]').getContext('webgl2').getContextAttributes().antialias"
 # The plots' own canvases, as one number.
 PLOT = """[...document.querySelectorAll('.uplot canvas')].map(one => {
   const d = one.getContext('2d').getImageData(0, 0, one.width, one.height).data;

@@ -1,101 +1,18 @@
-"""A whole session behind a page, met at the protocol's level: hands, tabs that go, nonsense, slow ones, the end."""
+"""A whole session behind a page, met at the protocol's level: hands, tabs that go, nonsense, slow ones."""
 
 import asyncio
-import os
-import signal
-import subprocess
-import sys
-import threading
 import time
-from pathlib import Path
 
 import msgspec.msgpack
 import numpy as np
 import pytest
-import viser
-from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from surgsim_env.live.errors import LiveError
-from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.hand_messages import HandMotion, write_hand
-from surgsim_env.live.organ_choice import HIDDEN, NONE, OrganChoice
-from surgsim_env.live.page import Page
 from surgsim_env.live.protocol_client import CAMERA, ProtocolClient, hand_message, press_path
-from surgsim_env.live.requests import Change, Pause, Record, Reset
-from surgsim_env.live.session import Session
-from surgsim_env.pacing import PaceSettings
-from surgsim_env.scenes import make_scene
+from tests.live.served import SECONDS, wait_until
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-# A physics at a quarter of real time leaves room on a machine where other tests run beside.
-PACE = PaceSettings(period=0.004)
-SECONDS = 60.0
-
-
-class Served:
-    """A page with its loop in a thread."""
-
-    def __init__(self, out: Path) -> None:
-        self.out = out
-        self.session = Session(make_scene("phantom_small"), pace=PACE)
-        self.session.wait()
-        self.page = Page(self.session, host="127.0.0.1", port=0, remote=False, out=out)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self.page.run, args=(self._stop.is_set,))
-        self._thread.start()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join(timeout=20)
-        self.page.server.stop()
-        self.session.close()
-
-    @property
-    def address(self) -> str:
-        return self.page.server.address
-
-    @property
-    def force(self) -> float:
-        return float(np.linalg.norm(self.session.frame()["force"][0]))
-
-    def socket(self, path="/"):
-        gate = self.page.server.gate
-        return connect(
-            f"ws://127.0.0.1:{gate.port}{path}",
-            origin=f"http://127.0.0.1:{gate.port}",
-            additional_headers={"Cookie": f"{gate.cookie}={gate.token}"},
-            subprotocols=[f"viser-v{viser.__version__}"] if path == "/" else None,
-            max_size=None,
-            compression=None,
-        )
-
-
-@pytest.fixture(scope="module")
-def served(tmp_path_factory):
-    made = Served(tmp_path_factory.mktemp("live") / "out")
-    yield made
-    made.close()
-
-
-@pytest.fixture(autouse=True)
-def fresh(served):
-    before = int(served.session.frame()["organ"])
-    served.session.park()
-    served.session.ask(Change(OrganChoice(lesions=NONE)))
-
-    def renewed() -> bool:
-        frame = served.session.frame()
-        return int(frame["organ"]) > before and frame["phase"] == Phase.RUNNING
-
-    wait_until(renewed)
-
-
-def wait_until(condition, seconds=SECONDS):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come to pass"
-        time.sleep(0.02)
+pytestmark = pytest.mark.usefixtures("fresh")
 
 
 def test_a_client_presses_and_is_sent_a_moving_organ(served):
@@ -234,72 +151,6 @@ def test_two_tabs_share_one_organ_and_one_may_go(served):
     assert not other.errors
 
 
-def setting(handle, value):
-    return msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}})
-
-
-async def send(served, *messages):
-    async with served.socket() as socket:
-        await socket.send(msgspec.msgpack.encode(CAMERA))
-        await asyncio.wait_for(socket.recv(), SECONDS)
-        for message in messages:
-            await socket.send(message)
-        await asyncio.sleep(0.5)
-
-
-def test_panel_settings_reach_the_physics(served):
-    """A slider's own message, as a browser sends it; one beyond its range changes nothing."""
-    panel, session = served.page._panel, served.session
-
-    organ = int(session.frame()["organ"])
-    asyncio.run(send(served, setting(panel._modulus, 9.0)))
-    wait_until(lambda: int(session.frame()["organ"]) > organ)
-    assert session.choice.modulus_factor == pytest.approx(9.0 / (session.scene.material.youngs_modulus / 1e3))
-    ignored = served.page._judge.ignored
-    asyncio.run(send(served, setting(panel._modulus, 1e9), setting(panel._lesions, "all of them")))
-    assert served.page._judge.ignored == ignored + 2 and panel._modulus.value == 9.0
-    asyncio.run(send(served, setting(panel._pause, True)))
-    wait_until(lambda: session.frame()["phase"] == Phase.PAUSED)
-    session.ask(Pause(False))
-    wait_until(lambda: session.frame()["phase"] == Phase.RUNNING)
-
-
-def test_a_click_means_what_the_physics_is_doing(served, monkeypatch, tmp_path):
-    """Whatever the button's name says: names are never renewed here."""
-    panel, session = served.page._panel, served.session
-    monkeypatch.setattr(served.page, "_out", tmp_path)
-    monkeypatch.setattr(panel, "_name", lambda *_: None)
-    for phase in (Phase.PAUSED, Phase.RUNNING):
-        asyncio.run(send(served, setting(panel._pause, True)))
-        wait_until(lambda phase=phase: session.frame()["phase"] == phase)
-    for recording in (True, False):
-        asyncio.run(send(served, setting(panel._record, True)))
-        wait_until(lambda recording=recording: bool(session.frame()["recording"]) == recording)
-    wait_until((tmp_path / "recording-1.csv").is_file)
-
-
-def test_buttons_are_renamed_with_the_next_picture(served, monkeypatch):
-    panel, session = served.page._panel, served.session
-    # They do not wait for the words that are said twice a second.
-    monkeypatch.setattr(served.page, "_say", lambda _: None)
-    session.ask(Pause(True))
-    wait_until(lambda: panel._pause.label == "Go on", 20.0)
-    session.ask(Pause(False))
-    wait_until(lambda: panel._pause.label == "Pause", 20.0)
-
-
-def test_a_recording_is_written_to_its_folder_alone(served):
-    session = served.session
-    session.ask(Record(True))
-    wait_until(lambda: session.frame()["recording"])
-    wait_until(lambda: session.exchange.recorded.count > 100)
-    session.ask(Record(False))
-    wait_until(lambda: (served.out / "recording-1.csv").is_file())
-    assert [path.name for path in served.out.iterdir()] == ["recording-1.csv"]
-    session.ask(Reset())
-    wait_until(lambda: session.frame()["time"] < 0.5)
-
-
 def test_a_client_that_is_not_let_in_or_sends_no_more_says_so(served):
     stranger = ProtocolClient(served.address + "x")
     stranger.start()
@@ -323,64 +174,3 @@ def test_a_place_that_is_not_finite_is_refused(served):
         served.session.move_to(0, np.array([0.0, np.nan, 0.0]))
     served.session.move_to(0, np.full(3, 9.0))
     assert (served.session.targets[0] <= served.session.instrument.upper + 0.011).all()
-
-
-CHILD = """
-import sys, time
-from surgsim_env.live.session import Session
-from surgsim_env.pacing import PaceSettings
-from surgsim_env.scenes import make_scene
-if __name__ == "__main__":
-    session = Session(make_scene("phantom_small"), pace=PaceSettings(period=0.01))
-    session.wait()
-    print(session._process.pid, flush=True)
-    time.sleep(600)
-"""
-
-
-def test_the_physics_ends_with_a_page_that_was_killed(tmp_path):
-    script = tmp_path / "page.py"
-    script.write_text(CHILD)
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True, env=environment)
-    assert parent.stdout is not None
-    child = int(parent.stdout.readline())
-    assert _lives(child)
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
-    wait_until(lambda: not _lives(child))
-
-
-def _lives(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def test_a_physics_that_dies_is_said(tmp_path):
-    session = Session(make_scene("phantom_small"), pace=PACE)
-    page = None
-    try:
-        session.wait()
-        page = Page(session, host="127.0.0.1", port=0, remote=False, out=tmp_path)
-        session._process.kill()
-        with pytest.raises(LiveError, match="physics' process died"):
-            page.run(lambda: False)
-    finally:
-        if page is not None:
-            page.server.stop()
-        session.close()
-
-
-def test_why_the_physics_refused_is_said(monkeypatch):
-    """What only the child finds out."""
-    monkeypatch.setattr(
-        "surgsim_env.live.session.OrganChoice", lambda lesions: OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)
-    )
-    session = Session(make_scene("phantom_small"), pace=PACE)
-    try:
-        with pytest.raises(LiveError, match=r"physics' process died: .*step"):
-            session.wait()
-    finally:
-        session.close()

@@ -1,8 +1,10 @@
 """No more pictures are made than the slowest browser draws."""
 
+import struct
+
 import pytest
 
-from surgsim_env.live.hand_messages import read_rate, write_rate
+from surgsim_env.live.hand_messages import DrawingReport, read_report, write_report
 from surgsim_env.live.picture_rate import RATE_LEAST, RATE_MOST, REPORT_AGE_MOST, PictureRate
 from surgsim_env.live.web_messages import NonsenseError
 
@@ -36,8 +38,19 @@ def test_a_tab_that_sleeps_counts_no_more():
     assert rate.rate == RATE_MOST
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 1e9])
-def test_a_rate_that_is_none_is_nonsense(value):
+@pytest.mark.parametrize("rate", [float("nan"), float("inf"), -1.0, 1e9])
+def test_a_rate_that_is_none_is_nonsense(rate):
     with pytest.raises(NonsenseError, match="frames a second"):
-        read_rate(write_rate(value))
-    assert read_rate(b"0" * 16) is None and read_rate(write_rate(30.0)) == 30.0
+        read_report(write_report(DrawingReport(rate, False)))
+
+
+@pytest.mark.parametrize("flags", [(2, 0), (0, 2), (1, 0xFFFF)])
+def test_a_flag_that_is_none_is_nonsense(flags):
+    with pytest.raises(NonsenseError, match="counted"):
+        read_report(struct.pack("<fHH", 30.0, *flags))
+
+
+@pytest.mark.parametrize("report", [DrawingReport(30.0, False), DrawingReport(0.0, True), DrawingReport(None, True)])
+def test_a_report_arrives_as_it_was_sent(report):
+    assert read_report(write_report(report)) == report
+    assert read_report(b"0" * 16) is None and read_report("text") is None

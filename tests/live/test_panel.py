@@ -1,0 +1,115 @@
+"""What the panel and the browser ask of a page, as their own messages: settings, recordings, plain pictures."""
+
+import asyncio
+import time
+
+import pytest
+
+from surgsim_env.live.exchange_records import Phase
+from surgsim_env.live.hand_messages import DrawingReport, HandMotion, write_hand, write_report
+from surgsim_env.live.protocol_client import ProtocolClient, press_path
+from surgsim_env.live.requests import Pause, Record, Reset
+from tests.live.served import send, setting, wait_until
+
+pytestmark = pytest.mark.usefixtures("fresh")
+
+
+def test_panel_settings_reach_the_physics(served):
+    """A slider's own message, as a browser sends it; one beyond its range changes nothing."""
+    panel, session = served.page._panel, served.session
+
+    organ = int(session.frame()["organ"])
+    asyncio.run(send(served, setting(panel._modulus, 9.0)))
+    wait_until(lambda: int(session.frame()["organ"]) > organ)
+    assert session.choice.modulus_factor == pytest.approx(9.0 / (session.scene.material.youngs_modulus / 1e3))
+    ignored = served.page._judge.ignored
+    asyncio.run(send(served, setting(panel._modulus, 1e9), setting(panel._lesions, "all of them")))
+    assert served.page._judge.ignored == ignored + 2 and panel._modulus.value == 9.0
+    asyncio.run(send(served, setting(panel._pause, True)))
+    wait_until(lambda: session.frame()["phase"] == Phase.PAUSED)
+    session.ask(Pause(False))
+    wait_until(lambda: session.frame()["phase"] == Phase.RUNNING)
+
+
+def test_a_click_means_what_the_physics_is_doing(served, monkeypatch, tmp_path):
+    """Whatever the button's name says: names are never renewed here."""
+    panel, session = served.page._panel, served.session
+    monkeypatch.setattr(served.page, "_out", tmp_path)
+    monkeypatch.setattr(panel, "_name", lambda *_: None)
+    for phase in (Phase.PAUSED, Phase.RUNNING):
+        asyncio.run(send(served, setting(panel._pause, True)))
+        wait_until(lambda phase=phase: session.frame()["phase"] == phase)
+    for recording in (True, False):
+        asyncio.run(send(served, setting(panel._record, True)))
+        wait_until(lambda recording=recording: bool(session.frame()["recording"]) == recording)
+    wait_until((tmp_path / "recording-1.csv").is_file)
+
+
+def test_buttons_are_renamed_with_the_next_picture(served, monkeypatch):
+    panel, session = served.page._panel, served.session
+    # They do not wait for the words that are said twice a second.
+    monkeypatch.setattr(served.page, "_say", lambda _: None)
+    session.ask(Pause(True))
+    wait_until(lambda: panel._pause.label == "Go on", 20.0)
+    session.ask(Pause(False))
+    wait_until(lambda: panel._pause.label == "Pause", 20.0)
+
+
+def test_a_recording_is_written_to_its_folder_alone(served):
+    session = served.session
+    session.ask(Record(True))
+    wait_until(lambda: session.frame()["recording"])
+    wait_until(lambda: session.exchange.recorded.count > 100)
+    session.ask(Record(False))
+    wait_until(lambda: (served.out / "recording-1.csv").is_file())
+    assert [path.name for path in served.out.iterdir()] == ["recording-1.csv"]
+    session.ask(Reset())
+    wait_until(lambda: session.frame()["time"] < 0.5)
+
+
+def test_plain_pictures_have_fewer_triangles_and_keep_the_paint(served):
+    """Whoever changes it, and whatever is painted meanwhile; lesions that are shown stay so."""
+    organ = served.page._organ
+    fine = len(organ._organ.faces)
+    client = ProtocolClient(served.address, press_path(served.session.anatomy), rate=30.0)
+    client.start()
+    try:
+        wait_until(lambda: served.page.felt.felt.any())
+        served.page._show_lesions(True)
+        for plain in (True, False, True, False):
+            served.page.show_plain(plain)
+            made = served.page.pictures
+            wait_until(lambda made=made: served.page.pictures > made + 3)
+            assert (len(organ._organ.faces) < fine) == plain and len(organ._organ.vertices) > organ._organ.faces.max()
+            assert served.page._panel._plain.value == plain
+            for paint in organ._paint:
+                assert not len(paint._used) or paint._used.max() < len(organ._organ.vertices)
+            wait_until(lambda: any(len(paint._used) for paint in organ._paint))
+        served.page._show_lesions(False)
+    finally:
+        client.stop()
+    assert not client.errors
+
+
+def report_of(served, software, rate=None):
+    async def attempt():
+        async with served.socket("/hand") as socket:
+            await socket.send(write_report(DrawingReport(rate, software)))
+            await socket.send(write_hand(HandMotion((0.0, 0.0, 0.0), 0)))
+
+    asyncio.run(attempt())
+
+
+def test_a_browser_without_a_graphics_card_is_drawn_for_plainly_until_its_user_says_otherwise(served):
+    page = served.page
+    page._plain, page._tabs.software = None, False
+    report_of(served, False, 60.0)
+    time.sleep(0.2)
+    assert page._plain is None
+    report_of(served, True)
+    wait_until(lambda: page._plain)
+    asyncio.run(send(served, setting(page._panel._plain, False)))
+    wait_until(lambda: page._plain is False)
+    report_of(served, True)
+    time.sleep(0.2)
+    assert page._plain is False and not page._panel._plain.value

@@ -33,9 +33,11 @@ demo: $(VENV)/.ready-demo
 	$(VENV)/bin/surgsim palpate --scene liver --out runs/demo
 
 test: $(VENV)/.ready-dev
+	$(PY) -m tests.compile_kernels
 	$(PY) -m pytest $(PYTEST_ARGS)
 
 test-all: $(VENV)/.ready-dev
+	$(PY) -m tests.compile_kernels
 	$(PY) -m pytest $(PYTEST_ARGS) -m ""
 
 test-agents: $(VENV)/.ready-agents

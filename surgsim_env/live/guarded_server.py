@@ -28,6 +28,9 @@ SOCKETS_MOST = 16
 # How long a client may be silent to a ping before it is given up [s].
 PING_INTERVAL = 10.0
 
+# In this order: the second tells the server what the first counts.
+SCRIPTS = ("drawing.js", "hand.js")
+
 HandServer = Callable[[ServerConnection], Awaitable[None]]
 
 
@@ -189,12 +192,13 @@ def _without_announcement():
 
 
 def _with_script(response: Response) -> Response:
-    """The page with the script that reads keys and gamepads."""
-    script = files("surgsim_env.live").joinpath("hand.js").read_bytes()
+    """The page with our scripts, before its own."""
+    folder = files("surgsim_env.live")
+    script = b"".join(b"<script>" + folder.joinpath(name).read_bytes() + b"</script>" for name in SCRIPTS)
     head, mark, rest = response.body.partition(b"</head>")
     if not mark:
         raise RuntimeError(f"viser {viser.__version__} has a page without a head: install viser>=1.1,<1.2")
-    body = head + b"<script>" + script + b"</script>" + mark + rest
+    body = head + script + mark + rest
     headers = Headers(response.headers)
     for name in ("Content-Length", "Content-Encoding"):
         if name in headers:

@@ -1,33 +1,17 @@
 // Keys and gamepads steer the instrument: packets as hand_messages.py has them, 40 times a second while something is held.
-// A browser that draws without a graphics card is told to leave out what nobody misses, and says so to the server.
+// Every second the server is told how the browser draws (drawing.js).
 (() => {
   "use strict";
   if (location.search.includes("token=")) history.replaceState(null, "", location.pathname);
   const PERIOD = 25, DEAD = 0.12;
   const held = new Set();
   let arm = 0, socket = null, wasMoving = false, armButton = false, jaw = false, jawButton = false;
-  const software = (() => {
-    const gl = document.createElement("canvas").getContext("webgl2");
-    if (gl === null) return false;
-    const info = gl.getExtension("WEBGL_debug_renderer_info");
-    const name = String(gl.getParameter(info === null ? gl.RENDERER : info.UNMASKED_RENDERER_WEBGL));
-    gl.getExtension("WEBGL_lose_context")?.loseContext();
-    return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
-  })();
-  if (software) {
-    // Smoothed edges, and a picture kept to be read again, cost as much as half of the rest.
-    const real = HTMLCanvasElement.prototype.getContext;
-    HTMLCanvasElement.prototype.getContext = function (kind, given) {
-      const is3d = String(kind).startsWith("webgl");
-      return real.call(this, kind, is3d ? { ...given, antialias: false, preserveDrawingBuffer: false } : given);
-    };
-  }
   const report = (rate) => {
     if (socket === null || socket.readyState !== WebSocket.OPEN) return;
     const packet = new DataView(new ArrayBuffer(8));
     packet.setFloat32(0, Math.min(rate ?? 0, 1000), true);
     packet.setUint16(4, rate === null ? 0 : 1, true);
-    packet.setUint16(6, software ? 1 : 0, true);
+    packet.setUint16(6, window.surgsim.software ? 1 : 0, true);
     socket.send(packet.buffer);
   };
   const connect = () => {
@@ -87,15 +71,12 @@
     }
     wasMoving = moving;
   }, PERIOD);
-  // How many frames the browser comes to in a second: the server sends no more pictures than that.
-  let frames = 0;
-  const count = () => { frames += 1; requestAnimationFrame(count); };
-  requestAnimationFrame(count);
+  // The server sends no more pictures than the browser comes to.
   let since = performance.now();
   setInterval(() => {
-    const now = performance.now(), rate = 1000 * frames / (now - since);
+    const now = performance.now(), rate = (1000 * window.surgsim.frames) / (now - since);
     since = now;
-    frames = 0;
+    window.surgsim.frames = 0;
     if (!document.hidden) report(rate);
   }, 1000);
   connect();

@@ -28,7 +28,7 @@ class View:
     out: Path = Path("runs/live")
     """Folder for recordings."""
     plain: bool = False
-    """No shadows and no reflections: for a browser without a graphics card."""
+    """No shadows and no reflections from the start; a browser without a graphics card asks for that itself."""
     seconds: float | None = None
     """Stop after this time."""
     measure: bool = False

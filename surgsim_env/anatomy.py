@@ -192,9 +192,11 @@ def load_anatomy(scene: Scene) -> Anatomy:
 def _load_anatomy(scene: Scene, file_time: int | None) -> Anatomy:
     """`load_anatomy`, remembered for as long as the mesh file keeps its time of change [ns]."""
     anatomy = anatomy_of(scene, _load_mesh(scene))
-    warn_of_coarse_cells(
-        f"scene {scene.name!r}", anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth
-    )
+    # Nobody presses the organ of a retraction to feel it.
+    if scene.retract is None:
+        warn_of_coarse_cells(
+            f"scene {scene.name!r}", anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth
+        )
     return anatomy
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 from surgsim_env.anatomy import load_anatomy
 from surgsim_env.levels import find_level
+from surgsim_env.retract_scene import make_retract_scene
 from surgsim_env.scenes import make_scene, with_instrument
 from surgsim_env.simulation import Simulation
 from surgsim_env.surgical_env import SurgicalEnv
@@ -170,7 +171,8 @@ class RetractEnv(SurgicalEnv):
     of an edge of the mesh in the lobe's thirds, from the held edge to the free one.
 
     ## Arguments
-    * `scene`: a scene's name or the path of a scene file with a `[retract]` table; default "lobe".
+    * `scene`: a scene's name or the path of a scene file with a `[retract]` table, or that names such a file, as
+      those of `surgsim organ` do; default "lobe".
     * `instrument`: the scene's own by default, or the name of an arm with a jaw, or the path of its TOML file.
     * `obs_mode`: "state" (default) or "rgb" (needs OpenGL).
     * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
@@ -190,7 +192,7 @@ class RetractEnv(SurgicalEnv):
         render_mode: str | None = None,
         **pictures: Any,
     ) -> None:
-        anatomy = load_anatomy(with_instrument(make_scene(scene), instrument))
+        anatomy = load_anatomy(with_instrument(make_retract_scene(scene), instrument))
         simulation = Simulation(anatomy)
         task = RetractTask(anatomy, simulation.instrument)
         super().__init__(simulation, task, render_mode=render_mode, pictures=pictures, obs_mode=obs_mode)
@@ -266,7 +268,7 @@ class BimanualRetractEnv(SurgicalEnv):
         render_mode: str | None = None,
         **pictures: Any,
     ) -> None:
-        anatomy = load_anatomy(with_instrument(make_scene(scene), instrument))
+        anatomy = load_anatomy(with_instrument(make_retract_scene(scene), instrument))
         simulation = Simulation(anatomy)
         task = BimanualRetractTask(anatomy, simulation.instrument)
         super().__init__(simulation, task, render_mode=render_mode, pictures=pictures, obs_mode=obs_mode)

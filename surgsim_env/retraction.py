@@ -27,11 +27,25 @@ class RetractionCamera:
 
 
 @dataclass(frozen=True)
+class Flap:
+    """The part of an organ that is lifted, where that is not the whole of it: corners of its box [m]."""
+
+    lower: Vector
+    upper: Vector
+
+    def __post_init__(self) -> None:
+        for low, high, axis in zip(self.lower, self.upper, "xyz"):
+            if not -math.inf < low < high < math.inf:
+                raise ValueError(f"retract.flap: it reaches from {axis} = {low:g} to {high:g} m; give low < high")
+
+
+@dataclass(frozen=True)
 class Retraction:
     """What a retraction draws anew in each episode: the lobe, what it hides, the tip's place.
 
     The lobe is a block with x along its anchored edge, y from that edge (y = 0) to the free one, and z up; it lies on a
-    bed whose top is z = 0.
+    bed whose top is z = 0. Of an organ of another shape the same is said of its `flap`, and the organ is as it is: its
+    scale and its held share are 1.
 
     Args:
         target_distance: range of the target's distance from the anchored edge, along y [m].
@@ -45,6 +59,7 @@ class Retraction:
         held_share: range of the share of the anchored edge, about its middle, that is held.
         camera: how the endoscope moves.
         right_start_lower, right_start_upper: corners of the box in which the right one of two tips starts [m].
+        flap: which part of the organ is lifted; None: all of it.
     """
 
     target_distance: Range
@@ -60,6 +75,7 @@ class Retraction:
     camera: RetractionCamera = RetractionCamera()
     right_start_lower: Vector | None = None
     right_start_upper: Vector | None = None
+    flap: Flap | None = None
 
     def __post_init__(self) -> None:
         for name in ("target_distance", "target_along", "scale", "youngs_modulus", "capsule_stiffness", "held_share"):
@@ -68,6 +84,11 @@ class Retraction:
                 raise ValueError(f"retract.{name} = [{low:g}, {high:g}]; the rule is 0 < low <= high, finite")
         if self.held_share[1] > 1.0:
             raise ValueError(f"retract.held_share = {list(self.held_share)}; no more than 1 can be held")
+        if self.flap is not None and (self.scale != (1.0, 1.0) or self.held_share != (1.0, 1.0)):
+            raise ValueError(
+                f"retract: scale {list(self.scale)} and held_share {list(self.held_share)} go with a whole lobe; with "
+                "retract.flap both are [1, 1]"
+            )
         if not 0.0 < self.target_radius < math.inf:
             raise ValueError(f"retract.target_radius is {self.target_radius:g} m; it must be finite and above 0")
         if not 0.0 <= self.capsule_share <= 1.0:

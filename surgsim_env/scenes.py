@@ -14,7 +14,7 @@ from msdm_core.support import Support, SupportLaw
 from surgsim_env.anchors import Anchor, Ball, Bed, Box
 from surgsim_env.arms.description import list_arms
 from surgsim_env.arms.port import Port
-from surgsim_env.retraction import Retraction, RetractionCamera
+from surgsim_env.retraction import Flap, Retraction, RetractionCamera
 from surgsim_env.scene_files import scenes_folder
 from surgsim_env.tissue_region import TissueRegion
 from surgsim_env.toml_tables import fill, nearest, read_toml
@@ -277,7 +277,8 @@ class Scene:
     The organ is settled under `gravity` [m/s^2] onto its anchors and `supports`, which push as contact does where no
     `support_law` is given. `port` is where an arm enters the body; if it is not given,
     `arms.port_placement.default_port` finds one. `ports` are those of two arms, the left one's first. `regions` of
-    the mesh have materials of their own.
+    the mesh have materials of their own. `retract_scene` names the file of the scene of the same organ that a
+    retraction takes, `retract_refusal` says why there is none.
     """
 
     name: str
@@ -305,6 +306,8 @@ class Scene:
     supports: tuple[Support, ...] = ()
     support_law: SupportLaw | None = None
     regions: tuple[TissueRegion, ...] = ()
+    retract_scene: str | None = None
+    retract_refusal: str | None = None
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
@@ -321,7 +324,7 @@ def _require(what: str, value: float, least: float, unit: str, *, above: bool = 
 _TABLES = (
     *(Scene, MeshSource, BlockMesh, SurfaceMesh, TetFile, Material, Capsule, Damping, Anchor, Box, Ball, Bed),
     *(Contact, Instrument, Timing, Limits, ForceSensor, Palpation, LesionDraw, FixedLesion, Endoscope, Port),
-    *(Retraction, RetractionCamera, Support, SupportLaw, TissueRegion),
+    *(Retraction, RetractionCamera, Flap, Support, SupportLaw, TissueRegion),
 )
 
 

@@ -88,6 +88,23 @@ def visible(
     Raises:
         ValueError: the eye stands in the middle of the points.
     """
+    hidden, cone = _hidden_by(eye, points, node_position, triangles)
+    hide_behind_shapes(
+        *cone, geoms, model.geom_type, model.geom_size, model.geom_rbound, data.geom_xpos, data.geom_xmat,
+        np.zeros(3), hidden,
+    )  # fmt: skip
+    return hidden == 0
+
+
+def uncovered(eye: FloatArray, points: FloatArray, node_position: FloatArray, triangles: IntArray) -> NDArray[np.bool_]:
+    """Which points are seen from an eye past triangles alone; arguments, result and errors as those of `visible`."""
+    return _hidden_by(eye, points, node_position, triangles)[0] == 0
+
+
+def _hidden_by(
+    eye: FloatArray, points: FloatArray, node_position: FloatArray, triangles: IntArray
+) -> tuple[NDArray[np.uint8], tuple[FloatArray, FloatArray, FloatArray, float, float, float]]:
+    """1 where triangles hide a point, (n,), and the cone from the eye around the points as kernels take it."""
     rays = points - eye
     middle = rays.mean(axis=0)
     distances = np.linalg.norm(rays, axis=1)
@@ -98,8 +115,4 @@ def visible(
     hidden = np.zeros(len(points), dtype=np.uint8)
     cone = (np.asarray(eye, dtype=np.float64), points, axis, cosine, sine, float(distances.max()))
     hide_behind_triangles(*cone, node_position, triangles, hidden)
-    hide_behind_shapes(
-        *cone, geoms, model.geom_type, model.geom_size, model.geom_rbound, data.geom_xpos, data.geom_xmat,
-        np.zeros(3), hidden,
-    )  # fmt: skip
-    return hidden == 0
+    return hidden, cone

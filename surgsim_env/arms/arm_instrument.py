@@ -130,8 +130,10 @@ class ArmInstrument(Instrument):
         corners = face.points[face.triangles]
         thick = np.flatnonzero(face.thickness >= face.thickness_smallest)
         tried = thick[np.linspace(0, len(thick) - 1, min(PLACES_TRIED, len(thick))).astype(int)]
-        radius = anatomy.scene.instrument.tip_radius
-        for place in [self.parked, *(corners[tried].mean(axis=1) - radius * face.approach)]:
+        radius, retract = anatomy.scene.instrument.tip_radius, anatomy.scene.retract
+        places = [self.parked, *(corners[tried].mean(axis=1) - radius * face.approach)]
+        # Of a flap it takes the edge alone, before which it is parked.
+        for place in places[:1] if retract is not None and retract.flap is not None else places:
             found = self.steered.reach(place)
             if not placed(found):
                 raise ValueError(
@@ -172,7 +174,13 @@ def joint_servo(model: mujoco.MjModel, joints: tuple[str, ...]):
 
 
 def parked_place(anatomy: Anatomy) -> FloatArray:
-    """Where a tip waits before the first reset: above the middle of the palpable face [m], (3,)."""
+    """Where a tip waits before the first reset [m], (3,).
+
+    Above the middle of the palpable face; for a flap of an organ where a retraction begins.
+    """
+    retract = anatomy.scene.retract
+    if retract is not None and retract.flap is not None:
+        return 0.5 * (np.array(retract.start_lower) + np.array(retract.start_upper))
     corners = anatomy.face.points[anatomy.face.triangles]
     middle = anatomy.face.project(corners.mean(axis=(0, 1)))[0]
     return middle - (anatomy.scene.instrument.tip_radius + PARKED_GAP) * anatomy.face.approach

@@ -20,6 +20,8 @@ from surgsim_env.patient.label_names import FORM, parse_labels
 from surgsim_env.patient.patient_mesh import PatientMesh, mesh_image
 from surgsim_env.patient.patient_scene import PatientScene, patient_scene
 from surgsim_env.patient.report import MARK, report_page
+from surgsim_env.patient.retract_scene import RetractScene, find_retraction, told, with_retraction
+from surgsim_env.patient.retract_text import retract_text
 from surgsim_env.patient.scene_text import FIRST_LINE, scene_text
 from surgsim_env.patient.surface_mesh import mesh_surfaces
 from surgsim_env.scenes import Scene, load_scene
@@ -78,9 +80,13 @@ def make_organ(request: Request, console: Console) -> None:
     patient = _patient(request)
     folder, name = (request.out.parent, request.out) if request.out else (Path(), Path("patient.vtu"))
     found = patient_scene(patient, name.stem, folder, name.name, options=options, moduli=_moduli(request.modulus))
+    turned = _retract_file(name)
+    retraction = find_retraction(found, folder, turned.name)
+    found = with_retraction(found, retraction, turned.with_suffix(".toml").name)
     _tell(found, console)
+    console.print(f"retraction: {told(retraction)}", highlight=False)
     if request.out is not None:
-        written = write_patient(found, request.out, request.command)
+        written = write_patient(found, request.out, request.command, retraction)
         console.print(f"written: {', '.join(map(str, written))}", highlight=False, soft_wrap=True)
 
 
@@ -105,21 +111,35 @@ def palpable_patient(request: "PalpateRequest", folder: Path, console: Console) 
     return load_scene(out.with_suffix(".toml"))
 
 
-def write_patient(found: PatientScene, out: Path, command: str) -> list[Path]:
-    """Write the mesh, the scene beside it and report.html, all of them or none; returns their paths."""
+def write_patient(
+    found: PatientScene, out: Path, command: str, retraction: RetractScene | str | None = None
+) -> list[Path]:
+    """Write the mesh, its scene and report.html, those of a retraction too, all or none; returns their paths."""
     from msdm_core.mesh_io import write_mesh
 
     text, scene_file = scene_text(found), out.with_suffix(".toml")
-    page = report_page(found, text, scene_file.name, command)
-    targets = [out, scene_file, out.with_name(REPORT_NAME)]
+    page = report_page(found, text, scene_file.name, command, retraction)
+    targets, turned = [out, scene_file, out.with_name(REPORT_NAME)], _retract_file(out)
+    if isinstance(retraction, RetractScene):
+        targets += [turned, turned.with_suffix(".toml")]
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".surgsim-part-") as part:
         write_mesh(Path(part, out.name), found.patient.mesh)
         Path(part, scene_file.name).write_text(text, encoding="utf-8", newline="\n")
         # What a page cannot show, such as bytes of a file's name that are not UTF-8, becomes a question mark.
         Path(part, REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
         load_scene(Path(part, scene_file.name))
+        if isinstance(retraction, RetractScene):
+            write_mesh(Path(part, turned.name), retraction.anatomy.mesh)
+            lifted = Path(part, turned.with_suffix(".toml").name)
+            lifted.write_text(retract_text(found, retraction), encoding="utf-8", newline="\n")
+            load_scene(lifted)
         _replace(targets, Path(part))
     return targets
+
+
+def _retract_file(out: Path) -> Path:
+    """Where the mesh that a retraction takes is written, beside the organ's."""
+    return out.with_name(f"{out.stem}_retract{out.suffix}")
 
 
 def _replace(targets: Sequence[Path], part: Path) -> None:
@@ -188,7 +208,13 @@ def _moduli(texts: Sequence[str]) -> Mapping[str, float]:
 def _check_targets(out: Path) -> None:
     """Refuse places that cannot be written, and files that are not an earlier run's, before the work."""
     check_target(out)
-    for path, mark in ((out.with_suffix(".toml"), FIRST_LINE), (out.with_name(REPORT_NAME), MARK)):
+    turned = _retract_file(out)
+    scene = turned.with_suffix(".toml")
+    if turned.exists() and not scene.exists():
+        raise ValueError(
+            f"--out {out}: {turned} is there, and not of an earlier run; choose another place or remove it"
+        )
+    for path, mark in ((out.with_suffix(".toml"), FIRST_LINE), (scene, FIRST_LINE), (out.with_name(REPORT_NAME), MARK)):
         if path.is_dir():
             raise ValueError(f"--out {out}: {path.name} is a folder there; choose another place or remove it")
         if path.exists() and not _begins(path, mark):

@@ -10,6 +10,7 @@ import numpy as np
 from msdm_core.regions import Material
 from msdm_core.stability import stable_dt
 from surgsim_env.anatomy import Anatomy, anatomy_of
+from surgsim_env.levels import LEVELS
 from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, plan_sites
 from surgsim_env.palpation.surface_scene import (
     CONTACT_MODULI_PER_CELL,
@@ -44,7 +45,7 @@ SOFT_PER_PRESS, HARD_PER_PRESS = 2.0, 4.0
 LESION_RADIUS, LESION_COVER, LESION_RIM = (1.5, 2.1), (0.25, 0.65), 2.1
 LESION_RATIO = (5.0, 8.0)
 LESION_SHRINKS = (1.0, 0.75, 0.55)
-LESION_DRAWS = 12
+LESION_DRAWS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,16 +219,18 @@ def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
 
 
 def _has_room(anatomy: Anatomy) -> bool:
-    draws = np.random.default_rng(0)
-    assert anatomy.scene.lesion is not None
-    low, high = anatomy.scene.lesion.radius
-    largest = replace(anatomy.scene.lesion, radius=(high, high))
+    """Whether every draw finds a place: the largest lesions under the thickest cover, and several of a level's."""
+    draws, draw = np.random.default_rng(0), anatomy.scene.lesion
+    assert draw is not None
+    largest = replace(draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[1],) * 2)
     try:
         for number in range(LESION_DRAWS):
             anatomy.random_lesion(draws, largest if number % 2 else None)
+        for level in LEVELS.values():
+            level.draw(anatomy, draws, lesion_count=len(level.lesion_count_weights) - 1)
     except ValueError:
         return False
-    return low > 0.0
+    return draw.radius[0] > 0.0
 
 
 def _with_substeps(anatomy: Anatomy) -> Anatomy:

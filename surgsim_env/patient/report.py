@@ -12,6 +12,7 @@ from surgsim_env.html_page import html_page, html_picture, html_table, page_star
 from surgsim_env.patient.patient_mesh import DIHEDRAL_SMALLEST
 from surgsim_env.patient.patient_scene import PatientScene, material_rows
 from surgsim_env.patient.pictures import organ_picture, quality_picture
+from surgsim_env.patient.retract_scene import RetractScene, told
 
 # By this an earlier run's report is known, which may be replaced.
 GENERATOR = "surgsim organ"
@@ -19,7 +20,9 @@ MARK = page_start(GENERATOR)
 VOLUME_ERROR_LARGEST = 0.02
 
 
-def report_page(found: PatientScene, scene_text: str, scene_file: str, command: str) -> str:
+def report_page(
+    found: PatientScene, scene_text: str, scene_file: str, command: str, retraction: RetractScene | str | None = None
+) -> str:
     """The page's text.
 
     Args:
@@ -27,6 +30,7 @@ def report_page(found: PatientScene, scene_text: str, scene_file: str, command: 
         scene_text: the scene as it is written.
         scene_file: its file's name.
         command: that makes this report.
+        retraction: its scene, or why there is none; None where nobody looked.
     """
     patient = found.patient
     whole = html_picture(
@@ -43,6 +47,7 @@ def report_page(found: PatientScene, scene_text: str, scene_file: str, command: 
         ("mesh", "Mesh", _mesh(found) + tets),
         ("tissue", "Tissue, masses and step", _tissue(found) + _step(found)),
         ("touch", "How it is palpated", _touch(found)),
+        ("retraction", "How it is retracted", "" if retraction is None else f"<p>{escape(told(retraction))}</p>"),
         ("scene", f"The scene, {scene_file}", f"<pre><code>{escape(scene_text)}</code></pre>"),
         ("command", "The command that made this report", f"<pre><code>{escape(command)}</code></pre>"),
     ]

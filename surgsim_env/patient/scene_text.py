@@ -2,8 +2,6 @@
 
 import json
 import math
-import re
-from typing import Any
 
 from surgsim_env.patient.materials import TissueMaterial
 from surgsim_env.patient.patient_scene import (
@@ -13,7 +11,8 @@ from surgsim_env.patient.patient_scene import (
     SOFT_PER_PRESS,
     PatientScene,
 )
-from surgsim_env.scenes import LesionDraw
+from surgsim_env.patient.toml_lines import comment, entry
+from surgsim_env.scenes import LesionDraw, Scene
 
 # By this first line an earlier run's file is known, which may be replaced.
 FIRST_LINE = "# Made by surgsim from a patient's organ."
@@ -25,18 +24,35 @@ def scene_text(found: PatientScene) -> str:
     tets, lines = scene.mesh.tets, [FIRST_LINE]
     assert tets is not None
     lines += [
-        f"# From {_comment(', '.join(patient.sources))}.",
+        f"# From {comment(', '.join(patient.sources))}.",
         f"# Mesh: {patient.mesher}, cells of {patient.cell_size * 1e3:.4g} mm.",
         f"# Axes: {patient.convention}.",
         "# Change any number here; surgsim organ replaces this file only if it begins as it does.",
-        *(f"# Note: {_comment(note)}" for note in (*patient.notes, *found.notes)),
-        _entry("description", scene.description),
+        *(f"# Note: {comment(note)}" for note in (*patient.notes, *found.notes)),
+        entry("description", scene.description),
+        *_retraction(scene),
         "",
         "[mesh.tets]",
-        _entry("file", tets.file),
-        _entry("length_unit", tets.length_unit),
+        entry("file", tets.file),
+        entry("length_unit", tets.length_unit),
         "",
-        "[material]             # " + _comment(f"{patient.organ_name}: {found.organ.source}"),
+        *tissue_lines(found, scene),
+    ]
+    return "\n".join([*lines, *_anchors(scene), *_touch(found), ""])
+
+
+def _retraction(scene: Scene) -> list[str]:
+    if scene.retract_scene is not None:
+        return [entry("retract_scene", scene.retract_scene, "which environments of retraction take")]
+    if scene.retract_refusal is not None:
+        return [entry("retract_refusal", scene.retract_refusal)]
+    return []
+
+
+def tissue_lines(found: PatientScene, scene: Scene) -> list[str]:
+    """Materials, regions, capsule and damping of a scene of the organ."""
+    lines = [
+        "[material]             # " + comment(f"{found.patient.organ_name}: {found.organ.source}"),
         *_material(found.organ),
     ]
     for region in scene.regions:
@@ -44,30 +60,33 @@ def scene_text(found: PatientScene) -> str:
         lines += [
             "",
             "[[regions]]            # tets of the mesh with a material of their own",
-            _entry("name", region.name),
+            entry("name", region.name),
         ]
         if region.lesion:
-            lines.append(_entry("lesion", True, "palpation looks for it; healthy organs do not have it"))
-        lines += [f"[regions.material]     # {_comment(what.source)}", *_material(what)]
-    return "\n".join([*lines, *_body(found), *_touch(found), ""])
+            lines.append(entry("lesion", True, "palpation looks for it; healthy organs do not have it"))
+        lines += [f"[regions.material]     # {comment(what.source)}", *_material(what)]
+    return lines + _shell(scene)
 
 
-def _body(found: PatientScene) -> list[str]:
-    scene = found.scene
+def _shell(scene: Scene) -> list[str]:
     capsule = scene.capsule
     assert capsule is not None and capsule.thickness is not None
-    lines = [
+    return [
         "",
         "[capsule]              # on the boundary; as in the scene liver, with its sources; delete it where none is",
-        _entry("youngs_modulus", capsule.youngs_modulus, "[Pa]"),
-        _entry("thickness", capsule.thickness, "[m]; only modulus x thickness matters"),
+        entry("youngs_modulus", capsule.youngs_modulus, "[Pa]"),
+        entry("thickness", capsule.thickness, "[m]; only modulus x thickness matters"),
         "",
         "[damping]              # as in the scene liver",
-        _entry("alpha", scene.damping.alpha, "[1/s]"),
-        _entry("beta", scene.damping.beta),
+        entry("alpha", scene.damping.alpha, "[1/s]"),
+        entry("beta", scene.damping.beta),
     ]
+
+
+def _anchors(scene: Scene) -> list[str]:
+    lines = []
     for anchor in scene.anchors:
-        lines += ["", "[[anchors]]", _entry("name", anchor.name)]
+        lines += ["", "[[anchors]]", entry("name", anchor.name)]
         if anchor.bed is not None:
             shown = f"{{ direction = {json.dumps(anchor.bed.direction)}, share = {anchor.bed.share!r} }}"
             lines.append(f"bed = {shown} # chosen: it lies on the side away from the probe; put its ligaments here")
@@ -83,19 +102,19 @@ def _touch(found: PatientScene) -> list[str]:
     return [
         "",
         "[contact]",
-        _entry("stiffness", scene.contact.stiffness, "[N/m^3] chosen: 18 E / cell"),
-        _entry("damping", scene.contact.damping, "[N s/m^3] as in the scene liver"),
-        _entry("friction", scene.contact.friction, "as in the scene liver"),
+        entry("stiffness", scene.contact.stiffness, "[N/m^3] chosen: 18 E / cell"),
+        entry("damping", scene.contact.damping, "[N s/m^3] as in the scene liver"),
+        entry("friction", scene.contact.friction, "as in the scene liver"),
         *_instrument(found),
         "",
         f"[limits]               # [N] chosen: {SOFT_PER_PRESS:g} and {HARD_PER_PRESS:g} times a healthy press (Hertz)",
-        _entry("soft_force", scene.limits.soft_force),
-        _entry("hard_force", scene.limits.hard_force),
+        entry("soft_force", scene.limits.soft_force),
+        entry("hard_force", scene.limits.hard_force),
         "",
         "[sensor]               # per axis, as in the scene liver",
-        _entry("noise", scene.sensor.noise, "[N]"),
-        _entry("bias", scene.sensor.bias, "[N]"),
-        _entry("range", scene.sensor.range, "[N]"),
+        entry("noise", scene.sensor.noise, "[N]"),
+        entry("bias", scene.sensor.bias, "[N]"),
+        entry("range", scene.sensor.range, "[N]"),
         *_palpation(found),
         *(_lesion(scene.lesion) if scene.lesion else []),
     ]
@@ -108,14 +127,14 @@ def _instrument(found: PatientScene) -> list[str]:
     return [
         "",
         "[instrument]",
-        _entry("model", instrument.model),
-        _entry("tip_radius", instrument.tip_radius, why),
-        _entry("approach", instrument.approach, "direction of the probe, in the axes above"),
+        entry("model", instrument.model),
+        entry("tip_radius", instrument.tip_radius, why),
+        entry("approach", instrument.approach, "direction of the probe, in the axes above"),
         "",
         "[timing]",
-        _entry("haptic_step", timing.haptic_step, "[s]"),
-        _entry("substep_count", timing.substep_count, "stable with contact, every lesion here and the worst drawn"),
-        _entry("haptic_steps_per_control", timing.haptic_steps_per_control),
+        entry("haptic_step", timing.haptic_step, "[s]"),
+        entry("substep_count", timing.substep_count, "stable with contact, every lesion here and the worst drawn"),
+        entry("haptic_steps_per_control", timing.haptic_steps_per_control),
     ]
 
 
@@ -125,12 +144,12 @@ def _palpation(found: PatientScene) -> list[str]:
     return [
         "",
         "[palpation]",
-        _entry("press_depth", palpation.press_depth, "[m] chosen: 7/12 of the tip's radius, as in the scene liver"),
-        _entry("face_angle_deg", palpation.face_angle_deg),
-        _entry("face_margin", palpation.face_margin, "[m]"),
-        _entry("thickness_smallest", palpation.thickness_smallest, "[m] of organ below a site"),
-        _entry("site_spacing", palpation.site_spacing, sites),
-        _entry("clearance", palpation.clearance, "[m]"),
+        entry("press_depth", palpation.press_depth, "[m] chosen: 7/12 of the tip's radius, as in the scene liver"),
+        entry("face_angle_deg", palpation.face_angle_deg),
+        entry("face_margin", palpation.face_margin, "[m]"),
+        entry("thickness_smallest", palpation.thickness_smallest, "[m] of organ below a site"),
+        entry("site_spacing", palpation.site_spacing, sites),
+        entry("clearance", palpation.clearance, "[m]"),
     ]
 
 
@@ -138,38 +157,18 @@ def _lesion(draw: LesionDraw) -> list[str]:
     return [
         "",
         "[lesion]               # hidden anew in each episode, in the organ without its segmented lesions",
-        _entry("radius", draw.radius, "[m] chosen in proportion to the tip, as in the scene liver"),
-        _entry("cover", draw.cover, "[m] tissue above its top"),
-        _entry(
+        entry("radius", draw.radius, "[m] chosen in proportion to the tip, as in the scene liver"),
+        entry("cover", draw.cover, "[m] tissue above its top"),
+        entry(
             "modulus_ratio", draw.modulus_ratio, "HCC 51, metastases 50 in 6.6 kPa liver (doi 10.1177/8756479317733713)"
         ),
-        _entry("rim_distance", draw.rim_distance, "[m]"),
+        entry("rim_distance", draw.rim_distance, "[m]"),
     ]
 
 
 def _material(what: TissueMaterial) -> list[str]:
     return [
-        _entry("youngs_modulus", what.material.youngs_modulus, "[Pa]"),
-        _entry("density", what.material.density, "[kg/m^3] a common textbook value, not checked against a source"),
-        _entry("poisson_ratio", what.material.poisson_ratio, "chosen: nearly incompressible"),
+        entry("youngs_modulus", what.material.youngs_modulus, "[Pa]"),
+        entry("density", what.material.density, "[kg/m^3] a common textbook value, not checked against a source"),
+        entry("poisson_ratio", what.material.poisson_ratio, "chosen: nearly incompressible"),
     ]
-
-
-def _entry(name: str, value: Any, comment: str = "") -> str:
-    text = _quoted(value) if isinstance(value, str) else repr(value) if isinstance(value, float) else json.dumps(value)
-    line = f"{name} = {text}"
-    return f"{line:<22} # {_comment(comment)}" if comment else line
-
-
-def _quoted(text: str) -> str:
-    """A TOML string: JSON's, but for DEL, which TOML wants escaped, and halves of surrogate pairs, which it refuses.
-
-    Such halves are how Python writes the bytes of file names that are not UTF-8; they become the replacement character.
-    """
-    whole = re.sub("[\ud800-\udfff]", "\ufffd", text)
-    return json.dumps(whole, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _comment(text: str) -> str:
-    """What TOML lets stand in a comment: one line without control characters."""
-    return "".join(one if one.isprintable() else " " for one in text)

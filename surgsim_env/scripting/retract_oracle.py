@@ -7,6 +7,7 @@ import numpy as np
 
 from msdm_core.mesh import FloatArray
 from msdm_core.support import Support
+from surgsim_env.scripting.flap_oracle import flap_steps
 from surgsim_env.scripting.jaw_steps import CloseJaw
 from surgsim_env.scripting.steps import MoveTo, Predicate, Step
 from surgsim_env.scripting.wrapped_steps import MayEnd, Until
@@ -49,6 +50,9 @@ def retraction_steps(
         aside: how far beside the target the edge is grasped, along x [m].
         fold: share of the second way, on which the lifted edge is folded back.
     """
+    table = simulation.anatomy.scene.retract
+    if table is not None and table.flap is not None:
+        return flap_steps(simulation, target, turning_size, enough, aside=aside)
     rest, nodes = simulation.organ_model.node_rest_position, simulation.organ_state.node_position
     depth = float(rest[:, 1].max())
     edge = rest[:, 1] > depth - 1e-6

@@ -18,7 +18,7 @@ from surgsim_env.rewards import RETRACT_WEIGHTS, weighted
 from surgsim_env.scenes import Endoscope, ForceSensor
 from surgsim_env.sensors import ForceReading
 from surgsim_env.simulation import Simulation
-from surgsim_env.tasks.retraction_draw import RetractionDraw, draw_retraction, drawn_organ
+from surgsim_env.tasks.retraction_draw import RetractionDraw, draw_retraction, drawn_organ, lifted_box
 from surgsim_env.tasks.retraction_record import RetractionRecord, region_strains
 from surgsim_env.tasks.task import Bounds, InfoValue, Start, Verdict
 from surgsim_env.visibility import Disc, hiding_geoms, visible
@@ -85,7 +85,7 @@ class RetractTask:
         self.torque_reading = ForceReading(
             ForceSensor(sensor.noise * TORQUE_LEVER, sensor.bias * TORQUE_LEVER, sensor.range * TORQUE_LEVER)
         )
-        self.tracked_nodes = _nearest_nodes(anatomy.mesh.points)
+        self.tracked_nodes = _nearest_nodes(anatomy.mesh.points, lifted_box(self.table, anatomy.mesh.points))
         self._hiding = hiding_geoms(instrument.model)
         self.drawn: RetractionDraw | None = None
         self.record = RetractionRecord()
@@ -347,7 +347,8 @@ class RetractTask:
         return rotation.reshape(3, 3)[:, [0, 2]].T.ravel()
 
     def _note(self, simulation: Simulation, grasp: Grasp) -> None:
-        strain = region_strains(simulation.organ_model, simulation.organ_state.node_position)
+        box = lifted_box(self.table, simulation.organ_model.node_rest_position)
+        strain = region_strains(simulation.organ_model, simulation.organ_state.node_position, box)
         tip = simulation.instrument.tip_position
         duration = self.anatomy.scene.timing.control_step
         self.record.note(grasp, simulation.pull_peak, tip, strain, self.jaw_target < 0.0, duration)
@@ -381,8 +382,8 @@ def _checked_scene(anatomy: Anatomy) -> tuple[Retraction, Endoscope]:
     return scene.retract, scene.endoscope
 
 
-def _nearest_nodes(points: FloatArray) -> NDArray[np.int64]:
-    """The nodes nearest to the TRACKED places of a lobe, (n_tracked,)."""
-    low, high = points.min(axis=0), points.max(axis=0)
+def _nearest_nodes(points: FloatArray, box: tuple[FloatArray, FloatArray]) -> NDArray[np.int64]:
+    """The nodes nearest to the TRACKED places of what is lifted, (n_tracked,)."""
+    low, high = box
     places = low + np.array(TRACKED) * (high - low)
     return np.array([int(np.argmin(((points - place) ** 2).sum(axis=1))) for place in places])

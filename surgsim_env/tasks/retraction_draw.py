@@ -85,6 +85,13 @@ def drawn_organ(anatomy: Anatomy, drawn: RetractionDraw) -> OrganModel:
     return anatomy.compiled(specification)
 
 
+def lifted_box(table: Retraction, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners of the box of what is lifted, of an organ whose nodes are at some places [m]: two of shape (3,)."""
+    if table.flap is None:
+        return points.min(axis=0), points.max(axis=0)
+    return np.array(table.flap.lower), np.array(table.flap.upper)
+
+
 def held_nodes(points: FloatArray, anchors: IntArray, share: float) -> IntArray:
     """Those of the anchored nodes that lie in the middle share of the edge, along x."""
     along = points[anchors, 0]

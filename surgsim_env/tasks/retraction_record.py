@@ -98,16 +98,23 @@ class RetractionRecord:
         return cls(**json.loads(text))
 
 
-def region_strains(model: OrganModel, node_position: FloatArray) -> list[float]:
-    """Largest strain of an edge in each third of a lobe, by the middle of the edge at rest along y.
+def region_strains(model: OrganModel, node_position: FloatArray, box: tuple[FloatArray, FloatArray]) -> list[float]:
+    """Largest strain of an edge in each third of what is lifted, by the middle of the edge at rest along y.
 
     The strain of an edge is its lengthening over its length at rest; shortening counts as 0.
+
+    Args:
+        model: the organ.
+        node_position: of its nodes now [m], (n_node, 3).
+        box: corners of the box of what is lifted [m], (3,) each; other edges do not count.
     """
     first, second = model.spring_nodes.T
     lengths = np.linalg.norm(node_position[first] - node_position[second], axis=1)
     strain = lengths / model.spring_rest_length - 1.0
-    rest = model.node_rest_position[:, 1]
+    rest = model.node_rest_position
     middle = 0.5 * (rest[first] + rest[second])
-    low, high = float(rest.min()), float(rest.max())
-    third = np.minimum((len(REGIONS) * (middle - low) / (high - low)).astype(np.int64), len(REGIONS) - 1)
+    lifted = ((middle >= box[0]) & (middle <= box[1])).all(axis=1)
+    low, high = float(box[0][1]), float(box[1][1])
+    share = (len(REGIONS) * (middle[:, 1] - low) / (high - low)).astype(np.int64)
+    third = np.where(lifted, np.minimum(share, len(REGIONS) - 1), -1)
     return [float(strain[third == region].max(initial=0.0)) for region in range(len(REGIONS))]

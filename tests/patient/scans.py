@@ -67,3 +67,23 @@ def check_organ(image, spacing):
     assert lesions[0] > 2.0
     assert lesions[1] < -12.0
     assert lesions[2] > 6.0
+
+
+# A wedge as a liver's edge is one: half its width along x, its length up from its edge along z, how thick that is and
+# how it grows [mm], LPS.
+WEDGE_HALF, WEDGE_LENGTH, WEDGE_EDGE, WEDGE_SLOPE = 48.0, 92.0, 5.0, 0.40
+# The middle of its lesion, and that's radius [mm].
+WEDGE_LESION, WEDGE_LESION_RADIUS = np.array([20.0, -14.0, 66.0]), 9.0
+
+
+def wedge(path: Path, spacing: float = 1.5) -> Path:
+    """A wedge with its level side to the back, its edge to the feet, a lesion near its thick end."""
+    x, y, z = (np.arange(low, high, spacing) for low, high in ((-54.0, 54.0), (-54.0, 9.0), (-9.0, 99.0)))
+    place = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+    aside, depth, height = np.abs(place[..., 0]), place[..., 2], -place[..., 1]
+    thickness = WEDGE_EDGE + WEDGE_SLOPE * depth
+    inside = (aside <= WEDGE_HALF) & (depth >= 0.0) & (depth <= WEDGE_LENGTH) & (height >= 0.0) & (height <= thickness)
+    ill = inside & (((place - WEDGE_LESION) ** 2).sum(axis=-1) <= WEDGE_LESION_RADIUS**2)
+    affine = np.diag([-spacing, -spacing, spacing, 1.0])
+    affine[:3, 3] = -x[0], -y[0], z[0]
+    return write_nifti(path, np.where(ill, 2, inside).astype(np.uint8), affine)

@@ -14,7 +14,7 @@ from surgsim_env.anatomy import load_anatomy
 from surgsim_env.cli import main
 from surgsim_env.patient.materials import organ_material, region_material
 from surgsim_env.patient.patient_scene import _check_moduli
-from surgsim_env.patient.scene_text import _entry
+from surgsim_env.patient.toml_lines import entry
 from surgsim_env.scenes import load_scene
 from tests.patient.scans import LABELS, LESIONS, MIDDLE, ORGAN_VOLUME, scan
 
@@ -52,7 +52,7 @@ def test_the_scene_file_states_its_axes_and_sources(written):
     "name", ["scan\U0001f600.nii.gz", 'a"b\\c\td\x7f\x1b.nii.gz', "half\ud83d.nii.gz", "byte\udc80.nii.gz"]
 )
 def test_strings_of_a_scene_are_toml_whatever_a_file_is_called(name):
-    (value,) = tomllib.loads(_entry("description", name)).values()
+    (value,) = tomllib.loads(entry("description", name)).values()
     assert value == re.sub("[\ud800-\udfff]", "\ufffd", name)
 
 

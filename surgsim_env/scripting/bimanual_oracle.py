@@ -11,6 +11,8 @@ from surgsim_env.simulation import Simulation
 ASIDE = -0.008
 # The edge is folded back by this share of what a retraction may need: the right arm needs room, not the endoscope.
 FOLD = 0.66
+# A flap is lifted by this share of it: 11 mm.
+LIFT = 0.45
 # Places of the right tip on its way: before the lobe (from the target in x, from the free edge in y, height), then at
 # its mouth (from the target in x and y, height), then over the target (free height) [m].
 BEFORE, MOUTH, OVER = (0.010, 0.018, 0.022), (0.002, 0.012, 0.010), 0.0015
@@ -37,5 +39,5 @@ def bimanual_steps(simulation: Simulation, target: FloatArray, turning_size: int
         MoveTo(over, REACHING_SPEED, name="stand over the target"),
         PressSupport(TOUCH_FORCE, over, name="touch it"),
     ]
-    left = retraction_steps(simulation, target, turning_size, lambda _: False, aside=ASIDE, fold=FOLD)
+    left = retraction_steps(simulation, target, turning_size, lambda _: False, aside=ASIDE, fold=FOLD, lift=LIFT)
     return [*(MayEnd(OfArm(step, "left")) for step in left), *(MayEnd(OfArm(step, "right")) for step in right)]

@@ -32,7 +32,13 @@ FRICTION_KEPT = 0.06
 
 
 def flap_steps(
-    simulation: Simulation, target: FloatArray, turning_size: int, enough: Predicate, *, aside: float = 0.0
+    simulation: Simulation,
+    target: FloatArray,
+    turning_size: int,
+    enough: Predicate,
+    *,
+    aside: float = 0.0,
+    share: float = 1.0,
 ) -> list[Step]:
     """Grasp the edge of a flap before a target [m] (3,) along the jaw and lift it; the organ as it rests now.
 
@@ -42,6 +48,7 @@ def flap_steps(
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
         enough: whether the target is seen well enough to lift the edge no farther.
         aside: how far beside the target the edge is grasped, along x [m].
+        share: of LIFT, at most.
     """
     scene, rest = simulation.anatomy.scene, simulation.organ_model.node_rest_position
     assert scene.retract is not None and scene.retract.flap is not None
@@ -60,14 +67,15 @@ def flap_steps(
     y = max(float(place[0]) - GRASP_DEPTH, bed + BED_GAP + PAD_REACH, fits)
     grasp = np.array([along, y, float(np.interp(y, place[::-1], sides.mean(axis=1)[::-1]))])
     waiting = grasp - jaw * (WAITING_GAP + float(place[0]) - y)
-    risen = grasp + np.array([0.0, OUTWARD_SHARE * LIFT, LIFT])
+    lift = share * LIFT
+    risen = grasp + np.array([0.0, OUTWARD_SHARE * lift, lift])
     return [
         MoveTo(_point(waiting), tolerance=0.001, name="wait before it"),
         MoveTo(_point(grasp), APPROACH_SPEED, 0.001, name="go around the edge"),
         CloseJaw(GRIP_FORCE, name="grasp"),
         MayEnd(
             Until(
-                MoveTo(_point(risen), LIFTING_SPEED, 0.001, _turn(TURN_RATE * LIFT, turning_size), name="lift"),
+                MoveTo(_point(risen), LIFTING_SPEED, 0.001, _turn(TURN_RATE * lift, turning_size), name="lift"),
                 lambda view: enough(view) or _about_to_slip(view),
             )
         ),

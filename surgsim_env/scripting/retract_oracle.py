@@ -39,6 +39,7 @@ def retraction_steps(
     *,
     aside: float = 0.0,
     fold: float = 1.0,
+    lift: float = 1.0,
 ) -> list[Step]:
     """Grasp the free edge beside a target [m] (3,) and fold it back; the lobe as it rests now.
 
@@ -49,10 +50,11 @@ def retraction_steps(
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
         aside: how far beside the target the edge is grasped, along x [m].
         fold: share of the second way, on which the lifted edge is folded back.
+        lift: of a flap, which is not folded, the share of its one way.
     """
     table = simulation.anatomy.scene.retract
     if table is not None and table.flap is not None:
-        return flap_steps(simulation, target, turning_size, enough, aside=aside)
+        return flap_steps(simulation, target, turning_size, enough, aside=aside, share=lift)
     rest, nodes = simulation.organ_model.node_rest_position, simulation.organ_state.node_position
     depth = float(rest[:, 1].max())
     edge = rest[:, 1] > depth - 1e-6

@@ -120,8 +120,9 @@ def write_patient(
     text, scene_file = scene_text(found), out.with_suffix(".toml")
     page = report_page(found, text, scene_file.name, command, retraction)
     targets, turned = [out, scene_file, out.with_name(REPORT_NAME)], _retract_file(out)
+    lifted = turned.with_suffix(".toml")
     if isinstance(retraction, RetractScene):
-        targets += [turned, turned.with_suffix(".toml")]
+        targets += [turned, lifted]
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".surgsim-part-") as part:
         write_mesh(Path(part, out.name), found.patient.mesh)
         Path(part, scene_file.name).write_text(text, encoding="utf-8", newline="\n")
@@ -130,10 +131,13 @@ def write_patient(
         load_scene(Path(part, scene_file.name))
         if isinstance(retraction, RetractScene):
             write_mesh(Path(part, turned.name), retraction.anatomy.mesh)
-            lifted = Path(part, turned.with_suffix(".toml").name)
-            lifted.write_text(retract_text(found, retraction), encoding="utf-8", newline="\n")
-            load_scene(lifted)
+            Path(part, lifted.name).write_text(retract_text(found, retraction), encoding="utf-8", newline="\n")
+            load_scene(Path(part, lifted.name))
         _replace(targets, Path(part))
+    if not isinstance(retraction, RetractScene) and lifted.exists() and _begins(lifted, FIRST_LINE):
+        # An earlier run's, of another organ than is there now.
+        turned.unlink(missing_ok=True)
+        lifted.unlink()
     return targets
 
 

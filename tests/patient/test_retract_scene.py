@@ -15,6 +15,7 @@ from surgsim_env.cli import main
 from surgsim_env.patient.command import _check_targets
 from surgsim_env.patient.organ_voxels import OrganVoxels
 from surgsim_env.patient.rim import JAW_OPENING, JAW_PLAY, OVERLAP_LEAST, VOXEL, NoRim, Rim, _thickness, find_rim
+from surgsim_env.patient.scene_text import FIRST_LINE
 from surgsim_env.retract_scene import make_retract_scene
 from surgsim_env.retraction import Flap, Retraction
 from surgsim_env.scenes import load_scene
@@ -155,9 +156,13 @@ def test_an_organ_without_a_thin_edge_says_so(tmp_path, capsys):
     ball = trimesh.creation.icosphere(3, 30.0)
     ball.export(tmp_path / "ball.stl")
     out = tmp_path / "patient.vtu"
+    # An earlier run found an edge.
+    earlier = [tmp_path / "patient_retract.vtu", tmp_path / "patient_retract.toml"]
+    for file in earlier:
+        file.write_text(f"{FIRST_LINE}\n", encoding="utf-8")
     assert main(["organ", str(tmp_path / "ball.stl"), "--length-unit", "mm", "--out", str(out)]) == 0
     assert "retraction: none: " in capsys.readouterr().out
-    assert not (tmp_path / "patient_retract.toml").exists()
+    assert not any(file.exists() for file in earlier)
     reason = load_scene(out.with_suffix(".toml")).retract_refusal
     assert reason is not None and f"the jaw opens {JAW_OPENING * 1e3:g} mm" in reason
     for name in RETRACTIONS:

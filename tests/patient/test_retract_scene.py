@@ -1,5 +1,6 @@
 """The scene of retraction of a patient's organ: which edge is lifted, what is written, what takes it, who refuses."""
 
+import json
 from pathlib import Path
 
 import gymnasium as gym
@@ -150,6 +151,17 @@ def test_the_oracle_lifts_the_wedge_s_edge(env):
     assert trace.info["success"]
     assert trace.info["slips"] == 0
     assert trace.info["pull_force_peak"] < env.unwrapped.scene.limits.soft_force
+
+
+@pytest.mark.slow
+def test_a_real_liver_s_edge_is_lifted_from_the_command_line(tmp_path, anatomy_folder):
+    out = tmp_path / "patient.vtu"
+    assert main(["organ", str(anatomy_folder / "openhelp_liver.stl"), "--length-unit", "mm", "--out", str(out)]) == 0
+    scene = str(out.with_suffix(".toml"))
+    assert main(["retract", "--scene", scene, "--seed", "3", "--out", str(tmp_path / "run")]) == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["success"] and summary["slips"] == 0
+    assert not summary["torn"] and not summary["failure"]
 
 
 def test_an_organ_without_a_thin_edge_says_so(tmp_path, capsys):

@@ -202,7 +202,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--most-steps", type=int, help="stop after so many, to go on later")
     given = parser.parse_args(arguments)
     run = RllibRun.read(given.config)
-    ray.init(address=given.address, include_dashboard=False if given.address is None else None)
+    # Without a word Ray joins what RAY_ADDRESS or a file of an earlier cluster names, and waits if that is gone.
+    ray.init(address=given.address or "local", include_dashboard=False if given.address is None else None)
     try:
         steps = train(run, given.out or Path("runs") / run.name, most_steps=given.most_steps)
     finally:

@@ -129,7 +129,7 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, folder: Path, mesh_file
         contact=replace(lobe.contact, stiffness=patient.contact.stiffness),
         instrument=replace(
             lobe.instrument,
-            tip_radius=0.003,
+            tip_radius=0.005,
             approach=_vector(0.0, -math.sin(tilt), -math.cos(tilt)),
             tip_direction=_vector(*rim.jaw),
         ),

@@ -11,8 +11,8 @@ from surgsim_env.simulation import Simulation
 ASIDE = -0.008
 # The edge is folded back by this share of what a retraction may need: the right arm needs room, not the endoscope.
 FOLD = 0.66
-# A flap is lifted by this share of it: 11 mm.
-LIFT = 0.45
+# A flap is lifted by this share of it: 17 mm. Less leaves the right arm no room beside the jaw.
+LIFT = 0.7
 # Places of the right tip on its way: before the lobe (from the target in x, from the free edge in y, height), then at
 # its mouth (from the target in x and y, height), then over the target (free height) [m].
 BEFORE, MOUTH, OVER = (0.010, 0.018, 0.022), (0.002, 0.012, 0.010), 0.0015

@@ -34,7 +34,8 @@ def run(folder, table, *more):
     done = subprocess.run(
         [sys.executable, "-m", "agents.train_rllib", str(config), "--out", str(folder / "out"), *more],
         cwd=REPOSITORY,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        # Nobody answers there, and nobody is to be asked: a local Ray is started.
+        env={**os.environ, "OMP_NUM_THREADS": "1", "RAY_ADDRESS": "192.0.2.1:6379"},
         capture_output=True,
         text=True,
         timeout=900,

@@ -157,11 +157,12 @@ def test_the_oracle_lifts_the_wedge_s_edge(env):
 def test_a_real_liver_s_edge_is_lifted_from_the_command_line(tmp_path, anatomy_folder):
     out = tmp_path / "patient.vtu"
     assert main(["organ", str(anatomy_folder / "openhelp_liver.stl"), "--length-unit", "mm", "--out", str(out)]) == 0
-    scene = str(out.with_suffix(".toml"))
-    assert main(["retract", "--scene", scene, "--seed", "3", "--out", str(tmp_path / "run")]) == 0
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
-    assert summary["success"] and summary["slips"] == 0
-    assert not summary["torn"] and not summary["failure"]
+    for arms in ([], ["--bimanual"]):
+        run = ["retract", "--scene", str(out.with_suffix(".toml")), "--seed", "3", "--out", str(tmp_path / "run")]
+        assert main([*run, *arms]) == 0
+        summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
+        assert summary["success"] and summary["slips"] == 0
+        assert not summary["torn"] and not summary["failure"]
 
 
 def test_an_organ_without_a_thin_edge_says_so(tmp_path, capsys):

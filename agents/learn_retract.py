@@ -1,7 +1,7 @@
 """Learn SurgSim/Retract-v0 from the scripted expert with DAgger: the policy plays, the expert says what it would do.
 
-    python -m agents.learn_retract --out agents/policies/retract_dagger.zip
-    python -m agents.learn_retract --without-force --out agents/policies/retract_dagger_without_force.zip
+    python -m agents.learn_retract --rounds 6 --out agents/policies/retract_dagger.zip
+    python -m agents.learn_retract --rounds 6 --without-force --out agents/policies/retract_dagger_without_force.zip
 
 With `--without-force` the policy sees 0 in place of the jaw's wrench, its grip and its pull; the expert still sees all.
 What it comes to is a policy of stable-baselines3's PPO, which `agents.train` can go on from (`warm_start`).

@@ -35,6 +35,8 @@ BED_INSIDE, BED_GAP = 0.016, 0.002
 BED_WIDTH, BED_THICKNESS = 0.030, 0.040
 # The disc: its radius, and how far its middle's place is drawn, inward from the bed's border and along it [m].
 TARGET_RADIUS, TARGET_IN, TARGET_ALONG = 0.004, (0.005, 0.008), 0.003
+# Of a right arm's ball [m]: the neck behind it (3 mm) would else meet the bed before it.
+RIGHT_TIP_RADIUS = 0.005
 # Healthy liver's spread over its mean, 1.65 of 6.63 kPa (doi 10.1177/8756479317733713).
 MODULUS_SPREAD = 0.25
 
@@ -129,7 +131,7 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, folder: Path, mesh_file
         contact=replace(lobe.contact, stiffness=patient.contact.stiffness),
         instrument=replace(
             lobe.instrument,
-            tip_radius=0.005,
+            tip_radius=RIGHT_TIP_RADIUS,
             approach=_vector(0.0, -math.sin(tilt), -math.cos(tilt)),
             tip_direction=_vector(*rim.jaw),
         ),

@@ -65,9 +65,7 @@ def _touch(made: RetractScene) -> list[str]:
         "",
         "[instrument]           # the jaw points along the middle of the edge",
         entry("model", scene.instrument.model),
-        entry(
-            "tip_radius", scene.instrument.tip_radius, "[m] chosen: of a right arm's ball, which goes under the edge"
-        ),
+        entry("tip_radius", scene.instrument.tip_radius, "[m] chosen: of a right arm's ball, wider than its neck"),
         entry("approach", scene.instrument.approach),
         entry("tip_direction", scene.instrument.tip_direction),
         *_port("[port]", scene.port),

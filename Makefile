@@ -12,14 +12,15 @@ TORCH := torch==2.13.0
 WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
 WITH_RAY := --editable=.[dev,distributed]
 
-PYTEST_ARGS ?= -n 2
+# A file's tests run in one worker, which makes what they share once.
+PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .PHONY: help demo test test-all test-agents test-distributed with-ray bench docs lint clean distclean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo         press the simulated probe into the liver; results in runs/demo"
-	@echo "make test         the tests (PYTEST_ARGS='-n 2' is the default)"
+	@echo "make test         the tests (PYTEST_ARGS='-n 2 --dist loadfile' is the default)"
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
 	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
@@ -31,6 +32,10 @@ help:
 
 demo: $(VENV)/.ready-demo
 	$(VENV)/bin/surgsim palpate --scene liver --out runs/demo
+
+# Tests run side by side: threads that wait for their parts of a small matrix cost more than they save.
+test test-all test-agents: export OMP_NUM_THREADS := 1
+test test-all test-agents: export OPENBLAS_NUM_THREADS := 1
 
 test: $(VENV)/.ready-dev
 	$(PY) -m tests.compile_kernels

@@ -1,9 +1,9 @@
-"""Clone a policy from a Minari dataset and say how often the clone succeeds.
+"""Clone a policy from a Minari dataset and measure how often the clone succeeds.
 
     python -m agents.behaviour_cloning surgsim/retract/oracle-v0 --out runs/clone.zip
 
-The dataset says which environment it comes from (`agents/record_demonstrations.py` writes such). What comes out is a
-PPO or RecurrentPPO of stable-baselines3 with its normalisation: reinforcement learning goes on from it with
+The dataset names its environment (`agents/record_demonstrations.py` writes such datasets). The result is a PPO or
+RecurrentPPO of stable-baselines3 with its normalisation; reinforcement learning starts from it with
 `warm_start: runs/clone.zip` in a configuration of `agents/train.py`.
 """
 
@@ -20,8 +20,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.cloning import CloningCurve, CloningOptions, clone, normalise_by, pad
 from agents.training.algorithms import algorithm_class
+from agents.training.cloning import CloningCurve, CloningOptions, clone, normalise_by, pad
 from agents.training.policy_files import PolicyDescription, TrainedPolicy, describe, save_policy
 
 # Episodes are scored on seeds from here on; demonstrations come from lower ones.
@@ -31,13 +31,13 @@ FIRST_SEED = 500_000
 def clone_dataset(
     dataset: minari.MinariDataset, *, recurrent: bool = False, width: int = 128, options: CloningOptions | None = None
 ) -> tuple[TrainedPolicy, CloningCurve]:
-    """Fit a new policy to a dataset; it, and the losses of each epoch.
+    """Fit a new policy to a dataset; returns the policy and the losses of each epoch.
 
     Args:
         dataset: of flat observations and actions.
-        recurrent: a policy with a memory of its own (LSTM), from whole episodes.
+        recurrent: a policy with an LSTM, fitted to whole episodes.
         width: of the two layers (of the LSTM).
-        options: how long and how fast.
+        options: of the fit.
     """
     episodes = list(dataset.iterate_episodes())
     observations = [np.asarray(episode.observations)[:-1] for episode in episodes]
@@ -82,14 +82,14 @@ def play(env: gym.Env, policy: TrainedPolicy, seeds: Sequence[int]) -> list[dict
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Clone, keep, play, tell."""
+    """Clone, save, play, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", help="its name, such as surgsim/retract/oracle-v0")
     parser.add_argument("--out", type=Path, default=Path("runs/clone.zip"), help="where the policy is written")
     parser.add_argument("--epochs", type=int, default=CloningOptions.epochs)
-    parser.add_argument("--recurrent", action="store_true", help="a policy with a memory of its own")
+    parser.add_argument("--recurrent", action="store_true", help="a policy with an LSTM")
     parser.add_argument("--width", type=int, default=128, help="of the layers")
-    parser.add_argument("--episodes", type=int, default=10, help="how many the clone plays")
+    parser.add_argument("--episodes", type=int, default=10, help="number of episodes that the clone plays")
     parser.add_argument("--seed", type=int, default=0, help="of the fit")
     given = parser.parse_args(arguments)
     dataset = minari.load_dataset(given.dataset)

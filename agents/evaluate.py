@@ -6,8 +6,8 @@
     python -m agents.evaluate --reach --scene phantom --level hard       # lesions below the sensor's reach
     python -m agents.evaluate --leaderboard
 
-Results go to agents/results/, one file a method and place; the leaderboard is written from all of them. A policy is a
-zip of pickles: load only those that you trust.
+Results go to agents/results/, one file per method, scene and level; the leaderboard is written from all of them. A
+policy is a zip of pickles: load only files that you trust.
 """
 
 import argparse
@@ -23,26 +23,26 @@ import gymnasium as gym
 import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.leaderboard import SITES, write_leaderboard
-from agents.results_files import RESULTS, Result
-from agents.roster import AGENTS, POLICIES, RASTER_SIDES, TASK_AGENTS, WORDS, find_agent
-from agents.site_episodes import AgentChooser, PolicyChooser, SiteChooser, play
-from agents.task_episodes import Actor, play_tasks, task_figures
-from surgsim_env.evaluation.palpation import EVALUATION_SEEDS, press_errors, score
+from agents.roster import AGENTS, POLICIES, RASTER_SIDES, REFERENCES, TASK_AGENTS, find_agent
+from agents.scoring.leaderboard import SITES, write_leaderboard
+from agents.scoring.results_files import RESULTS, Result
+from agents.scoring.site_episodes import AgentChooser, PolicyChooser, SiteChooser, play
+from agents.scoring.task_episodes import Actor, play_tasks, task_figures
+from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score
 
-# Of the bootstrap.
+# Seed of the bootstrap.
 BOOTSTRAP_SEED = 0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Read the command line and do what it asks."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--all", action="store_true", help="every baseline, and every policy for this place")
+    what.add_argument("--all", action="store_true", help="every baseline, and every policy for this scene")
     what.add_argument("--agent", help=f"one of {', '.join([*AGENTS, *TASK_AGENTS])}")
     what.add_argument("--policy", type=Path, help="NAME.zip, with NAME.json beside it")
-    what.add_argument("--reach", action="store_true", help="which lesions the sensor can feel at all")
-    what.add_argument("--leaderboard", action="store_true", help="write it and do nothing else")
+    what.add_argument("--reach", action="store_true", help="count the lesions below the sensor's reach")
+    what.add_argument("--leaderboard", action="store_true", help="write the leaderboard only")
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--level", default="standard")
     parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """What the options ask for."""
+    """Evaluate what the options select."""
     if options.reach:
         write_reach(options)
     elif options.agent is not None:
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def evaluate_all(options: argparse.Namespace) -> None:
-    """Every baseline on the place that the options name, then every policy made for it."""
+    """Every baseline on the scene and level of the options, then every policy trained on that scene."""
     widest = 7 if "wide" in options.scene else 5
     skipped = {f"raster_{side}" for side in RASTER_SIDES if not widest - 3 <= side <= widest}
     for name in AGENTS:
@@ -89,7 +89,7 @@ def evaluate_all(options: argparse.Namespace) -> None:
 
 
 def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
-    """A baseline of SurgSim/PalpateSites-v0, or the script of another environment on that one's own scene."""
+    """A baseline of SurgSim/PalpateSites-v0, or the script of another environment on its own scene."""
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
         command, kwargs = f"python -m agents.evaluate --agent {name}", dict(script.kwargs)
@@ -98,15 +98,15 @@ def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
             command += f" --scene {options.scene} --level {options.level}"
         return _evaluate_task(name, script.make(kwargs), script.env_id, kwargs, command, options)
     kwargs: dict[str, Any] = {"scene": options.scene, "level": options.level}
-    if name in WORDS:
-        # What these say does not change with what is felt.
+    if name in REFERENCES:
+        # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
     command = f"python -m agents.evaluate --agent {name} --scene {options.scene} --level {options.level}"
     return _evaluate_sites(name, AgentChooser(find_agent(name)), kwargs, command, options)
 
 
 def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
-    """A trained policy on what it was trained for; `--level` sets the level where its environment has one."""
+    """A trained policy on its own environment; `--level` sets the level if the environment has one."""
     from agents.training.policy_files import load_policy
 
     policy = load_policy(path)
@@ -116,7 +116,7 @@ def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
         kwargs["level"] = options.level
         command += f" --level {options.level}"
     if options.video is not None:
-        from agents.policy_video import film
+        from agents.scoring.policy_video import film
 
         film(policy, kwargs, EVALUATION_SEEDS[: options.video_episodes], options.video)
     if policy.description.env_id == SITES:
@@ -176,8 +176,8 @@ def _evaluate_task(
 
 
 def write_reach(options: argparse.Namespace) -> None:
-    """Press over each lesion of the evaluation seeds, with it and without it, and count those that stay hidden."""
-    from surgsim_env.palpation.lesion_reach import lesion_reaches
+    """Press over each lesion of the evaluation seeds, with and without it, and count those below the sensor's reach."""
+    from surgsim_env.palpation.scores import lesion_reaches
 
     kwargs = {"scene": options.scene, "level": options.level}
     env = gym.make(SITES, **kwargs).unwrapped
@@ -215,7 +215,7 @@ def _environments(
 
 
 def _saved(options: argparse.Namespace, command: str, taken: float, **scored: Any) -> Result:
-    """The result of what was played on the evaluation seeds in so many seconds, kept in its file and told."""
+    """Save and print the result of episodes that took `taken` seconds."""
     result = Result(
         seeds=(EVALUATION_SEEDS[0], EVALUATION_SEEDS[options.episodes - 1]),
         command=_with_options(command, options),
@@ -225,14 +225,14 @@ def _saved(options: argparse.Namespace, command: str, taken: float, **scored: An
     )
     path = result.save(options.results)
     shown = {name: figure.value for name, figure in result.figures.items()}
-    told = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
-    figures = ", ".join(f"{name} {shown[name]:.3g}" for name in told if shown.get(name) is not None)
+    printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
+    figures = ", ".join(f"{name} {shown[name]:.3g}" for name in printed if shown.get(name) is not None)
     print(f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s -> {path}", flush=True)
     return result
 
 
 class _Progress:
-    """Says from time to time that something moves."""
+    """Prints the number of steps about once a minute."""
 
     def __init__(self, name: str, every: float = 60.0) -> None:
         self.name, self.every, self.count = name, every, 0
@@ -253,7 +253,7 @@ def _with_options(command: str, options: argparse.Namespace) -> str:
 
 
 def _from_here(path: Path) -> str:
-    """The path as seen from the checkout, so that no machine's folders are written."""
+    """The path relative to the checkout, so that no machine's folders are written."""
     absolute, checkout = path.resolve(), POLICIES.parent.parent
     return absolute.relative_to(checkout).as_posix() if absolute.is_relative_to(checkout) else path.name
 

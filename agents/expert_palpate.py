@@ -1,8 +1,8 @@
 """A scripted expert for SurgSim/Palpate-v0 with memory=True: slide over the face, go back to the stiffest, declare.
 
-It has no state: each action follows from one observation, so that a network can be taught to do the same
-(`agents/learn_palpate.py`). The tip slides along rows at a steady depth, less where the force nears the soft limit;
-what it felt is in the observation. When the rows are done it goes back to the stiffest place and declares it.
+It has no state: each action is a function of one observation, so that a network can learn it
+(`agents/learn_palpate.py`). The tip slides along rows at a constant depth, less where the force nears the soft limit;
+the observation holds the measured contrast. After the rows it returns to the stiffest place and declares it.
 
     python -m agents.expert_palpate --scene phantom --episodes 48
 """
@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 import surgsim_env  # noqa: F401  (registers the ids)
 
 ROWS_FEWEST = 5
-NEAR = 0.003  # [m] gaps below this are closed the more slowly the smaller they are; a row's end reaches as far
-GOAL_NEAR = 0.006  # [m] likewise on the way to the first row and to the stiffest place
-ABOVE = 0.004  # [m] the tip comes down within this of the rows' begin
-TRAVEL_GAP = 0.001  # [m] between tip and surface on the way there
-CLOSE_ENOUGH = 0.0015  # [m] a row is reached
-DECLARE_NEAR = 0.003  # [m] to the stiffest place
-FORCE_GAIN = 20.0  # [1/N] full speed upwards at 50 mN too much
+NEAR = 0.003  # [m] below this distance speed is proportional to it; also the zone at the end of a row
+GOAL_NEAR = 0.006  # [m] the same on the way to the first row and to the stiffest place
+ABOVE = 0.004  # [m] within this of the first row's start the tip descends
+TRAVEL_GAP = 0.001  # [m] between tip and surface before that
+CLOSE_ENOUGH = 0.0015  # [m] within this a row is reached
+DECLARE_NEAR = 0.003  # [m] within this of the stiffest place it declares
+FORCE_GAIN = 20.0  # [1/N] full speed upwards at an excess force of 50 mN
 
 
 class PalpateExpert:
     """Actions (n, 4) for observations (n, n_observation) of a block's flat top.
 
-    While it slides along the rows, where to go follows from the place alone: row by row in alternating directions. That
-    this has begun, and that it is over, is told by the marks of the rows' first and last site.
+    Along the rows the direction is a function of place: row by row in alternating directions. The visited marks of the
+    first and the last site of the rows show that the search has begun, and that it is over.
     """
 
     def __init__(
@@ -39,37 +39,41 @@ class PalpateExpert:
 
         Args:
             env: with memory=True.
-            depth: that it slides at [m].
-            row_spacing: at most so far apart are the rows [m], of which there are five or more.
-            force_share: it lifts where the force is above this share of the soft limit.
+            depth: of the tip while it slides [m].
+            row_spacing: largest distance between rows [m]; there are at least five rows.
+            force_share: the tip lifts where the force exceeds this share of the soft limit.
 
         Raises:
-            ValueError: a scene that is no block, or an environment without memory.
+            ValueError: a scene that is not a block, or an environment without memory.
         """
         scene, task = env.unwrapped.scene, env.unwrapped.task
         if scene.mesh.block is None:
-            raise ValueError(f"this expert slides on a block's flat top; scene {scene.name!r} is none: use phantom")
+            raise ValueError(f"this expert slides on a block's flat top; {scene.name!r} is not a block: use phantom")
         if task.memory is None:
-            raise ValueError("this expert has no memory of its own: make the environment with memory=True")
+            raise ValueError("this expert reads the memory of the observation: make the environment with memory=True")
+        self.slices = task.observation_slices
         self.chart, side = task.memory.chart, task.memory.chart.side_count
         self.surface = scene.mesh.block.size[2] + scene.instrument.tip_radius
         self.force_most = force_share * scene.limits.soft_force
         self.depth = depth
-        # Rows lie on rows of sites, whose marks tell that they were felt.
+        # Rows lie on rows of sites, which have visited marks.
         row_count = max(int(np.ceil(self.chart.extent[1] / row_spacing - 1e-6)) + 1, ROWS_FEWEST)
         rows = np.unique(np.round(np.linspace(0, side - 1, row_count)).astype(int))
         self.rows = self.chart.lower[1] + rows * self.chart.extent[1] / (side - 1)
-        self.first = 10 + side**2 + rows[0] * side
-        self.last = 10 + side**2 + rows[-1] * side + (side - 1 if len(rows) % 2 else 0)
+        marks = self.slices["visited"].start
+        self.first = marks + rows[0] * side
+        self.last = marks + rows[-1] * side + (side - 1 if len(rows) % 2 else 0)
         self.start = np.array([self.chart.lower[0], self.rows[0]])
 
     def act(self, observations: NDArray) -> NDArray[np.float32]:
         """The next actions."""
         seen = np.asarray(observations, dtype=np.float64)
-        tip, height, force = seen[:, :2], seen[:, 2], seen[:, 8]
+        position, force, stiffest = (
+            seen[:, self.slices[name]] for name in ("tip_position", "contact_force", "stiffest")
+        )
+        tip, height, force = position[:, :2], position[:, 2], force[:, 2]
         begun, over = seen[:, self.first] > 0.5, seen[:, self.last] > 0.5
-        stiffest = self.chart.plane_point(seen[:, -3:-1])
-        goal = np.where(over[:, None], stiffest, self.start)
+        goal = np.where(over[:, None], self.chart.plane_point(stiffest[:, :2]), self.start)
         gap = goal - tip
         distance = np.linalg.norm(gap, axis=1)
         sliding = begun & ~over
@@ -82,7 +86,7 @@ class PalpateExpert:
         return np.clip(np.column_stack([across, rise, declare]), -1.0, 1.0).astype(np.float32)
 
     def _along_rows(self, tip: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Directions (n, 2) at places (n, 2) [m]: along the row that was reached, at its end on to the next."""
+        """Directions (n, 2) at places (n, 2) [m]: along the current row, at its end to the next."""
         spacing = self.rows[1] - self.rows[0]
         row = np.clip(np.floor((tip[:, 1] - self.rows[0] + CLOSE_ENOUGH) / spacing), 0, len(self.rows) - 1).astype(int)
         way = np.where(row % 2 == 0, 1.0, -1.0)
@@ -95,7 +99,7 @@ class PalpateExpert:
 
 
 def play(envs: gym.vector.VectorEnv, expert, episodes: int, seed: int) -> list[dict]:
-    """Last infos of so many episodes, with their seconds and largest force [N]; every environment plays its share."""
+    """Last infos of episodes, with steps, largest force [N] and return; each environment plays an equal share."""
     observation, _ = envs.reset(seed=list(range(seed, seed + envs.num_envs)))
     records: list[list[dict]] = [[] for _ in range(envs.num_envs)]
     share = -(-episodes // envs.num_envs)
@@ -117,7 +121,7 @@ def play(envs: gym.vector.VectorEnv, expert, episodes: int, seed: int) -> list[d
 
 
 def main() -> None:
-    """Print one line an episode, and the figures of all."""
+    """Print one line per episode, and the figures of all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--level", default=None)

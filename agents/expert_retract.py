@@ -1,8 +1,8 @@
-"""A scripted expert for SurgSim/Retract-v0 that remembers nothing: each action follows from the observation alone.
+"""A scripted expert for SurgSim/Retract-v0 without state: each action is a function of the observation.
 
-What `surgsim_env.scripting.retract_oracle` does as a script, it reads off where things are, so that it knows what to do
-in any state that a learning agent gets into: that is what DAgger asks of an expert (Ross et al. 2011). It is made for
-the scene `lobe` with its own grasper, whose wrist turns about one hinge. Run it from a checkout:
+It performs the procedure of `surgsim_env.scripting.oracle`, but can act in any state that a learning agent reaches, as
+DAgger requires of an expert (Ross et al. 2011). It is written for the scene `lobe` with its own grasper, whose wrist
+turns about one hinge. Run it from a checkout:
 
     python agents/expert_retract.py --episodes 20
 """
@@ -16,34 +16,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.tasks.retract import RetractTask
 
 SPEED = 0.02  # [m/s] full scale of an action's velocity
 TURNING = 0.5  # [rad/s] full scale of the wrist
 CONTROL_STEP = 0.05  # [s]
 
-# Where the observation has what (docs of `RetractEnv`, instrument with one hinge).
-TIP, POINTS_ALONG, GAP = slice(0, 3), slice(9, 12), 12
-GRIP, HOLDS, EDGE, MIDDLE, VISIBLE, TARGET = 19, 21, slice(22, 37), slice(37, 52), 52, slice(53, 55)
+# Entries of the observation, of an instrument with one hinge: channels of numbers and vectors, then single numbers.
+SLICES = RetractTask.channel_slices(tip_axes=6)
+TIP, EDGE, TARGET = (SLICES[name] for name in ("tip_position", "edge_points", "target_place"))
+POINTS_ALONG = slice(SLICES["tip_axes"].start + 3, SLICES["tip_axes"].stop)
+GAP, GRIP, HOLDS, VISIBLE = (SLICES[name].start for name in ("opening", "grip_force", "holds", "visible"))
 
-# Before the free edge, where the jaw waits; how deep its middle goes in over the edge [m].
+# Distance of the waiting jaw from the free edge; depth of its middle over the edge in a grasp [m].
 WAITING_GAP, GRASP_DEPTH = 0.016, 0.0065
-# Nearer than this to the bed's end the pads do not go [m].
+# Least distance of the pads from the bed's end [m].
 NEAREST = 0.0475
-# From the lobe's top to the middle of its thickness [m]; of a free edge that hangs down a little.
+# From the lobe's top to the middle of its thickness, for a free edge that sags slightly [m].
 HALF_THICKNESS = 0.006
-# The approach may begin this far off its line; the jaw closes this near its goal [m].
+# Largest offset from the approach line; distance from the goal at which the jaw closes [m].
 ALIGNED, ARRIVED = 0.0015, 0.0008
-# The jaw is told to be closed where it is this near the grasp and has begun to close, or holds.
+# A jaw that has begun to close (gap below OPEN_GAP) within NEAR_GRASP of the grasp keeps closing [m].
 OPEN_GAP, NEAR_GRASP = 0.0195, 0.004
-GRIP_FORCE = 0.22  # [N] it lifts from here on
-# Where the tip takes the edge: up first, then over; y and z [m].
+GRIP_FORCE = 0.22  # [N] it lifts above this grip
+# Goals of the tip with the edge, y and z [m]: first up, then over.
 RISEN, FOLDED = (0.0465, 0.031), (0.024, 0.050)
 SEEN_ENOUGH = 0.9
 CARRYING_SPEED, APPROACH_SPEED = 0.015, 0.015
 
 
 class RetractExpert:
-    """Goes before the edge over the target, around it, closes, lifts, folds, and keeps still where enough is seen."""
+    """Waits before the edge above the target, encloses and grips it, lifts, folds, and holds once enough is visible."""
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
         """The action (5,) for an observation (56,)."""
@@ -52,7 +55,7 @@ class RetractExpert:
         return np.concatenate([velocity / SPEED, [turning / TURNING, jaw]]).clip(-1.0, 1.0).astype(np.float32)
 
     def act_all(self, observations: NDArray[np.floating], begins: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Actions (n, 5) for observations (n, 56) of several environments; when episodes begin makes no difference."""
+        """Actions (n, 5) for observations (n, 56) of several environments; `begins` is not used."""
         return np.array([self.act(observation) for observation in observations])
 
     def _grasped(self, now: NDArray[np.float64]) -> bool:
@@ -80,13 +83,13 @@ class RetractExpert:
         if across < ALIGNED or (across < 2.0 * ALIGNED and tip[1] < waiting[1] - 0.002):
             return towards(off, APPROACH_SPEED), turning, 1.0
         if tip[1] < waiting[1] - 0.004:
-            # Beside its line: out first, straight away from the edge.
+            # Off its line: first straight away from the edge.
             return np.array([0.0, SPEED, 0.0]), turning, 1.0
         return towards(waiting - tip, SPEED), turning, 1.0
 
 
 def grasp_place(now: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where the tip grasps the free edge over the target [m] (3,), from the points of the edge that are seen."""
+    """Place where the tip grasps the free edge above the target [m] (3,), from the observed points of the edge."""
     edge = now[EDGE].reshape(5, 3)
     along = float(now[TARGET][0])
     border = float(np.interp(along, edge[:, 0], edge[:, 1]))
@@ -95,19 +98,19 @@ def grasp_place(now: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def towards(gap: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
-    """A velocity along a way left [m], slower on its last millimetre: the tip lags behind what is asked."""
+    """A velocity along a remaining way [m], slower on its last millimetre, because the tip lags behind its command."""
     distance = float(np.linalg.norm(gap))
     return gap * (min(speed, 0.6 * distance / CONTROL_STEP) / max(distance, 1e-9))
 
 
 def _levelling(now: NDArray[np.float64]) -> float:
-    """The wrist's speed that keeps the jaw level [rad/s]; above 0 its pads sink."""
+    """Angular velocity of the wrist that levels the jaw [rad/s]; above 0 its pads sink."""
     _, y, z = now[POINTS_ALONG]
     return -0.6 * math.atan2(-z, -y) / CONTROL_STEP
 
 
 def run_episode(env: gym.Env, expert: RetractExpert, seed: int) -> dict[str, float | bool | str]:
-    """One episode's outcome: success, harm, steps, return, largest pull [N]."""
+    """Outcome of one episode: success, harm, steps, return, largest pull [N]."""
     observation, info = env.reset(seed=seed)
     total, steps, done = 0.0, 0, False
     while not done:

@@ -1,16 +1,15 @@
-"""Level-set search for SurgSim/PalpateSites-v0: press where it is most in doubt whether there is a lesion.
+"""Level-set search for SurgSim/PalpateSites-v0: press where it is most uncertain whether there is a lesion.
 
 Implicit level sets by upper confidence bounds, ILS-UCB (Garg et al. 2016, "Tumor localization using automated palpation
 with Gaussian process adaptive sampling"; Gotovos et al. 2013): the level h is a share of the largest expected excess,
-and the site of the largest ambiguity min(upper bound - h, h - lower bound) is pressed: the outlines of lesions, and
-whatever nobody has felt yet.
+and the site of the largest ambiguity min(upper bound - h, h - lower bound) is pressed: the outlines of lesions and
+unexplored regions.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.site_agent import SiteFacts
-from agents.site_process import SiteProcess
+from agents.scoring.site_agent import SiteFacts, SiteProcess
 from surgsim_env.palpation.lesion_estimator import EXCESS_LEAST, EXCESS_LEAST_NOISE
 
 BETA = 2.0
@@ -23,7 +22,7 @@ class GpLevelSet:
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
         """Begin an episode."""
         self.rng, self.process, self.count = rng, SiteProcess(facts), 0
-        # What the estimator calls no lesion is no level to look for.
+        # The least excess that the estimator reports as a lesion.
         self.least = EXCESS_LEAST + EXCESS_LEAST_NOISE * facts.noise
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -33,7 +32,7 @@ class GpLevelSet:
         if first is not None:
             return first
         belief = self.process.belief(observation)
-        excess, doubt = belief.excess, BETA * belief.spread
-        level = max(self.least, LEVEL_SHARE * float(excess.max()))
-        ambiguity = np.minimum(excess + doubt - level, level - excess + doubt)
+        excess, margin = belief.excess, BETA * belief.spread
+        level = max(self.least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
+        ambiguity = np.minimum(excess + margin - level, level - excess + margin)
         return self.process.best(ambiguity, observation, self.rng)

@@ -1,16 +1,15 @@
 """GP-UCB for SurgSim/PalpateSites-v0 (Srinivas et al. 2010): press where tissue may be stiffest.
 
-argmax of mean + BETA x standard deviation of what a Gaussian process on log contrast takes for excess, over the
-grid's sites.
+The argmax over the grid's sites of mean + BETA x standard deviation of the excess, by a Gaussian process on log
+contrast.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.site_agent import SiteFacts
-from agents.site_process import SiteProcess
+from agents.scoring.site_agent import SiteFacts, SiteProcess
 
-# Chosen on organs that no evaluation uses, as all numbers of these agents (docs/palpation.md).
+# Chosen on organs that no evaluation uses, as all parameters of these agents (docs/palpation.md).
 BETA = 3.0
 
 

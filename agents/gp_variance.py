@@ -1,13 +1,12 @@
-"""Variance reduction for SurgSim/PalpateSites-v0: press where the Gaussian process knows least.
+"""Variance reduction for SurgSim/PalpateSites-v0: press where the variance of the Gaussian process is largest.
 
-What was felt plays no part, so that its presses fill the chart evenly: a raster that can be stopped at any time.
+The variance does not depend on the measured contrast, so the presses fill the chart evenly: a raster of any length.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.site_agent import SiteFacts
-from agents.site_process import SiteProcess
+from agents.scoring.site_agent import SiteFacts, SiteProcess
 
 
 class GpVariance:

@@ -1,4 +1,4 @@
-"""A person at the keyboard: what keys are held down in the window is the action.
+"""A person at the keyboard: the keys held down in the window give the action.
 
     python -m agents.record_demonstrations SurgSim/Retract-v0 --env-arguments '{"render_mode": "human"}' \
         --by agents.keyboard:Keyboard --episodes 5 --dataset surgsim/retract/human-v0
@@ -6,7 +6,7 @@
     A D left, right    S W near, far    F R down, up    Q E turn the wrist
     space: close the jaw, or "the lesion is here"
 
-One control step is 50 ms of the organ's time; where a machine takes longer for it, the person sees it slower.
+One control step is 50 ms of simulated time; on a machine that takes longer, the episode runs in slow motion.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ DIRECTIONS: Mapping[str, tuple[int, float]] = {
     **{"A": (0, -1.0), "D": (0, 1.0), "S": (1, -1.0), "W": (1, 1.0), "F": (2, -1.0), "R": (2, 1.0)},
     **{"Q": (3, -1.0), "E": (3, 1.0)},
 }
-# Of full speed, which is 20 mm/s.
+# Share of full speed, which is 20 mm/s.
 SHARE = 0.5
 
 
@@ -31,7 +31,7 @@ class Keyboard:
         """Take an environment with render_mode="human".
 
         Raises:
-            ValueError: it shows no window, or its actions are neither those of a tip that declares nor of one jaw.
+            ValueError: an environment without a window, or whose actions are not those of one tip.
         """
         if env.render_mode != "human":
             raise ValueError(f'render_mode is {env.render_mode!r}; a person needs the window of render_mode="human"')
@@ -42,10 +42,10 @@ class Keyboard:
         self._jaw = hasattr(self._env.task, "jaw_place")  # type: ignore[attr-defined]
 
     def reset(self) -> None:
-        """Nothing is remembered."""
+        """Begin an episode; there is no state."""
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """The action of the keys that are held down.
+        """The action of the keys held down.
 
         Raises:
             KeyboardInterrupt: the window was closed.
@@ -56,7 +56,7 @@ class Keyboard:
         return self.action(window.held_keys())
 
     def action(self, held: str) -> NDArray[np.float32]:
-        """The action that keys ask for, shape (n_action,)."""
+        """The action of some keys, shape (n_action,)."""
         action = np.zeros(self._size, dtype=np.float32)
         for key, (axis, direction) in DIRECTIONS.items():
             if key in held and axis < self._size - 1:

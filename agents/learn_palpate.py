@@ -1,9 +1,9 @@
-"""Teach a network what the scripted expert of SurgSim/Palpate-v0 does, where a force costs microseconds.
+"""Teach a network the scripted expert of SurgSim/Palpate-v0 on a fast surrogate with a force formula.
 
     python -m agents.learn_palpate --scene phantom --out runs/palpate_phantom_cloned.zip
 
-It is shown what the expert does all over the face (`imagined`), and in the places that it comes to itself (DAgger,
-Ross, Gordon & Bagnell 2011). PPO goes on from what comes out: `warm_start` in agents/configs/palpate_*.yaml.
+The expert labels synthetic observations all over the face (`imagined`) and the states that the network reaches (DAgger,
+Ross, Gordon & Bagnell 2011). PPO continues from the result: `warm_start` in agents/configs/palpate_*.yaml.
 """
 
 import argparse
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.cloning import CloningOptions, clone, normalise_by
 from agents.expert_palpate import PalpateExpert
-from agents.palpate_surrogate import PalpateSurrogate
+from agents.training.cloning import CloningOptions, clone, normalise_by
 from agents.training.extractors import MemorySummary
+from agents.training.palpate_surrogate import PalpateSurrogate
 from agents.training.policy_files import TrainedPolicy, describe, save_policy
 from agents.training.wrappers import blinded
-from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
-# Rounds that the expert plays, with random errors so that it shows how to make up for them.
+# Rounds that the expert plays, with random errors, so that the data show how to correct them.
 EXPERT_ROUNDS = 2
 ERROR, ERROR_KEPT = 0.3, 0.9
 
@@ -38,17 +38,17 @@ def play_round(
     rng: np.random.Generator,
     begun: tuple[NDArray, NDArray[np.bool_]],
 ) -> tuple[list[NDArray], list[NDArray], list[float], tuple[NDArray, NDArray[np.bool_]]]:
-    """Observations, the expert's actions there, successes, and where the round was left; the expert plays if no policy.
+    """Observations, the expert's actions there, successes, and the state to continue from.
 
-    Errors are a first-order autoregressive noise on the action.
+    The policy plays, or the expert if there is none. Errors are first-order autoregressive noise on the action.
     """
     observation, begins = begun
-    seen, told, won = [], [], []
+    seen, labels, won = [], [], []
     error = np.zeros((envs.num_envs, 3))
     for _ in range(steps):
         wanted = expert.act(observation)
         seen.append(observation)
-        told.append(wanted)
+        labels.append(wanted)
         action = wanted.copy() if policy is None else policy.act(observation, begins)
         error = ERROR_KEPT * error + ERROR * rng.normal(size=error.shape) * [1.0, 1.0, 0.5]
         erring = 0.5 * error * (np.arange(envs.num_envs) % 2 == 0)[:, None]
@@ -56,51 +56,54 @@ def play_round(
         observation, _, terminated, truncated, info = envs.step(action)
         begins = terminated | truncated
         won += [float(info["final_info"]["success"][index]) for index in np.flatnonzero(begins)]
-    return seen, told, won, (observation, begins)
+    return seen, labels, won, (observation, begins)
 
 
 def imagined(
     observations: NDArray[np.float32], envs: PalpateSurrogate, expert: PalpateExpert, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """The same observations with the tip anywhere over the face, and the search begun, under way or over."""
+    """The same observations with the tip anywhere over the face, and the search not begun, in progress or over."""
     made, count = observations.copy(), len(observations)
+    # Views of the channels.
+    tip, force, visited, stiffest = (
+        made[:, envs.task.observation_slices[name]] for name in ("tip_position", "contact_force", "visited", "stiffest")
+    )
     low, high = envs.chart.lower - 0.005, envs.chart.upper + 0.005
-    made[:, :2] = rng.uniform(low, high, (count, 2))
+    tip[:, :2] = rng.uniform(low, high, (count, 2))
     near = rng.random(count) < 0.7
     depth = np.where(near, rng.normal(expert.depth, 0.0005, count), rng.uniform(-0.008, 0.0045, count))
-    made[:, 2] = envs.surface - depth
+    tip[:, 2] = envs.surface - depth
     stiffness = envs.touch.stiffness * rng.uniform(0.6, 2.2, count)
-    made[:, 8] = stiffness * np.maximum(depth, 0.0) ** envs.touch.exponent + rng.normal(0.0, 0.015, count)
-    # Not begun, under way, over.
+    force[:, 2] = stiffness * np.maximum(depth, 0.0) ** envs.touch.exponent + rng.normal(0.0, 0.015, count)
+    # Not begun, in progress, over.
     stage = rng.choice(3, count, p=[0.1, 0.5, 0.4])
-    marks = 10 + envs.chart.side_count**2
     corners = np.array([0, envs.chart.side_count - 1])
     for row in corners * envs.chart.side_count:
         for column in corners:
-            made[:, marks + row + column] = np.where(stage == 2, 1.0, (stage == 1) & (rng.random(count) < 0.5))
+            visited[:, row + column] = np.where(stage == 2, 1.0, (stage == 1) & (rng.random(count) < 0.5))
     made[:, expert.first] = stage >= 1
     made[:, expert.last] = stage == 2
-    made[:, -3:-1] = rng.uniform(-1.0, 1.0, (count, 2))
-    # Some close to the stiffest place, where it must be declared.
+    stiffest[:, :2] = rng.uniform(-1.0, 1.0, (count, 2))
+    # Some near the stiffest place, where the expert declares.
     close = (stage == 2) & (rng.random(count) < 0.4)
-    spot = envs.chart.plane_point(made[:, -3:-1]) + rng.normal(0.0, 0.003, (count, 2))
-    made[close, :2] = spot[close]
+    spot = envs.chart.plane_point(stiffest[:, :2]) + rng.normal(0.0, 0.003, (count, 2))
+    tip[close, :2] = spot[close]
     return made
 
 
 def main() -> None:
-    """Teach, printing a line a round, and write the policy after each."""
+    """Train; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=200, help="of each environment in a round")
+    parser.add_argument("--steps", type=int, default=200, help="steps of each environment in a round")
     parser.add_argument("--envs", type=int, default=128)
-    parser.add_argument("--epochs", type=int, default=12, help="of each round")
-    parser.add_argument("--imagined", type=int, default=100_000, help="observations of a round that are made up")
+    parser.add_argument("--epochs", type=int, default=12, help="epochs of each round")
+    parser.add_argument("--imagined", type=int, default=100_000, help="synthetic observations of a round")
     parser.add_argument("--seed", type=int, default=2_000_000)
     parser.add_argument(
-        "--without-force", action="store_true", help="the network sees no force, nor what follows from it"
+        "--without-force", action="store_true", help="the network sees no force, nor quantities derived from it"
     )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -112,13 +115,13 @@ def main() -> None:
     model = PPO("MlpPolicy", scaled, policy_kwargs=NETWORK, device="cpu", seed=0)
     begun = (envs.reset(seed=arguments.seed)[0], np.ones(envs.num_envs, dtype=np.bool_))
     seen: list[NDArray] = []
-    told: list[NDArray] = []
+    labels: list[NDArray] = []
     begin, policy = time.time(), None
     for index in range(arguments.rounds):
         played = policy if index >= EXPERT_ROUNDS else None
-        new_seen, new_told, won, begun = play_round(envs, expert, played, arguments.steps, rng, begun)
+        new_seen, new_labels, won, begun = play_round(envs, expert, played, arguments.steps, rng, begun)
         seen += new_seen
-        told += new_told
+        labels += new_labels
         real = np.concatenate(seen)
         if index < EXPERT_ROUNDS:
             normalise_by(scaled, blinded(real, entries))
@@ -127,7 +130,7 @@ def main() -> None:
         curve = clone(
             model,
             blinded(np.concatenate([real, made]), entries),
-            np.concatenate([*told, expert.act(made)]),
+            np.concatenate([*labels, expert.act(made)]),
             normalisation=scaled,
             options=options,
         )

@@ -1,10 +1,10 @@
-"""Teach a network with a memory of its own what the expert of SurgSim/Palpate-v0 does; it sees no memory=True.
+"""Teach an LSTM the scripted expert of SurgSim/Palpate-v0 from observations without memory.
 
     python -m agents.learn_palpate_recurrent --scene phantom --out runs/palpate_phantom_recurrent_cloned.zip
 
-The expert reads what was felt from the observation, the network sees place and force alone and must keep in mind what
-it needs: whole episodes are cloned. First the expert plays, with errors to make up for; then the network does, and the
-expert says what it would have done there.
+The expert reads the contrast map from the observation; the network sees place and force alone and must remember the
+rest, so whole episodes are cloned. First the expert plays, with random errors; then the network plays and the expert
+labels its states.
 """
 
 import argparse
@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.cloning import CloningOptions, clone, normalise_by, pad
 from agents.expert_palpate import PalpateExpert
 from agents.learn_palpate import ERROR, ERROR_KEPT
-from agents.palpate_surrogate import PalpateSurrogate
-from agents.training.extractors import BEFORE, PlaceAndForce
+from agents.training.cloning import CloningOptions, clone, normalise_by, pad
+from agents.training.extractors import WITHOUT_MEMORY, PlaceAndForce
+from agents.training.palpate_surrogate import PalpateSurrogate
 from agents.training.policy_files import TrainedPolicy, describe, save_policy
-from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {
     "lstm_hidden_size": 96,
@@ -31,7 +31,9 @@ NETWORK = {
     "activation_fn": torch.nn.Tanh,
     "features_extractor_class": PlaceAndForce,
 }
-# The way back to the stiffest place is a tenth of an episode: its steps count so much more.
+# Entries of the observation without memory, which precede those of the memory.
+SHORT = max(part.stop for part in WITHOUT_MEMORY.values())
+# Weight of the steps back to the stiffest place, which are a tenth of an episode.
 BACK_WEIGHT = 4.0
 
 
@@ -45,7 +47,7 @@ def play_episodes(
 ) -> tuple[list[NDArray], list[NDArray], list[NDArray], list[bool]]:
     """First episode of each environment: its short observations, the expert's actions, weights, success.
 
-    A decision lasts `repeat` control steps; what lies between decisions is left out.
+    A decision lasts `repeat` control steps; the steps between decisions are left out.
     """
     observation, _ = envs.reset(seed=int(rng.integers(2**31)))
     begins, running = np.ones(envs.num_envs, dtype=np.bool_), np.ones(envs.num_envs, dtype=np.bool_)
@@ -53,15 +55,15 @@ def play_episodes(
     error = np.zeros((envs.num_envs, 3))
     if policy is not None:
         policy.reset(envs.num_envs)
-    seen, told, weight = [], [], []
+    seen, labels, weight = [], [], []
     for step in range(steps):
         if step % repeat == 0:
             wanted = expert.act(observation)
-            seen.append(observation[:, :BEFORE])
-            told.append(wanted)
+            seen.append(observation[:, :SHORT])
+            labels.append(wanted)
             weight.append(np.where(observation[:, expert.last] > 0.5, BACK_WEIGHT, 1.0))
             error = ERROR_KEPT * error + ERROR * rng.normal(size=error.shape) * [1.0, 1.0, 0.5]
-        action = wanted.copy() if policy is None else policy.act(observation[:, :BEFORE], begins)
+        action = wanted.copy() if policy is None else policy.act(observation[:, :SHORT], begins)
         erring = 0.4 * error * (np.arange(envs.num_envs) % 2 == 0)[:, None]
         action[:, :3] = np.clip(action[:, :3] + erring, -1.0, 1.0)
         length += running
@@ -72,22 +74,22 @@ def play_episodes(
         running &= ~begins
         if not running.any():
             break
-    columns = [np.stack(rows, axis=1) for rows in (seen, told, weight)]
+    columns = [np.stack(rows, axis=1) for rows in (seen, labels, weight)]
     parts = [[column[index, : -(-length[index] // repeat)] for index in range(envs.num_envs)] for column in columns]
     return parts[0], parts[1], parts[2], won
 
 
 def main() -> None:
-    """Teach, printing a line a round, and write the policy after each."""
+    """Train; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--rounds", type=int, default=1, help="those after the first are the network's own")
+    parser.add_argument("--rounds", type=int, default=1, help="rounds; the network plays those after the first")
     parser.add_argument("--envs", type=int, default=512, help="episodes of a round")
-    parser.add_argument("--steps", type=int, default=420, help="of an episode at most")
-    parser.add_argument("--repeat", type=int, default=2, help="control steps that a decision lasts")
+    parser.add_argument("--steps", type=int, default=420, help="largest number of steps of an episode")
+    parser.add_argument("--repeat", type=int, default=2, help="control steps per decision")
     parser.add_argument("--batch-size", type=int, default=32, help="episodes of a gradient step")
-    parser.add_argument("--epochs", type=int, default=250, help="of each round")
+    parser.add_argument("--epochs", type=int, default=250, help="epochs of each round")
     parser.add_argument("--seed", type=int, default=2_000_000)
     arguments = parser.parse_args()
     torch.set_num_threads(1)

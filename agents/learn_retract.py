@@ -1,10 +1,10 @@
-"""Learn SurgSim/Retract-v0 from the scripted expert with DAgger: the policy plays, the expert says what it would do.
+"""Learn SurgSim/Retract-v0 from the scripted expert with DAgger: the policy plays, the expert labels.
 
     python -m agents.learn_retract --rounds 6 --out agents/policies/retract_dagger.zip
     python -m agents.learn_retract --rounds 6 --without-force --out agents/policies/retract_dagger_without_force.zip
 
-With `--without-force` the policy sees 0 in place of the jaw's wrench, its grip and its pull; the expert still sees all.
-What it comes to is a policy of stable-baselines3's PPO, which `agents.train` can go on from (`warm_start`).
+With `--without-force` the policy sees 0 in place of the jaw's wrench, its grip and its pull; the expert sees all
+channels. The result is a policy of stable-baselines3's PPO, from which `agents.train` can start (`warm_start`).
 """
 
 import argparse
@@ -23,22 +23,22 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.cloning import CloningOptions
-from agents.dagger import dagger
 from agents.expert_retract import RetractExpert
+from agents.training.cloning import CloningOptions
+from agents.training.dagger import dagger
 from agents.training.policy_files import describe, save_policy
 from agents.training.wrappers import blinded
-from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 ID = "SurgSim/Retract-v0"
-# As in the configurations of `agents.train` that go on from here.
+# The same as in the configurations of `agents.train` that start from the result.
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh}
-# Seeds of training's own; those of the evaluation are from 1,000,000 on, those of periodic evaluations from 500,000 on.
+# Training seeds; scores use seeds from 1,000,000, periodic evaluations from 500,000.
 FIRST_SEED = 2_000_000
 
 
 def make_envs(count: int, dtype: str, threads: int) -> VectorEnv:
-    """Environments side by side, as DAgger wants them."""
+    """Environments side by side that reset in the same step, as DAgger requires."""
     return gym.make_vec(
         ID,
         num_envs=count,
@@ -50,7 +50,7 @@ def make_envs(count: int, dtype: str, threads: int) -> VectorEnv:
 
 
 class SeeingExpert:
-    """The expert in each of some environments: it sees what the environments know, whatever the policy is shown."""
+    """The expert in each environment; it sees the unmodified observation, whatever the policy is shown."""
 
     def __init__(self, envs: VectorEnv) -> None:
         self._singles = [env.unwrapped for env in envs.unwrapped.envs]  # type: ignore[attr-defined]
@@ -62,7 +62,7 @@ class SeeingExpert:
 
 
 class Blind(VectorWrapper):
-    """Environments some entries of whose observations are 0; what `final_obs` holds is left as it is."""
+    """Environments with some entries of their observations set to 0; `final_obs` is not changed."""
 
     def __init__(self, envs: VectorEnv, entries: Sequence[int]) -> None:
         super().__init__(envs)
@@ -80,7 +80,7 @@ class Blind(VectorWrapper):
 
 
 def learn(arguments: argparse.Namespace) -> None:
-    """Rounds of DAgger, the policy saved after each, a line of figures for each."""
+    """Run DAgger; save the policy and print a line of figures after each round."""
     torch.set_num_threads(1)
     envs = make_envs(arguments.envs, arguments.dtype, arguments.threads)
     expert = SeeingExpert(envs)
@@ -117,7 +117,7 @@ def learn(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Learn as the command line says."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="the policy's file, NAME.zip")
     parser.add_argument("--rounds", type=int, default=10)

@@ -13,29 +13,29 @@ import matplotlib
 import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.leaderboard import SITES, best_raster_alone
-from agents.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
-from agents.results_files import Result, load_results
-from agents.roster import POLICIES, WORDS, find_agent
-from agents.site_agent import site_facts
-from msdm_core.mesh import FloatArray
-from surgsim_env.evaluation.palpation import ERROR_LINE
+from agents.roster import POLICIES, REFERENCES, find_agent
+from agents.scoring.leaderboard import SITES, best_raster_alone
+from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
+from agents.scoring.results_files import Result, load_results
+from agents.scoring.site_agent import site_facts
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.palpation.scores import ERROR_LINE
 
 matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
-# Of the methods in alphabetical order (Okabe & Ito 2008, their yellow darkened).
+# Colours of the methods in alphabetical order (Okabe & Ito 2008, with a darker yellow).
 LINE_COLOURS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#999999", "#0072B2", "#D55E00", "#CC79A7")
-# An organ that no evaluation uses, with two lesions, and when it is shown.
+# An organ with two lesions that no evaluation uses, and the presses after which it is shown.
 SHOWN_SEED, SHOWN_PRESSES = 3_000_003, (4, 9, 16)
-# The trained agent that is shown, an organ with two lesions that neither its training nor an evaluation uses, and when.
+# The trained agent, an organ with two lesions that neither its training nor an evaluation uses, and the presses shown.
 SHOWN_POLICY, AGENT_SEED, AGENT_PRESSES = "sites_ppo_seed0.zip", 4_000_009, (4, 12)
 
 
 def draw_errors(results: list[Result], path: Path) -> None:
-    """Median OSPA over organs with lesions after each press: a panel a place, a line a method, seeds as a band."""
-    rows = [row for row in results if row.env_id == SITES and row.method not in WORDS]
+    """Median OSPA over organs with lesions after each press: one panel per scene and level, one line per method."""
+    rows = [row for row in results if row.env_id == SITES and row.method not in REFERENCES]
     places = sorted({row.place for row in rows}, key=lambda place: ("standard" not in place, place))
     methods = sorted({family(row.method) for row in rows})
     figure = Figure(figsize=(10.4, 3.6 * math.ceil(len(places) / 2)), dpi=110, layout="constrained")
@@ -61,7 +61,7 @@ def draw_errors(results: list[Result], path: Path) -> None:
 
 
 def family(method: str) -> str:
-    """What a line is called: seeds of one policy, and rasters of all sides, share a name."""
+    """Label of a line: seeds of one policy, and rasters of all sides, share one."""
     if method.startswith("raster_"):
         return "best raster"
     return re.sub(r"_seed\d+$", "", method)
@@ -81,7 +81,7 @@ def draw_medians(axes: Any, medians: FloatArray, name: str, colour: str) -> None
 
 
 def draw_search(path: Path) -> None:
-    """What GP-UCB and the raster of 3 x 3 believe after a few presses of the same organ."""
+    """Excess maps of GP-UCB and the raster of 3 x 3 after a few presses on the same organ."""
     env = gym.make(SITES, scene="phantom", level="standard")
     figure = Figure(figsize=(11.0, 6.4), dpi=100, layout="constrained")
     grid = figure.subplots(2, len(SHOWN_PRESSES))
@@ -99,7 +99,7 @@ def draw_search(path: Path) -> None:
 
 
 def draw_agent(path: Path) -> None:
-    """Two frames of a trained policy's film: early, and when it has found what there is."""
+    """Two frames of a trained policy's film: early, and after it has found the lesions."""
     from PIL import Image
 
     from agents.training.policy_files import load_policy
@@ -112,7 +112,7 @@ def draw_agent(path: Path) -> None:
 
 
 def main() -> None:
-    """Draw them."""
+    """Draw all figures."""
     draw_agent(IMAGES / "agent_at_work.png")
     draw_search(IMAGES / "palpation_search.png")
     draw_errors(load_results(), IMAGES / "palpation_errors.png")

@@ -1,92 +1,39 @@
-"""A library of presses: organs drawn as SurgSim/PalpateSites-v0 draws them, each pressed once at every site of a grid.
-
-Made once (hours of simulation), learned on at leisure: `PressLibraryEnv` is that environment with presses looked up
-instead of simulated. Its task, sensor, estimator and rewards are the environment's own code. Run it from a checkout:
+"""Make a library of presses: organs drawn as SurgSim/PalpateSites-v0 draws them, each pressed at every site of a grid.
 
     python -m agents.press_library --scene phantom --level standard --organs 400 --out runs/phantom_standard.npz
 
-It goes on where it was stopped, and what is there can be used while it grows. Results are reported on the environment
-itself, never on the library.
+Hours of simulation, done once; training then looks presses up (`agents/training/press_library.py`). A stopped run
+continues where it ended, and a library can be used while it grows. Scores are computed on the environment itself, never
+on the library.
 """
 
 import argparse
-import os
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.lane_group import LaneGroup
-from surgsim_env.levels import DrawnOrgan, find_level
-from surgsim_env.palpation.charted_face import Site, interpolated
+from agents.training.press_library import KEPT, PressLibrary, load_library
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.healthy_map import charted_face, healthy_map
-from surgsim_env.palpation.site_press import PressResult, SitePress, press_in_lanes, press_phases
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
-from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.palpation.press import SitePress, press_in_lanes, press_phases
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.levels import DrawnOrgan, find_level
+from surgsim_env.scene.load import make_scene
 
-# Organ number k of a library is drawn from this seed plus k; the benchmark's evaluation seeds begin at 1 000 000.
+# Organ k of a library is drawn from this seed plus k; the benchmark's evaluation seeds begin at 1 000 000.
 FIRST_SEED = 3_000_000
+# Organs that are pressed side by side.
 LANES = 16
-# What a press left, for each organ and site.
-KEPT = ("force", "depth", "force_peak", "stopped", "duration")
-
-
-@dataclass(frozen=True, eq=False)
-class PressLibrary:
-    """Presses of organs at all sites of a chart's grid.
-
-    Fields:
-        scene, level: what they were drawn from
-        organs: what was drawn, as JSON                                                             (n_organ,)
-        presses: force along the normal [N], depth [m], force_peak [N], stopped (0 or 1) and duration [s] of each
-            press, sites row by row along the chart's second axis                                   (n_organ, n, n, 5)
-    """
-
-    scene: str
-    level: str
-    organs: tuple[str, ...]
-    presses: FloatArray
-
-    def save(self, path: Path) -> None:
-        """Write it, whole or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part.npz")
-        np.savez_compressed(
-            part, scene=self.scene, level=self.level, organs=np.array(self.organs),
-            presses=self.presses.astype(np.float32),
-        )  # fmt: skip
-        os.replace(part, path)
-
-
-def load_library(path: str | Path) -> PressLibrary:
-    """Read a library.
-
-    Raises:
-        ValueError: a file that is none.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            organs = tuple(str(text) for text in file["organs"])
-            presses = file["presses"].astype(np.float64)
-            return PressLibrary(str(file["scene"]), str(file["level"]), organs, presses)
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(
-            f"{path} is no library of presses ({error}): make one with python -m agents.press_library"
-        ) from None
 
 
 def press_organs(anatomy: Anatomy, drawn: list[DrawnOrgan], group: LaneGroup) -> FloatArray:
     """Press organs side by side at every site; shape (n_organ, n, n, 5). No more organs than the group has lanes.
 
     Raises:
-        RuntimeError: a press came to a fault (says where).
+        RuntimeError: a press ended in a fault (says where).
     """
     charted, phases = charted_face(anatomy), press_phases(anatomy.scene)
     side = charted.chart.side_count
@@ -110,9 +57,9 @@ def press_organs(anatomy: Anatomy, drawn: list[DrawnOrgan], group: LaneGroup) ->
 def make_library(
     path: Path, scene: str, level: str, organ_count: int, *, dtype: type = np.float32, lanes: int = LANES
 ) -> PressLibrary:
-    """Press organs until a library has so many, batch by batch; each batch is kept as soon as it is there.
+    """Press organs in batches until a library has `organ_count`; each batch is saved when it is complete.
 
-    In float32 forces are within 0.5 % of the environment's, a tenth of the sensor's noise; `lanes` organs go together.
+    In float32 forces are within 0.5 % of the environment's, a tenth of the sensor's noise; a batch has `lanes` organs.
 
     Raises:
         ValueError: the file at `path` is of another scene or level.
@@ -143,85 +90,8 @@ def make_library(
     return library
 
 
-class PressLibraryEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """SurgSim/PalpateSites-v0 with presses looked up in a library, bilinear between the sites of its grid.
-
-    Each reset draws one of the library's organs; sensor noise and bias are drawn anew. `info` has what the task tells,
-    not what only a simulation knows (`added_mass`, `workspace_limited`, `trocar_error_mm`).
-    """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
-
-    def __init__(self, library: str | Path | PressLibrary, memory: bool = True, budget: int | None = None) -> None:
-        """Take a library, or the path of one.
-
-        Raises:
-            ValueError: a file that is no library, or one without organs.
-        """
-        self.library = library if isinstance(library, PressLibrary) else load_library(library)
-        if not self.library.organs:
-            raise ValueError("the library holds no organ yet: wait for its first batch")
-        level, scene = find_level(self.library.level), make_scene(self.library.scene)
-        anatomy = load_anatomy(level.scene(scene))
-        self.task = PalpateSitesTask(anatomy, level, healthy_map(scene), memory=memory, budget=budget)
-        self.drawn = [DrawnOrgan.from_json(text, anatomy) for text in self.library.organs]
-        self.truths = [organ.places(anatomy) for organ in self.drawn]
-        bounds = self.task.bounds(None)
-        low, high = bounds.low.astype(np.float32), bounds.high.astype(np.float32)
-        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.task.action_size,), dtype=np.float32)
-        self.organ = 0
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Draw an organ; `options={"organ": k}` asks for number k.
-
-        Raises:
-            ValueError: another option, or an organ that the library has not.
-        """
-        super().reset(seed=seed)
-        drawn, asked = int(self.np_random.integers(len(self.drawn))), dict(options or {})
-        self.organ = asked.pop("organ", drawn)
-        if asked or self.organ not in range(len(self.drawn)):
-            raise ValueError(
-                f'reset options are {options}; the rule is {{"organ": k}} with k from 0 to {len(self.drawn) - 1}'
-            )
-        self.task.begin_episode(self.drawn[self.organ], self.np_random, self.truths[self.organ])
-        values, saturated = self.task.observe(None, self.np_random)
-        return values.astype(np.float32), self._info(
-            saturated, self.task.blank_info(), dict.fromkeys(self.task.weights, 0.0)
-        )
-
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Look a press up."""
-        values = np.asarray(action, dtype=np.float64)
-        self.task.begin(values)
-        site = self.task.site(values)
-        result = self.press(site)
-        self.task.take(site, result)
-        values, saturated = self.task.observe(None, self.np_random)
-        verdict = self.task.judge(None, result.force_peak, "")
-        info = self._info(saturated, verdict.info, verdict.rewards)
-        return values.astype(np.float32), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info
-
-    def press(self, site: Site) -> PressResult:
-        """What a press of this episode's organ at a site comes to."""
-        force, depth, peak, stopped, duration = interpolated(self.library.presses[self.organ], site.place).tolist()
-        return PressResult(force * site.normal, depth, peak, stopped > 0.5, "", duration)
-
-    @staticmethod
-    def _info(saturated: bool, told: dict[str, Any], rewards: dict[str, float]) -> dict[str, Any]:
-        return {
-            "sim_fault": "",
-            "sensor_saturated": saturated,
-            **told,
-            **{f"reward_{name}": value for name, value in rewards.items()},
-        }
-
-
 def main() -> None:
-    """Make a library, or go on with one."""
+    """Make a library, or continue one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--level", default="standard")

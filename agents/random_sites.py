@@ -1,13 +1,13 @@
-"""Random presses for SurgSim/PalpateSites-v0: anywhere on the chart, all places alike."""
+"""Random presses for SurgSim/PalpateSites-v0: uniformly distributed over the chart."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.site_agent import SiteFacts
+from agents.scoring.site_agent import SiteFacts
 
 
 class RandomSites:
-    """Presses places drawn evenly over the chart."""
+    """Presses uniformly distributed places."""
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
         """Begin an episode."""

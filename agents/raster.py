@@ -1,7 +1,7 @@
 """A scripted agent for SurgSim/Palpate-v0: press a raster, go back to the stiffest place, declare it.
 
-It reads nothing but the observation (tip position, force) and the scene file (where the phantom's top is, how far a
-press may go), so its score is one that a learning agent has to beat. Run it from a checkout:
+It uses the observation (tip position, force) and the scene file (height of the phantom, force limits) only, so a
+learning agent should beat its score. Run it from a checkout:
 
     python agents/raster.py --episodes 5
 """
@@ -27,18 +27,20 @@ class RasterAgent:
     def __init__(self, env: gym.Env, *, sites_per_side: int = 5) -> None:
         scene = env.unwrapped.scene
         if scene.mesh.block is None:
-            raise ValueError(f"this agent presses the flat top of a block; scene {scene.name!r} is none: use phantom")
+            raise ValueError(f"this agent presses the flat top of a block; {scene.name!r} is not a block: use phantom")
         width, depth, self.top = scene.mesh.block.size
         self.radius = scene.instrument.tip_radius
+        self.slices = env.unwrapped.observation_slices
         self.soft_force = scene.limits.soft_force
         rim = scene.lesion.rim_distance
         xs, ys = np.linspace(rim, width - rim, sites_per_side), np.linspace(rim, depth - rim, sites_per_side)
-        # Rows in alternating directions: the way is shorter.
+        # Rows in alternating directions shorten the path.
         self.sites = [(x, y) for row, y in enumerate(ys) for x in (xs if row % 2 == 0 else xs[::-1])]
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The next action, from an observation."""
-        self.observation = observation
+        self.tip = observation[self.slices["tip_position"]]
+        self.force = float(observation[self.slices["contact_force"]][2])
         return next(self._plan)
 
     def reset(self) -> None:
@@ -52,7 +54,7 @@ class RasterAgent:
         for x, y in self.sites:
             yield from self._go(np.array([x, y, travel]))
             yield from self._go(np.array([x, y, pressed]))
-            self.forces.append(float(self.observation[8]))
+            self.forces.append(self.force)
             yield from self._go(np.array([x, y, travel]))
         x, y = self._stiffest()
         yield from self._go(np.array([x, y, travel]))
@@ -61,16 +63,16 @@ class RasterAgent:
             yield np.array([0.0, 0.0, 0.0, 1.0], dtype=np.float32)
 
     def _go(self, target: np.ndarray) -> Iterator[np.ndarray]:
-        """Velocities towards a place [m], till it is reached or the soft limit is felt on the way down."""
+        """Velocities towards a place [m] until it is reached, or the soft limit on the way down."""
         while True:
-            gap = target - self.observation[:3]
-            felt = self.observation[8] > self.soft_force and gap[2] < 0.0
-            if np.linalg.norm(gap) < CLOSE_ENOUGH or felt:
+            gap = target - self.tip
+            pressing = self.force > self.soft_force and gap[2] < 0.0
+            if np.linalg.norm(gap) < CLOSE_ENOUGH or pressing:
                 return
             yield np.append(np.clip(gap / (SPEED * CONTROL_STEP), -1.0, 1.0), 0.0).astype(np.float32)
 
     def _stiffest(self) -> np.ndarray:
-        """Centre of the excess force around the stiffest site: neighbours tell on which side of it the lesion lies."""
+        """Centroid of the excess force around the stiffest site: its neighbours refine the estimate."""
         sites, forces = np.array(self.sites), np.array(self.forces)
         best = sites[np.argmax(forces)]
         excess = np.maximum(forces - np.median(forces), 0.0)
@@ -79,7 +81,7 @@ class RasterAgent:
 
 
 def run_episode(env: gym.Env, agent: RasterAgent, seed: int) -> dict:
-    """Play one episode; its last info, with the return and the steps taken added."""
+    """Play one episode; returns its last info with return and number of steps."""
     observation, info = env.reset(seed=seed)
     agent.reset()
     total, steps, over = 0.0, 0, False
@@ -90,7 +92,7 @@ def run_episode(env: gym.Env, agent: RasterAgent, seed: int) -> dict:
 
 
 def main() -> None:
-    """Print one line an episode."""
+    """Print one line per episode."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--scene", default="phantom")

@@ -1,12 +1,12 @@
-"""Raster presses for SurgSim/PalpateSites-v0: the middles of n x n equal fields, row by row, there and back.
+"""Raster presses for SurgSim/PalpateSites-v0: the centres of n x n equal fields in boustrophedon order.
 
-Presses that are left go to the corners of the fields, n + 1 a side, and then round again.
+Further presses go to the corners of the fields, n + 1 per side, and then through both again.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.site_agent import SiteFacts
+from agents.scoring.site_agent import SiteFacts
 
 
 class RasterSites:

@@ -4,9 +4,9 @@
     python -m agents.record_demonstrations SurgSim/Palpate-v0 --by agents.raster:RasterAgent \
         --dataset surgsim/palpate/raster-v0
 
-Datasets lie in the folder that MINARI_DATASETS_PATH names, by default ~/.minari/datasets. Each episode is kept with its
-seed: `dataset.recover_environment()` reset with it and given the actions again gives the same observations to the bit.
-A person plays with `agents/keyboard.py`. Anything else that steps an environment is recorded by `Recorder`:
+Datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored with its
+seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations to the
+bit. A person plays with `agents/keyboard.py`. `Recorder` records any other code that steps an environment:
 
     env = Recorder(gym.make("SurgSim/Palpate-v0"))
     ...  # reset and step it
@@ -33,17 +33,17 @@ from tqdm import tqdm
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
-# Seeds for scores alone (surgsim_env.evaluation.palpation): nobody learns from them.
+# Seeds reserved for scores (surgsim_env.palpation.scores).
 SEEDS_FOR_SCORES = range(1_000_000, 1_000_100)
 CODE = "agents/record_demonstrations.py of surgsim"
 
-# Plays one episode in an environment, from its reset with a seed on.
+# Plays one episode in an environment, reset with a seed.
 Player = Callable[[gym.Env, int], None]
 
 
 @dataclass
 class Episode:
-    """What an episode showed: one observation and one info more than actions."""
+    """A recorded episode, with one observation and one info more than actions."""
 
     seed: int | None
     observations: list[NDArray] = field(default_factory=list)
@@ -55,11 +55,11 @@ class Episode:
 
     @property
     def success(self) -> bool:
-        """What the last info says."""
+        """Success according to the last info."""
         return bool(self.infos[-1].get("success", False))
 
     def buffer(self, index: int) -> EpisodeBuffer:
-        """The episode as Minari writes it; one that nothing ended was cut short."""
+        """The episode in Minari's form; an unfinished episode counts as truncated."""
         ends = np.zeros((2, len(self.actions)), dtype=np.bool_)
         ends[:, -1] = self.terminated, self.truncated or not self.terminated
         return EpisodeBuffer(
@@ -75,7 +75,7 @@ class Episode:
 
 
 class Recorder(gym.Wrapper):
-    """Keeps every episode that is played in an environment; those without a step are forgotten."""
+    """Records every episode that is played in an environment."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
@@ -83,7 +83,7 @@ class Recorder(gym.Wrapper):
 
     @property
     def episodes(self) -> list[Episode]:
-        """Those that have a step at least."""
+        """The episodes with at least one step."""
         return [episode for episode in self.all_episodes if episode.actions]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -94,7 +94,7 @@ class Recorder(gym.Wrapper):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One step, kept."""
+        """Step the environment and record it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         episode = self.all_episodes[-1]
         episode.actions.append(np.array(action, dtype=self.action_space.dtype))
@@ -104,14 +104,14 @@ class Recorder(gym.Wrapper):
         return observation, reward, terminated, truncated, info
 
     def _see(self, observation: Any, info: dict[str, Any]) -> None:
-        """Minari holds infos as arrays of one type each: numbers and truths are kept, words are not."""
+        """Record observation and info; Minari stores infos as typed arrays, so only numbers and booleans are kept."""
         episode = self.all_episodes[-1]
         episode.observations.append(np.array(observation))
         episode.infos.append({name: value for name, value in info.items() if isinstance(value, bool | int | float)})
 
 
 def play_oracle(env: gym.Env, seed: int) -> None:
-    """The oracle, which knows the truth; an episode in which it fails is one that failed."""
+    """Play the oracle, which knows the true state; an error of its script counts as a failed episode."""
     env.reset(seed=seed)
     try:
         run_script(env, oracle_script(env))
@@ -120,7 +120,7 @@ def play_oracle(env: gym.Env, seed: int) -> None:
 
 
 def player(by: str, env: gym.Env) -> Player:
-    """Who plays: "oracle", a policy's NAME.zip, or MODULE:CLASS with `reset()` and `act(observation)`."""
+    """The player of a name: "oracle", a policy's NAME.zip, or MODULE:CLASS with `reset()` and `act(observation)`."""
     if by == "oracle":
         return play_oracle
     if by.endswith(".zip"):
@@ -136,7 +136,7 @@ def player(by: str, env: gym.Env) -> Player:
 
 
 def play_agent(env: gym.Env, seed: int, agent: Any) -> None:
-    """One episode of an agent with `reset()` and `act(observation)`."""
+    """Play one episode of an agent with `reset()` and `act(observation)`."""
     observation, _ = env.reset(seed=seed)
     agent.reset()
     over = False
@@ -163,14 +163,14 @@ class _PolicyAgent:
 
 
 def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[Episode]:
-    """Play an episode for each seed; those that came to success, or all.
+    """Play an episode for each seed; returns those that succeeded, or all.
 
     Raises:
-        ValueError: seeds that are kept for scores.
+        ValueError: seeds that are reserved for scores.
     """
     kept = next((seed for seed in seeds if seed in SEEDS_FOR_SCORES), None)
     if kept is not None:
-        raise ValueError(f"seed {kept} is kept for scores, as all in {SEEDS_FOR_SCORES}: record from others")
+        raise ValueError(f"seed {kept} is reserved for scores, as all in {SEEDS_FOR_SCORES}: record other seeds")
     recorder = Recorder(env)
     progress = tqdm(seeds, unit="episode")
     for seed in progress:
@@ -182,15 +182,15 @@ def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: b
 def write_dataset(
     episodes: Sequence[Episode], env: gym.Env, name: str, *, algorithm_name: str, author: str = "surgsim"
 ) -> minari.MinariDataset:
-    """Write episodes as a Minari dataset that knows how its environment was made.
+    """Write episodes as a Minari dataset with the spec of its environment.
 
-    `minari.DataCollector` records too; it needs jax, and keeps failures. This is what it writes, without both.
+    The dataset is the same as that of `minari.DataCollector`, which requires jax and stores failures.
 
     Args:
-        episodes: one at least.
-        env: they were played in it; made with gym.make.
+        episodes: at least one.
+        env: of the episodes; made with gym.make.
         name: of the dataset, such as "surgsim/retract/oracle-v0".
-        algorithm_name: who played.
+        algorithm_name: of the player.
         author: of the dataset.
 
     Raises:
@@ -199,12 +199,12 @@ def write_dataset(
     if not episodes:
         raise ValueError("there is no episode to write: none was played, or none succeeded (--keep-failures)")
     if env.spec is None:
-        raise ValueError("the environment does not know how it was made, so that nobody could make it again: gym.make")
-    # Who wants to see it asks for that anew, maybe where there is no display.
+        raise ValueError("the environment has no spec, so the dataset could not recover it: make it with gym.make")
+    # The dataset may be used on a machine without a display.
     spec = copy.deepcopy(env.spec)
     spec.kwargs.pop("render_mode", None)
     with warnings.catch_warnings():
-        # That neither an email nor another environment for evaluation is given.
+        # Minari warns that neither an email nor an environment for evaluation is given.
         warnings.filterwarnings("ignore", message=".*is set to None")
         return minari.create_dataset_from_buffers(
             name,
@@ -220,12 +220,12 @@ def write_dataset(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Play and write."""
+    """Play episodes and write the dataset."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
     parser.add_argument("--by", default="oracle", help="oracle, NAME.zip, or MODULE:CLASS with reset() and act()")
-    parser.add_argument("--episodes", type=int, default=10, help="how many are played")
+    parser.add_argument("--episodes", type=int, default=10, help="number of episodes to play")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
     parser.add_argument("--dataset", required=True, help="the dataset's name, such as surgsim/retract/oracle-v0")

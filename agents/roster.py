@@ -1,11 +1,13 @@
-"""The methods that `agents.evaluate` knows by name."""
+"""The methods that `agents.evaluate` knows by name, with the reference scores: oracle and blind guess."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
 
 from agents.expert_palpate import PalpateExpert
 from agents.expert_retract import RetractExpert
@@ -14,12 +16,48 @@ from agents.gp_ucb import GpUcb
 from agents.gp_variance import GpVariance
 from agents.random_sites import RandomSites
 from agents.raster_sites import RasterSites
-from agents.site_agent import SiteAgent
+from agents.scoring.site_agent import SiteAgent, SiteFacts
+from agents.scoring.task_episodes import Actor
 from agents.sobol_sites import SobolSites
-from agents.task_episodes import Actor
-from agents.words import Middle, Truth
+from surgsim_env.palpation.scores import MapScore
 
-# Rasters of so many places a side are tried on each scene; the leaderboard shows the best of them.
+
+class Truth:
+    """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %.
+
+    It presses the middle of the chart, as the environment asks for presses; `estimate` and `estimate_map` are scored
+    in place of the estimator's output.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The middle of the chart."""
+        return np.zeros(2, dtype=np.float32)
+
+    def estimate(self, task: Any) -> NDArray[np.float64]:
+        """Places of the lesions on the surface [m], shape (k, 3)."""
+        return task.truth
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        """The true map: 1 over lesions, else 0, and the true outline."""
+        return replace(made, excess=made.lesion.astype(np.float64), outline=made.outline_true)
+
+
+class Middle(Truth):
+    """The blind guess: one lesion in the middle of the chart, regardless of the presses."""
+
+    def estimate(self, task: Any) -> NDArray[np.float64]:
+        """The middle of the chart on the surface [m], shape (1, 3)."""
+        return task.charted.surface(np.zeros((1, 2)))
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        """A uniform map without an outline."""
+        return replace(made, excess=np.zeros_like(made.excess), outline=np.zeros_like(made.outline))
+
+
+# Sides of the rasters tried on each scene; the leaderboard shows the best raster.
 RASTER_SIDES = (2, 3, 4, 5, 6, 7)
 
 AGENTS: dict[str, Callable[[], SiteAgent]] = {
@@ -29,13 +67,13 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "gp_variance": GpVariance,
     "gp_ucb": GpUcb,
     "gp_level_set": GpLevelSet,
-    # What the scores are at best, and by guessing.
+    # Bounds of the scores: the truth, and a blind guess.
     "truth": Truth,
     "middle": Middle,
 }
 
-# Those that say where lesions are without feeling for them.
-WORDS = ("truth", "middle")
+# Methods whose estimates do not depend on what their presses feel.
+REFERENCES = ("truth", "middle")
 
 
 @dataclass(frozen=True)
@@ -45,7 +83,7 @@ class TaskAgent:
     Args:
         env_id: the environment's.
         make: the script, for the environment's arguments.
-        kwargs: arguments of its own that the environment needs.
+        kwargs: further arguments of the environment.
         has_places: whether the environment takes `scene` and `level`.
     """
 
@@ -69,10 +107,10 @@ POLICIES = Path(__file__).resolve().parent / "policies"
 
 
 def find_agent(name: str) -> Callable[[], SiteAgent]:
-    """How to make the agent of a name.
+    """The factory of the agent with a name.
 
     Raises:
-        ValueError: an unknown name; lists the known.
+        ValueError: an unknown name (lists the known).
     """
     if name not in AGENTS:
         raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS])}")

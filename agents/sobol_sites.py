@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from agents.site_agent import SiteFacts
+from agents.scoring.site_agent import SiteFacts
 
 
 class SobolSites:
-    """Presses the places of a sequence that is scrambled anew each episode."""
+    """Presses the places of a sequence with a new scrambling in each episode."""
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
         """Begin an episode."""

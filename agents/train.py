@@ -1,4 +1,4 @@
-"""Train an agent as a configuration file says; go on with a run that was stopped, or killed, by starting it again.
+"""Train an agent from a configuration file; the same command resumes a run that was stopped or killed.
 
     python -m agents.train agents/configs/palpate_phantom_small_ppo.yaml
     python -m agents.train agents/configs/sites_ppo.yaml --seed 3     # the same with another seed
@@ -6,7 +6,7 @@
 
 The run's folder (runs/NAME-seedSEED unless --out names another) holds checkpoints, the best policy of the periodic
 evaluations with its normalisation (best/STEPS/policy.zip and .json), the final one, csv files and TensorBoard's.
-A resumed run begins new episodes where the killed one's were; it ends with the same number of steps.
+A resumed run starts new episodes and ends with the same number of steps.
 """
 
 import argparse
@@ -21,16 +21,16 @@ from agents.training.run import Run
 
 
 def train(config: TrainingConfig, folder: Path, *, progress: bool = False) -> int:
-    """Learn until the configuration's number of steps is reached; returns the number that it came to."""
+    """Train up to the configuration's number of steps; returns the number reached."""
     run = Run(config, folder)
     model, start = run.model, run.model.num_timesteps
     if run.resumed_from is not None:
-        print(f"going on from {run.resumed_from} ({start} of {config.total_steps} steps)", flush=True)
+        print(f"resuming from {run.resumed_from} ({start} of {config.total_steps} steps)", flush=True)
     if start >= config.total_steps:
         return start
     between = BetweenRollouts(run)
     callbacks = CallbackList([between, CriticFirst(config.critic_first)])
-    # A run that goes on counts from where it is to the same end.
+    # A resumed run trains for the remaining steps.
     model.learn(config.total_steps - start, callbacks, reset_num_timesteps=start == 0, progress_bar=progress)
     between.finish()
     run.bare.close()
@@ -38,7 +38,7 @@ def train(config: TrainingConfig, folder: Path, *, progress: bool = False) -> in
 
 
 def main() -> None:
-    """Train as the command line says."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config", type=Path, help="a YAML file, such as those in agents/configs")
     parser.add_argument("--out", type=Path, help="the run's folder")

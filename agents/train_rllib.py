@@ -1,11 +1,11 @@
-"""Train with Ray RLlib, on this machine or on a cluster, as a JSON file says; started again, it goes on.
+"""Train with Ray RLlib, on this machine or on a cluster, from a JSON file; the same command resumes a run.
 
     python -m agents.train_rllib agents/configs/rllib_palpate.json
     python -m agents.train_rllib agents/configs/rllib_palpate.json --address auto   # on the cluster that is running
 
-Needs the extra `distributed` (agents/README.md says why it is one of its own). Environments are made inside the
+Needs the extra `distributed` (see agents/README.md). Environments are made inside the
 workers, which only need `surgsim` installed; with `"gym_env_vectorize_mode": "vector_entry_point"` a worker's
-environments stand in lanes. The sections of the file are methods of RLlib's AlgorithmConfig, with their arguments.
+environments run in lanes. The sections of the file are methods of RLlib's AlgorithmConfig, with their arguments.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-# Ray asks nobody and reports nothing.
+# No usage report and no question about it.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 import ray
@@ -27,13 +27,13 @@ from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.tune.registry import get_trainable_cls, register_env
 
 STEPS = "num_env_steps_sampled_lifetime"
-# The first environment on a machine compiles its kernels, lanes for minutes on a busy one [s].
+# Time limit of a sample [s]: the first environment on a machine compiles its kernels, which may take minutes.
 PATIENCE = 900.0
 
 
 @dataclass(frozen=True)
 class RllibRun:
-    """What the JSON file holds.
+    """Configuration of a run, the content of the JSON file.
 
     Fields:
         name: of the run's folder
@@ -61,7 +61,7 @@ class RllibRun:
         """Read a file.
 
         Raises:
-            ValueError: an entry or a section that is unknown (says which there are).
+            ValueError: an unknown entry or section (lists the known).
         """
         table = json.loads(path.read_text(encoding="utf-8"))
         unknown = sorted(set(table) - set(cls.__dataclass_fields__))
@@ -70,15 +70,14 @@ class RllibRun:
         run = cls(**table)
         for section in run.sections:
             if not callable(getattr(AlgorithmConfig, section, None)):
-                raise ValueError(f"{path}: section {section!r} is no method of RLlib's AlgorithmConfig")
+                raise ValueError(f"{path}: section {section!r} is not a method of RLlib's AlgorithmConfig")
         return run
 
 
 def register_environment(name: str, env_id: str, env_kwargs: dict[str, Any]) -> None:
-    """Tell Ray how a worker makes the environment: alone, or `num_envs` of them in lanes.
+    """Register the environment's factory with Ray: one environment, or `num_envs` of them in lanes.
 
-    The function is pickled whole and runs in the worker, where nothing of this process is known: it imports what it
-    needs.
+    The function is pickled whole and runs in a worker process, so it imports what it needs.
     """
 
     def make(context: dict[str, Any]) -> Any:
@@ -88,7 +87,7 @@ def register_environment(name: str, env_id: str, env_kwargs: dict[str, Any]) -> 
 
         if "num_envs" not in context:
             return gym.make(env_id, **env_kwargs)
-        # The worker's cores are Ray's to give: one thread each.
+        # Ray assigns the worker's cores: one thread each.
         lanes = {"vectorization_mode": "vector_entry_point", "threads": 1}
         return gym.make_vec(env_id, num_envs=context["num_envs"], **lanes, **env_kwargs)
 
@@ -118,12 +117,12 @@ def configured(run: RllibRun) -> AlgorithmConfig:
 
 
 def train(run: RllibRun, folder: Path, *, most_steps: int | None = None) -> int:
-    """Learn until `total_steps`, from the newest checkpoint in the folder on if there is one; the steps it came to.
+    """Train until `total_steps`, from the folder's checkpoint if there is one; returns the number of steps reached.
 
     Args:
-        run: what is learned.
-        folder: gets `progress.csv`, `checkpoint` (whole or absent) and TensorBoard's files.
-        most_steps: stop after so many of this call's own steps, to go on later.
+        run: the configuration.
+        folder: for `progress.csv`, `checkpoint` (complete or absent) and TensorBoard's files.
+        most_steps: largest number of steps of this call; a later call continues.
     """
     from tensorboardX import SummaryWriter
 
@@ -152,10 +151,10 @@ def train(run: RllibRun, folder: Path, *, most_steps: int | None = None) -> int:
 
 
 def _row(result: dict[str, Any]) -> dict[str, float]:
-    """The figures of an iteration that are kept; nan where no episode ended yet."""
+    """The recorded figures of an iteration; nan before the first episode ends."""
     runners = result.get("env_runners", {})
     if STEPS not in runners:
-        raise RuntimeError(f"no worker gave a sample within {PATIENCE:g} s; what they say is in Ray's logs, above")
+        raise RuntimeError(f"no worker returned a sample within {PATIENCE:g} s; see Ray's logs above")
     return {
         "steps": int(runners[STEPS]),
         "return": float(runners.get("episode_return_mean", float("nan"))),
@@ -174,7 +173,7 @@ def _write_row(path: Path, row: dict[str, float]) -> None:
 
 
 def _save(algorithm: Algorithm, checkpoint: Path, steps: int) -> None:
-    """Write a checkpoint that is there whole or not at all: under another name first."""
+    """Write a checkpoint atomically: under another name first."""
     import shutil
 
     fresh, old = checkpoint.with_name("checkpoint-new"), checkpoint.with_name("checkpoint-old")
@@ -189,20 +188,20 @@ def _save(algorithm: Algorithm, checkpoint: Path, steps: int) -> None:
 
 
 def _steps_so_far(checkpoint: Path) -> int:
-    said = checkpoint / "steps.json"
-    return json.loads(said.read_text(encoding="utf-8"))["steps"] if said.is_file() else 0
+    file = checkpoint / "steps.json"
+    return json.loads(file.read_text(encoding="utf-8"))["steps"] if file.is_file() else 0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train as the command line says."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config", type=Path, help="a JSON file, such as agents/configs/rllib_palpate.json")
     parser.add_argument("--out", type=Path, help="the run's folder; runs/NAME otherwise")
     parser.add_argument("--address", help='of a running Ray, such as "auto"; a local one is started otherwise')
-    parser.add_argument("--most-steps", type=int, help="stop after so many, to go on later")
+    parser.add_argument("--most-steps", type=int, help="stop after this many steps; the same command continues")
     given = parser.parse_args(arguments)
     run = RllibRun.read(given.config)
-    # Without a word Ray joins what RAY_ADDRESS or a file of an earlier cluster names, and waits if that is gone.
+    # Without an address Ray would join the cluster of RAY_ADDRESS or of an earlier file, and wait if that is gone.
     ray.init(address=given.address or "local", include_dashboard=False if given.address is None else None)
     try:
         steps = train(run, given.out or Path("runs") / run.name, most_steps=given.most_steps)

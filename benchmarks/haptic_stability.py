@@ -1,11 +1,11 @@
-"""How stiff a coupling may be: the limit that is promised, and where a simulated device in contact begins to fail.
+"""Largest stiffness of a haptic coupling: the limit of `stiffness_limit`, and where a simulated device fails.
 
     python benchmarks/haptic_stability.py --out docs/images/haptic_stability.png
 
-A device of 50 g with some damping, pushed down with 0.3 N by a hand that damps nothing, presses the scene phantom_small
-for 1.5 s through couplings of growing stiffness. Found by bisection: the least stiffness at which the loop gave the
-hand more energy than it had taken, or at which the device still shook with 0.1 m/s at the end. Prints
-`name value unit` lines; minutes.
+A device of 50 g with some damping, pushed down with 0.3 N by a hand without damping, presses the scene phantom_small
+for 1.5 s through couplings of growing stiffness. Bisection finds the least stiffness at which the loop gives the hand
+more energy than it took, or at which the device still oscillates with 0.1 m/s at the end. Prints `name value unit`
+lines; takes minutes.
 """
 
 import argparse
@@ -13,18 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.kernels import OrganModel
-from surgsim_env.anatomy import load_anatomy
+from msdm_core.kernels.structure_kernels import OrganModel
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import DAMPING_SHARE, TipDynamics, VirtualCoupling, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
-from surgsim_env.haptics.limits import ForceLimits
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.tip_drive import tip_drives
 from surgsim_env.haptics.watchdog import WatchdogTimes
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 
 DT = 1e-3
 START = np.array([0.02, 0.02, 0.0285])
@@ -37,15 +36,15 @@ BISECTIONS = 6
 
 
 class UndeclaredDevice(SimulatedDevice):
-    """Pushes and does not say so, so that no coupling is refused."""
+    """A device that declares no dynamics, so that no coupling is refused."""
 
     @property
     def dynamics(self) -> None:
-        """Not told."""
+        """Not declared."""
 
 
 def fails(simulation: Simulation, organ: OrganModel, damping: float, delay: int, stiffness: float) -> bool:
-    """Whether contact through a coupling gives energy, or does not come to rest."""
+    """Whether contact through a coupling generates energy, or keeps oscillating."""
     simulation.reset(organ, START)
     hand = Hand(push=(0.0, 0.0, -0.3))
     device = UndeclaredDevice(mass=MASS, damping=damping, haptic_step=DT, position=START, hand=hand, pose_delay=delay)
@@ -71,12 +70,12 @@ def promised_stiffness(tip: TipDynamics, damping: float, delay: int) -> float:
 
 
 def coupling_damping(damping: float) -> float:
-    """A quarter of the device's damping, as long as the tip has as much [N s/m]."""
+    """DAMPING_SHARE of the damping of the device, of at most 2 N s/m [N s/m]."""
     return DAMPING_SHARE * min(damping, 2.0)
 
 
 def failing_stiffness(simulation: Simulation, organ: OrganModel, damping: float, delay: int, limit: float) -> float:
-    """The least stiffness that fails, to some per cent, between half the limit and sixteen times it [N/m]."""
+    """The least stiffness that fails, within a few per cent, between half the limit and sixteen times it [N/m]."""
     low, high = np.log(0.5 * limit), np.log(16.0 * limit)
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)

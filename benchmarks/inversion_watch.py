@@ -1,10 +1,10 @@
-"""What watching every tet for inversion costs: the kernels as they are against a copy that does not look.
+"""Cost of the check of every tet for inversion: the kernels against a copy without the check.
 
     python benchmarks/inversion_watch.py --scene phantom
 
-Two copies of msdm_core/tissue_kernels.py are compiled in a temporary folder; their volume kernels and a whole substep
-without contact run in turn in this process, on the scene's organ at rest. Prints `name value unit` lines; times are
-medians of processor time.
+Two copies of msdm_core/kernels/group_kernels.py are compiled in a temporary folder; their volume kernels and a whole
+substep without contact run alternately in this process, on the organ of the scene at rest. Prints `name value unit`
+lines; times are medians of processor time.
 """
 
 import argparse
@@ -24,7 +24,7 @@ WATCH = """        lowest = keep_lower(ratio, lowest, ratio, lowest)
 
 
 def compiled_copy(folder: Path, name: str, text: str) -> ModuleType:
-    """A module of that text; numba compiles it at its first call."""
+    """A module with this text; numba compiles it at its first call."""
     path = folder / f"{name}.py"
     path.write_text(text, encoding="utf-8")
     spec = importlib.util.spec_from_file_location(name, path)
@@ -35,8 +35,8 @@ def compiled_copy(folder: Path, name: str, text: str) -> ModuleType:
 
 
 def volume_arguments(model: Any) -> tuple:
-    """Arguments of `add_tet_forces` for a scene's organ at rest."""
-    from msdm_core.organ import rest_state
+    """Arguments of `add_tet_groups` for the organ of a scene at rest."""
+    from msdm_core.organ.compile import rest_state
 
     state = rest_state(model)
     state.row_position[:, :3] = model.node_rest_position
@@ -48,7 +48,7 @@ def volume_arguments(model: Any) -> tuple:
 
 
 def seconds(run, arguments: tuple, count: int) -> float:
-    """Processor time of one call, over `count` of them [s]: what else runs on the machine disturbs it least."""
+    """Processor time of one call, the mean of `count` calls [s]; other processes on the machine disturb it least."""
     begin = time.process_time()
     for _ in range(count):
         run(*arguments)
@@ -62,23 +62,23 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=201)
     arguments = parser.parse_args()
 
-    from msdm_core import tissue_kernels
-    from msdm_core.organ import rest_state
-    from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
-    from surgsim_env.anatomy import load_anatomy
-    from surgsim_env.scenes import make_scene
+    from msdm_core.kernels import group_kernels
+    from msdm_core.organ.compile import rest_state
+    from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+    from surgsim_env.scene.anatomy import load_anatomy
+    from surgsim_env.scene.load import make_scene
 
     scene = make_scene(arguments.scene)
     model = load_anatomy(scene).organ()
-    text = Path(tissue_kernels.__file__).read_text(encoding="utf-8")
+    text = Path(group_kernels.__file__).read_text(encoding="utf-8")
     if text.count(WATCH) != 1:
-        sys.exit("the lines that watch are no longer those that this script takes out: bring WATCH up to date")
+        sys.exit("the lines of the check differ from WATCH, which this script removes: update WATCH")
     times: dict[str, list[float]] = {"watching": [], "blind": [], "substep": []}
     state, wrench = rest_state(model), np.zeros((0, 6))
     dt = 0.5 * model.stable_step
     with tempfile.TemporaryDirectory() as folder:
         runs = {
-            name: (compiled_copy(Path(folder), f"{name}_kernels", source).add_tet_forces, volume_arguments(model))
+            name: (compiled_copy(Path(folder), f"{name}_kernels", source).add_tet_groups, volume_arguments(model))
             for name, source in (("watching", text), ("blind", text.replace(WATCH, "")))
         }
         runs["substep"] = (advance_organ, (model, state, NO_SHAPES, NO_CONTACT, dt, 1, wrench))

@@ -1,8 +1,8 @@
-"""What one substep costs an organ alone, and beside others: 8 organs in float64, 16 in float32.
+"""Cost of a substep of an organ alone, and side by side with others: 8 organs in float64, 16 in float32.
 
     python benchmarks/lanes.py --scene phantom
 
-Balls press the scene's organ at places of their own; every organ has a lesion of its own. The three runs take turns in
+Balls press the organ of the scene, each at another place; every organ has another lesion. The three runs alternate in
 this process. Prints `name value unit` lines: medians of processor time per organ and substep.
 """
 
@@ -14,23 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel
-from msdm_core.lane_organs import stack_organs
-from msdm_core.lanes import advance_lanes, rest_lanes, stack_shapes
-from msdm_core.organ import rest_state
-from msdm_core.shapes import round_shapes
-from msdm_core.stepping import advance_organ
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.scenes import make_scene
+from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel
+from msdm_core.lanes.lane_organs import stack_organs
+from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_shapes
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stepping import advance_organ, round_shapes
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
 
-ROOM = 16  # lanes at most
+ROOM = 16  # largest number of lanes
 PRESS_DEPTH = 4e-3  # [m]
 PRESS_SPEED = 0.02  # [m/s]
 HAPTIC_STEP = 1e-3  # [s]
 
 
 def press_sites(anatomy: Anatomy, model: OrganModel) -> np.ndarray:
-    """Places on top of the organ near its middle, a different one for each lane (ROOM, 3) [m]."""
+    """Places on top of the organ near its middle, another one for each lane, (ROOM, 3) [m]."""
     surface = model.surface_triangles
     corners = model.node_rest_position[surface]
     middle = corners.mean(axis=1)
@@ -40,13 +39,13 @@ def press_sites(anatomy: Anatomy, model: OrganModel) -> np.ndarray:
 
 
 def ball(site: np.ndarray, radius: float) -> ContactShapes:
-    """A ball that touches a site from above and moves down."""
+    """A ball that touches a site from above and moves down at PRESS_SPEED."""
     centre = site + np.array([0.0, 0.0, radius])
     return round_shapes([[centre, centre]], radius, twist=[0.0, 0.0, -PRESS_SPEED, 0.0, 0.0, 0.0])
 
 
 class Group:
-    """Some organs that advance together by one haptic step a call."""
+    """Organs that advance together by one haptic step a call, pressed by PRESS_DEPTH."""
 
     def __init__(
         self,

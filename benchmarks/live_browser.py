@@ -1,7 +1,7 @@
-"""Pictures a second that a software-rendered Chromium draws of a live scene, and how the physics keeps time beside it.
+"""Pictures a second of a live scene in a software-rendered Chromium, and the speed of the physics meanwhile.
 
 From the repository's root: PYTHONPATH=. python benchmarks/live_browser.py --out docs/images/live_view.png
-Prints `name value unit` lines; with --out it presses first and keeps a picture of the page.
+Prints `name value unit` lines; with --out it presses the organ first and saves a picture of the page.
 """
 
 import argparse
@@ -10,29 +10,29 @@ import threading
 import time
 from pathlib import Path
 
-from surgsim_env.live.command import report_lines
+from surgsim_env.cli.view import report_lines
+from surgsim_env.haptics.pacing import timeliness
 from surgsim_env.live.page import Page
 from surgsim_env.live.protocol_client import press_path
 from surgsim_env.live.session import Session
-from surgsim_env.pacing import timeliness
-from surgsim_env.scenes import make_scene
-from tests.live.chromium import Browser
+from surgsim_env.scene.load import make_scene
+from tests.chromium import Browser, Chromium
 
-# Pictures are frames with something new in them.
+# Only frames that show something new count.
 COUNTED = "[window.pictures, window.frames_drawn]"
 # viser draws fewer pixels than the window has where a browser is slow.
 CANVAS_SIZE = "(() => { const c = document.querySelector('canvas[data-engine]'); return [c.width, c.height]; })()"
 
 
 def press_around(session: Session, stop: threading.Event) -> None:
-    """Press in and out at one place, moving the hand 30 times a second."""
+    """Press in and out at one place; the hand moves 30 times a second."""
     path, start = press_path(session.anatomy), time.monotonic()
     while not stop.wait(1.0 / 30.0):
         session.move_to(0, path(time.monotonic() - start))
 
 
 def press_raster(session: Session, spacing: float, depth: float) -> None:
-    """Press at places around the middle of the palpable face, as a hand would; ends deep in the last one."""
+    """Press at places around the middle of the palpable face; ends deep in the last one."""
     face, radius = session.anatomy.face, session.scene.instrument.tip_radius
     sites, normals = face.raster(spacing)
     middle = sites.mean(axis=0)
@@ -45,14 +45,14 @@ def press_raster(session: Session, spacing: float, depth: float) -> None:
 
 
 def _let_pass(session: Session, span: float) -> None:
-    """Until the simulation has gone on by a time [s], however slowly it runs."""
+    """Wait until the simulation has advanced by a time [s], however slowly it runs."""
     start = float(session.frame()["time"])
     while float(session.frame()["time"]) - start < span and session.alive:
         time.sleep(0.02)
 
 
 def main() -> None:
-    """Serve, open, measure, and keep a picture if asked."""
+    """Serve the page, open it, measure, and save a picture if --out is given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scene", default="liver")
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -70,15 +70,15 @@ def main() -> None:
         page.show_plain(not given.shadows)
         threads.append(threading.Thread(target=page.run, args=(stop.is_set,)))
         threads[0].start()
-        with Browser(folder, *given.size) as browser:
+        with Chromium(folder) as chromium, chromium.page(*given.size) as browser:
             browser.count_pictures()
             browser.open(page.server.address)
-            browser.wait_for("!!document.body && document.body.innerText.includes('steps/s')", 300)
+            browser.wait_for("!!document.body && document.body.innerText.includes('steps/s')")
             browser.run("document.querySelector('.mantine-Notification-closeButton')?.click()")
             if given.out is not None:
                 press_raster(session, session.scene.palpation.site_spacing, session.scene.palpation.press_depth)
-                browser.wait_for("window.pictures > 8", 300)
-                browser.shot(given.out)
+                browser.wait_for("window.pictures > 8")
+                given.out.write_bytes(browser.shot())
             if given.seconds > 0.0:
                 threads.append(threading.Thread(target=press_around, args=(session, stop)))
                 threads[-1].start()
@@ -94,7 +94,7 @@ def main() -> None:
 
 
 def measure(session: Session, browser: Browser, seconds: float) -> None:
-    """Print what was kept up for some seconds."""
+    """Print the rates over some seconds."""
     before, counted, start = session.timing(), browser.run(COUNTED), time.monotonic()
     time.sleep(seconds)
     after, wall = session.timing(), time.monotonic() - start

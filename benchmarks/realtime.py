@@ -1,4 +1,4 @@
-"""How fast a scene runs: simulated over wall-clock time of Palpate-v0 in contact, reset, cold and warm start.
+"""Speed of a scene: simulated over wall-clock time of Palpate-v0 in contact, reset, cold and warm start.
 
     python benchmarks/realtime.py --scene phantom
 
@@ -59,7 +59,7 @@ def main() -> None:
         env.simulation.restart(point + normal * radius)
         begin = time.perf_counter()
         for step in range(20):
-            # In at 13 mm/s for six steps, then to and fro: contact and friction at every haptic step.
+            # Pressed in at 13 mm/s for six steps, then moved back and forth: contact and friction at every haptic step.
             direction = np.roll(normal, 1) * 0.25 * (-1) ** step if step >= 6 else -0.66 * normal
             env.step(np.append(direction, 0.0).astype(np.float32))
         factors.append(env.simulation.time / (time.perf_counter() - begin))

@@ -1,10 +1,10 @@
-"""How fast pictures are drawn: frames a second of a pressed organ at 640 x 480, off screen, by option.
+"""Speed of rendering: frames a second of a pressed organ at 640 x 480, off screen, by option.
 
     python benchmarks/rendering.py --scene liver
 
 Prints `name value unit` lines: the median over the frames, with the upload of the deformed surface and without the time
-of the simulation. Without a graphics card Mesa draws on all cores (llvmpipe). `first` is the first picture, loading
-included.
+of the simulation. Without a graphics card Mesa draws on all cores (llvmpipe). `first` is the first picture, with
+loading.
 """
 
 import argparse
@@ -26,7 +26,7 @@ CASES = {
 
 
 def press(env: gym.Env, steps: int) -> None:
-    """Go in above the lesion for so many control steps."""
+    """Press above the lesion for a number of control steps."""
     palpate = env.unwrapped
     point, outward = palpate.simulation.anatomy.face.project(palpate.task.lesion.centre)
     palpate.simulation.restart(point + outward * (palpate.scene.instrument.tip_radius + 0.001))

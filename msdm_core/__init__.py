@@ -6,22 +6,23 @@ from msdm_core import numba_cache
 
 with numba_cache.kernel_cache(Path(__file__).parent):
     # First of all: what is compiled is cached where it was decorated.
-    from msdm_core import kernels, lane_kernels, linear_kernels  # noqa: F401
-from msdm_core.damping import Damping
+    from msdm_core.kernels import linear_kernels, ray_kernels, substep_kernels  # noqa: F401
 from msdm_core.errors import MeshError, OrganDivergedError, OrganError
-from msdm_core.fitting import FitReport, spring_fit
-from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.lumping import lump_mass
-from msdm_core.mesh import TetMesh
-from msdm_core.mesh_io import read_mesh, read_surface, write_mesh
-from msdm_core.meshing import box_mesh, mesh_surface
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.quality import mesh_quality
-from msdm_core.regions import Capsule, Lesion, Material
-from msdm_core.segmentation_meshing import mesh_segmentation
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import advance
-from msdm_core.stiffness import spring_network
+from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material.fitting import FitReport, spring_fit
+from msdm_core.material.lumping import lump_mass
+from msdm_core.material.regions import Capsule, Damping, Lesion, Material
+from msdm_core.material.stiffness import spring_network
+from msdm_core.mesh.quality import mesh_quality
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
+from msdm_core.mesh_files.surface_io import read_surface
+from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
+from msdm_core.meshing.segmentation_meshing import mesh_segmentation
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import advance
+from msdm_core.organ.support import Support, SupportLaw
 
 __all__ = [
     "Capsule",
@@ -37,6 +38,8 @@ __all__ = [
     "OrganModel",
     "OrganSpec",
     "OrganState",
+    "Support",
+    "SupportLaw",
     "TetMesh",
     "advance",
     "box_mesh",

@@ -20,7 +20,7 @@ from pathlib import Path
 from numba.core import config
 from numba.misc.appdirs import AppDirs
 
-KERNEL_FILES = ("*kernels.py", "vector.py")
+KERNEL_FILES = "*kernels.py"
 FOLDER_PREFIX = "surgsim-kernels-"
 STALE_AGE = 7 * 24 * 3600.0  # [s]
 
@@ -51,12 +51,12 @@ def provide_cache_folder(source_folder: Path) -> Path | None:
 
 @contextmanager
 def kernel_cache(*source_folders: Path) -> Iterator[None]:
-    """Let functions decorated inside be cached in a folder of their own, new whenever a compiled file has changed.
+    """Cache functions decorated inside in a folder of their own, a new one whenever a compiled file has changed.
 
     Args:
         source_folders: folders whose KERNEL_FILES are compiled together; the cache lies in the first.
     """
-    files = sorted(file for folder in source_folders for name in KERNEL_FILES for file in folder.glob(name))
+    files = sorted(file for folder in source_folders for file in folder.rglob(KERNEL_FILES))
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
     before: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
     place = next(place for place in _places(source_folders[0]) if _can_write(place))
@@ -73,7 +73,7 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
 
 
 def _places(source_folder: Path) -> list[Path]:
-    """Where numba may keep compiled code, in its own order."""
+    """Folders in which numba may keep compiled code, in its own order."""
     user_folder = Path(AppDirs(appname="numba", appauthor=False).user_cache_dir)
     # For a user without a home, numba's own folder is a relative "~/.cache": it would litter the working folder.
     places = [source_folder / "__pycache__", *([user_folder] if user_folder.is_absolute() else [])]
@@ -99,7 +99,7 @@ def _can_write(folder: Path) -> bool:
 
 
 def _private_temporary_folder() -> Path:
-    """The same folder at every start, as long as nobody else can have put anything in it; else a new one.
+    """The same folder at every start, as long as no other user can write to it; else a new one.
 
     numba unpickles what it finds, so a folder that another user owns or may write to is never used.
     """

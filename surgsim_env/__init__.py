@@ -1,22 +1,104 @@
 """surgsim_env: soft organs and robotic instruments as Gymnasium environments; importing it registers their ids."""
 
+import importlib
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import msdm_core
 from msdm_core import numba_cache
-
-with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
-    # First of all: what is compiled is cached where it was decorated.
-    from surgsim_env import haptic_kernels, lane_haptic_kernels, visibility_kernels  # noqa: F401
 from surgsim_env.rendering.gl import import_mujoco
 
 import_mujoco()
-from surgsim_env.arms.arm import load_arm  # noqa: E402
-from surgsim_env.arms.description import list_arms  # noqa: E402
-from surgsim_env.arms.port import Port  # noqa: E402
-from surgsim_env.registration import register  # noqa: E402
-from surgsim_env.scenes import list_scenes, make_scene  # noqa: E402
+with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
+    # Before anything else imports them: compiled code is cached where it was when it was decorated.
+    from surgsim_env.coupling import haptic_kernels  # noqa: F401
+    from surgsim_env.instruments import mujoco_kernels, tool_kernels  # noqa: F401
+    from surgsim_env.tasks import visibility_kernels  # noqa: F401
+from msdm_core.errors import MeshError, OrganDivergedError, OrganError  # noqa: E402
+from msdm_core.organ.support import Support  # noqa: E402
+from surgsim_env.coupling.simulation import Simulation  # noqa: E402
+from surgsim_env.envs.ids import register, register_task  # noqa: E402
+from surgsim_env.envs.surgical_env import SurgicalEnv  # noqa: E402
+from surgsim_env.instruments.arm.arm import load_arm  # noqa: E402
+from surgsim_env.scene.anatomy import load_anatomy  # noqa: E402
+from surgsim_env.scene.load import list_arms, list_scenes, load_scene, make_scene  # noqa: E402
+from surgsim_env.scene.model import Port, Scene  # noqa: E402
+from surgsim_env.tasks.bimanual_retract import BimanualRetractTask  # noqa: E402
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward  # noqa: E402
+from surgsim_env.tasks.palpate import PalpateTask  # noqa: E402
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask  # noqa: E402
+from surgsim_env.tasks.retract import RetractTask  # noqa: E402
+from surgsim_env.tasks.task import (  # noqa: E402
+    CONTACT_FORCE,
+    TIME_LEFT,
+    TIP_POSITION,
+    TIP_VELOCITY,
+    Start,
+    Task,
+    Verdict,
+)
 
-__all__ = ["Port", "list_arms", "list_scenes", "load_arm", "make_scene", "register"]
+if TYPE_CHECKING:
+    from surgsim_env import scripting
+    from surgsim_env.envs.bimanual_parallel import BimanualRetractParallelEnv
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.rendering.gl import NoGLError
+    from surgsim_env.rendering.options import RenderOptions
+
+__all__ = [
+    "CONTACT_FORCE",
+    "TIME_LEFT",
+    "TIP_POSITION",
+    "TIP_VELOCITY",
+    "BimanualRetractParallelEnv",
+    "BimanualRetractTask",
+    "Channel",
+    "Command",
+    "ControlStep",
+    "MeshError",
+    "NoGLError",
+    "OrganDivergedError",
+    "OrganError",
+    "PalpateSitesTask",
+    "PalpateTask",
+    "Port",
+    "RenderOptions",
+    "RetractTask",
+    "Reward",
+    "Scene",
+    "Simulation",
+    "Start",
+    "Support",
+    "SurgicalEnv",
+    "Task",
+    "VectorEnvForStableBaselines",
+    "Verdict",
+    "list_arms",
+    "list_scenes",
+    "load_anatomy",
+    "load_arm",
+    "load_scene",
+    "make_scene",
+    "register",
+    "register_task",
+    "scripting",
+]
+
+# Imported on first use: they need extras, or time that `import surgsim_env` should not take.
+_LAZY = {
+    "BimanualRetractParallelEnv": "surgsim_env.envs.bimanual_parallel",
+    "NoGLError": "surgsim_env.rendering.gl",
+    "RenderOptions": "surgsim_env.rendering.options",
+    "VectorEnvForStableBaselines": "surgsim_env.envs.stable_baselines",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "scripting":
+        return importlib.import_module("surgsim_env.scripting")
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_LAZY[name]), name)
+
 
 register()

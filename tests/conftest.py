@@ -1,15 +1,21 @@
-"""What several test modules share: the anatomy files and random meshes."""
+"""What several test modules share: patience, a browser, the anatomy files and random meshes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
-from msdm_core.mesh import TetMesh, tet_volumes
+from msdm_core.mesh.tet_mesh import TetMesh, tet_volumes
+from tests.chromium import CHROMIUM, Chromium
+
+# Nothing that passes depends on how fast it runs.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 ANATOMY = Path(__file__).resolve().parents[2] / "shared" / "data" / "anatomy"
 
@@ -20,6 +26,15 @@ def anatomy_folder() -> Path:
     if not ANATOMY.is_dir():
         pytest.skip(f"the anatomy files are not at {ANATOMY}")
     return ANATOMY
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory) -> Iterator[Chromium]:
+    """A browser that all tests open their pages in."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: apt-get install chromium (.ci/run does)")
+    with Chromium(tmp_path_factory.mktemp("chromium")) as browser:
+        yield browser
 
 
 @pytest.fixture(scope="session")

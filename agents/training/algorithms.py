@@ -1,4 +1,4 @@
-"""Algorithms by name, and their hyperparameters from what YAML can say."""
+"""Algorithms by name, and hyperparameters from YAML values."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from agents.site_policy import SitePolicy
 from agents.training.extractors import MemorySummary, PlaceAndForce
-from surgsim_env.toml_tables import nearest
+from agents.training.site_policy import SitePolicy
+from surgsim_env.scene.load import nearest
 
 EXTRACTORS = {"MemorySummary": MemorySummary, "PlaceAndForce": PlaceAndForce}
 ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU}
@@ -29,7 +29,7 @@ def algorithms() -> dict[str, type[BaseAlgorithm]]:
 
 
 def policy_class(name: str) -> str | type[BasePolicy]:
-    """A policy of this project by name; a name of stable-baselines3's as it is."""
+    """A policy of this project by name; other names are passed on to stable-baselines3."""
     return {"SitePolicy": SitePolicy}.get(name, name)
 
 
@@ -46,7 +46,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 
 def keywords(hyperparameters: dict[str, Any]) -> dict[str, Any]:
-    """Hyperparameters as the algorithm takes them: `{linear: x}` is a schedule, some names are classes.
+    """Hyperparameters as the algorithm's arguments: `{linear: x}` becomes a schedule, some names become classes.
 
     Raises:
         ValueError: an activation function or a features extractor that is unknown.

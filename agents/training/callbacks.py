@@ -1,4 +1,4 @@
-"""What happens beside learning: checkpoints between rollouts, periodic evaluation, the value that learns first."""
+"""Callbacks: checkpoints between rollouts, periodic evaluation, a value function that is trained first."""
 
 import csv
 from dataclasses import replace
@@ -14,10 +14,9 @@ from agents.training.whole_folders import keep_newest, write_file, write_folder
 
 
 class BetweenRollouts(BaseCallback):
-    """Evaluates, then saves, when enough steps have gone by; only where a rollout begins, when no update is half done.
+    """Evaluates and saves at intervals, only at the start of a rollout, when no update is in progress.
 
-    So a run that goes on from a checkpoint makes the same rollouts as one that was never stopped, and ends with the
-    same number of steps.
+    A resumed run thus has the same rollouts as an uninterrupted one, and ends with the same number of steps.
     """
 
     def __init__(self, run: Run) -> None:
@@ -54,18 +53,18 @@ class BetweenRollouts(BaseCallback):
         self.run.save_checkpoint({"evaluated_at": self.evaluated_at, "best_score": self.best_score})
 
     def evaluate(self) -> None:
-        """Play episodes, note the figures, keep the policy if it is the best so far."""
+        """Play episodes, record the figures, save the policy if it is the best so far."""
         settings, model = self.run.config.evaluation, self.run.model
         if self._envs is None:
             count = min(self.run.config.environment.count, settings.episodes)
             self._envs = make_environments(self.run.config.environment, count)
-        # These environments repeat actions, blind and believe by themselves.
+        # These environments repeat actions, remove force and compute beliefs themselves.
         seen = replace(self.run.description(), action_repeat=1, force_entries=[], belief=None)
         figures = mean_figures(play_episodes(TrainedPolicy(model, seen), self._envs, settings.episodes))
         self.evaluated_at = model.num_timesteps
         if settings.score not in figures:
             raise ValueError(
-                f"evaluation.score is {settings.score!r}, of which episodes say nothing; they say: {', '.join(figures)}"
+                f"evaluation.score is {settings.score!r}, which no episode reports; known are {', '.join(figures)}"
             )
         score = figures[settings.score]
         _append_row(self.run.folder / "evaluations.csv", {"steps": model.num_timesteps, **figures})
@@ -86,7 +85,7 @@ class BetweenRollouts(BaseCallback):
 
 
 class CriticFirst(BaseCallback):
-    """For so many steps only the value learns: a cloned policy acts well before its value knows what that is worth."""
+    """Trains the value function alone for the first steps: a cloned policy has an untrained value function."""
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -114,7 +113,7 @@ def _append_row(file: Path, row: dict[str, float]) -> None:
 
 
 def _forget_rows_after(file: Path, steps: int) -> None:
-    """What a killed run noted after its last checkpoint is evaluated again."""
+    """Drop rows that a killed run wrote after its last checkpoint: they will be evaluated again."""
     if not file.exists():
         return
     header, *rows = file.read_text(encoding="utf-8").splitlines(keepends=True)

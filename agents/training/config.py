@@ -1,4 +1,4 @@
-"""What a training run is told: one YAML file read into frozen dataclasses, every entry checked."""
+"""Configuration of a training run: one YAML file read into frozen dataclasses, every entry checked."""
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -6,23 +6,23 @@ from typing import Any, Literal
 
 import yaml
 
-from surgsim_env.toml_tables import fill
+from surgsim_env.scene.load import fill
 
 
 @dataclass(frozen=True)
 class EnvironmentSettings:
-    """The environments that are learned on.
+    """The training environments.
 
     Fields:
         id: of the environment, such as "SurgSim/Palpate-v0"
         kwargs: its arguments (scene, level, memory, ...)
         kind: "lanes" (side by side in vector registers), "library" (presses looked up, PalpateSites only), "surrogate"
             (forces by formula, Palpate on blocks only) or "dummy" (one after the other, any Gymnasium id)
-        count: how many
+        count: number of environments
         dtype, threads: of lanes
-        library: the file of a "library"
-        action_repeat: control steps that one decision lasts
-        without_force: force entries of the observation are set to 0
+        library: file of presses for kind "library"
+        action_repeat: control steps per decision
+        without_force: force channels of the observation are set to 0
         belief: PalpateSites with memory as maps of belief, its action as a site's number: for the policy "SitePolicy"
         normalize_observation, normalize_reward: running mean and variance, as stable-baselines3's VecNormalize
     """
@@ -52,13 +52,13 @@ class EnvironmentSettings:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Periodic evaluation, deterministic, on seeds of its own.
+    """Periodic deterministic evaluation on separate seeds.
 
     Fields:
         every: environment steps between evaluations; 0 for none
         episodes: of each evaluation
-        score: what the best policy is chosen by: "return", or an entry of the episodes' last info
-        score_sign: 1 where more is better, -1 where less is
+        score: criterion of the best policy: "return", or an entry of the episodes' last info
+        score_sign: 1 if more is better, -1 if less is
     """
 
     every: int = 50_000
@@ -77,8 +77,8 @@ class CheckpointSettings:
 
     Fields:
         every: environment steps between them
-        keep: how many of the newest are kept
-        replay_buffer: save it too (off-policy algorithms): without it a resumed run fills a new one before it learns on
+        keep: number of checkpoints that are kept
+        replay_buffer: save the replay buffer (off-policy algorithms); else a resumed run first fills a new one
     """
 
     every: int = 50_000
@@ -98,14 +98,14 @@ class TrainingConfig:
         name: of the run and its policy
         algorithm: a class of stable_baselines3 or sb3_contrib, such as "PPO", "SAC", "RecurrentPPO"
         policy: its policy's name
-        environment: what is learned on
+        environment: the training environments
         total_steps: environment steps (decisions, summed over environments)
-        seed: of everything
-        hyperparameters: handed to the algorithm; `{linear: x}` falls from x to 0, activation functions go by name
-        warm_start: a policy file that the run begins with, its normalisation included
-        warm_spread: standard deviation of the actions that a warm start begins to explore with; its own by default
-        critic_first: so many steps train the value alone, which a cloned policy has not learned
-        torch_threads: cores that the networks may use
+        seed: of environments, networks and exploration
+        hyperparameters: arguments of the algorithm; `{linear: x}` falls from x to 0, activation functions by name
+        warm_start: initial policy file, with its normalisation
+        warm_spread: initial standard deviation of a warm start's actions; by default the file's
+        critic_first: first steps that train the value function alone, which a cloned policy lacks
+        torch_threads: threads of torch
     """
 
     name: str
@@ -148,10 +148,9 @@ def read_config(path: Path, **changes: Any) -> TrainingConfig:
     except yaml.YAMLError as error:
         raise ValueError(f"configuration {path} is not valid YAML: {error}") from None
     if not isinstance(table, dict):
-        raise ValueError(f"configuration {path} is no table of entries but {type(table).__name__}")
+        raise ValueError(f"configuration {path} must hold a table of entries, not {type(table).__name__}")
     table |= {name: value for name, value in changes.items() if value is not None}
-    parts = (EnvironmentSettings, EvaluationSettings, CheckpointSettings)
-    return fill(TrainingConfig, table, f"configuration {path}", parts)
+    return fill(TrainingConfig, table, f"configuration {path}")
 
 
 def config_text(config: TrainingConfig) -> str:
@@ -165,7 +164,7 @@ def _at_least(name: str, value: int, least: int) -> None:
 
 
 def _refuse_texts_of_numbers(value: Any, where: str) -> None:
-    """YAML reads 3e-4 as a text: without a point it is no number there."""
+    """Refuse texts such as 3e-4: YAML reads a number without a point as text."""
     if isinstance(value, dict):
         for key, entry in value.items():
             _refuse_texts_of_numbers(entry, f"{where}.{key}")

@@ -1,23 +1,24 @@
-"""The vector environments of a run, as its configuration asks for them."""
+"""The vector environments of a run's configuration."""
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.site_belief import BeliefSettings, BelievingEnvs, SiteBelief
+from agents.scoring.site_agent import SiteFacts, site_facts
 from agents.training.config import EnvironmentSettings
+from agents.training.site_belief import BelievingEnvs, SiteBelief
 from agents.training.wrappers import EpisodeMonitor, RepeatedAction, WithoutForce
-from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
-# Seeds of training episodes lie above these, those of its evaluation are the latter and on; a benchmark's lie apart
-# from both (`surgsim_env.evaluation.palpation.EVALUATION_SEEDS`, from 1,000,000 to 1,000,099).
+# First seeds of training and of its periodic evaluation; scores use others
+# (`surgsim_env.palpation.scores.EVALUATION_SEEDS`, from 1,000,000 to 1,000,099).
 TRAINING_SEEDS_FROM = 2_000_000
 EVALUATION_SEED = 500_000
 
 
 def make_environments(settings: EnvironmentSettings, count: int | None = None) -> VecEnv:
-    """The environments with their wrappers, but for the normalisation."""
+    """The environments with all wrappers except the normalisation."""
     count = settings.count if count is None else count
     envs = _bare(settings, count)
     if settings.action_repeat > 1:
@@ -25,12 +26,12 @@ def make_environments(settings: EnvironmentSettings, count: int | None = None) -
     if settings.without_force:
         envs = WithoutForce(envs, force_entries(envs))
     if settings.belief:
-        envs = BelievingEnvs(envs, SiteBelief(belief_settings(envs)))
+        envs = BelievingEnvs(envs, SiteBelief(belief_facts(envs)))
     return EpisodeMonitor(envs)
 
 
 def normalized(envs: VecEnv, settings: EnvironmentSettings, gamma: float) -> VecEnv:
-    """The same, observations and rewards scaled as the settings say."""
+    """The environments with normalised observations and rewards, according to the settings."""
     if not settings.normalize_observation and not settings.normalize_reward:
         return envs
     return VecNormalize(
@@ -39,36 +40,29 @@ def normalized(envs: VecEnv, settings: EnvironmentSettings, gamma: float) -> Vec
 
 
 def training_seed(seed: int, steps: int) -> int:
-    """First seed of the environments' episodes, another one for each start of a run."""
+    """First seed of the environments' episodes, different at each start of a run."""
     drawn = int(np.random.SeedSequence([seed, steps]).generate_state(1)[0])
     return TRAINING_SEEDS_FROM + drawn % (2**31 - 2 * TRAINING_SEEDS_FROM)
 
 
 def force_entries(envs: VecEnv) -> list[int]:
-    """Entries of the observation that come from a force sensor, as the task says.
+    """Entries of the observation that depend on force sensing, by the task's `force_entries`.
 
     Raises:
-        ValueError: the task says nothing of it.
+        ValueError: the task has no `force_entries`.
     """
     task = envs.get_attr("unwrapped", indices=[0])[0].task
     if not hasattr(task, "force_entries"):
         raise ValueError(
-            f"{type(task).__name__} does not say which entries of its observation are forces: give it `force_entries`, "
-            "or train with without_force: false"
+            f"{type(task).__name__} does not declare which entries of its observation are forces: give it "
+            "`force_entries`, or train with without_force: false"
         )
     return list(task.force_entries)
 
 
-def belief_settings(envs: VecEnv) -> BeliefSettings:
-    """What the belief of environments of SurgSim/PalpateSites-v0 is built on."""
-    task = envs.get_attr("unwrapped", indices=[0])[0].task
-    estimator = task.estimator
-    return BeliefSettings(
-        extent=tuple(estimator.extent.tolist()),
-        site_count=task.site_count,
-        tip_radius=estimator.tip_radius,
-        noise=estimator.noise,
-    )
+def belief_facts(envs: VecEnv) -> SiteFacts:
+    """The constants of environments of SurgSim/PalpateSites-v0 that belief is computed with."""
+    return site_facts(envs.get_attr("unwrapped", indices=[0])[0])
 
 
 def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
@@ -84,11 +78,11 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
         )
         return VectorEnvForStableBaselines(envs)
     if settings.kind == "library":
-        from agents.press_library import PressLibraryEnv
+        from agents.training.press_library import PressLibraryEnv
 
         return DummyVecEnv([lambda: PressLibraryEnv(settings.library, **settings.kwargs)] * count)
     if settings.kind == "surrogate":
-        from agents.palpate_surrogate import PalpateSurrogate
+        from agents.training.palpate_surrogate import PalpateSurrogate
 
         chosen = {name: value for name, value in settings.kwargs.items() if name != "level"}
         return VectorEnvForStableBaselines(PalpateSurrogate(count, **chosen))

@@ -1,4 +1,4 @@
-"""Whole episodes of a policy on seeds of training's own, and what came of them."""
+"""Whole episodes of a policy on the seeds of periodic evaluation, and their mean figures."""
 
 from typing import Any
 
@@ -10,10 +10,10 @@ from agents.training.policy_files import TrainedPolicy
 
 
 def play_episodes(policy: TrainedPolicy, envs: VecEnv, episodes: int, seed: int = EVALUATION_SEED) -> list[dict]:
-    """The last infos of so many episodes, with their returns and lengths; deterministic.
+    """The last infos of deterministic episodes, with their returns and lengths.
 
-    Every environment plays its share, so that short episodes count no more than long ones. Environments that repeat
-    actions by themselves take a policy whose description says 1.
+    Each environment plays an equal share, so that short episodes are not over-represented. Environments that repeat
+    actions need a policy with action_repeat 1.
     """
     wanted = np.array([(episodes + index) // envs.num_envs for index in range(envs.num_envs)])
     envs.seed(seed)
@@ -29,7 +29,7 @@ def play_episodes(policy: TrainedPolicy, envs: VecEnv, episodes: int, seed: int 
 
 
 def mean_figures(records: list[dict[str, Any]]) -> dict[str, float]:
-    """Means over episodes of their return, length and every number of the last info."""
+    """Means over episodes of return, length and every number in the last info."""
     figures = {
         "return": float(np.mean([record["episode"]["r"] for record in records])),
         "length": float(np.mean([record["episode"]["l"] for record in records])),

@@ -1,4 +1,4 @@
-"""What networks see of long observations."""
+"""Feature extractors: the part of a long observation that a network reads."""
 
 import math
 
@@ -6,18 +6,15 @@ import gymnasium as gym
 import torch
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-# Entries of Palpate-v0's observation before the memory's grids, and behind them.
-BEFORE, BEHIND = 10, 3
-# Of the former: the tip's place and the force along z.
-SEEN = (0, 1, 2, 8)
+from surgsim_env.tasks.palpate import PalpateTask
 
 
 class MemorySummary(BaseFeaturesExtractor):
     """Of Palpate-v0 with memory: the tip's place, the force along z, the marks of the corners, the stiffest place.
 
-    Velocity, friction, time and the other marks are left out: they tell what was done last, and a network that is
-    taught what an expert does learns to do that again instead (de Haan, Jayaraman & Levine 2019, "Causal confusion in
-    imitation learning"); with them it came to stand still between rows.
+    Velocity, friction, time and the other marks are left out: they reveal the last action, and a cloned network learns
+    to repeat it (de Haan, Jayaraman & Levine 2019, "Causal confusion in imitation learning"); with them it stopped
+    between rows.
     """
 
     def __init__(self, observation_space: gym.Space) -> None:
@@ -28,16 +25,18 @@ class MemorySummary(BaseFeaturesExtractor):
         """
         assert observation_space.shape is not None
         length = observation_space.shape[0]
-        site_count = (length - BEFORE - BEHIND) // 2
+        site_count = (length - observation_length(0)) // 2
         side = math.isqrt(max(site_count, 0))
-        if site_count < 1 or side**2 != site_count or length != BEFORE + 2 * site_count + BEHIND:
+        if site_count < 1 or side**2 != site_count or length != observation_length(site_count):
             raise ValueError(
                 f"an observation of {length} numbers is not that of Palpate-v0 with memory=True "
-                f"({BEFORE} + 2 side^2 + {BEHIND}): leave the features extractor out"
+                f"({observation_length(0)} + 2 side^2): leave the features extractor out"
             )
+        slices = PalpateTask.channel_slices(contrast=site_count, visited=site_count, stiffest=3)
         corners = (0, side - 1, site_count - side, site_count - 1)
-        marks = [BEFORE + site_count + corner for corner in corners]
-        entries = [*SEEN, *marks, *range(length - BEHIND, length)]
+        marks = [slices["visited"].start + corner for corner in corners]
+        stiffest = slices["stiffest"]
+        entries = [*place_and_force(slices), *marks, *range(stiffest.start, stiffest.stop)]
         super().__init__(observation_space, len(entries))
         self.entries: torch.Tensor
         self.register_buffer("entries", torch.tensor(entries))
@@ -48,7 +47,7 @@ class MemorySummary(BaseFeaturesExtractor):
 
 
 class PlaceAndForce(BaseFeaturesExtractor):
-    """Of Palpate-v0 without memory: the tip's place and the force along z, as `MemorySummary` says why."""
+    """Of Palpate-v0 without memory: the tip's place and the force along z, for the reason given in `MemorySummary`."""
 
     def __init__(self, observation_space: gym.Space) -> None:
         """Choose the entries.
@@ -56,15 +55,33 @@ class PlaceAndForce(BaseFeaturesExtractor):
         Raises:
             ValueError: an observation that is not Palpate-v0's without memory.
         """
-        if observation_space.shape != (BEFORE,):
+        length = max(part.stop for part in WITHOUT_MEMORY.values())
+        if observation_space.shape != (length,):
             raise ValueError(
                 f"an observation of shape {observation_space.shape} is not that of Palpate-v0 with memory=False "
-                f"({BEFORE},): leave the features extractor out"
+                f"({length},): leave the features extractor out"
             )
-        super().__init__(observation_space, len(SEEN))
+        entries = place_and_force(WITHOUT_MEMORY)
+        super().__init__(observation_space, len(entries))
         self.entries: torch.Tensor
-        self.register_buffer("entries", torch.tensor(SEEN))
+        self.register_buffer("entries", torch.tensor(entries))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """The chosen entries of normalised observations (n, 10)."""
         return observations[:, self.entries]
+
+
+# Channels of Palpate-v0's observation without memory.
+WITHOUT_MEMORY = PalpateTask.channel_slices(contrast=0, visited=0, stiffest=0)
+
+
+def observation_length(site_count: int) -> int:
+    """Length of Palpate-v0's observation with a memory of `site_count` sites."""
+    slices = PalpateTask.channel_slices(contrast=site_count, visited=site_count, stiffest=3)
+    return max(part.stop for part in slices.values())
+
+
+def place_and_force(slices: dict[str, slice]) -> list[int]:
+    """Entries of the tip's position and of the contact force along z."""
+    tip, force = slices["tip_position"], slices["contact_force"]
+    return [*range(tip.start, tip.stop), force.stop - 1]

@@ -1,6 +1,6 @@
-"""Policies as files: NAME.zip is stable-baselines3's, NAME.json says what it plays on and how it sees it.
+"""Policies as files: NAME.zip is stable-baselines3's, NAME.json states its environment and preprocessing.
 
-A zip holds pickles: load only those that you trust.
+A zip holds pickles: load only files that you trust.
 """
 
 import json
@@ -14,26 +14,27 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.site_belief import BeliefSettings, SiteBelief
+from agents.scoring.site_agent import SiteFacts
 from agents.training.algorithms import algorithm_class
+from agents.training.site_belief import SiteBelief
 from agents.training.wrappers import blinded
 
-# What VecNormalize adds to variances, and where it cuts, by default.
+# Defaults of VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8
 CUT = 10.0
 
 
 @dataclass(frozen=True)
 class PolicyDescription:
-    """What NAME.json holds.
+    """Content of NAME.json.
 
     Fields:
-        algorithm: the class that wrote NAME.zip
-        env_id, env_kwargs: what the policy plays on
-        action_repeat: control steps that one decision lasts
-        force_entries: entries of the observation that it sees as 0; empty for one that feels
-        belief: fields of `BeliefSettings` where it sees maps of belief and names a site; None otherwise
-        observation_mean, observation_variance: of the normalisation, None without one
+        algorithm: class of the model in NAME.zip
+        env_id, env_kwargs: environment of the policy
+        action_repeat: control steps per decision
+        force_entries: entries of the observation that are set to 0; empty for a policy with force
+        belief: fields of `SiteFacts` for a policy on belief maps whose action is a site's number; else None
+        observation_mean, observation_variance: of the normalisation; None without one
         trained_steps, seed, score: of its training
     """
 
@@ -51,7 +52,7 @@ class PolicyDescription:
 
 
 def describe(model: BaseAlgorithm, normalisation: VecNormalize | None, **fields: Any) -> PolicyDescription:
-    """The description of a model that sees observations through a normalisation; `fields` say the rest."""
+    """The description of a model with its normalisation; `fields` are the other entries."""
     if normalisation is not None and normalisation.norm_obs:
         statistics: Any = normalisation.obs_rms
         fields |= {"observation_mean": statistics.mean.tolist(), "observation_variance": statistics.var.tolist()}
@@ -59,7 +60,7 @@ def describe(model: BaseAlgorithm, normalisation: VecNormalize | None, **fields:
 
 
 class TrainedPolicy:
-    """A policy with its normalisation, its blindness and its action repeat: call it each control step.
+    """A policy with its preprocessing and action repeat; `act` is called each control step.
 
     policy = load_policy(Path("agents/policies/NAME.zip"))
     policy.reset(env_count)
@@ -69,18 +70,18 @@ class TrainedPolicy:
     def __init__(self, model: BaseAlgorithm, description: PolicyDescription) -> None:
         self.model = model
         self.description = description
-        self.belief = None if description.belief is None else SiteBelief(BeliefSettings(**description.belief))
+        self.belief = None if description.belief is None else SiteBelief(SiteFacts(**description.belief))
         self.reset(1)
 
     def reset(self, count: int) -> None:
-        """Begin episodes in so many environments."""
+        """Begin episodes in `count` environments."""
         self._state: Any = None
         self._since = np.zeros(count, dtype=np.int64)
         self._actions = np.zeros((count, *self._actions_of.shape), dtype=self._actions_of.dtype)
 
     @property
     def _actions_of(self) -> gym.spaces.Space:
-        """The space that actions are given in: the model's own, but for a site's number."""
+        """The action space: the model's own, or places for a model that returns a site's number."""
         return self.model.action_space if self.belief is None else self.belief.action_space
 
     def act(self, observations: NDArray[Any], begins: NDArray[np.bool_], *, deterministic: bool = True) -> NDArray:
@@ -100,7 +101,7 @@ class TrainedPolicy:
         return self._actions.copy()
 
     def seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
-        """Observations as the network takes them: blinded, then as belief, then normalised."""
+        """Observations as the network reads them: force removed, then belief maps, then normalised."""
         one = self.description
         values = blinded(observations, one.force_entries) if one.force_entries else observations
         if self.belief is not None:
@@ -133,12 +134,12 @@ def load_policy(path: Path) -> TrainedPolicy:
 
 
 def read_description(path: Path) -> PolicyDescription:
-    """What NAME.json says."""
+    """Read NAME.json."""
     return PolicyDescription(**json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
 
 
 def _updated(before: Any, after: Any, deciding: NDArray[np.bool_]) -> Any:
-    """The recurrent state (layers, n, size) of those that decided, the former of the others."""
+    """The recurrent state (layers, n, size): new where a decision was made, unchanged elsewhere."""
     if after is None or before is None or deciding.all():
         return after
     return tuple(np.where(deciding[None, :, None], new, old) for old, new in zip(before, after, strict=True))

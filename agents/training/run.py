@@ -1,4 +1,4 @@
-"""One training run in its folder: begun, or gone on with from its last whole checkpoint."""
+"""A training run in its folder, new or resumed from its last complete checkpoint."""
 
 import json
 import math
@@ -14,11 +14,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.training.algorithms import algorithm_class, keywords, policy_class
 from agents.training.config import TrainingConfig, config_text
-from agents.training.environments import belief_settings, force_entries, make_environments, normalized, training_seed
+from agents.training.environments import belief_facts, force_entries, make_environments, normalized, training_seed
 from agents.training.policy_files import PolicyDescription, describe, load_policy
 from agents.training.whole_folders import keep_newest, whole_folders, write_file, write_folder
 
-# The observations that a warm start's mean and variance count for: new ones hardly move what the policy was cloned on.
+# Sample count of a warm start's normalisation: so large that new observations hardly change it.
 WARM_COUNT = 1e9
 
 
@@ -26,11 +26,11 @@ class Run:
     """The algorithm, its environments and its folder.
 
     The folder holds config.yaml, checkpoints/STEPS/, best/STEPS/ (policy.zip and policy.json), evaluations.csv, one
-    progress csv and one TensorBoard file for each start, and when the run is over final/STEPS/.
+    progress csv and one TensorBoard file for each start, and at the end final/STEPS/.
     """
 
     def __init__(self, config: TrainingConfig, folder: Path) -> None:
-        """Begin a run, or go on where its folder's last whole checkpoint left it.
+        """Begin a run, or resume it from its folder's last complete checkpoint.
 
         Raises:
             ValueError: the folder holds a run with another configuration.
@@ -52,7 +52,7 @@ class Run:
         return self.model.get_vec_normalize_env()
 
     def description(self, score: float | None = None) -> PolicyDescription:
-        """The policy as it is now, in words."""
+        """The description of the current policy."""
         settings = self.config.environment
         return describe(
             self.model,
@@ -61,14 +61,14 @@ class Run:
             env_kwargs=settings.kwargs,
             action_repeat=settings.action_repeat,
             force_entries=self.blind_entries,
-            belief=asdict(belief_settings(self.bare)) if settings.belief else None,
+            belief=asdict(belief_facts(self.bare)) if settings.belief else None,
             trained_steps=self.model.num_timesteps,
             seed=self.config.seed,
             score=score,
         )
 
     def save_checkpoint(self, notes: dict) -> None:
-        """Write what goes on from here: model, normalisation, replay buffer, and the callbacks' own notes."""
+        """Write a checkpoint: model, normalisation, replay buffer, and the callbacks' notes."""
 
         def fill(folder: Path) -> None:
             self.model.save(folder / "model.zip")
@@ -83,7 +83,7 @@ class Run:
         keep_newest(place, self.config.checkpoint.keep)
 
     def notes(self) -> dict:
-        """What the callbacks noted at the checkpoint that the run goes on from; empty for a new one."""
+        """The callbacks' notes in the checkpoint that the run was resumed from; empty for a new run."""
         if self.resumed_from is None:
             return {}
         return json.loads((self.resumed_from / "notes.json").read_text(encoding="utf-8"))
@@ -92,7 +92,7 @@ class Run:
         self.folder.mkdir(parents=True, exist_ok=True)
         file, text = self.folder / "config.yaml", config_text(self.config)
         if file.exists():
-            # A run may be made longer.
+            # A run may be extended.
             old, new = (
                 {line for line in one.splitlines() if not line.startswith("total_steps")}
                 for one in (file.read_text(encoding="utf-8"), text)
@@ -117,10 +117,10 @@ class Run:
         return model
 
     def _warm(self, model: BaseAlgorithm, path: Path) -> None:
-        """Take over a policy's weights and normalisation.
+        """Copy a policy's weights and normalisation.
 
         Raises:
-            ValueError: it was made for other networks, or with a normalisation that this run lacks, or the reverse.
+            ValueError: other networks, or only one of policy and run has a normalisation.
         """
         warm = load_policy(path)
         try:
@@ -156,13 +156,13 @@ class Run:
             assert isinstance(model, OffPolicyAlgorithm)
             model.load_replay_buffer(saved / "replay_buffer.pkl")
         elif isinstance(model, OffPolicyAlgorithm):
-            # Nothing to learn from yet: it is filled anew before learning goes on.
+            # The buffer is empty: it is filled before training continues.
             model.learning_starts += model.num_timesteps
         envs.seed(training_seed(self.config.seed, model.num_timesteps))
         return model
 
     def _logger(self) -> Logger:
-        """One progress file for each start: the steps that it begins with are in its name."""
+        """A logger with one progress file for each start, named by its first step."""
         start = f"_{self.model.num_timesteps:012d}"
         kinds = ("csv", "tensorboard")
         return Logger(str(self.folder), [make_output_format(kind, str(self.folder), start) for kind in kinds])

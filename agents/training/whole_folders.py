@@ -1,4 +1,4 @@
-"""Folders and files that are whole or absent: written under another name, synced, then renamed."""
+"""Atomic writes of folders and files: written under another name, synced, then renamed."""
 
 import os
 import shutil
@@ -9,10 +9,9 @@ UNFINISHED = ".unfinished"
 
 
 def write_folder(parent: Path, name: str, fill: Callable[[Path], None]) -> Path:
-    """Have `fill` write the files of a new folder; it gets its name when all are on the disk.
+    """Let `fill` write the files of a new folder, which gets its name when all are on the disk.
 
-    A kill at any moment leaves the folder whole or absent: what is unfinished bears another name, and the next call
-    removes it.
+    After a kill at any moment the folder is complete or absent; the next call removes an unfinished one.
     """
     parent.mkdir(parents=True, exist_ok=True)
     for leftover in parent.glob(f"*{UNFINISHED}"):
@@ -31,7 +30,7 @@ def write_folder(parent: Path, name: str, fill: Callable[[Path], None]) -> Path:
 
 
 def write_file(file: Path, text: str) -> None:
-    """Write a file that is the former or the new one at any moment."""
+    """Write a file atomically."""
     unfinished = file.with_name(file.name + UNFINISHED)
     unfinished.write_text(text, encoding="utf-8")
     _sync(unfinished)
@@ -50,7 +49,7 @@ def keep_newest(parent: Path, count: int) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Rename it first, so that none is ever half there under its name."""
+    """Remove a folder; it is renamed first, so that no incomplete folder has its name."""
     doomed = folder.with_name(f"{folder.name}.old{UNFINISHED}")
     os.replace(folder, doomed)
     shutil.rmtree(doomed)

@@ -1,4 +1,4 @@
-"""Wrappers of stable-baselines3's vector environments that training needs: repeats, blindness to force, figures."""
+"""Wrappers of stable-baselines3's vector environments: action repeat, removal of force, episode figures."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 class RepeatedAction(VecEnvWrapper):
     """One decision lasts `count` control steps; their rewards are summed.
 
-    Where an episode ends within a decision, its environment, which has begun the next episode, is told zeros for what
-    is left of the decision; the rewards of those steps count for the next episode.
+    If an episode ends within a decision, its environment, which has begun the next episode, gets zero actions for the
+    rest of the decision; the rewards of those steps count for the next episode.
     """
 
     def __init__(self, envs: VecEnv, count: int) -> None:
@@ -26,7 +26,7 @@ class RepeatedAction(VecEnvWrapper):
         return self.venv.reset()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions (n_env, n_action) for `step_wait`."""
+        """Store the actions (n_env, n_action) for `step_wait`."""
         self._actions = np.array(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -38,7 +38,7 @@ class RepeatedAction(VecEnvWrapper):
             observation, reward, done, infos = self.venv.step(self._actions)
             total += np.where(over, 0.0, reward)
             self._carried += np.where(over, reward, 0.0)
-            # An episode that ends in the zeros after another one is over would be lost: no task ends so soon.
+            # An episode that ended during these zero actions would be lost, but no task ends so soon.
             for index in np.flatnonzero(done & ~over):
                 ended[int(index)] = infos[index]
             over |= done
@@ -48,7 +48,7 @@ class RepeatedAction(VecEnvWrapper):
 
 
 class WithoutForce(VecEnvWrapper):
-    """Observations whose entries that come from the force sensor are 0."""
+    """Observations with the entries of the force sensor set to 0."""
 
     def __init__(self, envs: VecEnv, entries: Sequence[int]) -> None:
         super().__init__(envs)
@@ -68,7 +68,7 @@ class WithoutForce(VecEnvWrapper):
 
 
 class EpisodeMonitor(VecMonitor):
-    """Return, length and success of finished episodes, where stable-baselines3 logs them from."""
+    """Reports return, length and success of finished episodes to stable-baselines3's logger."""
 
     def step_wait(self) -> VecEnvStepReturn:
         """One step of all."""
@@ -80,7 +80,7 @@ class EpisodeMonitor(VecMonitor):
 
 
 def blinded(observation: VecEnvObs, entries: Sequence[int]) -> np.ndarray:
-    """A copy of observations (..., n) with some entries 0."""
+    """A copy of observations (..., n) with some entries set to 0."""
     seen = np.array(observation)
     seen[..., list(entries)] = 0.0
     return seen

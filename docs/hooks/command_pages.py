@@ -1,4 +1,4 @@
-"""`<!-- commands -->` in a page becomes what `surgsim --help` says of itself and of each command."""
+"""Replaces `<!-- commands -->` in a page by the help texts of `surgsim` and each of its commands."""
 
 import contextlib
 import html
@@ -12,12 +12,12 @@ from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
 MARK = "<!-- commands -->"
-# Wide enough for each option to stand on one line.
+# Wide enough for each option to be on one line.
 COLUMNS = {"COLUMNS": "4000"}
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Fill the mark in."""
+    """Replace the mark."""
     return markdown.replace(MARK, command_list()) if MARK in markdown else markdown
 
 
@@ -30,8 +30,8 @@ def command_list() -> str:
 
 
 def said(*arguments: str) -> str:
-    """What the command line prints, in one line for each option."""
-    from surgsim_env.cli import main
+    """The output of the command line, with one line for each option."""
+    from surgsim_env.cli.main import main
 
     printed = io.StringIO()
     with mock.patch.dict(os.environ, COLUMNS), contextlib.redirect_stdout(printed):
@@ -58,7 +58,7 @@ def _parts(text: str) -> tuple[str, str, list[tuple[str, list[tuple[str, str]]]]
 
 
 def _rows(body: str) -> list[tuple[str, str]]:
-    """What a box has: options, and what is told of each in its line or in those below, which stand farther in."""
+    """The rows of a box: options, and their help on the same line or on the indented lines below."""
     rows: list[tuple[str, str]] = []
     for line in body.splitlines():
         content = line.strip("│╰╯").rstrip()
@@ -70,7 +70,7 @@ def _rows(body: str) -> list[tuple[str, str]]:
         elif rows:
             what, told = rows[-1]
             rows[-1] = (what, f"{told} {content.strip()}".strip())
-    # tyro writes what may be left out as {None}|PATH ... (default: None).
+    # tyro marks optional values as {None}|PATH ... (default: None).
     none = re.compile(r"\{None\}\||\s*\(default: (?:None)?\)")
     return [(none.sub("", what), none.sub("", told)) for what, told in rows if what != "-h, --help"]
 
@@ -84,5 +84,5 @@ def _code(text: str) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text for a table's cell: no bar ends it, no option's two dashes become one."""
+    """Text for a table cell, with bars and the dashes of options escaped."""
     return re.sub(r"(?<![\w`-])(--[\w-]+)", r"`\1`", text.replace("|", "&#124;"))

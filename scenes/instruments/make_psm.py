@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Write `psm_palpator.xml`, `psm_grasper.xml`, `psm_retractor.xml`: a da Vinci-like arm with three tools of our own.
 
-Kinematics, limits and efforts come from the one table in `surgsim_env/arms/psm.py`; masses, servos and shapes are
-this project's own. The remote centre is held by an arc about it, on which a carriage with the insertion's rail runs: a
-mechanism without idle joints. Parts are drawn where they stand in the port's frame with all joints at 0 (the shaft
-along z, the remote centre at 0, the patient below) and written in their links' frames.
+Kinematics, limits and efforts come from the one table in `surgsim_env/instruments/arm/psm.py`; masses, servos and
+shapes are this project's own. The remote centre is held by an arc about it, on which a carriage with the insertion's
+rail runs: a mechanism without idle joints. Parts are drawn where they stand in the port's frame with all joints at 0
+(the shaft along z, the remote centre at 0, the patient below) and written in their links' frames.
 
     python scenes/instruments/make_psm.py [folder]
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surgsim_env.arms.psm import JAW_EFFORT, JAW_RANGE, PSM_LINKS, TIP_ROTATION, psm_frames
+from surgsim_env.instruments.arm.psm import JAW_EFFORT, JAW_RANGE, PSM_LINKS, TIP_ROTATION, psm_frames
 
 # Mass [kg], its centre at joints 0 in the port's frame [m], moments of inertia in the link's frame [kg m^2].
 INERTIA = {
@@ -75,8 +75,11 @@ def quaternion(rotation) -> str:
             [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
         ]
     )
-    value = np.linalg.eigh(k)[1][:, -1]
-    return numbers(np.round(value if value[np.argmax(np.abs(value))] > 0.0 else -value, 15))
+    value = np.round(np.linalg.eigh(k)[1][:, -1], 15)
+    # Both signs are the same rotation, and LAPACK's choice depends on the machine. Here the first of x, y, z that is
+    # not 0 is positive.
+    first = np.flatnonzero(value[1:])
+    return numbers(value * np.sign(value[1:][first[0]] if len(first) else value[0]))
 
 
 def local(link: str, point) -> str:
@@ -284,8 +287,8 @@ def model(tool: str) -> str:
     return HEAD.format(tool=tool) + "\n".join(lines) + middle + "\n".join(actuators) + TAIL
 
 
-HEAD = """<!-- A da Vinci-like arm (PSM) with a {tool}. Written by make_psm.py from surgsim_env/arms/psm.py: change it
-     there. The world's origin is the remote centre, -z points into the patient.
+HEAD = """<!-- A da Vinci-like arm (PSM) with a {tool}. Written by make_psm.py from surgsim_env/instruments/arm/psm.py:
+     change it there. The world's origin is the remote centre, -z points into the patient.
      Groups: 1 seen only, 2 outer links, 3 felt by tissue. -->
 <mujoco model="psm_{tool}">
   <compiler angle="radian" autolimits="true"/>

@@ -1,4 +1,4 @@
-"""Control steps a second of the palpation environment: one, and many in vector environments."""
+"""Control steps a second of the palpation environment, alone and in vector environments."""
 
 import time
 from collections.abc import Callable
@@ -9,10 +9,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.bench.effort import Effort
-from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
-from surgsim_env.bench.machine import core_count
-from surgsim_env.bench.statistics import median, spread
+from surgsim_env.bench.measurement import Effort, median, spread
+from surgsim_env.bench.report import AbsentError, Figure, Section, absent, core_count
 
 SCENE = "phantom"
 ENV_ID = "SurgSim/Palpate-v0"
@@ -27,15 +25,23 @@ organs a group in float64, 16 in float32, a thread a group; {{cores}} cores here
 
 def make_env() -> gym.Env:
     """One environment of the benchmark."""
-    import surgsim_env  # noqa: F401  registers the ids, also in a process of its own
-
+    # The import of this package has registered the id, also in a process of its own.
     return gym.make(ENV_ID, scene=SCENE)
 
 
-def stroke(observation: NDArray[Any], step: int) -> NDArray[np.float32]:
-    """Actions for observations (..., 10): down until 0.1 N, then to and fro."""
+def contact_force() -> slice:
+    """The entries of an observation that are the contact force."""
+    env = make_env()
+    try:
+        return env.unwrapped.observation_slices["contact_force"]  # type: ignore[attr-defined]
+    finally:
+        env.close()
+
+
+def stroke(observation: NDArray[Any], force: slice, step: int) -> NDArray[np.float32]:
+    """Actions for observations (..., n): down until 0.1 N, then to and fro."""
     action = np.zeros((*observation.shape[:-1], 4), dtype=np.float32)
-    touching = np.linalg.norm(observation[..., 6:9], axis=-1) > 0.1
+    touching = np.linalg.norm(observation[..., force], axis=-1) > 0.1
     action[..., 2] = np.where(touching, 0.0, -1.0)
     action[..., 0] = np.where(touching, 0.25 * (-1) ** step, 0.0)
     return action
@@ -50,7 +56,7 @@ class One:
         self.env = make_env()
 
     def reset(self, *, seed: int) -> tuple[Any, Any]:
-        """Start an episode."""
+        """Begin an episode."""
         return self.env.reset(seed=seed)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, ...]:
@@ -59,7 +65,7 @@ class One:
         return (self.env.reset()[0], *result[1:]) if result[2] or result[3] else result
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Close the environment."""
         self.env.close()
 
 
@@ -75,18 +81,16 @@ def processes(count: int) -> Any:
 
 def abreast(count: int, dtype: Literal["float64", "float32"] = "float64") -> Any:
     """Environments side by side in vector registers, one process, a thread for each group of organs."""
-    from surgsim_env.vector_env import PalpateVectorEnv
-
-    return PalpateVectorEnv(count, scene=SCENE, dtype=dtype)
+    return gym.make_vec(ENV_ID, count, vectorization_mode="vector_entry_point", scene=SCENE, dtype=dtype)
 
 
 def one(count: int) -> Any:
-    """No vector environment around it; of one only."""
+    """A single environment without a vector environment around it."""
     assert count == 1
     return One()
 
 
-# A row each; a way that this version lacks raises AbsentError.
+# One row each; a way that this version lacks raises AbsentError.
 WAYS: dict[str, Callable[[int], Any]] = {
     "single": one,
     "in turn": in_turn,
@@ -98,21 +102,21 @@ WAYS: dict[str, Callable[[int], Any]] = {
 
 def rate(make: Callable[[], Any], steps: int) -> float:
     """Control steps a second, all environments together."""
-    envs = make()
+    envs, force = make(), contact_force()
     try:
         observation = envs.reset(seed=0)[0]
         for step in range(WARM_UP):
-            observation = envs.step(stroke(observation, step))[0]
+            observation = envs.step(stroke(observation, force, step))[0]
         begin = time.perf_counter()
         for step in range(steps):
-            observation = envs.step(stroke(observation, step))[0]
+            observation = envs.step(stroke(observation, force, step))[0]
         return envs.num_envs * steps / (time.perf_counter() - begin)
     finally:
         envs.close()
 
 
 def measure(effort: Effort) -> Section:
-    """The rate of every way and count."""
+    """The rates of all ways and numbers of environments."""
     section = Section("control_steps", "Control steps a second", METHOD.format(cores=core_count()))
     for count in effort.env_counts:
         steps = max(2, effort.control_steps // count)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.bench.effort import Cells
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.bench.measurement import Cells
 from surgsim_env.bench.presses import (
     DENSITY,
     MODULUS,
@@ -21,9 +21,9 @@ from surgsim_env.bench.presses import (
     step_count,
 )
 
-# Half thickness of flex vertices [m]: the ball meets the surface that much higher.
+# Half thickness of flex vertices [m]: the ball meets the surface higher by this.
 SKIN = 0.0005
-# Contact as hard as it gives without noise: penetration stays below 0.05 mm.
+# The hardest contact without noise: penetration stays below 0.05 mm.
 CONTACT = 'condim="1" solref="0.002 1" solimp="0.99 0.999 0.0001"'
 MODEL = """<mujoco>
 <option timestep="{dt}" integrator="{integrator}" solver="CG" iterations="{iterations}" tolerance="1e-8"
@@ -57,7 +57,7 @@ class Flex:
     iterations: int = 100
 
     def contender(self) -> Contender:
-        """Ready to press."""
+        """This setting, compiled and ready to press."""
         kind = "full" if self.trilinear is None else "trilinear " + "x".join(map(str, self.trilinear))
         model = self._compile()
         nodes, tets = self.grid[0] * self.grid[1] * self.grid[2], int(model.flex_elemnum[0])
@@ -86,7 +86,7 @@ class Flex:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         place = offset * SIZE[0] / (self.grid[0] - 1)
         steps = step_count(self.dt)
-        # Without a handler MuJoCo writes a log file where it stands.
+        # Without a handler MuJoCo writes a log file into the working folder.
         mujoco.set_mju_user_warning(lambda text: None)
         try:
             clock = Clock()

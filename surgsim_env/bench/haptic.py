@@ -1,22 +1,21 @@
-"""How long a haptic step takes on the clock while a scene's organ is pressed."""
+"""Wall-clock time of a haptic step while a scene's organ is pressed."""
 
 import time
 
 import numpy as np
 
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.bench.effort import Effort
-from surgsim_env.bench.figures import Figure, Section
-from surgsim_env.bench.statistics import quantile
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.bench.measurement import Effort, quantile
+from surgsim_env.bench.report import Figure, Section
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 
 SPEED = 0.04  # [m/s]
 # Haptic steps held at depth after each press.
 HOLD_COUNT = 100
 METHOD = """Wall clock of each haptic step (instrument, contact, substeps, exchange) in contact, while the scene's tip
 presses the scene's organ with its lesions at random places, to the scene's depth, and rests there. The worst shows
-what the system did meanwhile as much as what this program did; `processor` is the time of the processor alone, which
+other activity of the system as much as this program's; `processor` is the time of the processor alone, which
 other processes on the machine hardly change. Real time is the scene's haptic step of 1000 us."""
 
 
@@ -33,7 +32,7 @@ def measure(effort: Effort) -> Section:
 
 
 def press_times(scene_name: str, count: int) -> tuple[list[float], list[float], str]:
-    """Wall clock and processor time of at least `count` haptic steps in contact [s], and what was pressed."""
+    """Wall-clock and processor times of at least `count` haptic steps in contact [s], and a note on the organ."""
     scene = make_scene(scene_name)
     anatomy = load_anatomy(scene)
     simulation = Simulation(anatomy)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from surgsim_env.bench.effort import Cells
-from surgsim_env.bench.figures import AbsentError
+from surgsim_env.bench.measurement import Cells
 from surgsim_env.bench.presses import (
     DENSITY,
     MODULUS,
@@ -24,6 +23,7 @@ from surgsim_env.bench.presses import (
     ball_height,
     step_count,
 )
+from surgsim_env.bench.report import AbsentError
 
 SKIN = 0.0005  # [m] radius of a particle: the ball meets the surface that much higher
 CONTACT = 2e3  # [N/m] per particle; penetration 0.05 mm

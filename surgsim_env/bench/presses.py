@@ -1,4 +1,4 @@
-"""The press that every simulator is put to: a ball on a bonded block, the elements' force, this project's."""
+"""The press on which simulators are compared, a ball on a bonded block: reference force and this project's press."""
 
 import time
 from collections.abc import Callable
@@ -7,12 +7,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.kernels import OrganModel
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.bench.effort import Cells
-from surgsim_env.palpation.scan import press
-from surgsim_env.scenes import BlockMesh, MeshSource, make_scene
-from surgsim_env.simulation import Simulation
+from msdm_core.kernels.structure_kernels import OrganModel
+from surgsim_env.bench.measurement import Cells
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.palpation.press import press
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import BlockMesh, MeshSource
 from surgsim_env.validation.layer_fem import ball_force, layer
 from surgsim_env.validation.punch import DISC
 
@@ -20,14 +21,14 @@ SIZE = (0.06, 0.06, 0.03)  # [m] of the block, x and y around 0, bottom at z = 0
 MODULUS, POISSON, DENSITY = 5000.0, 0.45, 1060.0
 RADIUS, DEPTH = 0.008, 0.004  # [m] of the ball, of the press
 SPEED, HOLD = 0.04, 0.1  # [m/s] on the way in, [s] at depth
-# So stiff a contact [N/m^3] is rigid to 0.4 % of the force.
+# A contact of this stiffness [N/m^3] is rigid to 0.4 % of the force.
 RIGID = 2e9
 # Where the ball is pressed: over the block's middle, and half a cell of the simulator's own mesh to its side.
 PLACES = (0.0, 0.5)
 
 
 class DivergedError(Exception):
-    """A peer's simulation came to grief; the message says how."""
+    """A peer's simulation diverged; the message says how."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +48,16 @@ class Clock:
         self._begin = time.perf_counter(), time.process_time()
 
     def read(self) -> tuple[float, float]:
-        """Seconds of the one and the other."""
+        """Wall clock and processor time [s]."""
         return time.perf_counter() - self._begin[0], time.process_time() - self._begin[1]
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A simulator at one setting: its name, what it is set to, its mesh, and how it presses.
+    """A simulator at one setting: its name, its settings and mesh in words, and its press.
 
     `press(offset)` takes the ball's place in cells of its own mesh, the same along x and y. `contact` is the stiffness
-    of contact [N/m^3] of the reference that its force is held against.
+    of contact [N/m^3] of the reference that its force is compared with.
     """
 
     name: str
@@ -72,7 +73,7 @@ def ball_height(when: float) -> float:
 
 
 def step_count(dt: float) -> int:
-    """How many steps of dt [s] a press takes."""
+    """Number of steps of dt [s] in a press."""
     return round((DEPTH / SPEED + HOLD) / dt)
 
 
@@ -84,13 +85,13 @@ def reference_force(contact: float) -> float:
 
 
 def organ_press(cells: Cells) -> Contender:
-    """This project: the scene `phantom` without its lesion, the whole product with its instrument in MuJoCo."""
+    """This project: the scene `phantom` without its lesion, end to end with its instrument in MuJoCo."""
     scene = make_scene("phantom")
     scene = replace(scene, mesh=MeshSource(block=BlockMesh(SIZE, cells)))
     anatomy = load_anatomy(scene)
     organ = anatomy.organ()
     simulation = Simulation(anatomy)
-    # Compiles, or reads what was compiled.
+    # Compiles the kernels, or loads them from the cache.
     _press_organ(simulation, organ, 0.0)
     timing = scene.timing
     return Contender(

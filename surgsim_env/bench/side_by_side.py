@@ -4,19 +4,17 @@ import importlib.util
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from surgsim_env.bench.effort import Effort
-from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
 from surgsim_env.bench.flex import Flex, fastest_within, longest_explicit
-from surgsim_env.bench.limits import LIMITS
+from surgsim_env.bench.measurement import Effort, median, spread
 from surgsim_env.bench.newton_peer import Newton
 from surgsim_env.bench.presses import PLACES, Contender, DivergedError, organ_press, reference_force
-from surgsim_env.bench.statistics import median, spread
+from surgsim_env.bench.report import AbsentError, Figure, Section, absent
 
 # Flex at its own fastest step stays within this share of its force at 1 ms.
 SHARE = 0.02
-# What takes longer than this in a round [s] is not repeated.
+# A round that takes longer than this [s] is not repeated.
 LONGEST_ROUND = 60.0
-NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] the explicit solver's, the longest that bears the press is taken
+NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] the explicit solver's, the longest that is stable in the press is used
 METHOD = """One press of a frictionless ball of 8 mm, 4 mm deep at 40 mm/s and 0.1 s of rest, on a block of
 60 x 60 x 30 mm, E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each
 round. `wall` and `processor` are seconds of wall clock and of processor time per simulated second (1 is real time),
@@ -33,7 +31,7 @@ FORCE, ERROR = ("force", "N"), ("error", "%")
 
 @dataclass
 class Tally:
-    """What a contender's presses took and gave."""
+    """Times and forces of a contender's presses."""
 
     contender: Contender
     walls: list[float] = field(default_factory=list)
@@ -62,7 +60,7 @@ class Tally:
 
 
 def measure(effort: Effort) -> Section:
-    """All contenders that are here, round by round; those that are not are named with the reason."""
+    """All contenders that are installed, round by round; the others are listed with the reason."""
     references = "scikit-fem is absent, no error is given"
     if importlib.util.find_spec("skfem") is not None:
         references = f"{reference_force(organ_press(effort.organ_cells).contact):.4f} N with this project's contact "
@@ -102,7 +100,7 @@ def _compiled(flex: Flex) -> Contender:
 
 
 def _fastest(grid: tuple[int, int, int], effort: Effort) -> Contender:
-    """Flex at the step that is fastest while its force stays near that of 1 ms."""
+    """Flex at the fastest step whose force stays near that at 1 ms."""
     base = Flex(grid)
     force = _compiled(base).press(0.0).force
     best, tried = fastest_within(base, force, effort.longer_steps, SHARE)
@@ -116,7 +114,7 @@ def _fastest(grid: tuple[int, int, int], effort: Effort) -> Contender:
 
 
 def _newton_explicit(grid: tuple[int, int, int]) -> Contender:
-    """Newton's explicit solver at the longest step that bears the press."""
+    """Newton's explicit solver at the longest step that is stable in the press."""
     tried = []
     for dt in NEWTON_STEPS:
         contender = Newton(grid, "explicit", dt).contender()
@@ -149,3 +147,24 @@ def _figures(tally: Tally, own: Tally) -> list[Figure]:
         error = 100.0 * (force / reference_force(contender.contact) - 1.0)
         figures.append(Figure(contender.name, ERROR[0], error, ERROR[1]))
     return figures
+
+
+# From running the two that are measured (mujoco 4.0.0, newton 1.8.0), from the others' repositories and threads.
+LIMITS = """### What each can give
+
+| simulator | moduli per region | tool force in newtons | Gymnasium environment of a soft organ | source |
+|---|---|---|---|---|
+| surgsim | per tet: capsule, lesions, tags | wrench on each tool, every 1 ms | yes | this repository |
+| MuJoCo flex | no: `young` is one number a flex (elements' stiffness is writable after compilation, \
+undocumented) | yes: sum of `mj_contactForce`; none with passive contact | no | run here; XML reference, `elasticity` |
+| Newton, explicit | per tet | `body_f` of a body without joints; contact at particles only, not on faces | no \
+| run here |
+| Newton, vbd | per tet | `contact_f` observable | no | run here; Newton #3052 on deformable contact force |
+| Isaac Lab | one a body | no: 0 for rigid-deformable contact, closed as not planned | yes, \
+no soft organ in its surgical tasks | IsaacLab #806, #4290 |
+| sofa_env (LapGym) | one a body | no: sum of internal forces, scaled by 1e-9 | yes, one simulation a process | \
+ScheiklP/sofa_env 85bf7e0 |
+| PyBullet soft bodies | one a body | no: the normal force is always 1 | no | bullet3 #4406, #3326, #4333 |
+| FF-SRL | one a mesh | no | no, two demonstrations | SanoScience/FF-SRL 1036742 |
+
+Only the first four were run here; the others are read from their code and threads, and may have moved since."""

@@ -1,4 +1,4 @@
-"""How long a first step takes from a fresh interpreter, cold and warm, and what another environment costs in memory."""
+"""Time from a fresh interpreter to the first step, cold and warm; memory of a further environment."""
 
 import os
 import subprocess
@@ -6,12 +6,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from surgsim_env.bench.effort import Effort
-from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
-from surgsim_env.bench.statistics import median, spread
+from surgsim_env.bench.measurement import Effort, median, spread
+from surgsim_env.bench.report import AbsentError, Figure, Section, absent
 
 SCENE = "phantom"
-# A process that hangs is given up after so long [s].
+# A process that hangs is stopped after this time [s].
 LIMIT = 600.0
 METHOD = f"""A fresh interpreter from its first import to the end of the first `step` of `SurgSim/Palpate-v0` on
 `{SCENE}`; cold is with an empty numba cache, warm with a full one. Memory is the growth of the process (resident set)
@@ -72,7 +71,7 @@ def measure(effort: Effort) -> Section:
 def _memory(count: int) -> Figure:
     case, quantity = "memory", "per further env"
     if not Path("/proc/self/statm").is_file():
-        return absent(case, quantity, "MB", "only measured where /proc tells the resident set (Linux)")
+        return absent(case, quantity, "MB", "only measured where /proc has the resident set (Linux)")
     try:
         growth = printed_number(GROWTH.format(count=count))
     except AbsentError as why:

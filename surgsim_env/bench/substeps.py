@@ -1,25 +1,23 @@
-"""What one substep of an organ costs against its number of nodes: springs, volume term and integration."""
+"""Time of one substep of an organ against its number of nodes: springs, volume term and integration."""
 
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import FAULT_NONE, OrganModel
-from msdm_core.lane_organs import stack_organs
-from msdm_core.lanes import advance_lanes, rest_lanes, stack_shapes
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Material
-from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
-from msdm_core.vector import lane_counts
-from surgsim_env.bench.effort import Cells, Effort
-from surgsim_env.bench.figures import AbsentError, Figure, Section, absent
-from surgsim_env.bench.statistics import exponent, interleaved, median, seconds_per_call, spread
+from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel
+from msdm_core.kernels.vector_kernels import lane_counts
+from msdm_core.lanes.lane_organs import stack_organs
+from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_shapes
+from msdm_core.material.regions import Damping, Material
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+from surgsim_env.bench.measurement import Cells, Effort, exponent, interleaved, median, seconds_per_call, spread
+from surgsim_env.bench.report import AbsentError, Figure, Section, absent
 
 CELL = 0.005  # [m]
-# The exponent is that of blocks from so many nodes on: below, calls and start-up count.
+# The exponent is that of blocks with at least this number of nodes: in smaller ones calls and start-up dominate.
 LEAST_NODES = 600
 METHOD = """Blocks of cubic 5 mm cells, E 5 kPa, nu 0.45, springs and volume term, no contact, one thread, bottom held,
 slightly sheared so that every force is at work. Microseconds of processor time per substep AND organ; medians, all
@@ -44,7 +42,7 @@ def single(model: OrganModel) -> Substep:
 
     def advance(count: int) -> None:
         if advance_organ(model, state, NO_SHAPES, NO_CONTACT, dt, count, wrench) != FAULT_NONE:
-            raise ValueError("the block that is timed came to grief: its substeps mean nothing")
+            raise ValueError("the timed block diverged: its times are not valid")
 
     advance(3)
     return lambda: seconds_per_call(advance)
@@ -60,13 +58,13 @@ def abreast(model: OrganModel, dtype: type = np.float64) -> Substep:
 
     def advance(count: int) -> None:
         if (advance_lanes(organs, state, shapes, NO_CONTACT, dt, count, wrench) != FAULT_NONE).any():
-            raise ValueError("the blocks that are timed came to grief: their substeps mean nothing")
+            raise ValueError("the timed blocks diverged: their times are not valid")
 
     advance(3)
     return lambda: seconds_per_call(advance) / lanes
 
 
-# Ways of stepping: a column each. A way that this version or machine lacks raises AbsentError.
+# Ways of stepping, one column each. A way that this version or machine lacks raises AbsentError.
 WAYS: dict[str, Callable[[OrganModel], Substep]] = {
     "single": single,
     "8 abreast": abreast,
@@ -75,7 +73,7 @@ WAYS: dict[str, Callable[[OrganModel], Substep]] = {
 
 
 def measure(effort: Effort) -> Section:
-    """The cost of a substep for every block and way, and how it grows."""
+    """The cost of a substep for every block and way, and its growth with the number of nodes."""
     section = Section("substep", "Substep cost against node count", METHOD)
     models = {f"{len(model.node_mass)} nodes": model for model in map(block, effort.blocks)}
     runs: dict[str, Substep] = {}

@@ -1,23 +1,23 @@
-"""The spring and damper between a device and the instrument's tip, and how stiff they may be."""
+"""The spring and damper between a device and the instrument's tip, and the limit of their stiffness."""
 
 import math
 from dataclasses import dataclass
 
 from surgsim_env.haptics.device import DeviceDynamics, require_positive
 
-# What a coupling chosen for a device takes of the largest stiffness, and its damping of the device's.
+# Stiffness of a default coupling as a share of the limit, and its damping as a share of the device's.
 STIFFNESS_SHARE = 0.8
 DAMPING_SHARE = 0.25
-# The stiffness chosen where no device's damping limits it [N/m]: soft enough to let a probe lag by a millimetre or two.
+# Default stiffness if no device's damping limits it [N/m]: a probe then lags by a millimetre or two.
 STIFFNESS_FREE = 500.0
 
 
 @dataclass(frozen=True)
 class VirtualCoupling:
-    """F = K e + B de/dt, e from the tip to the device: on the tip as it is, on the device turned round.
+    """F = K e + B de/dt on the tip and -F on the device, with e from the tip to the device.
 
     (Virtual coupling: Colgate, Stanley & Brown 1995, "Issues in the haptic display of tool use".) de/dt is the
-    difference of two haptic steps.
+    difference quotient of two haptic steps.
 
     Args:
         stiffness: K [N/m].
@@ -38,23 +38,23 @@ class VirtualCoupling:
 
 @dataclass(frozen=True)
 class TipDynamics:
-    """What a coupling pulls at: mass of the instrument's tip where it is lightest [kg], its damping [N s/m]."""
+    """Smallest apparent mass of the instrument's tip over all directions [kg], and its damping [N s/m]."""
 
     mass: float
     damping: float
 
 
 def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, haptic_step: float) -> float:
-    """The stiffest coupling that takes energy and gives none, whatever hand and organ do [N/m]; 0 if there is none.
+    """The stiffest coupling that is passive for any hand and organ [N/m]; 0 if there is none.
 
-    A force held for T while device and tip move by T v_d and T v_t (velocities of one step) differs from the spring's
-    own; what that adds in a step is at most T (K T / 2 + |B|) (|v_d| + |v_t|)^2, and a lag of L between pose and force
-    on the device's side adds T K L (|v_d| + |v_t|) |v_d|. Device and tip take b_d T v_d^2 and b_t T v_t^2, which is
-    never less where, with S = K T / 2 + |B| and D = K L,
+    A force held for T while device and tip move by T v_d and T v_t (velocities of one step) differs from the spring's;
+    the difference adds at most T (K T / 2 + |B|) (|v_d| + |v_t|)^2 of energy per step, and a lag L between pose and
+    force on the device's side adds T K L (|v_d| + |v_t|) |v_d|. Device and tip dissipate b_d T v_d^2 and b_t T v_t^2.
+    That suffices if, with S = K T / 2 + |B| and D = K L,
 
         (b_d - S - D) (b_t - S) >= (S + D / 2)^2,    S <= b_t.
 
-    With a tip that stands still (b_t to infinity) that is K <= 2 (b_d - |B|) / (T + 2 L): Colgate & Schenkel 1997,
+    For a tip at rest (b_t to infinity) this is K <= 2 (b_d - |B|) / (T + 2 L): Colgate & Schenkel 1997,
     "Passivity of a class of sampled-data systems", and each sample of lag costs K T of damping.
 
     Args:
@@ -70,16 +70,16 @@ def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, ha
         return 0.0
     slope = 0.5 * haptic_step * (mine + other) + lag * other
     bend = 0.25 * lag * lag
-    # The root in the form that holds for bend = 0.
+    # This form of the root is also valid for bend = 0.
     return 2.0 * rest / (slope + math.sqrt(slope * slope + 4.0 * bend * rest))
 
 
 def coupling_for(
     device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float, scale: float = 1.0
 ) -> VirtualCoupling:
-    """A coupling for a device: 0.8 of its limit, with a quarter of its damping in the coupling; else 500 N/m.
+    """The default coupling for a device: 0.8 of its limit with a quarter of its damping; without a device 500 N/m.
 
-    Where no device's damping limits it the damper is critical for the tip's mass, within what its step bears.
+    Without a device the damping is critical for the tip's mass, within the limit of the explicit step.
 
     Raises:
         ValueError: a device whose damping allows no coupling.
@@ -89,7 +89,7 @@ def coupling_for(
         return VirtualCoupling(stiffness, min(2.0 * math.sqrt(stiffness * tip.mass), 0.5 * tip.mass / haptic_step))
     felt = TipDynamics(tip.mass * scale, tip.damping * scale)
     damping = DAMPING_SHARE * min(device.damping, felt.damping)
-    # What the tip bears, see `check_coupling`, with its margin.
+    # The limit of the tip, as in `check_coupling`.
     bearable = (2.0 * felt.mass - 2.0 * damping * haptic_step) / haptic_step**2
     stiffness = STIFFNESS_SHARE * min(stiffness_limit(device, felt, damping, haptic_step), bearable)
     if stiffness <= 0.0:
@@ -103,19 +103,19 @@ def coupling_for(
 def check_coupling(
     coupling: VirtualCoupling, device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float, scale: float = 1.0
 ) -> None:
-    """Refuse a coupling that the device or the tip cannot bear.
+    """Refuse a coupling that is too stiff for the device or the tip.
 
     Args:
         coupling: between device and tip, in the scene's metres and newtons.
-        device: None where it does not push.
-        tip: what the coupling pulls at.
+        device: None if it exerts no force.
+        tip: dynamics of the tip.
         haptic_step: T [s].
-        scale: of the coupling as the device feels it: metres of the scene a metre of the device, squared.
+        scale: factor on the coupling as seen by the device: the square of scene metres per device metre.
 
     Raises:
-        ValueError: says the stiffness, the limit, what it was computed from, and the way out.
+        ValueError: states the stiffness, the limit, its inputs, and the way out.
     """
-    # Explicit steps of a mass on this spring and damper leave the unit circle at K T^2 + 2 B T = 4 m: half of it.
+    # Explicit steps of a mass on this spring and damper are unstable from K T^2 + 2 B T = 4 m; the limit is half of it.
     load = coupling.stiffness * haptic_step**2 + 2.0 * coupling.damping * haptic_step
     if load > 2.0 * tip.mass:
         raise ValueError(
@@ -125,13 +125,13 @@ def check_coupling(
         )
     if device is None:
         return
-    # What the device feels is scale times as stiff; the same energies in the device's metres.
+    # For the device the coupling is scale times as stiff: the same energies in the device's metres.
     felt = TipDynamics(tip.mass * scale, tip.damping * scale)
     limit = stiffness_limit(device, felt, coupling.damping * scale, haptic_step)
     if coupling.stiffness * scale > limit:
         raise ValueError(
             f"a coupling of {coupling.stiffness * scale:g} N/m at the device's handle is stiffer than {limit:.4g} N/m, "
-            f"the most that takes energy and gives none with device damping {device.damping:g} N s/m, tip damping "
+            f"the passivity limit with device damping {device.damping:g} N s/m, tip damping "
             f"{felt.damping:g} N s/m, coupling damping {coupling.damping * scale:g} N s/m, a haptic step of "
             f"{haptic_step * 1e3:g} ms and a lag of {device.lag(haptic_step) * 1e3:g} ms: lower the stiffness or the "
             "coupling's damping, or use a device with more damping or less delay"

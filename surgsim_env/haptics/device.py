@@ -1,18 +1,18 @@
-"""What a haptic device is to a simulation: a pose in, a force out, and the dynamics that say how stiff it may feel."""
+"""The interface of a haptic device: a pose in, a force out, and the dynamics that limit the coupling's stiffness."""
 
 import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 
 
 class DevicePose(NamedTuple):
-    """Where a device is held.
+    """Pose of a device's handle.
 
     Fields:
         position: in the device's own frame [m], shape (3,)
-        time: when it was read, on a clock that never goes back [s]
+        time: of reading, on a monotonic clock [s]
         buttons: one bit each, the first is 1
         rotation: unit quaternion (w, x, y, z) from the handle's axes to the device's frame; None where not measured.
             Not used in this version: a device moves a tip and does not turn it.
@@ -26,14 +26,14 @@ class DevicePose(NamedTuple):
 
 @dataclass(frozen=True)
 class DeviceDynamics:
-    """What a device that pushes back is made of, as its hand's end feels it.
+    """Dynamics of a device that exerts forces, at its handle.
 
     Args:
-        damping: viscous damping b that is there whoever holds it [N s/m]; more of it allows a stiffer coupling.
+        damping: viscous damping b of the device itself, without a hand [N s/m]; more of it allows a stiffer coupling.
         mass: apparent mass m at the handle [kg].
         delay: of pose and force together beyond the haptic step for which a force is held [s]: transport, filters.
         pose_interval: time between two of its poses [s]; None: a pose each haptic step.
-        force_largest: what it can push with [N].
+        force_largest: largest force that it can exert [N].
 
     Raises:
         ValueError: names the entry, its value and the rule.
@@ -55,20 +55,20 @@ class DeviceDynamics:
             require_positive("device pose_interval", self.pose_interval, "s")
 
     def lag(self, haptic_step: float) -> float:
-        """Delay beyond the holding of one haptic step [s]: the device's own, and that of its rarer poses."""
+        """Delay beyond one haptic step [s]: the device's own, and that of less frequent poses."""
         return self.delay + max(0.0, (self.pose_interval or haptic_step) - haptic_step)
 
 
 class HapticDevice(Protocol):
-    """A device that a `HapticLoop` reads and writes once a haptic step; neither call may ever wait."""
+    """A device that a `HapticLoop` reads and writes once per haptic step; neither call may block."""
 
     @property
     def dynamics(self) -> DeviceDynamics | None:
-        """What it is made of; None where it shows forces or drops them, but does not push."""
+        """Its dynamics; None if it displays forces but exerts none."""
         ...
 
     def read(self) -> DevicePose | None:
-        """The newest pose that was not read before; None where there is none.
+        """The newest pose not read before; None if there is none.
 
         A device at rest still gives poses: one that gives none for 50 ms counts as lost, and its force fades.
         """

@@ -1,11 +1,11 @@
-"""Where a device's frame lies in the scene, and the place that follows a device within its speed."""
+"""The device's frame in the scene, and a target that follows the device with limited speed."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.device import require_positive
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -16,9 +16,9 @@ class DeviceFrame:
     """x = origin + scale R x_device, and F_device = scale R^T F: power is the same on both sides.
 
     Args:
-        origin: where the device's zero lies in the scene [m].
-        rotation: R, rows of three, a rotation.
-        scale: metres of the scene a metre of the device.
+        origin: of the device's frame in the scene [m].
+        rotation: R, three rows.
+        scale: scene metres per device metre.
 
     Raises:
         ValueError: names the entry, its value and the rule.
@@ -36,21 +36,21 @@ class DeviceFrame:
         if turn.shape != (3, 3) or not np.isfinite(turn).all() or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6:
             raise ValueError(f"frame.rotation is {self.rotation!r}; its rows must be three perpendicular unit vectors")
         if np.linalg.det(turn) < 0.0:
-            raise ValueError(f"frame.rotation is {self.rotation!r}; that is a reflection: turn one axis round")
+            raise ValueError(f"frame.rotation is {self.rotation!r}; this is a reflection: reverse one axis")
 
 
 class Follower:
-    """The place in the scene that a coupling pulls towards: the device's, but never faster than a speed.
+    """The target of a coupling: it follows the device with limited speed.
 
-    It starts where the tip is and comes to the device at the approach speed; once there it may follow at the largest
-    speed. So neither a device that is far away at the start, nor one that comes back, nor a pose that jumps throws the
-    tip into an organ.
+    It starts at the tip and moves to the device at the approach speed; from then on it follows at up to the largest
+    speed. A distant device at the start, a restored link or a jump of the pose therefore cannot throw the tip into an
+    organ.
     """
 
     def __init__(
         self, place: FloatArray, approach_speed: float, speed_largest: float, smoothing: float, haptic_step: float
     ) -> None:
-        """Wait at a place [m]; speeds in [m/s], smoothing with a time constant [s], steps of `haptic_step` [s]."""
+        """Wait at a position [m], (3,); speeds [m/s], time constant of the smoothing [s], `haptic_step` [s]."""
         self.place = place.copy()
         self.approaching = True
         self.limited = False
@@ -58,7 +58,7 @@ class Follower:
         self._approach, self._largest = approach_speed * haptic_step, speed_largest * haptic_step
 
     def follow(self, target: FloatArray) -> None:
-        """Go on towards the device's place [m], (3,); `limited` says whether the speed kept it from getting there."""
+        """Move towards the device's position [m], (3,); `limited` tells whether the speed limit acted."""
         x, y, z = (target - self.place).tolist()
         distance, most = math.hypot(x, y, z), self._approach if self.approaching else self._largest
         wanted = self._share * distance
@@ -70,10 +70,10 @@ class Follower:
         self.approaching = False
 
     def wait(self) -> None:
-        """Stay; the next device is approached anew."""
+        """Stay, and approach the device again at the next pose."""
         self.approaching, self.limited = True, False
 
     def restart(self, place: FloatArray) -> None:
-        """Wait at another place [m]."""
+        """Wait at another position [m], (3,)."""
         self.place = place.copy()
         self.wait()

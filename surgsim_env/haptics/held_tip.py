@@ -1,28 +1,27 @@
-"""One device that holds one tip through a coupling."""
+"""One haptic device coupled to one tip."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.coupling import check_coupling, coupling_for
 from surgsim_env.haptics.device import DevicePose, HapticDevice
 from surgsim_env.haptics.frame import Follower
-from surgsim_env.haptics.limits import SlewLimit, held_within
 from surgsim_env.haptics.press_depth import PressDepth
-from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.settings import HapticSettings, SlewLimit, held_within
 from surgsim_env.haptics.telemetry import TipTelemetry
 from surgsim_env.haptics.tip_drive import TipDrive
 from surgsim_env.haptics.watchdog import Watchdog
 
-# A pose further from the device's zero than this is no pose [m].
+# Poses farther from the device's origin are refused [m].
 REACH_LARGEST = 100.0
-# Time constant of the way of a device that does not push [s].
+# Time constant of the filter for a device that exerts no force [s].
 SMOOTHING = 0.02
 
 
 class HeldTip:
-    """Pose in, force out, and the coupling's force onto the tip: once a haptic step, before the simulation's step."""
+    """Reads the pose, writes the force, applies the coupling to the tip: once per haptic step, first."""
 
     def __init__(
         self, device: HapticDevice, drive: TipDrive, settings: HapticSettings, depth: PressDepth, haptic_step: float
@@ -30,7 +29,7 @@ class HeldTip:
         """Couple a device to a tip.
 
         Raises:
-            ValueError: a coupling that device or tip cannot bear, or a force beyond what either can push with.
+            ValueError: a coupling too stiff for device or tip, or a force limit above what either can exert.
         """
         self.device, self.drive, self.settings = device, drive, settings
         frame, limits = settings.frame, settings.limits
@@ -39,7 +38,7 @@ class HeldTip:
         if dynamics is None:
             smoothing = SMOOTHING if smoothing is None else smoothing
         elif smoothing:
-            # |x - smoothed x| <= tau |dx/dt| summed over any way, as for a lag of tau.
+            # The filtered path differs from the path by at most tau |dx/dt|, as for a lag of tau.
             dynamics = replace(dynamics, delay=dynamics.delay + smoothing)
         self.coupling = settings.coupling or coupling_for(dynamics, drive.dynamics, haptic_step, scale)
         check_coupling(self.coupling, dynamics, drive.dynamics, haptic_step, scale)
@@ -58,7 +57,7 @@ class HeldTip:
         self.restart()
 
     def restart(self) -> None:
-        """The tip has been put somewhere else: no force, and the device is approached anew."""
+        """Restart after the tip was moved: zero force, and a slow approach to the device."""
         self.drive.restart()
         self._follower.restart(self.drive.position)
         self._watchdog.reset()
@@ -72,7 +71,7 @@ class HeldTip:
         self._refused, self._energy, self._fault = 0, 0.0, ""
 
     def step(self, contact_force: FloatArray) -> None:
-        """Read the device, push it and the tip; `contact_force` is the tissue's on the tip in the last step [N]."""
+        """Read the device, apply forces to both ends; `contact_force` [N], (3,), is the tissue's in the last step."""
         self._fault = ""
         self._read()
         share = self._watchdog.step(self._fresh)
@@ -90,7 +89,7 @@ class HeldTip:
         self._write(self._force)
 
     def release(self) -> None:
-        """No force at all, at once; poses are still read."""
+        """Set all forces to zero at once; poses are still read."""
         self._fault = ""
         self._read()
         self._watchdog.reset()
@@ -101,7 +100,7 @@ class HeldTip:
         self._write(self._force)
 
     def telemetry(self, contact_force: FloatArray) -> TipTelemetry:
-        """What came of the step; `contact_force` is the tissue's in it [N]."""
+        """The record of the step; `contact_force` [N], (3,), is the tissue's in it."""
         tip = self.drive.tip
         return TipTelemetry(
             pose=self._pose,
@@ -164,4 +163,4 @@ class HeldTip:
 
 def _check_force(what: str, wanted: float, most: float) -> None:
     if wanted > most:
-        raise ValueError(f"limits.force_largest asks for {wanted:g} N; the {what} can push with {most:g} N: lower it")
+        raise ValueError(f"limits.force_largest is {wanted:g} N; the {what} can exert {most:g} N: lower it")

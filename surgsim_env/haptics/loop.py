@@ -1,34 +1,34 @@
-"""The haptic loop: devices that hold the tips of a simulation's instrument, one haptic step at a time."""
+"""The haptic loop: devices coupled to the tips of a simulation's instrument, one haptic step at a time."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray, IntArray
-from surgsim_env.arms.pair import SIDES, Pair
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.device import HapticDevice
 from surgsim_env.haptics.held_tip import HeldTip
 from surgsim_env.haptics.press_depth import PressDepth
 from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.telemetry import HapticTelemetry
 from surgsim_env.haptics.tip_drive import tip_drives
-from surgsim_env.simulation import Simulation
+from surgsim_env.instruments.arm.pair import SIDES, Pair
 
 
 class HapticLoop:
-    """Steps a simulation whose instrument is held by devices; `step` never raises for what organ or device do.
+    """Steps a simulation whose instrument is coupled to devices; `step` never raises for faults of organ or device.
 
-    In each step the devices' poses are read, the couplings' forces written to them and put on the tips, and organ and
-    instrument advance by one haptic step: a force answers the pose of its own step, and nothing stands in between.
+    Each step reads the devices' poses, writes the couplings' forces to devices and tips, and advances organ and
+    instrument by one haptic step: a force responds to the pose of its own step.
 
-    Once the organ or MuJoCo came to grief (`fault` says why) forces are zero and the simulation stands still, until
+    After a divergence of the organ or MuJoCo (`fault` gives the reason) forces are zero and the simulation stops, until
     `reset`.
 
     Fields:
-        simulation: what is held
-        held: one for each device, with its coupling
-        fault: why the simulation stands still, or ""
+        simulation: of the instrument
+        held: one per device, with its coupling
+        fault: why the simulation has stopped, or ""
     """
 
     def __init__(
@@ -37,11 +37,11 @@ class HapticLoop:
         devices: HapticDevice | Sequence[HapticDevice],
         settings: HapticSettings | Sequence[HapticSettings] | None = None,
     ) -> None:
-        """Couple devices to the tips of an instrument where they are now.
+        """Couple devices to the tips of an instrument at their present positions.
 
         Args:
-            simulation: a scene's, reset; nobody else advances it meanwhile.
-            devices: one, or one for each tip, the left arm's first.
+            simulation: after a reset; only this loop may advance it.
+            devices: one, or one per tip, the left arm's first.
             settings: for all, or one for each.
 
         Raises:
@@ -85,15 +85,15 @@ class HapticLoop:
         return HapticTelemetry(simulation.time, self.fault, tips)
 
     def reset(self, organ_model: OrganModel | None = None, tip_position: FloatArray | None = None) -> None:
-        """Start anew: forces are zero, and devices are approached slowly from where the tip is put.
+        """Restart: forces are zero, and the tips approach the devices slowly from their new positions.
 
         Args:
             organ_model: another organ of the same scene; the same one by default.
             tip_position: [m], (3,), or (2, 3) for a pair; where the instrument parks by default.
 
         Raises:
-            OrganError: the scene's number of substeps is too small for this organ; the loop goes on with its own.
-            ValueError: an arm does not reach that place.
+            OrganError: the scene's number of substeps is too small for this organ; the loop keeps the previous one.
+            ValueError: an arm does not reach that position.
         """
         simulation = self.simulation
         place = simulation.instrument.parked if tip_position is None else np.asarray(tip_position, dtype=np.float64)
@@ -112,7 +112,7 @@ class HapticLoop:
 
 
 def _tools_of_tips(simulation: Simulation) -> list[IntArray]:
-    """Which tools of the instrument each tip carries."""
+    """Indices of the tools at each tip."""
     instrument = simulation.instrument
     if isinstance(instrument, Pair):
         return [instrument.tools_of(side) for side in SIDES]

@@ -1,4 +1,4 @@
-"""The CSV file that the motion of hands is kept in: a header, then numbers, a row for each time."""
+"""CSV files of the motion of hands: a header, then one row of numbers per time."""
 
 import csv
 from collections.abc import Iterator, Sequence
@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray, IntArray
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
-# Of a pose: 31 bits, so that they fit any integer that keeps them.
+# Of a pose: 31 bits, so that they fit into any integer type.
 BUTTONS_LARGEST = 2**31 - 1
 BUTTONS_RULE = f"a whole number from 0 to {BUTTONS_LARGEST}"
 
 
 class Motion(NamedTuple):
-    """What a file tells of some hands; its numbers may be nan or infinite, its buttons not.
+    """The motion of one or more hands; numbers may be nan or infinite, buttons may not.
 
     Fields:
         time: of each row [s]                        (n,)
@@ -30,27 +30,27 @@ class Motion(NamedTuple):
 
 def are_buttons(value: float) -> bool:
     """Whether a number is one that `BUTTONS_RULE` allows."""
-    # No comparison with a NaN holds.
+    # Comparisons with NaN are False.
     return 0 <= value <= BUTTONS_LARGEST and value == int(value)
 
 
 def motion_columns(mark: str = "") -> list[str]:
-    """Names of one hand's columns: x, y, z [m] and the buttons, each with the hand's mark."""
+    """Names of one hand's columns: x, y, z [m] and the buttons, each with the hand's suffix."""
     return [f"{name}{mark}" for name in ("x", "y", "z", "buttons")]
 
 
 def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int) -> Motion:
-    """Read a file with a header: time [s]; of each hand x, y, z [m] and, if it likes, buttons; other columns are left.
+    """Read a file with a header: time [s]; for each hand x, y, z [m] and optionally buttons; other columns are ignored.
 
     Args:
         path: of the file.
-        marks: behind the names of each hand's columns.
-        rows_largest: how many rows are read at most.
+        marks: suffix of the column names of each hand.
+        rows_largest: largest number of rows.
 
     Raises:
-        ValueError: a missing column, a row that is no numbers, buttons that are none, too many rows, or none; names the
-            file and the line.
-        OSError: a file that cannot be read.
+        ValueError: a missing column, a row that is not numeric, invalid buttons, too many rows or none; names the file
+            and the line.
+        OSError: the file cannot be read.
     """
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         reader = csv.DictReader(file)
@@ -58,7 +58,7 @@ def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int) 
             places, pressed = _columns(reader.fieldnames or [], marks, path.name)
             rows = list(_rows(reader, [*places, *pressed], path.name, rows_largest))
         except csv.Error as error:
-            raise ValueError(f"{path.name}, line {reader.line_num + 1}: {error}; it is no CSV file") from None
+            raise ValueError(f"{path.name}, line {reader.line_num + 1}: {error}; it is not a CSV file") from None
     if not rows:
         raise ValueError(f"{path.name}: no rows below the header")
     table = np.array(rows)
@@ -71,7 +71,7 @@ def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int) 
 
 
 def _columns(names: Sequence[str], marks: Sequence[str], file_name: str) -> tuple[list[str], list[str]]:
-    """The columns of time and places, and those of buttons that are there."""
+    """The columns of time and positions, and those of buttons that exist."""
     places = ["time", *(name for mark in marks for name in motion_columns(mark)[:3])]
     pressed = [motion_columns(mark)[3] for mark in marks]
     missing = [name for name in places if name not in names]

@@ -1,4 +1,4 @@
-"""The two packets that a device's bridge and a simulation send each other over UDP; `docs/haptics.md` has the table."""
+"""The two packets of the UDP protocol between a device's client and a simulation; `docs/haptics.md` has the table."""
 
 import math
 import struct
@@ -6,29 +6,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 
+# UDP port of the simulation, in no list of IANA.
+PORT = 47801
 MAGIC = b"SSHP"
 VERSION = 1
 KIND_POSE, KIND_FORCE = 1, 2
 # Little-endian, without gaps. Magic, version, kind, buttons, sequence, time; position, rotation.
 POSE = struct.Struct("<4sBBHId3d4d")
-# Magic, version, kind, nothing, sequence and time of the pose that it answers; force.
+# Magic, version, kind, zero, sequence and time of the answered pose; force.
 FORCE = struct.Struct("<4sBBHId3d")
 assert FORCE.size <= POSE.size
 
-# A pose further from the device's zero than this is refused [m].
+# Positions farther from the device's origin are refused [m].
 POSITION_LARGEST = 10.0
-# By how much the length of a rotation's quaternion may differ from 1.
+# Tolerance on the length of a rotation's quaternion.
 ROTATION_SLACK = 1e-3
 
 
 class PosePacket(NamedTuple):
-    """A pose as it travels.
+    """A pose.
 
     Fields:
-        sequence: counts up by at least 1 a packet, modulo 2^32
-        time: on the sender's clock [s]; the answer brings it back
+        sequence: increases with each packet, modulo 2^32
+        time: on the sender's clock [s]; the answer repeats it
         position: [m], (3,)
         buttons: one bit each, 16 of them
         rotation: unit quaternion (w, x, y, z), or None; checked, and not used in this version

@@ -1,4 +1,4 @@
-"""A device of given inertia and damping in a simulated hand, to try couplings on without one."""
+"""A simulated device of given inertia and damping in a simulated hand, for tests of couplings."""
 
 from collections import deque
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.device import DeviceDynamics, DevicePose, require_positive
 
 HandPath = Callable[[float], FloatArray]
@@ -15,12 +15,12 @@ HandPath = Callable[[float], FloatArray]
 
 @dataclass(frozen=True)
 class Hand:
-    """What holds a device: a spring and a damper to where the hand wants it, and a push.
+    """A hand that holds a device: a spring and a damper to its target, and a constant force.
 
     Args:
         stiffness: of the grip [N/m]; 0 for a hand that only pushes.
-        damping: of the grip, to where the hand wants it [N s/m].
-        push: [N].
+        damping: of the grip [N s/m].
+        push: constant force [N].
 
     Raises:
         ValueError: names the entry, its value and the rule.
@@ -38,9 +38,9 @@ class Hand:
 
 
 class SimulatedDevice:
-    """m dv/dt = F + push - b v - k_h (x - x_h) - b_h (v - dx_h/dt), solved exactly for a force held through a step.
+    """m dv/dt = F + push - b v - k_h (x - x_h) - b_h (v - dx_h/dt), solved exactly for a constant force in each step.
 
-    `advance` moves it on by one haptic step. Poses may come late, forces act late, positions be those of an encoder.
+    `advance` advances it by one haptic step. Poses and forces may be delayed, and positions rounded by an encoder.
     """
 
     def __init__(
@@ -56,18 +56,18 @@ class SimulatedDevice:
         pose_delay: int = 0,
         force_delay: int = 0,
     ) -> None:
-        """Hold a device still at a place.
+        """Start at rest.
 
         Args:
             mass: m [kg].
             damping: b [N s/m].
-            haptic_step: between two forces [s].
-            position: where it is held at the start [m], (3,).
+            haptic_step: [s].
+            position: initial position [m], (3,).
             hand: None: nobody holds it.
-            path: where the hand wants it at a time [m]; where it started by default.
-            encoder: what its positions are rounded to [m]; 0 for exact ones.
-            pose_delay: haptic steps after which a pose is read.
-            force_delay: haptic steps after which a force acts.
+            path: target of the hand [m], (3,), over time [s]; by default the initial position.
+            encoder: resolution of the positions [m]; 0 for exact ones.
+            pose_delay: of the poses, in haptic steps.
+            force_delay: of the forces, in haptic steps.
 
         Raises:
             ValueError: names the entry, its value and the rule.
@@ -85,7 +85,7 @@ class SimulatedDevice:
         self.position, self.velocity = start.copy(), np.zeros(3)
         self.time = 0.0
         self.linked = True
-        # The work of the forces on the handle since the start [J]: below zero while the loop takes energy.
+        # Work of the forces on the handle since the start [J]: negative while the loop dissipates.
         self.work = 0.0
         self._wanted = self._path(0.0).copy()
         self._poses = deque([self.position.copy()] * (pose_delay + 1), maxlen=pose_delay + 1)
@@ -94,16 +94,16 @@ class SimulatedDevice:
 
     @property
     def dynamics(self) -> DeviceDynamics:
-        """What it is made of."""
+        """Its dynamics."""
         return self._dynamics
 
     @property
     def force(self) -> FloatArray:
-        """What acts on the handle through the next `advance` [N], (3,)."""
+        """The force on the handle during the next `advance` [N], (3,)."""
         return self._forces[0]
 
     def read(self) -> DevicePose | None:
-        """The pose that has arrived; None while the link is cut (`linked` False)."""
+        """The pose after its delay; None while the link is lost (`linked` False)."""
         if not self.linked:
             return None
         place = self._poses[0]
@@ -112,11 +112,11 @@ class SimulatedDevice:
         return DevicePose(place.copy(), self.time)
 
     def write(self, force: FloatArray) -> None:
-        """Let a force act, [N], (3,), from now or after its delay."""
+        """Apply a force [N], (3,), after its delay."""
         self._forces.append(np.array(force, dtype=np.float64))
 
     def advance(self) -> None:
-        """Move on by one haptic step under the force that acts, in the hand."""
+        """Advance by one haptic step."""
         self.time += self._haptic_step
         wanted = self._path(self.time)
         before, force = self.position, self._forces[0]
@@ -128,15 +128,15 @@ class SimulatedDevice:
         self._poses.append(self.position.copy())
 
     def energy(self) -> float:
-        """Of motion and of the grip's spring [J]."""
+        """Kinetic energy plus that of the grip's spring [J]."""
         across = self.position - self._wanted
         kinetic = 0.5 * self._dynamics.mass * float(self.velocity @ self.velocity)
         return kinetic + 0.5 * self.hand.stiffness * float(across @ across)
 
     def _discretised(self) -> tuple[FloatArray, ...]:
-        """What a step makes of (x, v), of a force held, of the hand's place and its steady speed."""
+        """Matrices of one step: for (x, v), for a constant force, for the hand's target and its constant speed."""
         m, b, k, c = self._dynamics.mass, self._dynamics.damping, self.hand.stiffness, self.hand.damping
-        # d/dt (x, v, F, x_h, u_h): the hand's place goes on at its speed u_h, the force stays.
+        # d/dt (x, v, F, x_h, u_h): the hand's target moves at its speed u_h, the force is constant.
         rate = np.zeros((5, 5))
         rate[0, 1] = rate[3, 4] = 1.0
         rate[1] = np.array([-k, -(b + c), 1.0, k, c]) / m

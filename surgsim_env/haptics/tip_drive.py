@@ -1,23 +1,23 @@
-"""How the force of a coupling comes onto an instrument's tip, through the commands that the instrument has anyway."""
+"""Application of a coupling's force to an instrument's tip, through the instrument's velocity commands."""
 
 from typing import Protocol
 
 import mujoco
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.arms.arm_instrument import ArmInstrument
-from surgsim_env.arms.pair import SIDES, Pair
-from surgsim_env.arms.steering import SteeredArm
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.coupling import TipDynamics
-from surgsim_env.instrument import Instrument
+from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
+from surgsim_env.instruments.arm.pair import SIDES, Pair
+from surgsim_env.instruments.arm.steering import SteeredArm
+from surgsim_env.instruments.instrument import Instrument
 
-# An arm is steered as if its tip were this heavy [kg] and damped by this [N s/m]: as heavy as a probe, and damped by
-# more than what 100 N/m of tissue, felt 20 ms late, would feed into it.
+# Mass [kg] and damping [N s/m] of the point that an arm follows: as heavy as a probe, and damped by more than the
+# energy that tissue of 100 N/m with a lag of 20 ms feeds in.
 STEERED = TipDynamics(mass=0.15, damping=4.0)
-# Inverse kinematics of an arm, 0.3 ms each, are solved once in so many haptic steps.
+# Haptic steps per solution of an arm's inverse kinematics, which takes 0.3 ms.
 STEER_EVERY = 10
-# How fast an arm catches up with the point that it follows [s].
+# Time constant with which an arm follows the point [s].
 STEER_TIME = 0.02
 
 
@@ -25,9 +25,9 @@ class TipDrive(Protocol):
     """One tip of an instrument as a coupling sees it.
 
     Fields:
-        dynamics: mass and damping that the coupling meets
-        force_largest: what it can be pushed with [N]
-        has_jaw: whether it carries a jaw to command
+        dynamics: mass and damping at the coupling
+        force_largest: largest force that it can exert [N]
+        has_jaw: whether it has a jaw
     """
 
     dynamics: TipDynamics
@@ -36,21 +36,21 @@ class TipDrive(Protocol):
 
     @property
     def position(self) -> FloatArray:
-        """What the coupling pulls at [m], (3,)."""
+        """The point to which the coupling is attached [m], (3,)."""
         ...
 
     @property
     def tip(self) -> FloatArray:
-        """Where the tip is [m], (3,)."""
+        """Position of the tip [m], (3,)."""
         ...
 
     @property
     def limited(self) -> bool:
-        """Whether the edge of its workspace, or a joint's limit, holds it."""
+        """Whether the edge of its workspace or a joint limit stops it."""
         ...
 
     def push(self, force: FloatArray, contact_force: FloatArray) -> None:
-        """Let a force act on the tip through the next haptic step, beside the tissue's in the last one [N], (3,)."""
+        """Apply a force [N], (3,), during the next haptic step; `contact_force` is the tissue's in the last one."""
         ...
 
     def command_jaw(self, target: float) -> None:
@@ -58,19 +58,19 @@ class TipDrive(Protocol):
         ...
 
     def restart(self) -> None:
-        """The tip has been put somewhere else."""
+        """Restart after the tip was moved."""
         ...
 
 
 class CartesianDrive:
-    """The tip of a probe or grasper on slides: its servo pushes with the coupling's force, to the newton.
+    """The tip of a probe or grasper on slides: its servo exerts exactly the coupling's force.
 
-    The servo pushes with kp (c + u T - q) + kv (u - v), c - q being how far its target leads, v the slide's speed. So
+    The servo exerts kp (c + u T - q) + kv (u - v) with target c, position q, speed v and commanded speed u, so that
 
         u = (F - kp (c - q) + kv v) / (kp T + kv)
 
-    makes it push with F; the lead dies out with kv / kp (12 ms). MuJoCo takes kv implicitly, which makes the tip kv T
-    (60 g) heavier than its slides, and the slides' damping too, so that it takes energy at any step.
+    makes it exert F; the lead c - q decays with kv / kp (12 ms). MuJoCo integrates kv implicitly, which makes the tip
+    kv T (60 g) heavier than its slides, and the slides' damping too, so that it dissipates at any step.
     """
 
     def __init__(self, instrument: Instrument) -> None:
@@ -86,7 +86,7 @@ class CartesianDrive:
         joints = model.actuator_trnid[hold, 0]
         slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         if len(hold) < 3 or not slides.all() or not np.allclose(model.jnt_axis[joints], np.eye(3)):
-            raise TypeError(f"{type(instrument).__name__} has no slides along x, y and z to push its tip with")
+            raise TypeError(f"{type(instrument).__name__} has no slides along x, y and z that could push its tip")
         self._hold, self._place, self._speed = hold, model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._stiffness, self._damping = model.actuator_gainprm[hold, 0], model.actuator_gainprm[pace, 0]
         self._gain = 1.0 / (self._stiffness * model.opt.timestep + self._damping)
@@ -111,11 +111,11 @@ class CartesianDrive:
 
     @property
     def limited(self) -> bool:
-        """Whether the tip's box holds it."""
+        """Whether the tip's box stops it."""
         return self._instrument.workspace_limited
 
     def push(self, force: FloatArray, contact_force: FloatArray) -> None:
-        """Command the speed with which the servo pushes with a force [N], (3,); tissue pushes back by itself."""
+        """Command the speed at which the servo exerts a force [N], (3,); the simulation adds the tissue's."""
         data = self._instrument.data
         lead = data.ctrl[self._hold] - data.qpos[self._place]
         speed = data.qvel[self._speed]
@@ -126,14 +126,14 @@ class CartesianDrive:
         self._instrument.command_jaw(target)
 
     def restart(self) -> None:
-        """Nothing is remembered."""
+        """There is no state to restart."""
 
 
 class SteeredDrive:
-    """The tip of an arm: it follows a point that coupling and tissue push as they would push a tip of 150 g.
+    """The tip of an arm: it follows a point of 150 g on which the forces of coupling and tissue act.
 
-    m dv/dt = F + F_tissue - b v at haptic rate; the arm's inverse kinematics follow at a tenth of it. That lag is not
-    in `stiffness_limit`: what it promises is for tips on slides.
+    m dv/dt = F + F_tissue - b v at haptic rate; the arm's inverse kinematics follow at a tenth of it. `stiffness_limit`
+    does not include that lag: its guarantee is for tips on slides.
     """
 
     dynamics = STEERED
@@ -161,7 +161,7 @@ class SteeredDrive:
 
     @property
     def limited(self) -> bool:
-        """Whether the box, a joint's limit or its speed limit holds the tip."""
+        """Whether the box, a joint limit or a speed limit stops the tip."""
         return self._steered.limited
 
     def push(self, force: FloatArray, contact_force: FloatArray) -> None:
@@ -182,7 +182,7 @@ class SteeredDrive:
         self._steered.command_jaw(target)
 
     def restart(self) -> None:
-        """Follow from where the tip is now, at rest."""
+        """Restart at rest at the tip's present position."""
         self._place, self._velocity, self._step = self._steered.tip_position, np.zeros(3), 0
 
 

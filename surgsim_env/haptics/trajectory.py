@@ -1,4 +1,4 @@
-"""A device that plays a recorded trajectory, and the CSV file that it is recorded in."""
+"""A device that plays a recorded trajectory from a CSV file."""
 
 import csv
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray, IntArray
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.haptics.device import DevicePose, require_positive
 from surgsim_env.haptics.motion_file import BUTTONS_RULE, are_buttons, motion_columns, read_motion
 
@@ -15,10 +15,10 @@ ROWS_LARGEST = 3_600_000
 
 
 class TrajectoryDevice:
-    """Plays positions over time, linearly between its rows, one haptic step at each `read`; forces are kept, not felt.
+    """Plays positions over time, interpolated linearly, one haptic step per `read`; forces are stored.
 
     Fields:
-        force: the last that was written [N]                               (3,)
+        force: the last one written [N]                                    (3,)
     """
 
     dynamics = None
@@ -31,16 +31,16 @@ class TrajectoryDevice:
         *,
         haptic_step: float = 1e-3,
     ) -> None:
-        """Play a trajectory; its last pose is held when it is over.
+        """Play a trajectory; its last pose is held at the end.
 
         Args:
-            time: of each row [s], growing, (n,).
+            time: of each row [s], increasing, (n,).
             position: in the device's frame [m], (n, 3).
             buttons: pressed from each row on, from 0 to 2^31 - 1, (n,); none by default.
-            haptic_step: of the loop that reads it [s].
+            haptic_step: of the loop [s].
 
         Raises:
-            ValueError: shapes that do not fit, a number that is not finite, a time that does not grow (names the row).
+            ValueError: inconsistent shapes, a number that is not finite, times that do not increase (names the row).
         """
         require_positive("haptic_step", haptic_step, "s")
         self._time = np.array(time, dtype=np.float64)
@@ -53,7 +53,7 @@ class TrajectoryDevice:
                 f"{self._position.shape}"
             )
         if pressed.shape != (count,):
-            raise ValueError(f"a trajectory of {count} rows has buttons of shape {pressed.shape}; give one a row")
+            raise ValueError(f"a trajectory of {count} rows has buttons of shape {pressed.shape}; give one per row")
         wrong = [row for row, bits in enumerate(pressed.tolist()) if not are_buttons(bits)]
         if wrong:
             raise ValueError(
@@ -73,11 +73,11 @@ class TrajectoryDevice:
 
     @classmethod
     def load(cls, path: Path, *, haptic_step: float = 1e-3) -> "TrajectoryDevice":
-        """Read a CSV file with a header: time [s], x, y, z [m] and, if it likes, buttons; other columns are left.
+        """Read a CSV file with a header: time [s], x, y, z [m] and optionally buttons; other columns are ignored.
 
         Raises:
-            ValueError: what `read_motion` or `TrajectoryDevice` refuses; names the file, and the line or the row.
-            OSError: a file that cannot be read.
+            ValueError: as `read_motion` and `TrajectoryDevice`; names the file, and the line or the row.
+            OSError: the file cannot be read.
         """
         motion = read_motion(path, rows_largest=ROWS_LARGEST)
         try:
@@ -99,7 +99,7 @@ class TrajectoryDevice:
         return DevicePose(place, float(now), int(self._buttons[row]))
 
     def write(self, force: FloatArray) -> None:
-        """Keep the force."""
+        """Store the force [N], (3,)."""
         self.force = np.array(force)
 
     def rewind(self) -> None:
@@ -108,7 +108,7 @@ class TrajectoryDevice:
 
 
 def save_trajectory(path: Path, time: FloatArray, position: FloatArray, buttons: Sequence[int] | None = None) -> None:
-    """Write a trajectory that `TrajectoryDevice.load` reads: time [s] (n,), position [m] (n, 3), to the last bit."""
+    """Write a trajectory that `TrajectoryDevice.load` reads: time [s] (n,), position [m] (n, 3), with all digits."""
     pressed = [0] * len(time) if buttons is None else buttons
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

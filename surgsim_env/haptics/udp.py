@@ -1,4 +1,4 @@
-"""A device at the other end of a UDP socket on this machine: a bridge to OpenHaptics, CHAI3D, ROS or anything else."""
+"""A device behind a UDP socket on this machine, such as a client of OpenHaptics, CHAI3D or ROS."""
 
 import ipaddress
 import socket
@@ -6,27 +6,27 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.device import DeviceDynamics, DevicePose, require_positive
 from surgsim_env.haptics.packet import POSE, ForcePacket, PosePacket, newer, pack_force, unpack_pose
 
-# How many packets are looked at in one haptic step; a flood of more is left to the socket, which drops the rest.
+# Packets read per haptic step; the socket drops a flood of more.
 PACKETS_PER_READ = 16
-# What the socket keeps for us [bytes]: some tens of packets, so that a flood leaves nothing old behind.
+# Receive buffer of the socket [bytes]: a few tens of packets, so that a flood leaves no old ones.
 BUFFER_SIZE = 16384
 
 
 @dataclass(slots=True)
 class UdpCounts:
-    """Packets so far.
+    """Numbers of packets.
 
     Args:
-        accepted: poses that were newer than all before.
-        malformed: not a pose packet: length, magic, version, kind, or a number out of its range.
-        stale: old, doubled or out of order.
-        stranger: from another sender than the one that is attached.
+        accepted: new poses.
+        malformed: wrong length, magic, version or kind, or a number out of range.
+        stale: old, duplicated or out of order.
+        stranger: from another sender than the attached one.
         answered: forces sent.
-        unsent: forces that the socket would not take.
+        unsent: forces that the socket refused.
     """
 
     accepted: int = 0
@@ -38,11 +38,10 @@ class UdpCounts:
 
 
 class UdpDevice:
-    """Listens on a loopback address; the sender of the first good packet is attached until it falls silent.
+    """Listens on a loopback address; the sender of the first valid packet is attached.
 
-    Each pose that was read is answered by one force, which is shorter; nothing is ever sent but such answers. Silent is
-    who sent no good, new pose for `peer_timeout`: then the next sender of one is attached, also the same one with
-    sequence numbers that start again.
+    Each pose is answered by one force, a shorter packet; nothing else is sent. If the attached sender sends no new
+    valid pose for `peer_timeout`, the next sender of one is attached, possibly the same one with new sequence numbers.
     """
 
     def __init__(
@@ -58,10 +57,10 @@ class UdpDevice:
 
         Args:
             port: 0 for a free one.
-            host: a loopback address, as packets carry no secret.
-            dynamics: of the device behind the bridge; None where it does not push.
-            peer_timeout: silence after which another sender may attach [s].
-            clock: of this machine, never going back [s].
+            host: a loopback address, because packets are not authenticated.
+            dynamics: of the device; None if it exerts no force.
+            peer_timeout: time without poses after which another sender may attach [s].
+            clock: monotonic clock [s].
 
         Raises:
             ValueError: a host that is not a loopback address, a port or a time out of range.
@@ -88,48 +87,48 @@ class UdpDevice:
 
     @property
     def dynamics(self) -> DeviceDynamics | None:
-        """Of the device behind the bridge."""
+        """Dynamics of the device."""
         return self._dynamics
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port that it listens on."""
+        """Host and port of the socket."""
         host, port = self._socket.getsockname()[:2]
         return host, port
 
     @property
     def peer(self) -> tuple[str, int] | None:
-        """Host and port of the sender that is attached; None while there is none."""
+        """Host and port of the attached sender, or None."""
         return None if self._peer is None else (self._peer[0], self._peer[1])
 
     @property
     def counts(self) -> UdpCounts:
-        """Packets so far; a copy."""
+        """Numbers of packets; a copy."""
         return replace(self._counts)
 
     def read(self) -> DevicePose | None:
-        """The newest good pose that has come since the last call; None where none has."""
+        """The newest valid pose since the last call, or None."""
         now, newest = self._clock(), None
         if self._peer is not None and now - self._heard > self._peer_timeout:
             self._peer = self._last = None
         for _ in range(PACKETS_PER_READ):
             try:
-                # One byte more than a pose, so that a longer packet shows.
+                # One byte more than a pose, to detect longer packets.
                 data, sender = self._socket.recvfrom(POSE.size + 1)
             except BlockingIOError:
                 break
             except OSError:
-                # Of one packet: another system's word for one that is too long, or for a sender that has gone.
+                # Some systems raise for a packet that is too long, or for a sender that has closed its socket.
                 self._counts.malformed += 1
                 continue
-            newest = self._judged(data, sender, now) or newest
+            newest = self._checked(data, sender, now) or newest
         if newest is None:
             return None
         self._unanswered = True
         return DevicePose(newest.position, now, newest.buttons, newest.rotation)
 
     def write(self, force: FloatArray) -> None:
-        """Answer the pose that was read last with a force [N], (3,), if it has not been answered."""
+        """Answer the last pose with a force [N], (3,), unless it has been answered."""
         if not self._unanswered or self._last is None or self._peer is None:
             return
         self._unanswered = False
@@ -145,8 +144,8 @@ class UdpDevice:
         """Close the socket."""
         self._socket.close()
 
-    def _judged(self, data: bytes, sender: tuple, now: float) -> PosePacket | None:
-        """The pose in a packet if it is good, of the attached sender and new; else None, counted."""
+    def _checked(self, data: bytes, sender: tuple, now: float) -> PosePacket | None:
+        """The pose in a valid and new packet of the attached sender; otherwise None. Counts the packet."""
         counts = self._counts
         if self._peer is not None and sender != self._peer:
             counts.stranger += 1
@@ -170,7 +169,7 @@ def _loopback(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
         address = None
     if address is None or not address.is_loopback:
         raise ValueError(
-            f"host is {host!r}; a UDP device listens on a loopback address such as 127.0.0.1 alone, as its packets "
-            "carry no secret: bring a device of another machine here by a tunnel of your own"
+            f"host is {host!r}; a UDP device listens only on a loopback address such as 127.0.0.1, because its packets "
+            "are not authenticated: connect a device of another machine through a tunnel of your own"
         )
     return address

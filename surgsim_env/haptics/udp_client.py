@@ -1,7 +1,7 @@
-"""A bridge's other end in its shortest form: sends poses a thousand times a second and shows the forces that come back.
+"""A minimal client of `surgsim haptics`: sends poses 1000 times a second and prints the forces.
 
-`python -m surgsim_env.haptics.udp_client` presses 25 mm down and up once in four seconds, beside `surgsim haptics`. A
-real bridge reads its device where `pose` makes a position up, and pushes it where `show` prints.
+`python -m surgsim_env.haptics.udp_client` presses 25 mm down and up every four seconds. A real client reads its
+device's position instead, and applies the force to the device instead of printing it.
 """
 
 import math
@@ -11,15 +11,14 @@ import time
 
 import numpy as np
 
-from surgsim_env.haptics.options import PORT
-from surgsim_env.haptics.packet import FORCE, PosePacket, pack_pose, unpack_force
+from surgsim_env.haptics.packet import FORCE, PORT, PosePacket, pack_pose, unpack_force
 
-# Without an answer for so long a bridge pushes no more [s].
+# Time without an answer after which the force is zero [s].
 SILENCE = 0.05
 
 
 def run(port: int, seconds: float, direction: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> float:
-    """Press along a direction for a time [s]; returns the largest force that came back [N]."""
+    """Press along a direction for a time [s]; returns the largest force received [N]."""
     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     link.setblocking(False)
     link.connect(("127.0.0.1", port))
@@ -33,7 +32,7 @@ def run(port: int, seconds: float, direction: tuple[float, float, float] = (0.0,
             while (answer := unpack_force(link.recv(FORCE.size + 1))) is not None:
                 force, answered = answer.force, now
         except (BlockingIOError, ConnectionRefusedError):
-            pass  # nothing has come yet, or nobody listens yet
+            pass  # no answer yet, or no server yet
         if now - answered > SILENCE:
             force = np.zeros(3)
         largest = max(largest, float(np.linalg.norm(force)))

@@ -1,4 +1,4 @@
-"""What happens to the force when a device falls silent: it fades to zero, and comes back as gently."""
+"""Fading of the force when a device sends no poses, and its return."""
 
 import math
 from dataclasses import dataclass
@@ -8,12 +8,12 @@ from surgsim_env.haptics.device import require_positive
 
 @dataclass(frozen=True)
 class WatchdogTimes:
-    """How long silence is borne.
+    """Times of the watchdog.
 
     Args:
-        timeout: without a fresh pose [s], then the force fades.
+        timeout: time without a fresh pose after which the force fades [s].
         fade: time from full force to none, linearly [s].
-        resume: time from none to full force once poses come again [s].
+        resume: time from none to full force when poses return, linearly [s].
 
     Raises:
         ValueError: names the entry, its value and the rule.
@@ -29,11 +29,11 @@ class WatchdogTimes:
 
 
 class Watchdog:
-    """Counts haptic steps without a fresh pose; `share` is what is left of the force, 0 before the first pose."""
+    """Counts haptic steps without a fresh pose; `share` is the factor on the force, 0 before the first pose."""
 
     def __init__(self, times: WatchdogTimes, haptic_step: float) -> None:
-        """Watch with some times, in steps of `haptic_step` [s]."""
-        # Whole steps, so that no rounding of sums decides when the fading begins.
+        """Count in steps of `haptic_step` [s]."""
+        # Whole steps, so that rounding does not decide when the fading begins.
         self._patience = max(1, math.ceil(times.timeout / haptic_step - 1e-9))
         self._down = haptic_step / times.fade
         self._up = haptic_step / times.resume
@@ -46,7 +46,7 @@ class Watchdog:
         return self._silent >= self._patience
 
     def step(self, fresh: bool) -> float:
-        """Count one haptic step; returns the share of the force that the device may have, 0 to 1."""
+        """Count one haptic step; returns the factor on the force, 0 to 1."""
         self._silent = 0 if fresh else min(self._silent + 1, self._patience)
         if self.expired:
             self.share = max(0.0, self.share - self._down)
@@ -55,5 +55,5 @@ class Watchdog:
         return self.share
 
     def reset(self) -> None:
-        """As before the first pose."""
+        """Restart as before the first pose."""
         self.share, self._silent = 0.0, self._patience

@@ -1,25 +1,25 @@
-"""The browser as a haptic device: a place in shared memory that a page moves, followed smoothly."""
+"""The browser as a haptic device: a position in shared memory that a page sets, smoothed."""
 
 import math
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.device import DevicePose
 from surgsim_env.live.exchange_records import RecordedSteps
 from surgsim_env.live.shared_record import SharedRecord
 
-# A mouse says where it is 20 to 60 times a second: its place is followed with this time constant [s].
+# Time constant of the smoothing [s]: a mouse reports 20 to 60 positions a second.
 SMOOTHING = 0.030
-# The page's process beats 100 times a second; silent for so many steps it is taken for dead.
+# Steps without a beat (of 100 a second) after which the page's process counts as dead.
 SILENT_STEPS_MOST = 20
 
 
 class BrowserDevice:
-    """A `HapticDevice` whose pose a web page sets; it shows forces and pushes nobody (`dynamics` is None).
+    """A `HapticDevice` whose pose a web page sets; it displays forces and exerts none (`dynamics` is None).
 
-    A pose is fresh in every step for as long as the page's process lives: a hand that holds still says nothing. Without
-    a beat for 20 steps there is none, and the loop's watchdog lets the force fade.
+    While the page's process is alive every step has a pose, since a hand at rest sends no messages. After 20 steps
+    without a beat there is none, and the loop's watchdog fades the force.
     """
 
     dynamics = None
@@ -33,12 +33,12 @@ class BrowserDevice:
         self.restart(place)
 
     def restart(self, place: FloatArray) -> None:
-        """Begin at a place [m]."""
+        """Restart at a position [m], (3,)."""
         self._place = place.copy()
         self._steps, self._silent = 0, SILENT_STEPS_MOST
 
     def read(self) -> DevicePose | None:
-        """The smoothed place, while the page lives."""
+        """The smoothed pose; None when the page's process is dead."""
         self._steps += 1
         record = self._hand.glance()
         if record is None or int(record["beat"]) == self._beat:
@@ -52,27 +52,27 @@ class BrowserDevice:
         return DevicePose(self._place, self._steps * self._step_time, self._buttons)
 
     def write(self, force: FloatArray) -> None:
-        """Keep the force for the page to show [N], (3,)."""
+        """Store the force, for the page to display [N], (3,)."""
         self.force = force
 
 
 class RecordedHand:
-    """A `HapticDevice` that moves as one did while it was recorded; after the last step there is no pose."""
+    """A `HapticDevice` that replays recorded poses; after the last step it has none."""
 
     dynamics = None
 
     def __init__(self, recorded: RecordedSteps, arm: int) -> None:
-        """Play one arm of a recording from its beginning."""
+        """Replay one arm of a recording from its start."""
         self._recorded, self._arm, self._next = recorded, arm, 0
         self.force = np.zeros(3)
 
     @property
     def done(self) -> bool:
-        """Whether every step was played."""
+        """Whether every step was replayed."""
         return self._next >= self._recorded.count
 
     def read(self) -> DevicePose | None:
-        """The place of the next step; None where the recording had none."""
+        """The pose of the next step; None where the recording has none."""
         if self.done:
             return None
         step = self._recorded.steps[self._next]
@@ -82,12 +82,12 @@ class RecordedHand:
         return DevicePose(place, float(step["time"]), buttons) if np.isfinite(place).all() else None
 
     def write(self, force: FloatArray) -> None:
-        """Keep the force for the page to show [N], (3,)."""
+        """Store the force, for the page to display [N], (3,)."""
         self.force = force
 
 
 class Hands:
-    """What an arm is moved by: the page, or a recording while it is played; always the same device to its loop."""
+    """The device of one arm: the page's hand, or a recording during a replay."""
 
     dynamics = None
 
@@ -98,10 +98,10 @@ class Hands:
         self.pose: DevicePose | None = None
 
     def read(self) -> DevicePose | None:
-        """The pose of whoever moves the arm; kept in `pose`."""
+        """The pose of the active device; also stored in `pose`."""
         self.pose = (self.browser if self.recorded is None else self.recorded).read()
         return self.pose
 
     def write(self, force: FloatArray) -> None:
-        """To whoever moves the arm."""
+        """Pass the force to the active device [N], (3,)."""
         (self.browser if self.recorded is None else self.recorded).write(force)

@@ -1,8 +1,8 @@
-"""What stops a live session that began with sound input."""
+"""Errors of a live session after its input was accepted."""
 
 
 class LiveError(OSError):
-    """The session cannot begin or go on: its physics died, its memory is broken, its server cannot be guarded.
+    """The session cannot start or continue: its physics ended, its memory is inconsistent, its server is unprotected.
 
-    An `OSError`, so that the command line says it in one line.
+    An `OSError`, which the command line prints as one line.
     """

@@ -1,4 +1,4 @@
-"""What the physics' process and the page's share: where hands are, what became of it, traces, recorded steps."""
+"""What the processes of physics and page exchange: hands, frames, traces, recorded steps, requests."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.live.shared_record import SharedRecord
-from surgsim_env.live.shared_rows import SharedRows
-from surgsim_env.pacing import TIMING
+from surgsim_env.haptics.pacing import TIMING
+from surgsim_env.live.organ_choice import OrganChoice
+from surgsim_env.live.shared_record import SharedRecord, SharedRows
 
-# One row of the trace covers this many haptic steps, and so many rows are kept: 20 s at 1 kHz.
+# Haptic steps per row of the trace, and its number of rows: 20 s at 1 kHz.
 TRACE_STEPS, TRACE_LENGTH = 10, 2048
 # Longest recording, in haptic steps: 5 minutes at 1 kHz.
 RECORDING_MOST = 300_000
@@ -19,7 +19,7 @@ TEXT_MOST = 240
 
 
 class Phase(IntEnum):
-    """What the physics is doing."""
+    """State of the physics."""
 
     STARTING = 0
     RUNNING = 1
@@ -29,7 +29,7 @@ class Phase(IntEnum):
 
 
 def hand_type(arm_count: int) -> np.dtype:
-    """Page to physics: where each arm shall be [m], its buttons, a beat while the page lives, requests sent."""
+    """Page to physics: target of each arm [m], its buttons, a beat that counts up, the number of requests sent."""
     return np.dtype(
         [("target", "f8", (arm_count, 3)), ("buttons", "i8", (arm_count,)), ("beat", "i8"), ("requests", "i8")]
     )
@@ -38,9 +38,9 @@ def hand_type(arm_count: int) -> np.dtype:
 def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
     """Physics to page, some 60 times a second.
 
-    phase, organ (which one, counted from 1), recording and replaying, time [s] since the reset, fault or refusal in
-    words, added_mass [kg]; for each arm tip and coupled place [m], the tissue's force on it and the device's [N], the
-    share of force that the watchdog leaves, whether a limit acts; nodes [m], places [m] and rotations of shown geoms.
+    phase, organ (its number, from 1), recording and replaying, time [s] since the reset, a message (a fault or a
+    refusal), added_mass [kg]; for each arm: tip and target [m], the forces of tissue and device on it [N], the share
+    of the force that the watchdog passes, whether a limit acts; nodes [m]; positions [m] and rotations of geoms.
     """
     arms = (arm_count, 3)
     return np.dtype(
@@ -84,46 +84,46 @@ def recording_type(arm_count: int) -> np.dtype:
 
 
 class RecordedSteps:
-    """Room for a recording that both processes see; its count is written last, by one of them at a time."""
+    """A recording in shared memory; its count is written last, by one process at a time."""
 
     def __init__(self, arm_count: int, most: int = RECORDING_MOST) -> None:
-        """Nothing recorded."""
+        """Begin empty."""
         self._shared = SharedRows(recording_type(arm_count), most)
 
     @property
     def count(self) -> int:
-        """How many steps there are."""
+        """Number of steps."""
         return int(self._shared.counter[0])
 
     @property
     def full(self) -> bool:
-        """Whether there is no room for another."""
+        """Whether the memory is full."""
         return self.count >= len(self._shared.rows)
 
     @property
     def steps(self) -> NDArray[Any]:
-        """The recorded steps themselves, (count,)."""
+        """View of the recorded steps, (count,)."""
         return self._shared.rows[: self.count]
 
     def clear(self) -> None:
-        """Forget them."""
+        """Delete all steps."""
         self._shared.counter[0] = 0
 
     def append(self, time: float, hand: NDArray, buttons: list[int], tip: NDArray, force: NDArray) -> None:
-        """Add a step; there must be room."""
+        """Add a step; `full` must be False."""
         step = self._shared.rows[self.count]
         step["time"], step["hand"], step["buttons"], step["tip"], step["force"] = time, hand, buttons, tip, force
         self._shared.counter[0] += 1
 
     def fill(self, steps: NDArray[Any]) -> None:
-        """Take steps from elsewhere.
+        """Replace all steps, such as by those of a file.
 
         Raises:
-            ValueError: more of them than there is room for.
+            ValueError: more steps than RECORDING_MOST.
         """
         most = len(self._shared.rows)
         if len(steps) > most:
-            raise ValueError(f"a recording of {len(steps)} steps is longer than {most}: cut it")
+            raise ValueError(f"a recording of {len(steps)} steps is longer than the {most} that fit: shorten it")
         self.clear()
         self._shared.rows[: len(steps)] = steps
         self._shared.counter[0] = len(steps)
@@ -131,7 +131,7 @@ class RecordedSteps:
 
 @dataclass(frozen=True)
 class Exchange:
-    """All that is shared: `hand` and `recorded` (while it replays) are the page's to write, the rest the physics'."""
+    """Shared memory of a session. The page writes `hand` and, before a replay, `recorded`; the physics all others."""
 
     arm_count: int
     node_count: int
@@ -143,7 +143,7 @@ class Exchange:
 
 
 def new_exchange(arm_count: int, node_count: int, geom_count: int) -> Exchange:
-    """Memory for one session."""
+    """Allocate the memory of one session."""
     return Exchange(
         arm_count=arm_count,
         node_count=node_count,
@@ -155,6 +155,51 @@ def new_exchange(arm_count: int, node_count: int, geom_count: int) -> Exchange:
     )
 
 
-def said(text: str) -> bytes:
-    """A text as a frame holds it, cut to its length."""
+def encoded(text: str) -> bytes:
+    """A text in UTF-8, cut to the TEXT_MOST bytes that a frame holds."""
     return text.encode("utf-8")[:TEXT_MOST].decode("utf-8", "ignore").encode("utf-8")
+
+
+# ---- requests of the page, sent through a pipe ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Pause the physics, or continue."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
+class Reset:
+    """Restart with the same organ at rest, tips parked."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Restart with another organ at rest, tips parked."""
+
+    choice: OrganChoice
+
+
+@dataclass(frozen=True)
+class Record:
+    """Begin or end a recording."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Play the recording from its start, or stop; with `given` it was read from a file and starts at rest."""
+
+    on: bool
+    given: bool = False
+
+
+@dataclass(frozen=True)
+class End:
+    """End the physics' process."""
+
+
+Request = Pause | Reset | Change | Record | Replay | End

@@ -1,57 +1,57 @@
-"""What the tips have felt so far, spread over the organ's surface: how stiff it is for its place and depth."""
+"""Stiffness map of the organ's surface from the tips' contact forces."""
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from msdm_core.mesh import FloatArray, IntArray
-from surgsim_env.anatomy import Anatomy
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.palpation.touch_memory import Indenter
+from surgsim_env.scene.anatomy import Anatomy
 
-# Presses shallower than this share of the scene's depth say little of what lies below.
+# Presses shallower than this share of the scene's press depth are ignored: they hardly depend on deeper tissue.
 DEPTH_SHARE = 0.35
-# A touch speaks for what is around it with a Gaussian of this width, in contact radii sqrt(R d), and this far.
+# Standard deviation of a touch's Gaussian weight, in contact radii sqrt(R d), and its cut-off in deviations.
 WIDTH, REACH = 0.55, 2.0
-# A node that touches have said this much of, in full touches, is felt.
+# Least sum of weights at which a node counts as felt.
 WEIGHT_LEAST = 0.5
 
 
 class FeltMap:
-    """Stiffness of what was touched over Hertz's for the scene's tissue, at each surface node.
+    """Ratio of the measured force to Hertz's for the scene's healthy tissue, at each surface node.
 
-    A touch of force f at depth d counts as f / h(d), h being a ball's on a half space; of many touches around a node
-    the contrast is sum(w f h) / sum(w h^2), deep ones counting most, as in `palpation.touch_memory`.
+    With Hertz's force h(d) of a ball on a half space, touches of force f at depths d give a node the contrast
+    sum(w f h) / sum(w h^2) (weighted least squares), so that deep touches count most, as in `palpation.touch_memory`.
 
     Fields:
-        nodes: of the surface                                                    (n_surface,)
-        contrast: 0 where nothing was felt                                       (n_surface,)
-        felt: where something was                                                (n_surface,)
-        version: goes up with each change
+        nodes: indices of the surface nodes                                      (n_surface,)
+        contrast: the ratio; 0 without touches                                   (n_surface,)
+        felt: whether the weights of the touches suffice                         (n_surface,)
+        version: increases with each change
     """
 
     def __init__(self, anatomy: Anatomy) -> None:
-        """Nothing felt."""
+        """Begin without touches."""
         scene = anatomy.scene
         self.nodes: IntArray = anatomy.mesh.boundary_nodes
         self._tree = KDTree(anatomy.mesh.points[self.nodes])
         self._indenter = Indenter(scene.instrument.tip_radius, scene.material)
         self._depth_least = DEPTH_SHARE * scene.palpation.press_depth
         contact = (scene.instrument.tip_radius * scene.palpation.press_depth) ** 0.5
-        # Never finer than the mesh.
+        # Not finer than the mesh.
         self._width = max(WIDTH * contact, 0.6 * anatomy.palpable_cell)
         self._radius = scene.instrument.tip_radius
         self.version = 0
         self.clear()
 
     def clear(self) -> None:
-        """Forget."""
+        """Delete all touches."""
         self._product, self._square, self._weight = np.zeros((3, len(self.nodes)))
         self.version += 1
 
     def feel(self, tip: FloatArray, depth: float, force: float) -> None:
-        """Take in a touch: the tip's centre [m] (3,), its depth below the resting surface [m], the force's size [N]."""
+        """Add a touch: the tip's centre [m], (3,), its depth below the surface at rest [m], the force's size [N]."""
         if depth < self._depth_least or force <= 0.0:
             return
-        # The tip's centre is this far from the surface at rest, on either side of it.
+        # Distance of the tip's centre from the surface at rest, on either side.
         away = abs(self._radius - depth)
         near = self._tree.query_ball_point(tip, away + REACH * self._width)
         if not near:
@@ -67,10 +67,10 @@ class FeltMap:
 
     @property
     def felt(self) -> np.ndarray:
-        """Where enough was felt, (n_surface,)."""
+        """Whether a node counts as felt, (n_surface,)."""
         return self._weight >= WEIGHT_LEAST
 
     @property
     def contrast(self) -> FloatArray:
-        """Force over Hertz's, 0 where nothing was felt, (n_surface,)."""
+        """Force over Hertz's, 0 without touches, (n_surface,)."""
         return np.divide(self._product, self._square, out=np.zeros_like(self._product), where=self._square > 0.0)

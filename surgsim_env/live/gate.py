@@ -1,4 +1,4 @@
-"""Who may open the page: the Host, the Origin and a token of every request are judged before anything is answered."""
+"""Access control of the page: checks Host, Origin and token of every request before anything is answered."""
 
 import hmac
 import http
@@ -15,7 +15,7 @@ from websockets.http11 import Request, Response
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 TOKEN_FIELD = "token"
-# What a browser is told about the page: to keep it to itself, to frame it nowhere, to talk to nobody else.
+# Headers that forbid the browser to cache the page, to frame it, and to contact other servers from it.
 SAFE_HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -33,17 +33,17 @@ SAFE_HEADERS = {
 
 @dataclass(frozen=True)
 class Gate:
-    """Lets in requests that name this server, come from its own page, and carry the run's token.
+    """Accepts requests that name this server, come from its own page, and carry the token of this run.
 
-    The Host keeps out pages that point a name of their own at this machine (DNS rebinding), the Origin other sites'
-    pages that open a socket here, the token everybody else on the machine or the net. The page is opened once with the
-    token in its address and keeps it in a cookie that scripts cannot read and other sites' requests do not carry.
+    The check of Host stops DNS rebinding, the check of Origin stops sockets opened by pages of other sites, and the
+    token stops everyone else on the machine or the network. The address that is opened first contains the token; a
+    cookie keeps it, which scripts cannot read and requests of other sites do not carry.
 
     Args:
-        port: that this server answers on.
-        hosts: names it may be called by, without the port; addresses in numbers are let in too when `remote`.
-        remote: whether others than this machine may connect.
-        token: of this run; made anew by default.
+        port: of this server.
+        hosts: accepted names of the server, without the port; with `remote`, IP addresses are accepted too.
+        remote: whether other machines may connect.
+        token: of this run; random by default.
     """
 
     port: int
@@ -53,11 +53,11 @@ class Gate:
 
     @property
     def cookie(self) -> str:
-        """Name of the cookie; cookies do not know ports, so it says which."""
+        """Name of the cookie, with the port: cookies are shared between ports."""
         return f"surgsim_{self.port}"
 
     def refusal(self, request: Request) -> Response | None:
-        """An answer that turns a request away and says why, or None for one that may come in."""
+        """A response that refuses a request with its reason, or None for an accepted one."""
         hosts = request.headers.get_all("Host")
         if len(hosts) != 1 or not self._is_here(hosts[0]):
             return refuse(http.HTTPStatus.MISDIRECTED_REQUEST, "this server is not called by that name (Host)")
@@ -71,7 +71,7 @@ class Gate:
         return None
 
     def welcome(self, request: Request, response: Response) -> None:
-        """Add to the page's answer what the browser shall keep and heed."""
+        """Add the security headers and the cookie to the page's response."""
         for name, value in SAFE_HEADERS.items():
             response.headers[name] = value
         if self._is_token(_query_token(request)):
@@ -108,12 +108,12 @@ class Gate:
 
 
 def asks_for_socket(request: Request) -> bool:
-    """Whether a request asks to become a websocket, in whatever words."""
+    """Whether a request asks for a websocket, by any of its headers."""
     return any(name in request.headers for name in ("Upgrade", "Sec-WebSocket-Key", "Sec-WebSocket-Version"))
 
 
 def refuse(status: http.HTTPStatus, reason: str) -> Response:
-    """A short answer in plain text that closes the connection."""
+    """A short response in plain text that closes the connection."""
     body = f"surgsim: {reason}\n".encode()
     headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
     headers["Connection"] = "close"
@@ -122,10 +122,10 @@ def refuse(status: http.HTTPStatus, reason: str) -> Response:
 
 
 def listening_socket(host: str, port: int, *, remote: bool) -> socket.socket:
-    """A socket that listens on an address of this machine alone, or, where said, of any.
+    """A socket that listens on a loopback address, or with `remote` on any address.
 
     Raises:
-        ValueError: an address beyond this machine without `remote`; an address or a port that cannot be had.
+        ValueError: an address that other machines reach, without `remote`; an address or port that cannot be bound.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -150,7 +150,7 @@ def listening_socket(host: str, port: int, *, remote: bool) -> socket.socket:
 
 
 def names_of(host: str, *, remote: bool) -> tuple[str, ...]:
-    """The names that a server on this host may be called by."""
+    """Accepted names of a server on this host."""
     own = (host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()) if remote else ()
     return tuple(dict.fromkeys((*LOOPBACK, *own)))
 

@@ -1,25 +1,24 @@
-"""A viser server that cannot be reached but through the gate, and never opens a tunnel."""
+"""A viser server whose requests pass a gate and whose messages pass a filter, and which opens no public tunnel."""
 
 import http
 import threading
 from collections.abc import Awaitable, Callable
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from importlib.resources import files
+from io import StringIO
 from typing import Any
-from unittest import mock
 
 import viser
 import viser.infra
-import websockets.asyncio.server
 from viser import _messages
 from websockets import Headers
+from websockets.asyncio import server as websocket_server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from surgsim_env.live.errors import LiveError
 from surgsim_env.live.gate import Gate, asks_for_socket, listening_socket, names_of, refuse
-from surgsim_env.live.hand_messages import HAND_PATH
-from surgsim_env.live.web_messages import Judge, NonsenseError
+from surgsim_env.live.messages import HAND_PATH, InvalidMessageError, MessageFilter, RateLimit
 
 # What one client may send at once [bytes]: a pose, a slider, where its camera stands.
 MESSAGE_SIZE_MOST = 16 * 1024
@@ -35,27 +34,30 @@ HandServer = Callable[[ServerConnection], Awaitable[None]]
 
 
 class GuardedServer:
-    """A viser server whose every request passes a `Gate`, and whose every message passes a `Judge`.
+    """A viser server whose every request passes a `Gate`, and whose every message passes a `MessageFilter`.
 
-    viser 1.1 binds all interfaces, takes any Origin, and lets any client ask for a public tunnel. It calls
-    `websockets.asyncio.server.serve` once, from its constructor: that call is taken over here. Where a later viser does
-    not make it, nothing is served.
+    viser 1.1 binds all interfaces, accepts any Origin, and lets any client request a public tunnel, and has no option
+    for any of them. It opens its port with `websockets.asyncio.server.serve`, once, in its constructor; a subclass
+    stands in for it there. If a later viser opens its port in another way, the constructor raises and nothing is
+    served.
 
     Fields:
         viser: the server whose scene and panel are filled
         gate: who may connect
-        judge: which messages are let through
+        message_filter: which messages are let through
         address: what to open, token included
     """
 
-    def __init__(self, host: str, port: int, *, remote: bool, judge: Judge, serve_hand: HandServer) -> None:
+    def __init__(
+        self, host: str, port: int, *, remote: bool, message_filter: MessageFilter, serve_hand: HandServer
+    ) -> None:
         """Listen.
 
         Args:
             host: address to listen on.
             port: 0 takes a free one.
             remote: whether other machines may connect.
-            judge: of messages.
+            message_filter: of messages.
             serve_hand: takes over the sockets that keyboards and gamepads steer through.
 
         Raises:
@@ -65,7 +67,7 @@ class GuardedServer:
         self._listening = listening_socket(host, port, remote=remote)
         bound_port = self._listening.getsockname()[1]
         self.gate = Gate(bound_port, names_of(host, remote=remote), remote)
-        self.judge, self._serve_hand = judge, serve_hand
+        self.message_filter, self._serve_hand = message_filter, serve_hand
         self._guards = 0
         with self._taking_over_serve():
             self.viser = viser.ViserServer(host=host, port=bound_port, label="surgsim", verbose=False)
@@ -87,27 +89,37 @@ class GuardedServer:
 
     @contextmanager
     def _taking_over_serve(self):
-        real = websockets.asyncio.server.serve
+        guarded = self
 
-        def serve(handler: Any, host: str, port: int, **given: Any) -> Any:
-            self._guards += 1
-            for name in ("max_size", "create_connection", "ping_interval", "open_timeout"):
-                given.pop(name, None)
-            return real(
-                self._dispatch(handler),
-                sock=self._listening,
-                max_size=MESSAGE_SIZE_MOST,
-                ping_interval=PING_INTERVAL,
-                ping_timeout=PING_INTERVAL,
-                open_timeout=PING_INTERVAL,
-                create_connection=self._connection_type(),
-                process_request=self._answer(given.pop("process_request")),
-                **given,
-            )
+        class GuardedServe(websocket_server.serve):
+            """What viser 1.1 opens its port with: on our socket, with our limits, behind the gate and the filter."""
 
-        # viser's own thread makes the call; nobody else may serve in between.
-        with _SERVING, mock.patch.object(websockets.asyncio.server, "serve", serve), _without_announcement():
-            yield
+            def __init__(self, handler: Any, host: str, port: int, **given: Any) -> None:
+                guarded._guards += 1
+                super().__init__(
+                    guarded._dispatch(handler),
+                    **{
+                        **given,
+                        "sock": guarded._listening,
+                        "max_size": MESSAGE_SIZE_MOST,
+                        "ping_interval": PING_INTERVAL,
+                        "ping_timeout": PING_INTERVAL,
+                        "open_timeout": PING_INTERVAL,
+                        "create_connection": guarded._connection_type(),
+                        "process_request": guarded._answer(given["process_request"]),
+                    },
+                )
+
+        # viser has no parameter for any of these, and looks `serve` up in its own thread while its constructor waits.
+        with _SERVING:
+            serve = websocket_server.serve
+            websocket_server.serve = GuardedServe
+            try:
+                # viser prints an address without the token; the caller prints ours.
+                with redirect_stdout(StringIO()):
+                    yield
+            finally:
+                websocket_server.serve = serve
 
     def _answer(self, viser_answer: Callable[..., Response | None]) -> Callable[..., Response | None]:
         """What is answered to a request: a refusal, viser's page, or None to open a socket."""
@@ -145,29 +157,29 @@ class GuardedServer:
         return handle
 
     def _connection_type(self) -> type[ServerConnection]:
-        judge = self.judge
+        message_filter = self.message_filter
 
-        class JudgedConnection(ServerConnection):
-            """A connection whose messages are judged before viser decodes them; nonsense closes it."""
+        class FilteredConnection(ServerConnection):
+            """A connection whose messages are filtered before viser decodes them; an invalid one closes it."""
 
             def __init__(self, *given: Any, **named: Any) -> None:
                 super().__init__(*given, **named)
-                self._pace = judge.new_pace()
+                self._rate = RateLimit()
 
             async def recv(self, decode: bool | None = None) -> Any:
                 while True:
                     message = await super().recv(decode)
                     try:
-                        self._pace.count()
+                        self._rate.count()
                         if self.request is not None and self.request.path.partition("?")[0] == HAND_PATH:
                             return message
-                        if judge.lets_through(message):
+                        if message_filter.accepts(message):
                             return message
-                    except NonsenseError as error:
-                        judge.dropped += 1
+                    except InvalidMessageError as error:
+                        message_filter.dropped += 1
                         await self.close(1008, str(error)[:100])
 
-        return JudgedConnection
+        return FilteredConnection
 
     def _forget_tunnels(self) -> None:
         """Take away viser's handlers that open a public tunnel when a client asks; and the way to open one."""
@@ -182,13 +194,6 @@ class GuardedServer:
 
 
 _SERVING = threading.Lock()
-
-
-@contextmanager
-def _without_announcement():
-    """Viser prints an address without the token; ours is printed instead."""
-    with mock.patch("rich.print", lambda *_, **__: None):
-        yield
 
 
 def _with_script(response: Response) -> Response:

@@ -1,4 +1,4 @@
-// Keys and gamepads steer the instrument: packets as hand_messages.py has them, 40 times a second while something is held.
+// Keys and gamepads steer the instrument: packets as messages.py has them, 40 times a second while something is held.
 // Every second the server is told how the browser draws (drawing.js).
 (() => {
   "use strict";

@@ -1,23 +1,23 @@
-"""Where the tips of a live session begin: before the organ, in sight, touching nothing."""
+"""Initial positions of the tips of a live session: in front of the organ, visible, without contact."""
 
 import mujoco
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.arms.arm_instrument import ArmInstrument
-from surgsim_env.arms.pair import Pair
-from surgsim_env.instrument import Instrument
-from surgsim_env.tool_bodies import CONTACT_GROUP
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
+from surgsim_env.instruments.arm.pair import Pair
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
+from surgsim_env.scene.anatomy import Anatomy
 
-# A tip on slides begins this far from the organ [m], and nothing that tissue feels begins nearer than that.
+# Initial distance of a tip on slides from the organ, and smallest distance of any contact shape [m].
 HOME_GAP, SHAPE_GAP = 0.015, 0.004
 
 
 def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
-    """Where tips begin: before the middle of the palpable face, arms where they park. [m], (3,) or (2, 3).
+    """Initial tip positions [m], (3,) or (2, 3): over the middle of the palpable face, or where an arm parks.
 
-    Farther out where an open jaw, which reaches beyond its tip, would touch. `instrument` is parked, and stays so.
+    Farther away if an open jaw, which reaches beyond its tip, would touch. `instrument` is parked and is not moved.
     """
     face = anatomy.face
     if isinstance(instrument, ArmInstrument | Pair):
@@ -32,7 +32,7 @@ def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
 
 
 def _clearance(anatomy: Anatomy, instrument: Instrument, shift: FloatArray) -> float:
-    """How far a parked instrument, shifted [m] (3,), is from the organ along the face's approach, at least [m]."""
+    """Smallest distance [m] of a parked instrument, shifted by [m] (3,), from the organ along the approach."""
     model, data, face = instrument.model, instrument.data, anatomy.face
     out, gaps = -face.approach, []
     for geom in np.flatnonzero((model.geom_group == CONTACT_GROUP) & (model.geom_bodyid != 0)):

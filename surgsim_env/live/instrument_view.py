@@ -1,4 +1,4 @@
-"""The instrument on the page: its geoms, posed from frames, and the handles that a mouse takes it by."""
+"""The instrument on the page: its geoms, posed from frames, and its dragging by the mouse."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering.instrument_geoms import geom_colour
 
-# The page's scene is in decimetres: what viser's cameras and handles are made for is some metres large.
+# The page's scene is in decimetres: viser's cameras and handles are made for scenes of some metres.
 SCALE = 10.0
-# What moved by less [m] is not sent again.
+# Smaller changes are not sent [m].
 STILL = 2e-6
 
 _KIND = {
@@ -30,7 +30,7 @@ class InstrumentView:
             scene: viser's.
             model: the instrument's.
             geoms: which of its geoms are drawn.
-            arm_count: 1, or 2 where the second one's parts are named "right_".
+            arm_count: 1, or 2: then the names of the second arm's bodies begin with "right_".
         """
         self.nodes, self.arms = [], []
         self._shown: NDArray[np.float32] | None = None
@@ -42,7 +42,7 @@ class InstrumentView:
             self.arms.append(None if fixed else int(arm_count > 1 and body.startswith("right_")))
 
     def follow(self, position: NDArray[np.float32], rotation: NDArray[np.float32]) -> None:
-        """Put the nodes where the geoms are [m] (n_geom, 3), turned by matrices (n_geom, 9)."""
+        """Move the nodes to positions [m], (n_geom, 3), and rotation matrices, (n_geom, 9)."""
         quaternion, moved = np.zeros(4), self._moved(position, rotation)
         for node, place, turn, has_moved in zip(self.nodes, position, rotation, moved, strict=True):
             if not has_moved:
@@ -51,14 +51,14 @@ class InstrumentView:
             node.position, node.wxyz = place * SCALE, quaternion.copy()
 
     def _moved(self, position: NDArray[np.float32], rotation: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which geoms are elsewhere than they were shown last, (n_geom,)."""
+        """Which geoms have moved since they were last sent, (n_geom,)."""
         now = np.concatenate([position, rotation], axis=1)
         moved = np.ones(len(now), dtype=bool) if self._shown is None else np.abs(now - self._shown).max(axis=1) > STILL
         self._shown = now if self._shown is None else np.where(moved[:, None], now, self._shown)
         return moved
 
     def on_drag(self, moved: Callable[[int, str, FloatArray], None]) -> list[str]:
-        """Call back with an arm, the drag's phase and the pointer's place [m]; returns the nodes to drag."""
+        """Call `moved` with an arm, the phase of a drag and the pointer's position [m]; returns the nodes' names."""
         names = []
         for node, arm in zip(self.nodes, self.arms, strict=True):
             if arm is None:

@@ -1,4 +1,4 @@
-"""What the sliders ask for: the tissue's modulus and damping, and which lesions it hides."""
+"""The organ that the sliders describe: modulus and damping of the tissue, and its lesions."""
 
 import math
 from dataclasses import dataclass, replace
@@ -6,25 +6,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels import OrganModel
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.scenes import Scene
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Lesion
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.model import Scene
 
-# How much of an organ's mass may be added for fewer substeps, and the fewest.
+# Largest share of an organ's mass that may be added to save substeps, and the smallest number of substeps.
 ADDED_MASS_SHARE, SUBSTEPS_FEWEST = 0.01, 2
 SHOWN, HIDDEN, NONE = "as in the scene", "hidden", "none"
 
 
 @dataclass(frozen=True)
 class OrganChoice:
-    """An organ of a scene as the sliders have it.
+    """An organ of a scene as the sliders describe it.
 
     Args:
-        modulus_factor: of the healthy tissue's and its capsule's moduli; lesions keep their ratio over it.
-        damping_factor: of the scene's damping.
+        modulus_factor: on the moduli of healthy tissue and capsule; lesions keep their ratio to it.
+        damping_factor: on the scene's damping.
         lesions: SHOWN, the scene's own; HIDDEN, one drawn from the scene's ranges; NONE.
-        lesion_ratio: modulus of every lesion over the tissue's; None: each its own.
+        lesion_ratio: modulus of every lesion over the tissue's; None: as in the scene.
         lesion_size: factor of every lesion's radius.
         seed: of the hidden lesion.
 
@@ -51,13 +51,13 @@ class OrganChoice:
 
 
 def live_scene(scene: Scene) -> Scene:
-    """The scene in as few substeps as a hundredth of its mass more buys, so that there is time left in a haptic step.
+    """The scene with mass scaling and the fewest substeps that at most 1 % of added mass allows.
 
-    With mass scaling (`timing.mass_scaling`), as sliders ask for organs that no number of substeps was chosen for. The
-    liver's 2 substeps instead of 4 take 0.3 % of its mass, on the nodes that limit the step.
+    Fewer substeps leave time in each haptic step for drawing; mass scaling (`timing.mass_scaling`) also covers the
+    stiffer organs that the sliders describe. The liver needs 2 substeps instead of 4 with 0.3 % of its mass added.
 
     Raises:
-        ValueError: a scene whose mesh cannot be made.
+        ValueError: the mesh of the scene cannot be made.
     """
     timing = replace(scene.timing, mass_scaling=True)
     anatomy, choice = load_anatomy(replace(scene, timing=timing)), OrganChoice(lesions=lesion_kinds(scene)[0])
@@ -66,7 +66,7 @@ def live_scene(scene: Scene) -> Scene:
         try:
             organ = chosen_organ(replace(anatomy, scene=fewer), choice)
         except OrganError:
-            # More than mass scaling may add at all.
+            # It would need more than the limit of mass scaling.
             continue
         if organ.added_mass <= ADDED_MASS_SHARE * organ.node_mass.sum():
             return fewer
@@ -74,7 +74,7 @@ def live_scene(scene: Scene) -> Scene:
 
 
 def lesion_kinds(scene: Scene) -> tuple[str, ...]:
-    """What a scene's lesions may be, the first what it begins with."""
+    """The choices of lesions in a scene, the initial one first."""
     shown = scene.demonstration or any(region.lesion for region in scene.regions)
     kinds = (SHOWN,) if shown else ()
     return (*kinds, *((HIDDEN,) if scene.lesion is not None else ()), NONE)
@@ -84,7 +84,7 @@ def chosen_lesions(anatomy: Anatomy, choice: OrganChoice) -> list[Lesion]:
     """The lesions of a choice.
 
     Raises:
-        ValueError: hidden ones in a scene that has no ranges for them, or no room.
+        ValueError: hidden lesions in a scene without ranges for them, or without room.
     """
     if choice.lesions == NONE:
         return []
@@ -99,7 +99,7 @@ def chosen_organ(anatomy: Anatomy, choice: OrganChoice) -> OrganModel:
     """The organ of a choice.
 
     Raises:
-        ValueError: a lesion that there is no room for, or an organ too stiff for the scene's steps.
+        ValueError: no room for a lesion, or an organ too stiff for the scene's substep.
     """
     lesions = chosen_lesions(anatomy, choice)
     specification = anatomy.specification(lesions, modulus_factor=choice.modulus_factor)

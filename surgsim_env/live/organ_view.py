@@ -1,20 +1,20 @@
-"""The organ on the page: its surface as it deforms, what was felt painted on it, and the lesions it hides."""
+"""The organ on the page: its deforming surface, the stiffness map painted on it, and its lesions."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy
+from msdm_core.material.regions import Lesion
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.instrument_view import SCALE, STILL
 from surgsim_env.rendering.surface import TRIANGLES_MOST, drawn_surface
 from surgsim_env.rendering.tissue import lesion_ball
+from surgsim_env.scene.anatomy import Anatomy
 
 ORGAN_COLOUR, LESION_COLOUR = (158, 58, 50), (250, 214, 120)
-# Contrast from the first to the last colour, in medians of what was felt softest; colours from soft to stiff.
+# Contrast of the first and the last colour, relative to the lower quartile of the map; colours from soft to stiff.
 CONTRASTS = (0.75, 2.25)
 COLOURS = (
     (45, 67, 148),
@@ -26,9 +26,9 @@ COLOURS = (
     (240, 117, 48),
     (205, 46, 46),
 )
-# What is drawn plainly has no more triangles than this, where the simulation has no more itself.
+# Most triangles in plain mode, unless the simulation's surface has more.
 PLAIN_TRIANGLES_MOST = 5_000
-# The paint lies this far above the surface [m].
+# Offset of the paint above the surface [m].
 PAINT_ABOVE = 0.0004
 NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
@@ -37,8 +37,8 @@ class OrganView:
     """Nodes of a viser scene for an organ, its paint, and its lesions.
 
     Fields:
-        paints: whether what was felt is shown
-        plain: whether it is drawn with fewer triangles, from the next picture on
+        paints: whether the stiffness map is shown
+        plain: whether to draw fewer triangles, from the next picture on
     """
 
     def __init__(self, scene: Any, anatomy: Anatomy) -> None:
@@ -58,7 +58,7 @@ class OrganView:
         self._lesions: list[tuple[Any, Any]] = []
 
     def follow(self, node_position: FloatArray) -> None:
-        """Take the surface where the nodes are [m], (n_node, 3)."""
+        """Move the surface to the node positions [m], (n_node, 3)."""
         self._choose_surface()
         if self._fresh == 0 and np.abs(node_position - self._shown).max() < STILL:
             return
@@ -73,7 +73,7 @@ class OrganView:
             node.position = ball.centre_now(self._points, node_position) * SCALE
 
     def _choose_surface(self) -> None:
-        """Draw the other surface from now on, where that is wanted."""
+        """Switch between the fine and the plain surface, if `plain` changed."""
         if self.plain == self._drawn_plain:
             return
         self._drawn_plain = self.plain
@@ -91,7 +91,7 @@ class OrganView:
         )
 
     def paint(self, felt: FeltMap) -> None:
-        """Colour what was felt since the last time; the softest of it is blue."""
+        """Update the colours of the stiffness map; the softest part is blue."""
         self._choose_surface()
         if not self.paints or felt.version == self._painted:
             return
@@ -108,7 +108,7 @@ class OrganView:
             paint.cover(self._surface.faces[level == index])
 
     def show_paint(self, on: bool) -> None:
-        """Show or hide what was felt."""
+        """Show or hide the stiffness map."""
         self.paints, self._painted, self._fresh = on, -1, 1
         if not on:
             for paint in self._paint:
@@ -116,7 +116,7 @@ class OrganView:
                 paint.follow(np.zeros((0, 3), dtype=np.float32))
 
     def show_lesions(self, lesions: Sequence[Lesion]) -> None:
-        """Show lesions inside an organ that is seen through; none: it is not."""
+        """Show lesions inside a translucent organ; an empty list makes it opaque."""
         for _, node in self._lesions:
             node.remove()
         self._lesions = []
@@ -135,7 +135,7 @@ class OrganView:
 
 
 class _Paint:
-    """One colour's part of the surface."""
+    """The part of the surface in one colour."""
 
     def __init__(self, scene: Any, name: str, colour: tuple[int, int, int]) -> None:
         self._scene, self._name, self._colour = scene, name, colour
@@ -165,7 +165,7 @@ class _Paint:
 
 
 def colour_levels(contrast: FloatArray) -> np.ndarray:
-    """Which of COLOURS shows each contrast, -1 where it is NaN: relative to the lower quartile of what was felt."""
+    """Index into COLOURS of each contrast, relative to the lower quartile of all; -1 where it is NaN."""
     level = np.full(len(contrast), -1)
     known = np.isfinite(contrast)
     if known.any():

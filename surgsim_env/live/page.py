@@ -1,4 +1,4 @@
-"""The page: what the picture shows of frames, what the panel asks of the session, thirty times a second."""
+"""The page: shows frames of the physics and passes requests of the panel to the session, thirty times a second."""
 
 import contextlib
 import time
@@ -7,27 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.haptics.pacing import timeliness
 from surgsim_env.live.errors import LiveError
-from surgsim_env.live.exchange_records import Phase
+from surgsim_env.live.exchange_records import Change, Pause, Phase, Record, Replay, Reset
 from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.guarded_server import GuardedServer
-from surgsim_env.live.hand_sockets import HandSockets
 from surgsim_env.live.instrument_view import SCALE, InstrumentView
+from surgsim_env.live.messages import MessageFilter
 from surgsim_env.live.organ_choice import chosen_lesions
 from surgsim_env.live.organ_view import OrganView
-from surgsim_env.live.panel import Panel
+from surgsim_env.live.panel import Panel, headline, status_rows
 from surgsim_env.live.recording import write_recording
-from surgsim_env.live.requests import Change, Pause, Record, Replay, Reset
 from surgsim_env.live.session import Session
 from surgsim_env.live.stage import ForceArrow, Surroundings, add_handle
-from surgsim_env.live.status import headline, status_rows
-from surgsim_env.live.web_messages import Judge
-from surgsim_env.pacing import timeliness
+from surgsim_env.live.tabs import HandSockets
 
-# Between plots, and between words [s].
+# Between updates of the plots, and of the status text [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
-# How long the physics may take to end a recording [s].
+# Longest wait for the physics to end a recording [s].
 END_TIMEOUT = 2.0
 
 
@@ -35,28 +33,30 @@ class Page:
     """A session on a guarded viser server.
 
     Fields:
-        session, server: both ends
-        felt: what the tips have felt of this organ
-        pictures: how many were made
+        session, server: the physics' side and the browsers' side
+        felt: stiffness map of this organ from the touches so far
+        pictures: number of pictures sent
     """
 
     def __init__(self, session: Session, *, host: str, port: int, remote: bool, out: Path) -> None:
         """Serve.
 
         Args:
-            session: that has begun.
+            session: a running one.
             host: see `GuardedServer`.
             port: see `GuardedServer`.
             remote: see `GuardedServer`.
             out: folder that recordings are written to.
 
         Raises:
-            ValueError: an address that is not to be had.
+            ValueError: the address cannot be bound.
         """
         self.session, self._out = session, out
-        self._judge = Judge()
-        self._tabs = HandSockets(session, self._judge)
-        self.server = GuardedServer(host, port, remote=remote, judge=self._judge, serve_hand=self._tabs.serve)
+        self._message_filter = MessageFilter()
+        self._tabs = HandSockets(session, self._message_filter)
+        self.server = GuardedServer(
+            host, port, remote=remote, message_filter=self._message_filter, serve_hand=self._tabs.serve
+        )
         self.felt = FeltMap(session.anatomy)
         self.pictures = 0
         self._organ_number, self._traced = 1, 0
@@ -66,7 +66,7 @@ class Page:
         self._was_recording = False
         self._doing: tuple[int, bool, bool] | None = None
         self._said = ""
-        # None: nobody has said yet how to draw.
+        # None: neither a browser nor the user has chosen yet.
         self._plain: bool | None = None
         viser = self.server.viser
         with viser.atomic():
@@ -76,7 +76,7 @@ class Page:
             self._add_instrument()
             self._panel = Panel(
                 viser.gui,
-                self._judge,
+                self._message_filter,
                 session.scene,
                 session.arm_count,
                 session.instrument.jaw is not None,
@@ -87,17 +87,17 @@ class Page:
         """The instrument, a handle at each hand, an arrow of force at each tip."""
         session, scene = self.session, self.server.viser.scene
         self._instrument = InstrumentView(scene, session.instrument.model, session.geoms, session.arm_count)
-        self._judge.nodes.update(self._instrument.on_drag(self._dragged))
+        self._message_filter.nodes.update(self._instrument.on_drag(self._dragged))
         size = float(np.ptp(session.anatomy.mesh.points, axis=0).max())
         self._handles = [
             add_handle(scene, arm, place, size, session.directions, self._pulled)
             for arm, place in enumerate(session.parked)
         ]
-        self._judge.nodes.update(handle.name for handle in self._handles)
+        self._message_filter.nodes.update(handle.name for handle in self._handles)
         self._arrows = [ForceArrow(scene, arm, size) for arm in range(session.arm_count)]
 
     def _calls(self) -> dict[str, Callable[..., None]]:
-        """What the panel calls; a click turns over what the physics is doing then, not what a button's name says."""
+        """Callbacks of the panel; a click toggles the current state, which a button's label may lag behind."""
         session = self.session
         return {
             "pause": lambda: session.ask(Pause(session.frame()["phase"] != Phase.PAUSED)),
@@ -112,13 +112,13 @@ class Page:
         }
 
     def show_plain(self, on: bool) -> None:
-        """Leave shadows, reflections and the finest triangles away, on every page, or draw them again."""
+        """Turn shadows, reflections and the finest triangles off or on, in every tab."""
         self._plain = self._organ.plain = on
         self._surroundings.show_plain(on)
         self._panel.show_plain(on)
 
     def run(self, until: Callable[[], bool]) -> None:
-        """Make pictures until told to stop, or the physics is gone; as many as browsers come to.
+        """Send pictures until `until()` holds, at the rate that the browsers can draw.
 
         Raises:
             LiveError: the physics died.
@@ -146,10 +146,10 @@ class Page:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def end_recording(self) -> str:
-        """Write the recording that runs, if one does; a sentence on what came of it, or nothing.
+        """Write the current recording to a file; returns a sentence that states the result, or "".
 
-        Call it when `run` is over, in whatever way: what was recorded lies in memory that the physics does not take
-        along.
+        Call it after `run` has ended, also by an error: the recorded steps lie in shared memory, which outlives the
+        physics' process.
         """
         session, runs = self.session, self._was_recording
         with contextlib.suppress(LiveError):
@@ -165,7 +165,7 @@ class Page:
         return f"{self._out}: {write_recording(session.exchange.recorded.steps.copy(), self._out)}"
 
     def _pulled(self, arm: int, phase: str, place: FloatArray) -> None:
-        """A hand's own handle is pulled to a place [m]."""
+        """The handle of a hand is dragged to a position [m], (3,)."""
         if phase == "start":
             self._held.add(arm)
         self.session.move_to(arm, place)
@@ -194,7 +194,7 @@ class Page:
         self._organ.show_paint(on)
 
     def _attend(self, frame: np.ndarray) -> None:
-        """What is to be done whether anybody looks or not: touches felt, sliders heeded, recordings written."""
+        """Do what does not depend on open tabs: update the stiffness map, apply the sliders, write recordings."""
         session = self.session
         if self._plain is None and self._tabs.software:
             self.show_plain(True)
@@ -218,7 +218,7 @@ class Page:
             self._show_phase(frame)
 
     def _feel(self) -> None:
-        """Take the trace's new rows into the map."""
+        """Add the new rows of the trace to the stiffness map."""
         trace = self.session.exchange.trace.read()
         count = int(trace["count"])
         self._traced = min(self._traced, count)
@@ -230,7 +230,7 @@ class Page:
         self._traced = count
 
     def _show(self, frame: np.ndarray) -> None:
-        """One picture."""
+        """Update the picture."""
         self._organ.paint(self.felt)
         self._organ.follow(frame["node"].astype(np.float64))
         self._instrument.follow(frame["geom"], frame["turn"])
@@ -242,7 +242,7 @@ class Page:
                 handle.position = targets[arm] * SCALE
 
     def _say(self, frame: np.ndarray) -> None:
-        """How it goes, in words and figures."""
+        """Update the status text."""
         now, pictures = self.session.timing(), self.pictures
         wall = now[1] - self._before[1]
         kept = timeliness(self._before[0], now[0], wall)

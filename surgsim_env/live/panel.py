@@ -1,24 +1,36 @@
-"""The page's panel: buttons, sliders, plots, and how well the physics keeps time."""
+"""The page's panel: buttons, sliders, plots, and a status text with the timing of the physics."""
 
+import html
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from surgsim_env.haptics.pacing import Timeliness
+from surgsim_env.live.exchange_records import Phase
+from surgsim_env.live.messages import MessageFilter
 from surgsim_env.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
 from surgsim_env.live.organ_view import COLOURS, CONTRASTS
-from surgsim_env.live.web_messages import Judge, is_flag, is_number, is_one_of
-from surgsim_env.scenes import Scene
+from surgsim_env.scene.model import Scene
 
-# The plots show so much time [s], in so many points.
+# Time span of the plots [s], and their number of points.
 PLOTTED, PLOT_POINTS = 10.0, 250
-# The upper end of a plot that shows little; it doubles as needed.
+# Smallest upper end of a plot's scale; it doubles as needed.
 PLOT_LEAST = {"N": 0.5, "mm": 4.0}
-# A slider that has stood still for so long [s] means what it says.
+# A change applies when the sliders have not moved for this long [s].
 SETTLED = 0.35
 BUTTON_COLOUR = (52, 84, 96)
 ARM_COLOURS = ("#e8590c", "#1971c2")
+TITLES = {
+    Phase.STARTING: "starting",
+    Phase.RUNNING: "running",
+    Phase.PAUSED: "paused",
+    Phase.FAULT: "stopped by a fault: press Reset",
+    Phase.ENDED: "ended",
+}
 STEERING = """
 | | |
 |---|---|
@@ -32,43 +44,49 @@ Drag elsewhere to turn the view, wheel to zoom.
 
 
 class Panel:
-    """Everything beside the picture. Callbacks are called from viser's threads.
+    """The panel beside the picture. viser's threads call the callbacks.
 
     Fields:
-        choice: the organ that the sliders say
+        choice: the organ that the sliders describe
     """
 
     def __init__(
-        self, gui: Any, judge: Judge, scene: Scene, arm_count: int, has_jaw: bool, calls: dict[str, Callable[..., None]]
+        self,
+        gui: Any,
+        message_filter: MessageFilter,
+        scene: Scene,
+        arm_count: int,
+        has_jaw: bool,
+        calls: dict[str, Callable[..., None]],
     ) -> None:
         """Build it.
 
         Args:
             gui: viser's.
-            judge: is told what each element may be set to.
+            message_filter: receives the allowed values of each element.
             scene: of the session.
             arm_count: 1 or 2.
             has_jaw: whether the first arm has a jaw.
-            calls: what is called, by name: pause(), record() and replay(), which begin or end what they name;
+            calls: callbacks by name: pause(), record() and replay(), which toggle;
                 reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), plain(on).
         """
-        self._gui, self._judge, self._scene, self._calls = gui, judge, scene, calls
+        self._gui, self._message_filter, self._scene, self._calls = gui, message_filter, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
         self._changed: float | None = None
         self._status = gui.add_html(_status_html("starting", []))
         self._add_buttons()
         self._jaw = gui.add_checkbox("Close the jaw", initial_value=False, visible=has_jaw)
-        self._knows(self._jaw, is_flag)
+        self._allow(self._jaw, bool)
         self._jaw.on_update(lambda _: calls["close_jaw"](self._jaw.value))
         with gui.add_folder("Force and depth"):
             self._force = _plot(gui, "N", arm_count)
             self._depth = _plot(gui, "mm", arm_count)
         with gui.add_folder("Tissue"):
             self._add_tissue()
-        with gui.add_folder("What was felt"):
+        with gui.add_folder("Stiffness map"):
             self._add_map()
-        self._plain = gui.add_checkbox("Plain light", initial_value=False, hint="quicker without a graphics card")
-        self._knows(self._plain, is_flag)
+        self._plain = gui.add_checkbox("Plain light", initial_value=False, hint="faster without a graphics card")
+        self._allow(self._plain, bool)
         self._plain.on_update(lambda _: calls["plain"](self._plain.value))
         with gui.add_folder("How to steer", expand_by_default=False):
             second = "\n| X, or a shoulder button | the other arm |" if arm_count > 1 else ""
@@ -76,23 +94,23 @@ class Panel:
             gui.add_markdown(STEERING.format(second=second, jaw=jaw))
 
     def settled_choice(self) -> OrganChoice | None:
-        """The organ that sliders were moved to, once they stand still; None otherwise."""
+        """The organ that the sliders describe, once they have stopped moving; None otherwise."""
         if self._changed is None or time.monotonic() - self._changed < SETTLED:
             return None
         self._changed = None
         return self.choice
 
     def show_status(self, headline: str, rows: list[tuple[str, str]]) -> None:
-        """Say how it goes: a headline, and names with values."""
+        """Show a headline, and names with values."""
         self._status.content = _status_html(headline, rows)
 
     def show_phase(
         self, *, paused: bool, recording: bool, replaying: bool, recorded: int, step: float, jaw_closed: bool
     ) -> None:
-        """Name the buttons after what they do next."""
+        """Label the buttons with what a click will do."""
         if self._jaw.value != jaw_closed:
             self._jaw.value = jaw_closed
-        self._name(self._pause, "Go on" if paused else "Pause")
+        self._name(self._pause, "Continue" if paused else "Pause")
         self._name(self._record, f"End recording ({recorded * step:.0f} s)" if recording else "Record")
         self._name(self._replay, "End replay" if replaying else f"Replay ({recorded * step:.1f} s)")
         disabled = recorded == 0 or recording
@@ -100,7 +118,7 @@ class Panel:
             self._replay.disabled = disabled
 
     def show_plain(self, on: bool) -> None:
-        """Tick its box."""
+        """Set its check box."""
         if self._plain.value != on:
             self._plain.value = on
 
@@ -123,15 +141,13 @@ class Panel:
 
     def _add_buttons(self) -> None:
         calls = self._calls
-        self._pause = self._button("Pause", "stand still, or go on")
+        self._pause = self._button("Pause", "pause the physics, or continue")
         self._pause.on_click(lambda _: calls["pause"]())
         reset = self._button("Reset", "the same organ at rest, tips parked")
         reset.on_click(lambda _: calls["reset"]())
-        self._record = self._button(
-            "Record", "record hands, tips and forces a thousand times a second; written to a CSV file"
-        )
+        self._record = self._button("Record", "record hands, tips and forces at 1 kHz to a CSV file")
         self._record.on_click(lambda _: calls["record"]())
-        self._replay = self._button("Replay", "move as recorded, from the state that the recording began with")
+        self._replay = self._button("Replay", "repeat the recorded motion from the recording's initial state")
         self._replay.on_click(lambda _: calls["replay"]())
         self._replay.disabled = True
 
@@ -141,7 +157,7 @@ class Panel:
         self._damping = self._slider("Damping [1/s]", 0.25, 4.0, 0.05, 1.0, max(scene.damping.alpha, 1e-3))
         kinds = lesion_kinds(scene)
         self._lesions = gui.add_dropdown("Lesions", kinds, initial_value=kinds[0])
-        self._knows(self._lesions, is_one_of(*kinds))
+        self._allow(self._lesions, Literal[tuple(kinds)])
         ratio = max(
             (one.modulus_ratio for one in scene.demonstration),
             default=scene.lesion.modulus_ratio[1] if scene.lesion else 8.0,
@@ -154,16 +170,16 @@ class Panel:
             one.on_update(lambda _: self._choose())
         hide.on_click(lambda _: self._hide())
         show = gui.add_checkbox("Show lesions", initial_value=False)
-        self._knows(show, is_flag)
+        self._allow(show, bool)
         show.on_update(lambda _: self._calls["show_lesions"](show.value))
 
     def _add_map(self) -> None:
         gui = self._gui
         gui.add_html(_legend_html())
         paint = gui.add_checkbox("Paint it on the organ", initial_value=True)
-        self._knows(paint, is_flag)
+        self._allow(paint, bool)
         paint.on_update(lambda _: self._calls["paint"](paint.value))
-        self._button("Clear", "forget what was felt").on_click(lambda _: self._calls["clear_map"]())
+        self._button("Clear", "clear the stiffness map").on_click(lambda _: self._calls["clear_map"]())
 
     def _choose(self, **changes: Any) -> None:
         scene = self._scene
@@ -180,22 +196,22 @@ class Panel:
     def _hide(self) -> None:
         self._lesions.value = HIDDEN
         self._choose(seed=self.choice.seed + 1)
-        # A click says what it means at once.
+        # A click applies at once.
         self._changed = time.monotonic() - SETTLED
 
     def _slider(self, label: str, low: float, high: float, step: float, start: float, unit: float = 1.0) -> Any:
         values = [round(value * unit, 6) for value in (low, high, step, start)]
         slider = self._gui.add_slider(label, min=values[0], max=values[1], step=values[2], initial_value=values[3])
-        self._knows(slider, is_number(values[0] - 1e-9, values[1] + 1e-9))
+        self._allow(slider, Annotated[float, msgspec.Meta(ge=values[0] - 1e-9, le=values[1] + 1e-9)])
         return slider
 
     def _button(self, label: str, hint: str) -> Any:
         button = self._gui.add_button(label, hint=hint, color=BUTTON_COLOUR)
-        self._knows(button, is_flag)
+        self._allow(button, bool)
         return button
 
-    def _knows(self, handle: Any, allowed: Callable[[Any], bool]) -> None:
-        self._judge.values[handle._impl.uuid] = allowed
+    def _allow(self, handle: Any, values: Any) -> None:
+        self._message_filter.values[handle._impl.uuid] = values
 
     @staticmethod
     def _name(button: Any, label: str) -> None:
@@ -232,7 +248,7 @@ def _status_html(headline: str, rows: list[tuple[str, str]]) -> str:
     cells = "".join(
         f'<tr><td style="opacity:.65;padding-right:.8em">{name}</td>'
         f'<td style="text-align:right;font-variant-numeric:tabular-nums">{value}</td></tr>'
-        # Words without a name take the whole width.
+        # A text without a name takes the whole width.
         if name
         else f'<tr><td colspan="2" style="color:{ARM_COLOURS[0]}">{value}</td></tr>'
         for name, value in rows
@@ -249,6 +265,45 @@ def _legend_html() -> str:
     return (
         '<div style="padding:.2em .9em;font-size:.8em"><div style="height:.7em;border-radius:.35em;'
         f'background:linear-gradient(to right, {colours})"></div>'
-        f'<div style="display:flex;justify-content:space-between"><span>{low:g}</span><span>stiffness over the softest '
-        f"quarter felt</span><span>{high:g} and more</span></div></div>"
+        f'<div style="display:flex;justify-content:space-between"><span>{low:g}</span><span>stiffness over the lower '
+        f"quartile</span><span>{high:g} and more</span></div></div>"
     )
+
+
+def headline(frame: NDArray[Any]) -> str:
+    """The state of the physics in a frame, in words."""
+    if frame["replaying"]:
+        return "replaying"
+    return "recording" if frame["recording"] else TITLES[Phase(int(frame["phase"]))]
+
+
+def status_rows(
+    frame: NDArray[Any], kept: Timeliness, *, skipped: int, fps: float, drawn: float | None, said: str
+) -> list[tuple[str, str]]:
+    """Names with values, as HTML.
+
+    Args:
+        frame: the newest.
+        kept: timing of the steps since the last call.
+        skipped: steps skipped since the start.
+        fps: pictures sent [1/s].
+        drawn: pictures drawn by the slowest browser [1/s], None if unknown.
+        said: message of the page, shown when the physics has none.
+    """
+    force = " / ".join(f"{float(np.linalg.norm(one)):.2f}" for one in frame["force"])
+    rows = [
+        ("force, left / right arm" if len(frame["force"]) > 1 else "force", f"{force} N"),
+        ("simulated time", f"{float(frame['time']):.1f} s"),
+        ("physics", f"{kept.rate:.0f} steps/s"),
+        ("real-time factor", f"{kept.real_time:.3f}"),
+        ("late, median / 99 %", f"{kept.late_p50 * 1e3:.2f} / {kept.late_p99 * 1e3:.2f} ms"),
+        ("a step takes", f"{kept.spent_p50 * 1e3:.2f} ms"),
+        ("steps skipped so far", f"{skipped}"),
+        ("pictures", f"{fps:.0f} /s" + ("" if drawn is None else f" (browser {drawn:.0f})")),
+    ]
+    if float(frame["added_mass"]) > 0.0:
+        rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))
+    words = bytes(frame["said"]).decode("utf-8", "replace") or said
+    if words:
+        rows.append(("", html.escape(words)))
+    return rows

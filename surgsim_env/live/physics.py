@@ -1,37 +1,56 @@
-"""The physics of a live session: a haptic step whenever one is due, and what the page asks for in between."""
+"""The physics of a live session: haptic steps in real time, and the page's requests between them."""
 
+import contextlib
+import ctypes
+import gc
+import os
+import signal
+import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from msdm_core.kernels import OrganModel
-from surgsim_env.anatomy import load_anatomy
+from msdm_core.kernels.structure_kernels import OrganModel
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.loop import HapticLoop
+from surgsim_env.haptics.pacing import Pacer, PaceSettings
 from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.telemetry import HapticTelemetry
 from surgsim_env.live.browser_device import BrowserDevice, Hands, RecordedHand
-from surgsim_env.live.exchange_records import TRACE_LENGTH, TRACE_STEPS, Exchange, Phase, said
+from surgsim_env.live.exchange_records import (
+    TRACE_LENGTH,
+    TRACE_STEPS,
+    Change,
+    End,
+    Exchange,
+    Pause,
+    Phase,
+    Record,
+    Replay,
+    Request,
+    Reset,
+    encoded,
+)
 from surgsim_env.live.home import home_of
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
-from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Request, Reset
-from surgsim_env.pacing import Pacer, PaceSettings
 from surgsim_env.rendering.instrument_geoms import shown_geoms
-from surgsim_env.scenes import Scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.model import Scene
 
-# A frame for the page is written once in so many steps, the parent and the page's requests looked at likewise.
+# Steps between frames for the page, and between checks of the parent process and of requests.
 FRAME_STEPS, LOOK_STEPS = 16, 8
-# So many requests are heeded at a look; the others wait for the next.
+# Requests handled per check; others wait for the next.
 REQUESTS_MOST = 4
-# The hand may go through the air at this speed [m/s] before a tip follows no more.
+# Largest speeds at which a tip follows its hand, in general and on the way to the organ [m/s].
 SPEED_LARGEST, APPROACH_SPEED = 0.25, 0.05
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What a physics process is started with.
+    """Arguments of the physics' process.
 
     Args:
         scene: of the session.
@@ -45,10 +64,10 @@ class Setup:
 
 
 class Physics:
-    """Steps a simulation that the page's hands hold, tells the page, and does what it asks between two steps."""
+    """Steps a simulation whose tips follow the page's hands, writes frames, and handles requests between steps."""
 
     def __init__(self, setup: Setup, exchange: Exchange, requests: Connection) -> None:
-        """Load the scene, compile what is to be compiled, and couple the hands."""
+        """Load the scene, compile the organ, and couple the hands."""
         self._exchange, self._requests = exchange, requests
         self._anatomy = load_anatomy(setup.scene)
         self._simulation = Simulation(self._anatomy)
@@ -68,32 +87,32 @@ class Physics:
         self._recording, self._replaying = False, False
         self._start_state: dict[str, np.ndarray] | None = None
         self._peak = np.zeros(len(self._hands))
-        # Requests that were heeded; those that came before the first step lie in the pipe.
+        # Number of requests handled; earlier ones wait in the pipe.
         self._asked = 0
-        # The first steps load and compile.
+        # The first step loads or compiles the kernels.
         self._last = self._loop.step()
-        self._begin_again()
+        self._restart()
 
     def run(self, parent_lives: Any) -> None:
-        """Step until told to end."""
+        """Step until an End request or the end of the parent process."""
         count, frame_steps = 0, FRAME_STEPS
         self._pacer.start()
         while True:
             self._pacer.wait()
             if self._phase == Phase.RUNNING:
                 self._last = self._loop.step()
-                self._keep(self._last)
+                self._record_step(self._last)
                 self._pacer.done(self._simulation.haptic_dt)
             count += 1
             if count % frame_steps == 0:
-                self._tell()
-            if count % LOOK_STEPS == 0 and not self._look(parent_lives):
+                self._write_frame()
+            if count % LOOK_STEPS == 0 and not self._handle_requests(parent_lives):
                 break
         self._phase = Phase.ENDED
-        self._tell()
+        self._write_frame()
 
-    def _look(self, parent_lives: Any) -> bool:
-        """Do what was asked for; False to end."""
+    def _handle_requests(self, parent_lives: Any) -> bool:
+        """Handle requests; False to end."""
         if not parent_lives():
             return False
         asked = int(self._exchange.hand.peek["requests"])
@@ -108,17 +127,17 @@ class Physics:
                 if isinstance(request, End):
                     return False
                 self._asked += 1
-                self._do(request)
+                self._handle(request)
                 took_long = took_long or isinstance(request, Change | Replay | Reset)
         except (EOFError, OSError):
             return False
-        # Making an organ, or a state, takes longer than a step, and was asked for: the clock starts again. Any other
-        # request is heeded within a step, and what it costs is lateness like any other.
+        # Compiling an organ or restoring a state takes longer than a step, so the pacing starts again. Other requests
+        # are handled within a step, and their time counts as lateness.
         if took_long:
             self._pacer.start()
         return True
 
-    def _do(self, request: Request) -> None:
+    def _handle(self, request: Request) -> None:
         self._said = ""
         if isinstance(request, Pause):
             if self._phase in (Phase.RUNNING, Phase.PAUSED):
@@ -131,17 +150,17 @@ class Physics:
             self._record(request.on)
         elif isinstance(request, Replay):
             self._replay(request)
-        self._tell()
+        self._write_frame()
 
     def _rest(self, organ: OrganModel | None = None) -> None:
         self._recording = self._replaying = False
         for hand in self._hands:
             hand.recorded = None
         self._loop.reset(organ, self._home)
-        self._begin_again()
+        self._restart()
 
-    def _begin_again(self) -> None:
-        """The tips were put somewhere: hands start from there, and the trace anew."""
+    def _restart(self) -> None:
+        """After the tips were moved: restart the hands from there, and the trace."""
         self._phase = Phase.RUNNING
         for hand, held in zip(self._hands, self._loop.held, strict=True):
             hand.browser.restart(held.drive.tip)
@@ -150,7 +169,7 @@ class Physics:
         self._peak[:] = 0.0
         untouched = tuple(held.telemetry(np.zeros(3)) for held in self._loop.held)
         self._last = HapticTelemetry(self._simulation.time, "", untouched)
-        self._tell()
+        self._write_frame()
 
     def _change(self, choice: OrganChoice) -> None:
         before, number = self._organ, self._organ_number
@@ -162,14 +181,14 @@ class Physics:
         except ValueError as error:
             self._organ_number = number
             self._rest(before)
-            self._said = f"not that organ: {error}"
+            self._said = f"this organ cannot be made: {error}"
 
     def _record(self, on: bool) -> None:
         if on and self._recording:
             return
         if on and not self._replaying:
             self._exchange.recorded.clear()
-            # From a held instrument's state and couplings that start anew, so that a replay can start the same.
+            # The couplings restart here and in a replay, so that both begin in the same state.
             self._start_state = self._simulation.get_state()
             for held in self._loop.held:
                 held.restart()
@@ -189,13 +208,13 @@ class Physics:
             self._loop.fault = self._simulation.fault
             for held in self._loop.held:
                 held.restart()
-        self._begin_again()
+        self._restart()
         for arm, hand in enumerate(self._hands):
             hand.recorded = RecordedHand(self._exchange.recorded, arm)
         self._replaying = True
 
-    def _keep(self, told: HapticTelemetry) -> None:
-        """Note a step in trace and recording, and see what it came to."""
+    def _record_step(self, told: HapticTelemetry) -> None:
+        """Add a step to the trace and the recording, and react to the end of a replay and to faults."""
         exchange, simulation = self._exchange, self._simulation
         for arm, tip in enumerate(told.tips):
             x, y, z = tip.contact_force.tolist()
@@ -228,16 +247,16 @@ class Physics:
                 hand.browser.restart(held.drive.tip)
         if told.fault:
             self._phase, self._said, self._recording = Phase.FAULT, told.fault, False
-            self._tell()
+            self._write_frame()
 
-    def _tell(self) -> None:
+    def _write_frame(self) -> None:
         """Write a frame for the page."""
         simulation, told = self._simulation, self._last
         data = simulation.instrument.data
         with self._exchange.frame.writing() as frame:
             frame["phase"], frame["organ"] = int(self._phase), self._organ_number
             frame["recording"], frame["replaying"] = self._recording, self._replaying
-            frame["time"], frame["said"] = simulation.time, said(self._said)
+            frame["time"], frame["said"] = simulation.time, encoded(self._said)
             frame["added_mass"] = self._organ.added_mass
             for arm, tip in enumerate(told.tips):
                 frame["tip"][arm] = self._loop.held[arm].drive.tip
@@ -246,3 +265,50 @@ class Physics:
                 frame["limited"][arm] = tip.clamped or tip.workspace_limited
             frame["node"] = simulation.organ_state.node_position[:, :3]
             frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
+
+
+# Unix niceness (scheduling priority); values below 0 need the right to set them.
+NICENESS = -10
+
+
+def run_physics(setup: Setup, exchange: Exchange, requests: Connection, parent: int) -> None:
+    """Run the child process; it ends on request, or when the process with the id `parent` has ended.
+
+    An error at the start is sent through `requests` as a text, and the process ends with status 1.
+    """
+    # The page's process handles Ctrl-C and ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _set_timer_slack()
+    _raise_priority()
+    try:
+        physics = Physics(setup, exchange, requests)
+    except (ValueError, OSError) as error:
+        with contextlib.suppress(OSError):
+            requests.send(str(error))
+        sys.exit(1)
+    # Objects made so far stay, and no step creates reference cycles: garbage collection would only cost time.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    physics.run(lambda: os.getppid() == parent)
+
+
+def _raise_priority() -> None:
+    """Raise the process' priority above pictures and browsers, where that is allowed.
+
+    Linux shares the processor first between sessions (autogroups), then within each by niceness, so the physics gets
+    a session of its own.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        os.setsid()
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/autogroup").write_text(str(NICENESS))
+
+
+def _set_timer_slack() -> None:
+    """Set the timer slack of Linux to 1 ns: sleeps otherwise end up to 50 us late."""
+    if sys.platform == "linux":
+        set_timer_slack = 29
+        ctypes.CDLL(None).prctl(set_timer_slack, 1, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""A client that speaks the page's protocol without drawing: for measurements and tests."""
+"""A client of the page's protocol that draws nothing: for measurements and tests."""
 
 import asyncio
 import math
@@ -11,22 +11,22 @@ from urllib.parse import parse_qs, urlsplit
 import msgspec.msgpack
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.live.instrument_view import SCALE
+from surgsim_env.scene.anatomy import Anatomy
 
-# Its probe goes in and out of the organ with this period [s].
+# Period of its presses [s].
 PRESS_PERIOD = 4.0
 
 Path = Callable[[float], FloatArray]
 
 
 class ProtocolClient:
-    """Takes all that a browser would be sent, and moves the first hand 30 times a second.
+    """Receives everything that a browser would, and moves the first hand 30 times a second.
 
     Fields:
-        updates: windows of messages that came
-        errors: what went wrong, if anything
+        updates: number of message batches received
+        errors: descriptions of errors
     """
 
     def __init__(self, address: str, path: Path | None = None, *, rate: float = 30.0, pause: float = 0.0) -> None:
@@ -34,9 +34,9 @@ class ProtocolClient:
 
         Args:
             address: token included.
-            path: where the first hand goes over time [s], [m] (3,); None: nowhere.
+            path: position of the first hand [m], (3,), over time [s]; None: it stays.
             rate: of the poses that it sends [1/s].
-            pause: after each message that it takes [s]: a slow client.
+            pause: after each message received [s], to simulate a slow client.
         """
         parts = urlsplit(address)
         self._origin = f"{parts.scheme}://{parts.netloc}"
@@ -68,13 +68,16 @@ class ProtocolClient:
                 subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
                 max_size=None,
                 compression=None,
+                # A busy machine may leave it without a turn for long.
+                open_timeout=None,
+                ping_interval=None,
             ) as socket:
                 await socket.send(msgspec.msgpack.encode(CAMERA))
                 sending = asyncio.create_task(self._send(socket))
                 try:
                     while not self._stopping.is_set():
                         if self._path is not None and sending.done():
-                            self.errors.append(f"no more poses are sent: {sending.exception()!r}")
+                            self.errors.append(f"sending poses ended: {sending.exception()!r}")
                             return
                         try:
                             message = await asyncio.wait_for(socket.recv(), 0.2)
@@ -82,7 +85,7 @@ class ProtocolClient:
                             continue
                         self.updates, self.bytes = self.updates + 1, self.bytes + len(message)
                         if self._pause:
-                            await asyncio.sleep(self._pause)
+                            await asyncio.to_thread(self._stopping.wait, self._pause)
                 finally:
                     sending.cancel()
         except (OSError, WebSocketException) as error:
@@ -110,13 +113,13 @@ CAMERA = {
 
 
 def hand_message(place: FloatArray) -> bytes:
-    """The message of the first hand's handle, dragged to a place [m], (3,)."""
+    """The message that drags the first hand's handle to a position [m], (3,)."""
     moved = {"name": "/hand/0", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": (place * SCALE).tolist(), "owner": ""}
     return msgspec.msgpack.encode({"type": "TransformControlsUpdateMessage", **moved})
 
 
 def press_path(anatomy: Anatomy) -> Path:
-    """In and out of the organ at one place of its palpable face, to the depth that its scene is palpated with."""
+    """Periodic presses at one point of the palpable face, to the scene's press depth."""
     scene = anatomy.scene
     point, normal = anatomy.face.random_point(np.random.default_rng(0), scene.palpation.face_margin)
     radius, depth = scene.instrument.tip_radius, scene.palpation.press_depth

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from surgsim_env.haptics.motion_file import Motion, motion_columns, read_motion
 from surgsim_env.live.exchange_records import RECORDING_MOST, recording_type
 
-# Rows whose times differ from a haptic step by less than this share of it lie one apart.
+# Tolerance on the spacing of rows, as a share of the haptic step.
 STEP_TOLERANCE = 0.01
 
 
@@ -24,7 +24,7 @@ def columns(arm_count: int) -> list[str]:
 
 
 def write_recording(steps: NDArray[Any], folder: Path) -> str:
-    """Write recorded steps to the next free recording-NUMBER.csv of a folder; returns a sentence on what came of it."""
+    """Write steps to the next free recording-NUMBER.csv of a folder; returns a sentence that states the result."""
     if not len(steps):
         return "nothing was recorded"
     arm_count = steps["hand"].shape[1]
@@ -48,17 +48,17 @@ def write_recording(steps: NDArray[Any], folder: Path) -> str:
 def read_recording(path: Path, arm_count: int, haptic_step: float) -> NDArray[Any]:
     """The steps of a file that `write_recording` wrote, or of a trajectory with columns time, x, y, z.
 
-    Rows that lie a haptic step [s] apart are taken as they are. All others are a trajectory over time: between two of
-    its rows a hand moves evenly, and has the buttons of the first; beside a row without a place (nan) there is none.
+    Rows one haptic step [s] apart are used unchanged. Otherwise the rows are interpolated linearly in time, with the
+    buttons of the earlier row; next to a row without a position (nan) there is none.
 
     Raises:
-        ValueError: names the file, the line and what is wrong with it: no number, not finite, a time that does not
-            grow, more steps than a recording has room for.
-        OSError: a file that cannot be read.
+        ValueError: names the file, the line and what is wrong with it: no number, not finite, times that do not
+            increase, more steps than RECORDING_MOST.
+        OSError: the file cannot be read.
     """
     motion = read_motion(path, [_mark(arm) for arm in range(arm_count)], rows_largest=RECORDING_MOST)
     time = motion.time
-    # A step in which a hand said nothing is nan, nan, nan; its time is always a number.
+    # A step without a pose is nan, nan, nan; its time is always a number.
     if not np.isfinite(time).all() or np.isinf(motion.position).any():
         raise ValueError(f"{path.name} has a time or a place that is not finite")
     backward = np.flatnonzero(np.diff(time) <= 0.0)
@@ -89,7 +89,7 @@ def _resampled(path: Path, motion: Motion, haptic_step: float) -> Motion:
 
 
 def _mark(arm: int) -> str:
-    """Behind the names of an arm's columns."""
+    """Suffix of the names of an arm's columns."""
     return "" if arm == 0 else f"_{arm + 1}"
 
 

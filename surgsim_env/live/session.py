@@ -1,53 +1,59 @@
-"""A live session as its page's process sees it: hands that move, requests, and what the physics tells."""
+"""A live session, seen from the page's process: moves the hands, sends requests, reads the physics' frames."""
 
 import contextlib
 import multiprocessing
 import os
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import load_anatomy
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.haptics.pacing import PaceSettings
 from surgsim_env.live.errors import LiveError
-from surgsim_env.live.exchange_records import TRACE_LENGTH, Exchange, Phase, new_exchange
-from surgsim_env.live.hand_messages import HandMotion
+from surgsim_env.live.exchange_records import TRACE_LENGTH, Change, End, Exchange, Phase, Request, new_exchange
 from surgsim_env.live.home import home_of
+from surgsim_env.live.messages import HandMotion
 from surgsim_env.live.organ_choice import OrganChoice, lesion_kinds, live_scene
-from surgsim_env.live.physics import Setup
-from surgsim_env.live.physics_process import run_physics
-from surgsim_env.live.requests import Change, End, Request
-from surgsim_env.pacing import PaceSettings
+from surgsim_env.live.physics import Setup, run_physics
 from surgsim_env.rendering.instrument_geoms import shown_geoms
-from surgsim_env.scenes import Scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.model import Scene
 
-# The hands' beat [1/s], and how long a key or stick is taken to be held after it was last heard of [s].
+# Updates of the hands [1/s], and how long a key or stick counts as held after its last message [s].
 BEAT_RATE, HELD = 100.0, 0.15
-# A hand at full deflection moves a target this fast [m/s].
+# Speed of a target at full deflection [m/s].
 HAND_SPEED = 0.04
 # The button that closes a jaw, as `HapticSettings.jaw_button` has it.
 JAW_BUTTON = 1
-# How long compiling with an empty cache may take [s].
+# Longest start, with an empty numba cache [s].
 START_TIMEOUT = 300.0
 
 
 class Session:
-    """Starts the physics' process and speaks with it; every method may be called from any thread.
+    """Starts the physics' process and communicates with it; every method may be called from any thread.
 
     Fields:
-        anatomy, instrument: as the physics has them; the instrument stays parked
-        exchange: what both share
-        parked: where tips begin [m]                                             (n_arm, 3)
-        choice: the organ that was asked for last
+        anatomy, instrument: copies of the physics' ones; the instrument stays parked
+        exchange: memory shared with the physics
+        parked: initial positions of the tips [m]                                 (n_arm, 3)
+        choice: the organ requested last
         directions: unit vectors right, away and out of the view, as rows         (3, 3)
     """
 
-    def __init__(self, scene: Scene, *, pace: PaceSettings | None = None) -> None:
-        """Start; `wait` waits until it steps.
+    def __init__(
+        self, scene: Scene, *, pace: PaceSettings | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Start the process; `wait` returns when it steps.
+
+        Args:
+            scene: the scene that is shown.
+            pace: of the haptic steps; one a haptic step of the scene by default.
+            clock: measures how long keys and sticks are held [s].
 
         Raises:
             ValueError: a scene whose mesh or instrument cannot be made.
@@ -63,6 +69,7 @@ class Session:
         self._targets = self.parked.copy()
         self._buttons = np.zeros(len(self.parked), dtype=np.int64)
         self._motions: dict[int, tuple[FloatArray, float]] = {}
+        self._clock = clock
         self._lock = threading.Lock()
         self._requests = 0
         spawn = multiprocessing.get_context("spawn")
@@ -79,25 +86,25 @@ class Session:
 
     @property
     def arm_count(self) -> int:
-        """How many tips are held."""
+        """Number of tips."""
         return len(self.parked)
 
     @property
     def targets(self) -> FloatArray:
-        """Where the hands are [m], (n_arm, 3)."""
+        """Target positions of the hands [m], (n_arm, 3)."""
         with self._lock:
             return self._targets.copy()
 
     @property
     def alive(self) -> bool:
-        """Whether the physics' process lives."""
+        """Whether the physics' process is running."""
         return self._process.is_alive()
 
     def wait(self, timeout: float = START_TIMEOUT) -> None:
-        """Until the physics steps.
+        """Wait until the physics steps.
 
         Raises:
-            LiveError: it died, and why where it said so, or did not begin in time.
+            LiveError: the process ended (with its reason, where it sent one) or did not start in time.
         """
         deadline = time.monotonic() + timeout
         while self.frame()["phase"] == Phase.STARTING or not int(self.exchange.timing.peek["steps"]):
@@ -107,15 +114,15 @@ class Session:
             time.sleep(0.02)
 
     def require_alive(self) -> None:
-        """Check that the physics' process lives.
+        """Check that the physics' process is running.
 
         Raises:
-            LiveError: it died; with what it said.
+            LiveError: it ended; with its reason, where it sent one.
         """
         if self.alive:
             return
         said = ""
-        # What it could not say, Python has printed.
+        # Other errors were printed by Python.
         with contextlib.suppress(EOFError, OSError):
             said = self._pipe.recv() if self._pipe.poll() else ""
         why = said or f"exit code {self._process.exitcode}; its own message, if any, stands above"
@@ -138,7 +145,7 @@ class Session:
         return self.exchange.timing.peek.copy(), time.perf_counter()
 
     def ask(self, request: Request) -> None:
-        """Send a request; what it leads to shows in frames."""
+        """Send a request; its effect appears in later frames."""
         with self._lock:
             if isinstance(request, Change):
                 self.choice = request.choice
@@ -149,29 +156,29 @@ class Session:
             self._requests += 1
 
     def move_to(self, arm: int, target: FloatArray) -> None:
-        """Put a hand somewhere [m], (3,); it is held within the tip's workspace and a centimetre of its walls.
+        """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm.
 
         Raises:
-            ValueError: a place that is not finite.
+            ValueError: the target is not finite.
         """
         if not np.isfinite(target).all():
-            raise ValueError(f"a hand's place is {target}; it must be finite")
+            raise ValueError(f"the target of a hand is {target}; it must be finite")
         with self._lock:
             self._targets[arm] = np.clip(target, self.instrument.lower - 0.01, self.instrument.upper + 0.01)
 
     def park(self) -> None:
-        """Put all hands where tips are parked."""
+        """Set all targets to the parked positions."""
         with self._lock:
             self._targets[:] = self.parked
 
     def push(self, motion: HandMotion) -> None:
-        """Let a key or a stick move a hand; it is held until it is not heard of for a while.
+        """Move a hand by a key or a stick, until its messages stop.
 
-        A page does not know how many arms there are: the other arm of one is the same.
+        A page does not know the number of arms: with one arm, arm 1 is arm 0.
         """
         arm = motion.arm % self.arm_count
         with self._lock:
-            self._motions[arm] = (np.array(motion.axes), time.monotonic())
+            self._motions[arm] = (np.array(motion.axes), self._clock())
             if motion.turns_jaw:
                 self._buttons[arm] ^= JAW_BUTTON
 
@@ -182,11 +189,11 @@ class Session:
 
     @property
     def jaw_closed(self) -> bool:
-        """Whether the first arm's jaw was told to be closed."""
+        """Whether the first arm's jaw is commanded to close."""
         return bool(self._buttons[0] & JAW_BUTTON)
 
     def close(self) -> None:
-        """End the physics."""
+        """End the physics' process."""
         self.ask(End())
         self._ended.set()
         self._beating.join(timeout=1.0)
@@ -199,10 +206,10 @@ class Session:
         self._pipe.close()
 
     def _beat(self) -> None:
-        """Move hands that are pushed, and show the physics that this process lives."""
-        period, then = 1.0 / BEAT_RATE, time.monotonic()
+        """Move the hands that are pushed, and signal to the physics that this process is alive."""
+        period, then = 1.0 / BEAT_RATE, self._clock()
         while not self._ended.wait(period):
-            now = time.monotonic()
+            now = self._clock()
             passed, then = min(now - then, 0.1), now
             with self._lock:
                 for arm, (axes, heard) in list(self._motions.items()):

@@ -1,25 +1,26 @@
-"""A record in memory that two processes share: one writes and never waits, others read whole copies."""
+"""Records in memory shared by two processes: one writes without waiting, others read consistent copies."""
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing.sharedctypes import RawArray
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_env.live.errors import LiveError
-from surgsim_env.live.shared_rows import SharedRows
 
-# How long a reader tries before it says that the writer never holds still [s]: a writer may be put aside by other
-# processes in the middle of it. Between tries it lets others run for so long.
+# How long a reader tries before it raises [s], as the scheduler may stop a writer in the middle of a record; the pause
+# between tries [s].
 PATIENCE, PAUSE = 1.0, 50e-6
 
 
 class SharedRecord:
     """One numpy record under a sequence lock (Lameter 2005): odd while it is written, even when it is whole.
 
-    One thread writes at a time; a reader never makes it wait.
+    Only one thread may write; readers never block it.
     """
 
     def __init__(self, dtype: np.dtype) -> None:
@@ -28,7 +29,7 @@ class SharedRecord:
 
     @contextmanager
     def writing(self) -> Iterator[NDArray[Any]]:
-        """The record to change; readers that come meanwhile try again."""
+        """The record, to be changed; readers try again meanwhile."""
         shared = self._shared
         shared.counter[0] += 1
         shared.fence()
@@ -42,7 +43,7 @@ class SharedRecord:
         """A copy of the record as one `writing` left it, shape ().
 
         Raises:
-            LiveError: its writer died, or never stops, in the middle of it.
+            LiveError: no consistent copy within PATIENCE: the writer ended in the middle of the record.
         """
         begin = time.monotonic()
         while time.monotonic() - begin < PATIENCE:
@@ -50,10 +51,10 @@ class SharedRecord:
             if copy is not None:
                 return copy
             time.sleep(PAUSE)
-        raise LiveError("a shared record is never whole: the process that writes it died in the middle")
+        raise LiveError("a shared record stays incomplete: the process that writes it ended in the middle")
 
     def glance(self) -> NDArray[Any] | None:
-        """A copy of the record, or None where it is being written just now: it never waits, and never raises."""
+        """A copy of the record, or None while it is being written; never waits, never raises."""
         shared = self._shared
         before = int(shared.counter[0])
         shared.fence()
@@ -63,5 +64,43 @@ class SharedRecord:
 
     @property
     def peek(self) -> NDArray[Any]:
-        """The record itself, for its writer, and for readers of single numbers."""
+        """View of the record, for its writer and for readers of single numbers."""
         return self._shared.rows.reshape(())
+
+
+_COUNTER_SIZE = 8
+
+
+class SharedRows:
+    """An array of zeros shared with a child process that receives it as an argument of its `Process`.
+
+    The memory has no name that other processes could open, and is freed with the last process that uses it.
+
+    Fields:
+        counter: for synchronisation                                              (1,)
+        rows: of the dtype that it was made with                                 (count,)
+    """
+
+    def __init__(self, dtype: np.dtype, count: int = 1) -> None:
+        """Allocate `count` rows; the system provides pages of memory when they are first written."""
+        self._dtype, self._memory = dtype, RawArray("B", _COUNTER_SIZE + count * dtype.itemsize)
+        self._view()
+
+    def fence(self) -> None:
+        """Memory barrier: readers that use it too see writes before it earlier than writes after it."""
+        # x86 keeps the order of stores; on other processors, acquiring any lock does.
+        with self._barrier:
+            pass
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_dtype": self._dtype, "_memory": self._memory}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._view()
+
+    def _view(self) -> None:
+        whole = np.frombuffer(self._memory, dtype=np.uint8)
+        self.counter = whole[:_COUNTER_SIZE].view(np.int64)
+        self.rows = whole[_COUNTER_SIZE:].view(self._dtype)
+        self._barrier = threading.Lock()

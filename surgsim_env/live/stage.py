@@ -1,4 +1,4 @@
-"""What stands around the organ on the page: camera, light, ground, handles of the hands, arrows of force."""
+"""The surroundings of the organ on the page: camera, light, ground, handles of the hands, force arrows."""
 
 import math
 from collections.abc import Callable
@@ -7,28 +7,28 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.live.instrument_view import SCALE
 from surgsim_env.rendering.cameras import Camera, scene_cameras
+from surgsim_env.scene.anatomy import Anatomy
 
 HAND_COLOURS = ((255, 146, 43), (77, 171, 247))
 GROUND_COLOUR, FORCE_COLOUR, BRAND_COLOUR = (28, 58, 66), (255, 224, 102), (232, 89, 12)
-# The ground lies this far below the organ [m], and reaches so many times its size.
+# Distance of the ground below the organ [m], and its half size in sizes of the organ.
 GROUND_GAP, GROUND_REACH = 0.002, 4.0
-# The page's camera stands so many times as far off as the overview, and looks this share of half its height aside.
+# Distance of the page's camera in distances of the overview camera, and its sideways shift in half picture heights.
 FARTHER, ASIDE = 1.5, 0.42
-# In plain light, what comes from everywhere.
+# Ambient intensity in plain light.
 AMBIENT = 0.9
-# In the page's own decimetres; the handle is not larger than this share of the organ.
+# In the page's decimetres; HANDLE_SHARE limits the handle to a share of the organ.
 HANDLE_SIZE, HANDLE_SHARE, BALL_RADIUS = 0.35, 0.45, 0.03
 SHAFT_RADIUS, HEAD_RADIUS, HEAD_LENGTH = 0.012, 0.035, 0.07
-# Of an arrow: sizes of the organ for each newton, but at most so much [m/N]; the force below which there is none [N].
+# Length of a force arrow per newton: share of the organ's size, at most [m/N]; no arrow below the last value [N].
 FORCE_SHARE, FORCE_LENGTH, FORCE_LEAST = 0.4, 0.06, 0.005
 
 
 def page_camera(anatomy: Anatomy) -> Camera:
-    """Where the page is looked at from: the overview, farther off, with the organ left of the panel."""
+    """The page's initial camera: as the overview, farther away, with the organ left of the panel."""
     near = scene_cameras(anatomy, aspect=1.2)["overview"]
     distance = FARTHER * float(np.linalg.norm(near.position - near.target))
     aside = ASIDE * distance * math.tan(math.radians(0.5 * near.fov)) * near.rotation[:, 0]
@@ -40,11 +40,11 @@ class Surroundings:
     """Camera, light and ground.
 
     Fields:
-        directions: unit vectors right, away and out of the organ for whoever looks, as rows (3, 3)
+        directions: unit vectors right, away from the viewer, and out of the organ, as rows (3, 3)
     """
 
     def __init__(self, viser: Any, anatomy: Anatomy) -> None:
-        """Set them up on a viser server."""
+        """Add them to a viser server."""
         camera = page_camera(anatomy)
         viser.scene.set_up_direction(camera.up)
         first = viser.initial_camera
@@ -60,7 +60,7 @@ class Surroundings:
         self.show_plain(False)
 
     def show_plain(self, on: bool) -> None:
-        """Leave away what takes most of a software renderer's time: shadows, reflections, a ground that shines."""
+        """Turn off what costs a software renderer most: shadows, reflections, a glossy ground."""
         self._scene.configure_default_lights(enabled=True, cast_shadow=not on)
         self._scene.configure_environment_map(None if on else "warehouse", environment_intensity=0.6)
         self._scene.add_light_ambient("/ambient", intensity=AMBIENT if on else 0.0)
@@ -75,15 +75,15 @@ def add_handle(
     directions: FloatArray,
     pulled: Callable[[int, str, FloatArray], None],
 ) -> Any:
-    """The arrows that pull a hand out of the organ, into it, and across it.
+    """Add the arrows that drag a hand out of the organ, into it, and across it.
 
     Args:
         scene: viser's.
-        arm: whose hand it is.
-        place: where it begins [m], (3,).
+        arm: index of the hand.
+        place: initial position [m], (3,).
         size: of the organ [m].
         directions: see `Surroundings`.
-        pulled: called with the arm, the drag's phase and the place [m].
+        pulled: called with the arm, the phase of the drag and the position [m], (3,).
     """
     out = directions[2]
     across = np.cross(directions[1], out)
@@ -111,10 +111,10 @@ def add_handle(
 
 
 class ForceArrow:
-    """The tissue's force on a tip, as an arrow from the tip; a mesh like all others, which browsers have compiled."""
+    """The tissue's force on a tip, as an arrow. A plain mesh, whose shader the browser has compiled already."""
 
     def __init__(self, scene: Any, arm: int, size: float) -> None:
-        """Add it, of no length, to a scene with an organ of some size [m]."""
+        """Add it, with zero length, to a scene with an organ of `size` [m]."""
         import trimesh
 
         shaft = trimesh.creation.cylinder(radius=SHAFT_RADIUS, height=1.0, sections=12)
@@ -130,7 +130,7 @@ class ForceArrow:
         self._length = min(FORCE_SHARE * size, FORCE_LENGTH)
 
     def follow(self, tip: FloatArray, force: FloatArray) -> None:
-        """Point from a tip [m] (3,) along a force [N] (3,)."""
+        """Draw it from a tip [m], (3,), along a force [N], (3,)."""
         size = float(np.linalg.norm(force))
         shows = size > FORCE_LEAST
         if not shows:

@@ -1,1 +1,1 @@
-"""The main job: press an organ site by site, map its stiffness, and say where a lesion was felt."""
+"""Presses, contrast maps, lesion estimators and scores of palpation; `surgsim palpate`."""

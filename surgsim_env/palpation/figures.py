@@ -1,4 +1,4 @@
-"""Pictures of a palpation: both stiffness maps over the organ with a force-depth curve; the organ with its probe."""
+"""Pictures of a palpation: both contrast maps on the organ with force-depth curves; the organ with its probe."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.palpable_face import tangent_axes
-from surgsim_env.palpation.felt import ContrastMap, Truth
-from surgsim_env.palpation.job import MODEL, Palpation
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.palpation.contrast_map import ContrastMap, Truth
+from surgsim_env.palpation.job import MODEL, PalpationResult
 from surgsim_env.palpation.surface_drawing import (
     FADE_TO,
     INK,
@@ -24,6 +23,7 @@ from surgsim_env.palpation.surface_drawing import (
     save_png,
     tube,
 )
+from surgsim_env.scene.palpable_surface import tangent_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,14 +34,14 @@ LIVER = np.array([0.56, 0.20, 0.16])
 STEEL = np.array([0.80, 0.83, 0.88])
 NIGHT = "#0e1117"
 COLOUR_MAP = "magma"
-# Where a glow may run out beyond the last sites, it ends this many site spacings from them.
+# A glow that may extend beyond the last sites ends this many site spacings from them.
 RUN_OUT = 2.6
-# The colour scale ends at least here, so that a map without a lesion looks flat.
+# Least upper end of the colour scale, so that a map without a lesion looks flat.
 SMALLEST_TOP = 1.35
 
 
-def write_stiffness_map(palpation: Palpation, path: Path) -> None:
-    """Write the picture of both maps with what was felt, and force over depth on and off a lesion."""
+def write_stiffness_map(palpation: PalpationResult, path: Path) -> None:
+    """Write the picture of both maps with the estimated lesions, and force over depth on and off a lesion."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(16.5, 5.6), dpi=110, facecolor=PAPER, layout="constrained")
@@ -62,8 +62,8 @@ def write_stiffness_map(palpation: Palpation, path: Path) -> None:
     save_png(figure, path)
 
 
-def write_organ_picture(palpation: Palpation, path: Path) -> None:
-    """Write the organ with its stiffness map glowing on it and the probe where the strongest lesion was felt."""
+def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
+    """Write the organ with its contrast map as a glow and the probe on the strongest estimated lesion."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 6.2), dpi=120, facecolor=NIGHT)
@@ -97,7 +97,9 @@ def write_organ_picture(palpation: Palpation, path: Path) -> None:
     save_png(figure, path, facecolor=NIGHT)
 
 
-def _draw_map(figure: Figure, axes: Axes, palpation: Palpation, one: ContrastMap, patches: Patches, view: View) -> None:
+def _draw_map(
+    figure: Figure, axes: Axes, palpation: PalpationResult, one: ContrastMap, patches: Patches, view: View
+) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -126,9 +128,9 @@ def _result(one: ContrastMap) -> str:
 
 
 def _map_over(
-    palpation: Palpation, one: ContrastMap, patches: Patches, everywhere: bool = False
+    palpation: PalpationResult, one: ContrastMap, patches: Patches, everywhere: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """The map's value on each patch and its weight: 0 off the palpable face, unless it may run out everywhere."""
+    """The map's value on each patch and its weight: 0 off the palpable face unless `everywhere`."""
     anatomy = palpation.anatomy
     on_face = everywhere | _rows_in(anatomy.mesh.boundary_triangles, anatomy.face.triangles)[patches.origin]
     centres = patches.corners[on_face].mean(axis=1)
@@ -144,7 +146,7 @@ def _rows_in(rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return np.array([tuple(sorted(row)) in wanted for row in rows.tolist()])
 
 
-def _mark_sites(axes: Axes, palpation: Palpation, view: View, *, colour: str, alpha: float) -> None:
+def _mark_sites(axes: Axes, palpation: PalpationResult, view: View, *, colour: str, alpha: float) -> None:
     places = view.flat(palpation.sites)
     used = palpation.used
     axes.scatter(*places[used].T, s=5, color=colour, alpha=alpha, linewidths=0, zorder=2)
@@ -153,7 +155,7 @@ def _mark_sites(axes: Axes, palpation: Palpation, view: View, *, colour: str, al
 
 
 def _outline(axes: Axes, truth: Truth, view: View) -> None:
-    """The lesion's circle laid on the surface above it: an estimate inside it is within its radius."""
+    """Draw the lesion's circle on the surface above it: an estimate inside it is within its radius."""
     first, second = tangent_axes(truth.normal)
     angle = np.linspace(0.0, 2.0 * np.pi, 90)[:, None]
     circle = view.flat(truth.point + truth.radius * (np.cos(angle) * first + np.sin(angle) * second))
@@ -177,8 +179,8 @@ def _mark_estimates(axes: Axes, one: ContrastMap, view: View) -> None:
         )
 
 
-def _draw_curves(axes: Axes, palpation: Palpation) -> None:
-    """Force over depth where the contrast with the model is largest and where it is most ordinary."""
+def _draw_curves(axes: Axes, palpation: PalpationResult) -> None:
+    """Force over depth where the contrast with the model is largest and where it is closest to 1."""
     one = next(item for item in palpation.maps if item.name == MODEL)
     numbers = np.flatnonzero(palpation.used)
     stiff, usual = _typical_sites(palpation, one)
@@ -199,8 +201,8 @@ def _draw_curves(axes: Axes, palpation: Palpation) -> None:
     axes.legend(frameon=False, fontsize=9, loc="upper left")
 
 
-def _typical_sites(palpation: Palpation, one: ContrastMap) -> tuple[int | None, int | None]:
-    """Indices into the used sites: the largest contrast above a lesion, and the most ordinary healthy site."""
+def _typical_sites(palpation: PalpationResult, one: ContrastMap) -> tuple[int | None, int | None]:
+    """Indices into the used sites: the largest contrast above a lesion, and the healthy site closest to 1."""
     sites = palpation.sites[palpation.used]
     distance = np.full(len(sites), np.inf)
     for truth in palpation.truths:
@@ -212,7 +214,7 @@ def _typical_sites(palpation: Palpation, one: ContrastMap) -> tuple[int | None, 
 
 
 def _oblique(approach: FloatArray) -> View:
-    """Seen from beside the approach, so that the probe's shaft shows."""
+    """A view from beside the approach, so that the probe's shaft is visible."""
     right, up = tangent_axes(approach)
     return View.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
 

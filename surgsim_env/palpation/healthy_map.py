@@ -1,4 +1,4 @@
-"""How stiff a scene's healthy organ feels over its chart: what a press's stiffness is compared with."""
+"""Stiffness of a scene's healthy organ over its chart, the reference of contrast, cached on disk."""
 
 import hashlib
 import os
@@ -11,19 +11,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import msdm_core
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.lane_group import LaneGroup
-from surgsim_env.palpation.chart import make_chart
-from surgsim_env.palpation.charted_face import ChartedFace, interpolated
-from surgsim_env.palpation.site_press import SitePress, press_in_lanes, press_phases
-from surgsim_env.scene_files import scenes_folder
-from surgsim_env.scenes import Scene, with_instrument
-from surgsim_env.simulation import Simulation
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.palpation.chart import ChartedFace, interpolated, make_chart
+from surgsim_env.palpation.press import SitePress, press_in_lanes, press_phases
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import scenes_folder, with_instrument
+from surgsim_env.scene.model import Scene
 
 # Organs that are pressed side by side.
 LANES = 8
-# Names the folder of the cache.
+# Environment variable with the cache's folder.
 FOLDER_VARIABLE = "SURGSIM_CACHE"
 
 
@@ -47,11 +46,11 @@ def charted_face(anatomy: Anatomy) -> ChartedFace:
 def healthy_map(scene: Scene) -> HealthyMap:
     """The map of a scene, from its cache on disk or by pressing its healthy organ at every site of the chart's grid.
 
-    That takes `phantom` some 5 s of processor time and `phantom_wide` 90 s, once: the map is kept in the folder that
-    SURGSIM_CACHE names, else in the user's cache folder; where that cannot be written each process makes it anew.
+    Pressing takes 5 s of processor time for `phantom` and 90 s for `phantom_wide`. The cache is the folder named by
+    SURGSIM_CACHE, else the user's cache folder; if it is not writable, each process computes the map.
 
     Raises:
-        ValueError: a press on healthy tissue that came to a fault or felt nothing (says where).
+        ValueError: a press on healthy tissue that ended in a fault or measured no force (says where).
     """
     return _healthy_map(load_anatomy(with_instrument(scene, "probe")))
 
@@ -73,7 +72,7 @@ def _healthy_map(anatomy: Anatomy) -> HealthyMap:
 def _pressed(anatomy: Anatomy) -> FloatArray:
     """Press the healthy organ at each site of the chart's grid; stiffness [N/m], shape (m, m).
 
-    A coarser grid would take the mesh, which changes the force by some 3 % within a cell, for a slope of the organ.
+    A coarser grid would alias the mesh, which changes the force by some 3 % within a cell, into a slope of the organ.
     """
     charted, phases = charted_face(anatomy), press_phases(anatomy.scene)
     every = [charted.site(place) for place in charted.chart.sites]
@@ -91,7 +90,7 @@ def _pressed(anatomy: Anatomy) -> FloatArray:
             force = float(result.force @ press.normal)
             if result.fault or not force > 0.0:
                 raise ValueError(
-                    f"scene {anatomy.scene.name!r}: a press on healthy tissue at {press.point.tolist()} m felt "
+                    f"scene {anatomy.scene.name!r}: a press on healthy tissue at {press.point.tolist()} m measured "
                     f"{force:g} N {result.fault}: check palpation.press_depth and the palpable face"
                 )
             stiffness[site.place.tobytes()] = force / result.depth
@@ -100,7 +99,7 @@ def _pressed(anatomy: Anatomy) -> FloatArray:
 
 
 def _digest(anatomy: Anatomy) -> str:
-    """Of all that the map follows from, the code of the organ and of the press included."""
+    """Hash of everything that determines the map, including the source of the organ and of the press."""
     scene = anatomy.scene
     digest = hashlib.blake2b(digest_size=12)
     for array in (anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors):
@@ -112,16 +111,17 @@ def _digest(anatomy: Anatomy) -> str:
     )
     digest.update(repr(parts).encode())
     core, here = Path(msdm_core.__file__).parent, Path(__file__)
-    press = [here.with_name(f"{name}.py") for name in ("chart", "charted_face", "scan", "site_press")]
-    press += [here.parents[1] / f"{name}.py" for name in ("instrument", "palpable_face")]
+    package = here.parents[1]
+    press = [here.with_name(f"{name}.py") for name in ("chart", "press")]
+    press += [package / "instruments" / "instrument.py", package / "scene" / "palpable_surface.py"]
     press += [scenes_folder() / "instruments" / scene.instrument.model]
-    for path in (*sorted(core.glob("*.py")), *sorted(here.parents[1].glob("*kernels.py")), *press, here):
+    for path in (*sorted(core.rglob("*.py")), *sorted(package.rglob("*kernels.py")), *press, here):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
 def _folder() -> Path | None:
-    """Where maps are kept; None for an account without a home."""
+    """The cache's folder; None for an account without a home."""
     named = os.environ.get(FOLDER_VARIABLE)
     if named:
         return Path(named)
@@ -132,7 +132,7 @@ def _folder() -> Path | None:
 
 
 def _keep(path: Path, grid: FloatArray) -> None:
-    """Write the map whole or not at all; a folder that cannot be written costs time, nothing else."""
+    """Write the map atomically; a folder that is not writable is ignored."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix="part-") as folder:

@@ -1,4 +1,4 @@
-"""The main job: press an organ site by site, map its stiffness in two ways, and say where lesions were felt."""
+"""`surgsim palpate`: press an organ site by site, map its contrast against two baselines, estimate the lesions."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -8,21 +8,29 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from msdm_core.mesh import FloatArray
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.palpable_face import PalpableFace, tangent_axes
-from surgsim_env.palpation.analysis import contrast_with_model, contrast_with_neighbours, sensor_readings
-from surgsim_env.palpation.felt import ContrastMap, Truth, feel_lesions, score_map, seen_from_surface
-from surgsim_env.palpation.scan import Press, scan
-from surgsim_env.scenes import Ball
+from msdm_core.material.regions import Lesion
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.sensors import ForceReading
+from surgsim_env.palpation.contrast_map import (
+    ContrastMap,
+    Truth,
+    contrast_with_model,
+    contrast_with_neighbours,
+    feel_lesions,
+    score_map,
+    seen_from_surface,
+)
+from surgsim_env.palpation.press import Press, scan
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.model import Ball, ForceSensor
+from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
 
-# How wrong the pre-operative model is: its modulus by up to this share, the place of each press by this distance [m].
+# Errors of the pre-operative model: modulus by up to this share, place of each press by this distance [m].
 MODEL_MODULUS_ERROR = 0.2
 MODEL_SITE_ERROR = 0.002
-# A site within this many tip radii of a fixed node feels the support, not the tissue, and is not pressed.
+# A site within this many tip radii of a fixed node is dominated by the support and is not pressed.
 SUPPORT_TIP_RADII = 2.0
-# How far inward the rim of the palpable face is felt [m].
+# Decay length of the rim's influence on stiffness [m].
 RIM_REACH = 0.015
 
 NEIGHBOURS = "healthy neighbours"
@@ -30,18 +38,18 @@ MODEL = "pre-operative model"
 
 
 @dataclass(frozen=True, eq=False)
-class Palpation:
-    """What a palpation found.
+class PalpationResult:
+    """Result of a palpation.
 
     Fields:
-        anatomy, lesions, truths: the organ, what was hidden in it, and that seen from its surface
-        presses: of the organ, one for each site
+        anatomy, lesions, truths: the organ, its hidden lesions, and their places on the surface
+        presses: of the organ, one per site
         model_presses: of the pre-operative model, at sites that are MODEL_SITE_ERROR off
         reading: of the force sensor along the normal at the end of each press [N]                 (n_site,)
         used: sites whose two presses both reached the set depth and read a force above 0           (n_site,)
         maps: against the healthy neighbours and against the model; they hold the used sites only
-        model_modulus_factor: how wrong the model's modulus was
-        support_count: raster sites that were not pressed for lying too near to a support
+        model_modulus_factor: modulus of the model over the true one
+        support_count: raster sites too near to a support, which were not pressed
         seed, wall_time [s]: of the run
     """
 
@@ -60,7 +68,7 @@ class Palpation:
 
     @property
     def sites(self) -> FloatArray:
-        """Where it was pressed [m], shape (n_site, 3)."""
+        """The pressed sites [m], shape (n_site, 3)."""
         return np.array([press.site for press in self.presses])
 
     @property
@@ -77,11 +85,11 @@ def run_palpation(
     seed: int = 0,
     workers: int | None = None,
     console: Console | None = None,
-) -> Palpation:
+) -> PalpationResult:
     """Palpate a scene's organ; the same scene, lesions and seed give the same result.
 
     Args:
-        anatomy: what is pressed, its scene says how (see load_anatomy).
+        anatomy: the organ; its scene defines the press (see load_anatomy).
         lesions: hidden in the organ; the scene's demonstration lesions by default.
         around: press only the raster sites inside this ball.
         seed: of sensor noise and of the errors of the pre-operative model.
@@ -104,11 +112,10 @@ def run_palpation(
         presses = scan(anatomy, organ, sites, normals, workers=workers, progress=_task(bar, "organ", len(sites)))
         step = _task(bar, "its pre-operative model", len(sites))
         model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
-    reading = sensor_readings(np.array([press.force for press in presses]), normals, scene.sensor, rng)
-    model_force = np.array([press.force for press in model_presses])
-    model_reading = sensor_readings(model_force, model_normals, scene.sensor, rng)
+    reading = _read(presses, scene.sensor, rng)
+    model_reading = _read(model_presses, scene.sensor, rng)
     complete = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])
-    # A sensor's bias and noise may outweigh a feeble press; such a site has no stiffness to compare.
+    # Bias and noise may exceed the force of a weak press; such a site has no stiffness.
     used = complete & (reading > 0.0) & (model_reading > 0.0)
     if not used.any():
         why = presses[0].end or model_presses[0].end or "a force reading that is not above 0"
@@ -117,7 +124,7 @@ def run_palpation(
             f"by: {why}: change the press depth, limits.hard_force or the sensor"
         )
     truths = tuple(seen_from_surface(hidden, anatomy.mesh, anatomy.face.project))
-    return Palpation(
+    return PalpationResult(
         anatomy=anatomy,
         lesions=hidden,
         truths=truths,
@@ -133,11 +140,19 @@ def run_palpation(
     )
 
 
+def _read(presses: Sequence[Press], sensor: ForceSensor, rng: np.random.Generator) -> FloatArray:
+    """Readings of a scan along the normals [N], shape (n_site,): one bias for all, noise for each."""
+    reading = ForceReading(sensor)
+    reading.reset(rng)
+    force, normals = np.array([press.force for press in presses]), np.array([press.normal for press in presses])
+    return reading.read_along(force, normals, rng)
+
+
 def plan_sites(anatomy: Anatomy, around: Ball | None = None) -> tuple[FloatArray, FloatArray, int]:
-    """Raster sites [m] and normals, each (n_site, 3), without those that feel a support, and how many those were.
+    """Raster sites [m] and normals, each (n_site, 3), without those near a support, and the number of those.
 
     Raises:
-        ValueError: nothing is left.
+        ValueError: no site is left.
     """
     scene = anatomy.scene
     sites, normals = anatomy.face.raster(scene.palpation.site_spacing)
@@ -196,7 +211,7 @@ def _maps(
 
 
 def _geometry(face: PalpableFace, sites: FloatArray) -> FloatArray | None:
-    """What makes healthy sites differ: reciprocal thickness [1/m] and nearness of the rim, (n_site, 2)."""
+    """Geometric regressors of healthy stiffness: reciprocal thickness [1/m] and nearness of the rim, (n_site, 2)."""
     if not np.isfinite(face.thickness).any():
         return None
     centres = face.points[face.triangles].mean(axis=1)

@@ -1,27 +1,19 @@
 """From presses on a chart to lesions: the one estimator that every method of the benchmark is scored through."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.palpation.gaussian_process import REFERENCE_TIP_RADIUS, contrast_process
 
-# The numbers below hold for a tip of 8 mm and lengths go with the tip's radius, as the patch that it feels does. They
-# were chosen on organs that no evaluation uses, for the smallest mean error over random presses (docs/palpation.md).
-REFERENCE_TIP_RADIUS = 0.008
-# Prior of the background's log contrast, one number for the organ: moduli of +-30 % and a capsule.
-BACKGROUND_SPREAD = 0.25
-# Prior of what lesions add to it: spread, and length [m] over which it changes. A lesion is felt as a bell curve of
-# spread s = 7 mm, and a sum of such curves at random places has the correlation length sqrt(2) s.
-EXCESS_SPREAD = 0.225
-EXCESS_LENGTH = 0.010
-# What no press of a healthy organ explains besides the sensor's noise: a capsule that the map has not, the mesh.
-MODEL_SPREAD = 0.05
-# A lesion is a maximum of the excess above the first of these and so many standard deviations of the sensor's noise,
+# The numbers below hold for a tip of 8 mm and were chosen as those of the Gaussian process were (docs/palpation.md).
+# A lesion is a maximum of the excess above the first of these plus the second times the sensor's noise,
 EXCESS_LEAST = 0.07
 EXCESS_LEAST_NOISE = 0.75
-# at least so far [m] from a stronger one,
+# at least this far [m] from a stronger one,
 DISTANCE_LEAST = 0.012
 # placed at the centroid of the excess within this [m] of it,
 CENTROID_RADIUS = 0.009
@@ -34,10 +26,10 @@ MAP_SPACING = 0.002
 
 @dataclass(frozen=True, eq=False)
 class LesionEstimate:
-    """What presses say of the lesions below them.
+    """Lesions estimated from presses.
 
     Fields:
-        points: where the lesions are on the chart [m], the strongest first                             (k, 2)
+        points: places of the lesions on the chart [m], the strongest first                             (k, 2)
         strength: largest excess of the log contrast over each                                          (k,)
         background: log contrast of the tissue around them
         excess: what lesions add to the log contrast, at the map's points: row along the second axis    (g1, g0)
@@ -54,14 +46,11 @@ class LesionEstimate:
 
 
 class LesionEstimator:
-    """Lesions as the maxima of a Gaussian process with fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25).
-
-    log contrast at x = b + e(x) + noise, b ~ N(0, sb^2), e ~ GP(0, se^2 exp(-|x - x'|^2 / (2 l^2))). The mean of e
-    given the presses is the excess map; b takes up what is common to all sites: modulus, capsule, the sensor's bias.
+    """Lesions as the maxima of the posterior mean excess of a Gaussian process (`ContrastProcess`).
 
     Args:
         extent: of the chart, whose coordinates run from 0 to it [m], shape (2,).
-        tip_radius: of the ball that presses [m]; the model's lengths go with it.
+        tip_radius: of the ball that presses [m]; the model's lengths scale with it.
         noise: standard deviation of one log contrast by the sensor: its noise over the force of a healthy press.
 
     Raises:
@@ -78,10 +67,9 @@ class LesionEstimator:
             raise ValueError(f"noise is {noise:g}; it must be a standard deviation of log contrast, 0 or more")
         self.tip_radius, self.noise = tip_radius, noise
         self.scale = tip_radius / REFERENCE_TIP_RADIUS
-        self.length = EXCESS_LENGTH * self.scale
-        self.noise_variance = noise**2 + MODEL_SPREAD**2
         self.excess_least = EXCESS_LEAST + EXCESS_LEAST_NOISE * noise
         self.axes = (self._axis(0), self._axis(1))
+        self.process = contrast_process(self.axes, tip_radius=tip_radius, noise=noise)
 
     def _axis(self, index: int) -> FloatArray:
         """Coordinates of the map's points along an axis [m], from edge to edge."""
@@ -89,7 +77,7 @@ class LesionEstimator:
         return np.linspace(0.0, self.extent[index], count)
 
     def estimate(self, places: ArrayLike, log_contrast: ArrayLike) -> LesionEstimate:
-        """The lesions that presses tell of; without a press there are none.
+        """The lesions that presses indicate; without a press there are none.
 
         Args:
             places: of the presses on the chart [m], shape (n, 2).
@@ -104,39 +92,21 @@ class LesionEstimator:
             raise ValueError(f"{len(places)} places but log contrasts of shape {values.shape}; give one for each")
         if not (np.isfinite(places).all() and np.isfinite(values).all()):
             raise ValueError("a place or a log contrast is not finite: leave out presses that ended in a fault")
-        background, excess = self.posterior(places, values)
+        background, excess = self.process.mean(places, values)
         points, strength = self._maxima(excess)
         return LesionEstimate(points, strength, background, excess, self._outline(excess, points, strength), self.axes)
 
-    def posterior(self, places: FloatArray, values: FloatArray) -> tuple[float, FloatArray]:
-        """Posterior means of the background and of the excess at the map's points, shape (g1, g0)."""
-        across, along = (self._correlation(axis, places[:, i]) for i, axis in enumerate(self.axes))
-        if len(values) == 0:
-            return 0.0, np.zeros((len(along), len(across)))
-        correlation = self._correlation(places[:, 0], places[:, 0]) * self._correlation(places[:, 1], places[:, 1])
-        covariance = EXCESS_SPREAD**2 * correlation + BACKGROUND_SPREAD**2
-        covariance.flat[:: len(values) + 1] += self.noise_variance
-        weights = np.linalg.solve(covariance, values)
-        # The RBF is a product over the axes: the map is one matrix product.
-        return BACKGROUND_SPREAD**2 * float(weights.sum()), EXCESS_SPREAD**2 * (along * weights) @ across.T
-
-    def _correlation(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        return np.exp(-0.5 * ((first[:, None] - second) / self.length) ** 2)
-
     def _maxima(self, excess: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the lesions are [m], shape (k, 2), and how strong, shape (k,)."""
+        """Places of the lesions [m], shape (k, 2), and their strength, shape (k,)."""
         rows, columns = _local_maxima(excess, self.excess_least)
-        order = np.argsort(-excess[rows, columns], kind="stable")
-        points, strength = np.zeros((0, 2)), []
-        for row, column in zip(rows[order], columns[order], strict=True):
-            point = np.array([self.axes[0][column], self.axes[1][row]])
-            if (np.hypot(*(points - point).T) < DISTANCE_LEAST * self.scale).any():
-                continue
-            points = np.vstack([points, self._centroid(excess, point)])
-            strength.append(excess[row, column])
-            if len(strength) == LESIONS_MOST:
-                break
-        return points, np.array(strength)
+        peaks = np.column_stack([self.axes[0][columns], self.axes[1][rows]])
+        chosen, points = strongest_apart(
+            excess[rows, columns],
+            peaks,
+            DISTANCE_LEAST * self.scale,
+            place=lambda index: self._centroid(excess, peaks[index]),
+        )
+        return points[:LESIONS_MOST], excess[rows, columns][chosen[:LESIONS_MOST]]
 
     def _squared_distance(self, point: FloatArray) -> FloatArray:
         """From each of the map's points to a point [m^2], shape (g1, g0)."""
@@ -155,6 +125,34 @@ class LesionEstimator:
             return np.zeros(excess.shape, dtype=bool)
         nearest = np.argmin([self._squared_distance(point) for point in points], axis=0)
         return excess >= OUTLINE_SHARE * strength[nearest]
+
+
+def strongest_apart(
+    height: FloatArray,
+    peaks: FloatArray,
+    distance_least: float,
+    *,
+    place: Callable[[int], FloatArray] | None = None,
+) -> tuple[list[int], FloatArray]:
+    """Choose peaks from the highest down, each at least a distance from the places of those chosen before.
+
+    Args:
+        height: of the peaks, shape (n,).
+        peaks: where they are [m], shape (n, d).
+        distance_least: [m].
+        place: from a peak's index to the point (d,) that later peaks must keep away from; by default the peak itself.
+
+    Returns:
+        Indices of the chosen peaks, the highest first, and their places, shape (k, d).
+    """
+    chosen: list[int] = []
+    places = np.zeros((0, peaks.shape[1]))
+    for index in np.argsort(-height, kind="stable").tolist():
+        if (np.sqrt(((places - peaks[index]) ** 2).sum(axis=1)) < distance_least).any():
+            continue
+        chosen.append(index)
+        places = np.vstack([places, peaks[index] if place is None else place(index)])
+    return chosen, places
 
 
 def _local_maxima(values: FloatArray, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

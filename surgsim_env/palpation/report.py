@@ -1,4 +1,4 @@
-"""What a palpation leaves behind: palpation.csv, summary.json and the short table on the terminal."""
+"""Reports of a palpation: palpation.csv, summary.json and the short table on the terminal."""
 
 import csv
 import json
@@ -13,9 +13,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from surgsim_env.cell_share import contact_radius, share_text
-from surgsim_env.palpation.felt import ContrastMap, LesionScore
-from surgsim_env.palpation.job import MODEL, MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, Palpation
+from surgsim_env.palpation.contrast_map import ContrastMap, LesionScore
+from surgsim_env.palpation.job import MODEL, MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, PalpationResult
+from surgsim_env.scene.palpable_surface import contact_radius, share_text
 
 CSV_NAME, SUMMARY_NAME, PICTURE_NAME = "palpation.csv", "summary.json", "stiffness_map.png"
 COLUMNS = (
@@ -24,8 +24,8 @@ COLUMNS = (
 )
 
 
-def write_csv(palpation: Palpation, path: Path) -> None:
-    """One line for each site; lengths [m], forces [N], stiffness [N/m]; no contrasts where a press ended early."""
+def write_csv(palpation: PalpationResult, path: Path) -> None:
+    """One row per site; lengths [m], forces [N], stiffness [N/m]; no contrasts where a press ended early."""
     order = np.cumsum(palpation.used) - 1
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
@@ -38,8 +38,8 @@ def write_csv(palpation: Palpation, path: Path) -> None:
             writer.writerow([index, *(f"{value:.6g}" for value in numbers), *contrasts, early_end(palpation, index)])
 
 
-def early_end(palpation: Palpation, index: int) -> str:
-    """Why a site is in no map: what ended its press, or its model's press, early; empty for a complete one."""
+def early_end(palpation: PalpationResult, index: int) -> str:
+    """Why a site is in no map: the reason that its press or its model's press ended early; empty for a complete one."""
     if palpation.presses[index].end:
         return palpation.presses[index].end
     model_end = palpation.model_presses[index].end
@@ -48,8 +48,8 @@ def early_end(palpation: Palpation, index: int) -> str:
     return "" if palpation.used[index] else "force reading not above 0"
 
 
-def write_summary(palpation: Palpation, path: Path, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Write and return the summary; numbers that do not exist, such as the error of what was not felt, are null."""
+def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Write and return the summary; undefined numbers, such as the error of a missed lesion, are null."""
     scene, mesh = palpation.anatomy.scene, palpation.anatomy.mesh
     forces = [press.force_peak for press in palpation.presses]
     summary = {
@@ -122,8 +122,8 @@ def _healthy(one: ContrastMap) -> str:
     return "-" if math.isnan(one.healthy_std) else f"1 ± {one.healthy_std:.2f}"
 
 
-def print_report(palpation: Palpation, console: Console) -> None:
-    """The short table: where each lesion was felt, how far from the truth, its contrast beside the healthy spread."""
+def print_report(palpation: PalpationResult, console: Console) -> None:
+    """The short table: place, error and contrast of each lesion, and the spread of healthy sites."""
     table = Table(title=f"stiffness of {palpation.anatomy.scene.name}, felt against two baselines")
     table.add_column("against", no_wrap=True)
     table.add_column("lesion")
@@ -168,7 +168,7 @@ def verdict(one: ContrastMap) -> str:
 
 
 def _short(one: ContrastMap) -> str:
-    """The map's name as far as a terminal of 80 columns has room for it."""
+    """The map's name, short enough for a terminal of 80 columns."""
     return "model" if one.name == MODEL else "neighbours"
 
 
@@ -182,7 +182,7 @@ def _felt_cells(one: ContrastMap, score: LesionScore) -> tuple[str, str, str]:
 
 
 def package_version() -> str:
-    """Of this package, or "checkout" where it is not installed."""
+    """Version of this package, or "checkout" if it is not installed."""
     try:
         return version("surgsim")
     except PackageNotFoundError:
@@ -190,7 +190,7 @@ def package_version() -> str:
 
 
 def plain_json(value: Any, digits: int = 7) -> Any:
-    """JSON's own types: arrays as lists, numbers rounded to digits after the point, None where they are not finite."""
+    """JSON types: arrays as lists, numbers rounded to `digits` decimals, None if not finite."""
     if isinstance(value, Mapping):
         return {str(key): plain_json(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

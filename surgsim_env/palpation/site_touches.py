@@ -1,4 +1,4 @@
-"""What presses at sites told so far: force, depth and contrast of each, maps over the chart's grid, time and way."""
+"""Running record of site presses: force, depth and contrast of each, maps over the grid, time and path length."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -6,30 +6,30 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.palpation.charted_face import ChartedFace, Site
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.palpation.chart import ChartedFace, Site
 from surgsim_env.palpation.healthy_map import HealthyMap
-from surgsim_env.palpation.site_press import PressResult
-from surgsim_env.scenes import Palpation
+from surgsim_env.palpation.press import PressResult
+from surgsim_env.scene.model import PalpationSettings
 
-# How fast the tip travels from site to site, which is counted and not simulated [m/s].
+# Speed of the tip between sites [m/s]; this travel is counted, not simulated.
 TRAVEL_SPEED = 0.02
-# Log contrast is cut to +- this, and the touch says so.
+# Log contrast is clipped to +- this; `Touch.cut` reports it.
 LOG_CONTRAST_BOUND = 2.0
 
 
 @dataclass(frozen=True)
 class Touch:
-    """What the agent knows of a press.
+    """The observable outcome of a press.
 
     Args:
         place: on the chart, each -1 to 1.
-        moved: how far that is from the place that was asked for [m].
+        moved: distance from the requested place [m].
         force: along the inward normal, through the sensor model [N].
         depth: of the tip [m].
         log_contrast: log of stiffness over healthy stiffness there.
-        cut: that it was cut to its bound.
-        stopped: that force ended the way in before depth did.
+        cut: the log contrast was clipped to its bound.
+        stopped: force ended the way in before depth did.
     """
 
     place: tuple[float, float]
@@ -51,10 +51,10 @@ class SiteTouches:
 
     Fields:
         touches: one a press, in their order
-        seconds, path_length: of the tip so far, with the way to and off the sites, which is not simulated [s], [m]
+        seconds, path_length: of the tip so far [s], [m], with the travel between sites, which is not simulated
     """
 
-    def __init__(self, charted: ChartedFace, healthy: HealthyMap, palpation: Palpation) -> None:
+    def __init__(self, charted: ChartedFace, healthy: HealthyMap, palpation: PalpationSettings) -> None:
         self.charted, self.healthy, self.palpation = charted, healthy, palpation
         self.clear()
 
@@ -67,13 +67,13 @@ class SiteTouches:
 
     @property
     def last(self) -> Touch:
-        """The last touch; before the first one that says nothing."""
+        """The last touch; zeros before the first one."""
         return self.touches[-1] if self.touches else Touch((0.0, 0.0))
 
     def add(self, site: Site, result: PressResult, force: float) -> None:
-        """Note a press at a site, of which the sensor told a force along the normal [N]."""
+        """Record a press at a site, with the sensor's reading of the force along the normal [N]."""
         healthy = float(self.healthy.stiffness(site.place))
-        # A force that bias and noise turn round, or a tip that an arm did not get below the surface: softest there is.
+        # Bias and noise may reverse a small force, and an arm may not reach below the surface: the least contrast.
         contrast = force / (result.depth * healthy) if result.depth > 0.0 else 0.0
         log_contrast = math.log(contrast) if contrast > 0.0 else -math.inf
         bounded = min(max(log_contrast, -LOG_CONTRAST_BOUND), LOG_CONTRAST_BOUND)
@@ -90,19 +90,19 @@ class SiteTouches:
 
     @property
     def places(self) -> FloatArray:
-        """Where was pressed, lengths along the chart's sides [m], shape (n, 2)."""
+        """Places of the presses, lengths along the chart's sides [m], shape (n, 2)."""
         places = np.array([touch.place for touch in self.touches]).reshape(-1, 2)
         return 0.5 * (places + 1.0) * self.charted.chart.extent
 
     @property
     def log_contrasts(self) -> FloatArray:
-        """What was felt there, shape (n,)."""
+        """Log contrast of the presses, shape (n,)."""
         return np.array([touch.log_contrast for touch in self.touches])
 
     def maps(self) -> FloatArray:
-        """Log contrast and whether it was touched for each site of the chart's grid, shape (2 n_site,).
+        """Log contrast, and 1 where pressed, for each site of the chart's grid, shape (2 n_site,).
 
-        The latest counts where one was pressed again.
+        A site that was pressed again has its latest contrast.
         """
         return self._maps.ravel()
 
@@ -111,7 +111,7 @@ class SiteTouches:
         self._maps[:, site] = touch.log_contrast, 1.0
 
     def get_state(self) -> dict[str, Any]:
-        """All of it, for JSON."""
+        """The record as a table for JSON."""
         return {
             "touches": [asdict(touch) for touch in self.touches],
             "way": [self.seconds, self.path_length],
@@ -119,7 +119,7 @@ class SiteTouches:
         }
 
     def set_state(self, table: dict[str, Any]) -> None:
-        """Restore what `get_state` gave."""
+        """Restore the record from `get_state`."""
         self.touches = [Touch(**{**touch, "place": tuple(touch["place"])}) for touch in table["touches"]]
         self.seconds, self.path_length = table["way"]
         self._last_start = None if table["last_start"] is None else np.array(table["last_start"])

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import KDTree
 
-from msdm_core.mesh import FloatArray, IntArray
-from surgsim_env.palpable_face import tangent_axes
+from msdm_core.mesh.surface import triangle_lattice
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from surgsim_env.scene.palpable_surface import tangent_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +63,7 @@ class Patches:
 
 
 def curved_patches(points: FloatArray, triangles: IntArray, splits: int = SPLITS) -> Patches:
-    """A triangle surface as splits^2 smaller, bent triangles each: as smooth as the organ it stands for."""
+    """Each triangle of a surface as splits^2 smaller triangles, bent towards the smooth normals."""
     corners = points[triangles]
     area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face_normal = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
@@ -73,7 +74,8 @@ def curved_patches(points: FloatArray, triangles: IntArray, splits: int = SPLITS
     normals = mean[triangles]
     sharp = np.einsum("fij,fj->fi", normals, face_normal) < CREASE_COSINE
     normals = np.where(sharp[:, :, None], face_normal[:, None], normals)
-    weights, small = _split_triangle(splits)
+    lattice, small = triangle_lattice(splits)
+    weights = lattice / splits
     flat = np.einsum("wi,fij->fwj", weights, corners)
     offset = np.einsum("fwij,fij->fwi", flat[:, :, None] - corners[:, None], normals)
     bent = flat - np.einsum("wi,fwi,fij->fwj", weights, offset, normals)
@@ -84,27 +86,11 @@ def curved_patches(points: FloatArray, triangles: IntArray, splits: int = SPLITS
     return Patches(vertices[:, small].reshape(-1, 3, 3), smooth.reshape(-1, 3), origin)
 
 
-def _split_triangle(splits: int) -> tuple[FloatArray, IntArray]:
-    """Barycentric weights of a triangle's lattice points and the small triangles between them."""
-    index, weights = {}, []
-    for i in range(splits + 1):
-        for j in range(splits + 1 - i):
-            index[i, j] = len(weights)
-            weights.append((splits - i - j, i, j))
-    small = []
-    for i in range(splits):
-        for j in range(splits - i):
-            small.append((index[i, j], index[i + 1, j], index[i, j + 1]))
-            if i + j + 1 < splits:
-                small.append((index[i + 1, j], index[i + 1, j + 1], index[i, j + 1]))
-    return np.array(weights) / splits, np.array(small, dtype=np.int32)
-
-
 def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
     """A continuous field near the values at the sites [m] (n, 3), at other places (m, 3): radial functions."""
     if len(sites) < 8 or np.ptp(values) == 0.0:
         return values[KDTree(sites).query(places)[1]]
-    # In the plane that the sites lie nearest to: on a flat face they determine no more than that.
+    # In the best-fit plane of the sites: a flat face determines nothing across it.
     centred = sites - sites.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
     field = RBFInterpolator(
@@ -114,7 +100,7 @@ def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> F
 
 
 def nearness(sites: FloatArray, places: FloatArray, spacing: float, fade_to: float = FADE_TO) -> FloatArray:
-    """How much a map may say at each place: 1 near a site, fading to 0 beyond, shape (m,)."""
+    """Opacity of a map at each place: 1 near a site, fading to 0 beyond, shape (m,)."""
     distance = KDTree(sites).query(places)[0] / spacing
     return np.clip((fade_to - distance) / (fade_to - FADE_FROM), 0.0, 1.0)
 
@@ -150,7 +136,7 @@ def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray,
     quads = np.stack([a, b, c, d], axis=-1).reshape(-1, 4)
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     vertices = np.concatenate(points)
-    # Whatever way the axes turned, the triangles shall look outward.
+    # Triangles that face inward are flipped: the axes may be left-handed.
     corners = vertices[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     keep = np.linalg.norm(normal, axis=1) > 1e-16

@@ -1,37 +1,37 @@
-"""A scene for any closed surface: where the file says nothing, the shipped liver's values stand, and are stated."""
+"""A scene for any closed surface file; values that are not given are the shipped liver's."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from msdm_core.length_unit import LengthUnit
-from msdm_core.regions import Lesion
-from msdm_core.stability import stable_dt
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.scenes import Anchor, Ball, Bed, MeshSource, Scene, SurfaceMesh, Vector, make_scene
-from surgsim_env.timing import substeps_needed
+from msdm_core.material.regions import Lesion
+from msdm_core.mesh_files.mesh_file import LengthUnit
+from msdm_core.organ.stability import stable_dt
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Anchor, Ball, Bed, MeshSource, Scene, SurfaceMesh, Vector, substeps_needed
 
 PATTERN = "liver"
-# Against the file's third axis: from above in a file drawn z up; from the head in a CT's patient axes (z to the head).
+# Against the file's third axis: from above if z points up; from the head in a CT's patient axes (z to the head).
 DEFAULT_APPROACH = (0.0, 0.0, -1.0)
-# "It lies on its bed": without anchors, surface nodes in this deepest share of the organ along the approach are held.
+# Without anchors, surface nodes in this deepest share of the organ along the approach are held (its bed).
 BED_SHARE = 0.15
-# Contact stiffness over Young's modulus per cell: about 0.2 mm of penetration under a press, see the liver scene.
+# Contact stiffness times cell over Young's modulus: about 0.2 mm of penetration in a press, as in the liver scene.
 CONTACT_MODULI_PER_CELL = 18.0
-# More organ substeps in a haptic step than this would take hours.
+# Limit of organ substeps in a haptic step: more would take hours.
 SUBSTEPS_MOST = 200
-# Where a healthy press may lie; sites with less tissue below them than this many press depths are left out.
+# Sites with less tissue below them than this many press depths are left out.
 THICKNESS_PRESS_DEPTHS = 5.0
 
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """What is said of a surface beyond its file; see `surgsim palpate --help` for the meaning.
+    """Options of a surface scene beyond its file; `surgsim palpate --help` explains them.
 
     Args:
-        approach: direction in which the probe comes, in the file's axes; DEFAULT_APPROACH if nothing is said.
-        anchors: balls that hold the surface nodes inside them: x, y, z, radius [m]; none: its bed.
+        approach: direction of the probe's approach, in the file's axes; DEFAULT_APPROACH if not given.
+        anchors: balls whose surface nodes are held: x, y, z, radius [m]; without one, the bed is held.
         press_depth, tip_radius, spacing: [m].
         youngs_modulus: of the healthy tissue [Pa].
     """
@@ -48,7 +48,7 @@ def surface_scene(file: Path, *, length_unit: LengthUnit, cell_size: float, opti
     """The shipped liver's scene with another surface.
 
     Raises:
-        ValueError: names the length or the direction that is impossible.
+        ValueError: an invalid length or direction (names it).
     """
     scene = with_options(make_scene(PATTERN), replace(options, approach=options.approach or DEFAULT_APPROACH))
     if not cell_size > 0.0:
@@ -71,7 +71,7 @@ def with_options(scene: Scene, options: SurfaceOptions) -> Scene:
     """A scene with another approach, press depth, tip radius, site spacing or modulus, where given.
 
     Raises:
-        ValueError: names the value that is not above 0.
+        ValueError: a value that is not above 0 (names it).
     """
     given = {
         "press depth": options.press_depth,
@@ -102,12 +102,12 @@ def with_options(scene: Scene, options: SurfaceOptions) -> Scene:
 
 
 def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_factor_largest: float) -> Anatomy:
-    """The anatomy with as many organ substeps as the organ with lesions, and a stiffer one without, need.
+    """The anatomy with enough organ substeps for the organ with lesions and for a stiffer one without.
 
     Args:
-        scene: what is pressed.
-        lesions: hidden in it.
-        modulus_factor_largest: how much stiffer than the scene's tissue the pre-operative model may be.
+        scene: its mesh, materials and timing.
+        lesions: hidden in the organ.
+        modulus_factor_largest: largest modulus of the pre-operative model over the scene's.
     """
     anatomy = load_anatomy(scene)
     organs = [anatomy.organ(lesions), anatomy.organ(modulus_factor=modulus_factor_largest)]
@@ -130,7 +130,7 @@ def _direction(vector: Vector) -> Vector:
 
 
 def anchors_of(options: SurfaceOptions, approach: Vector) -> tuple[Anchor, ...]:
-    """The balls that options name as anchors, else the bed along the approach."""
+    """The balls given as anchors, else the bed along the approach."""
     if not options.anchors:
         return (Anchor("bed", bed=Bed(approach, BED_SHARE)),)
     balls = []

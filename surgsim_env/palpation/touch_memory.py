@@ -1,18 +1,18 @@
-"""What a moving tip has felt so far, site by site of a chart: a memory that an observation can hold."""
+"""Running record of a moving tip's contrast at each site of a chart, in a fixed size for observations."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from msdm_core.regions import Material
+from msdm_core.material.regions import Material
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.chart import Chart
 
 
 @dataclass(frozen=True)
 class Indenter:
-    """A ball on a soft half space: what a press of healthy tissue would feel like.
+    """A ball on a soft half space: the model of a press on healthy tissue.
 
     Args:
         radius: of the ball [m].
@@ -29,19 +29,19 @@ class Indenter:
 
 
 class TouchMemory:
-    """Contrast felt at each site of a chart: force over Hertz's for nominal tissue, fitted to all readings there.
+    """Contrast at each site of a chart: force over Hertz's for nominal tissue, fitted to all readings there.
 
     Readings f_i at depths with Hertz's forces h_i give the least-squares contrast sum(f_i h_i) / sum(h_i^2), so that
-    deep presses, which noise spoils least, count most. Readings beyond the chart, and of less than half the scene's
-    press depth, are left out: so |contrast| is at most the sensor's range over Hertz's force there (`bound`).
+    deep presses, which have the least relative noise, weigh most. Readings beyond the chart, and at less than half the
+    scene's press depth, are left out: |contrast| is at most the sensor's range over Hertz's force there (`bound`).
     """
 
     def __init__(self, chart: Chart, indenter: Indenter, *, press_depth: float, force_range: float) -> None:
-        """Remember nothing yet.
+        """Start with an empty record.
 
         Args:
-            chart: whose sites are remembered.
-            indenter: the healthy press.
+            chart: its sites are recorded.
+            indenter: model of the healthy press.
             press_depth: of the scene [m].
             force_range: of the sensor, each axis [N].
         """
@@ -55,7 +55,7 @@ class TouchMemory:
         self.product, self.square = np.zeros((2, self.chart.side_count**2))
 
     def feel(self, place: FloatArray, depth: float, force: float) -> None:
-        """Take in a reading of the force along the normal [N], at a place of the chart (2,) and a depth [m]."""
+        """Add a reading of the force along the normal [N], at a place of the chart (2,) and a depth [m]."""
         site = self.chart.site(place)
         if site is None or depth < self.least_depth:
             return
@@ -65,16 +65,16 @@ class TouchMemory:
 
     @property
     def visited(self) -> FloatArray:
-        """1 where a site was felt, else 0, shape (n_site,)."""
+        """1 where a site has a reading, else 0, shape (n_site,)."""
         return (self.square > 0.0).astype(np.float64)
 
     @property
     def contrast(self) -> FloatArray:
-        """Contrast of each site, 0 where it was not felt, shape (n_site,)."""
+        """Contrast of each site, 0 without a reading, shape (n_site,)."""
         return _ratio(self.product, self.square)
 
     def stiffest(self) -> FloatArray:
-        """Place (2,) and contrast of the stiffest neighbourhood: a site with the eight around it; zeros before any."""
+        """Place (2,) and contrast of the stiffest site, averaged with its eight neighbours; zeros without a reading."""
         if not self.square.any():
             return np.zeros(3)
         around = _ratio(self._with_neighbours(self.product), self._with_neighbours(self.square))

@@ -1,1 +1,1 @@
-"""From a patient's scan, or surfaces drawn from one, to a scene: labels, mesh, materials, report."""
+"""A patient's scan, or surfaces segmented from one, made into a scene: labels, mesh, materials, report."""

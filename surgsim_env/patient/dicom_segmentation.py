@@ -1,4 +1,4 @@
-"""DICOM segmentation objects (SEG): frames of segments, put together to one label image."""
+"""DICOM segmentation objects (SEG): frames of segments, assembled into one label image."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -8,30 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh import FloatArray
-from msdm_core.mesh_file import parsed
-from surgsim_env.patient.image_geometry import ImageGeometry
-from surgsim_env.patient.label_image import LabelSource, checked_shape
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh_files.mesh_file import parsed
+from surgsim_env.patient.label_source import ImageGeometry, LabelSource, checked_shape
 
 ADVICE = "export or copy it again"
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
-# pydicom holds the whole file, and its frames unpacked [bytes].
+# pydicom holds the whole file and its unpacked frames in memory [bytes].
 BYTES_MOST = 2_000_000_000
-# Places of frames may be off the grid by this share of a slice, or of a millimetre across it.
+# Frame positions may be off the grid by this share of the slice step, or of 1 mm where slices are thinner.
 SLACK = 0.02
 REASON_LENGTH = 200
 
 
 def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
-    """Look into a DICOM file; None if it is no segmentation object.
+    """Read the header of a DICOM file; None if it is no segmentation object.
 
     Args:
         file: the file.
-        wanted: segment numbers; where segments overlap, the later of these counts.
+        wanted: segment numbers; where segments overlap, the later one in this list applies.
 
     Raises:
-        MeshError: names the file and what is wrong with it, or lists its segments where a wanted one is not there.
+        MeshError: a damaged or unsupported file; a wanted segment that is not there (lists those that are).
     """
     try:
         import pydicom
@@ -88,7 +87,7 @@ def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
 
 
 def _group(data: Any, frame: Any, name: str) -> Any:
-    """The first item of a functional group, of the frame's own or of all frames'."""
+    """The first item of a functional group: the frame's own, else the one shared by all frames."""
     if name in frame:
         return frame[name][0]
     return data.SharedFunctionalGroupsSequence[0][name][0]
@@ -99,7 +98,9 @@ def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeomet
     turns = {tuple(map(float, _group(data, one, "PlaneOrientationSequence").ImageOrientationPatient)) for one in frames}
     measures = _group(data, frames[0], "PixelMeasuresSequence")
     if len(turns) != 1:
-        raise MeshError(f"{file}: its frames are turned in {len(turns)} ways; the rule is one stack: resample it")
+        raise MeshError(
+            f"{file}: its frames have {len(turns)} orientations; the rule is one stack of parallel slices: resample it"
+        )
     turn = np.array(turns.pop()).reshape(2, 3)
     normal = np.cross(turn[0], turn[1])
     places = np.array([_group(data, one, "PlanePositionSequence").ImagePositionPatient for one in frames], dtype=float)
@@ -119,10 +120,10 @@ def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeomet
 
 
 def _slice_step(file: Path, along: FloatArray, measures: Any) -> float:
-    """Distance between slices [mm], from the frames' places along the normal [mm]; of one slice, what is stated."""
+    """Distance between slices [mm], from the frames' positions along the normal [mm]; for one slice the stated one."""
     apart = np.diff(np.unique(np.round(along, 3)))
     if len(apart):
-        # Over the whole stack, so that the places' rounding does not add up.
+        # Averaged over the whole stack, so that rounded positions do not add up to an error.
         return float(np.ptp(along) / max(round(np.ptp(along) / apart.min()), 1))
     stated = measures.get("SpacingBetweenSlices") or measures.get("SliceThickness")
     if stated is None:

@@ -8,23 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh_file import parsed
-from surgsim_env.patient.image_geometry import ImageGeometry
-from surgsim_env.patient.label_image import RUN_VOXELS, LabelSource, checked_shape
+from msdm_core.mesh_files.mesh_file import parsed
+from surgsim_env.patient.label_source import RUN_VOXELS, ImageGeometry, LabelSource, checked_shape
 
 ADVICE = "export or copy it again"
 # SimpleITK reads whole images [bytes].
 BYTES_MOST = 4_000_000_000
-# Of SimpleITK's reasons the end says most [characters].
+# Only the end of SimpleITK's long messages is quoted [characters].
 REASON_LENGTH = 200
 READERS = {".nrrd": "NrrdImageIO", ".mha": "MetaImageIO", ".dcm": "GDCMImageIO"}
 
 
 def open_itk(file: Path) -> LabelSource:
-    """Look into an NRRD, MHA or DICOM file.
+    """Read the header of an NRRD, MHA or DICOM file.
 
     Raises:
-        MeshError: names the file and what is wrong with it, its header, or what SimpleITK cannot tell of it.
+        MeshError: a damaged file, an unsupported header, or a file that SimpleITK cannot parse.
     """
     try:
         import SimpleITK
@@ -54,7 +53,7 @@ def open_itk(file: Path) -> LabelSource:
 
     def runs() -> Iterator[tuple[int, NDArray]]:
         image = _asked(file, reader.Execute)
-        # Axes are reversed in it, so that the image's first runs fastest.
+        # SimpleITK's arrays have the axes reversed, so that the image's first axis is the fastest.
         values = SimpleITK.GetArrayViewFromImage(image).reshape(-1)
         for first in range(0, len(values), RUN_VOXELS):
             yield first, values[first : first + RUN_VOXELS]
@@ -63,7 +62,7 @@ def open_itk(file: Path) -> LabelSource:
 
 
 def _asked(file: Path, question: Callable[[], Any]) -> Any:
-    """What SimpleITK answers; where it cannot, its reason without the places in its own sources."""
+    """The result of a call to SimpleITK; its error messages without the positions in its own sources."""
     try:
         return parsed(file, lambda _: question(), ADVICE)
     except MeshError as error:
@@ -72,11 +71,11 @@ def _asked(file: Path, question: Callable[[], Any]) -> Any:
 
 
 def _stated_space(file: Path) -> tuple[str, ...]:
-    """A note where an NRRD header names no anatomical space: ITK then takes LPS."""
+    """A note if an NRRD header names no anatomical space: ITK then assumes LPS."""
     if file.suffix.lower() != ".nrrd":
         return ()
     with file.open("rb") as stream:
         head = stream.read(20_000).partition(b"\n\n")[0].decode("ascii", errors="replace").lower()
     if "\nspace:" in head:
         return ()
-    return ("the header names no anatomical space: left, back and up (LPS) are taken",)
+    return ("the header names no anatomical space: left, back and up (LPS) are assumed",)

@@ -1,4 +1,4 @@
-"""A label image made ready to be meshed: one part, each lesion a region of its own, cavities filled where asked."""
+"""Labels prepared for meshing: one connected part, each lesion a region of its own, cavities filled on request."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from msdm_core.errors import MeshError
-from msdm_core.segmentation_meshing import largest_part, parts_of
+from msdm_core.meshing.segmentation_meshing import largest_part, parts_of
 from surgsim_env.patient.label_image import LabelImage
 from surgsim_env.patient.materials import is_lesion
 
-# A lesion smaller than a ball of half a cell's radius cannot be shown (the rule of `msdm_core.regions.Lesion`).
+# A lesion smaller than a ball of half a cell's radius cannot be shown (the rule of
+# `msdm_core.material.regions.Lesion`).
 SMALLEST_SHARE_OF_CELL = np.pi / 6.0
-# More parts of one label than this are no lesions but noise.
+# Of a label's parts at most this many, the largest, are lesions; the rest is noise.
 PARTS_MOST = 24
 # Tags are bytes, and 0 is outside.
 NAMES_MOST = 255
@@ -26,9 +27,9 @@ class CleanLabels:
     Fields:
         tags: n for the n-th of `names`, counted from 1, 0 outside       (n_x, n_y, n_z) uint8
         names: the organ first; parts of a lesion's label are numbered, the largest first
-        lesions: which of the names are lesions
-        notes: what was left out, filled or is odd
-        image: where they come from
+        lesions: names of the regions that are lesions
+        notes: remarks on what was dropped, filled or is unusual
+        image: the labels before cleaning
     """
 
     tags: NDArray[np.uint8]
@@ -39,12 +40,12 @@ class CleanLabels:
 
 
 def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLabels:
-    """The largest part of the labels, its lesions apart, its cavities filled if `mend`.
+    """The largest part of the labels, with its lesions as regions of their own, its cavities filled if `mend`.
 
-    A part of a lesion's label too small for the cells becomes healthy tissue, and is said to be.
+    A part of a lesion too small for the cells becomes healthy tissue, with a note.
 
     Raises:
-        MeshError: names what two regions would be called once lesions are numbered, or how many regions there are.
+        MeshError: numbering the lesions gives two regions the same name, or there are more regions than tags.
     """
     tags, notes = _one_part(image)
     notes += _at_border(tags, image)
@@ -70,7 +71,7 @@ def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLab
         added = [name if parts.count == 1 else f"{name} {number}" for number in range(1, parts.count + 1)]
         _check_names(names, added, name)
         for number, one in enumerate(ndimage.find_objects(parts.numbers), start=1):
-            # One box at a time: masks of the whole image would take a byte a voxel each.
+            # One bounding box at a time: a mask of the whole image takes a byte a voxel.
             result[one][parts.numbers[one] == number] = len(names) + number
         names += added
         lesions += added if is_lesion(name) else []
@@ -120,7 +121,7 @@ def _cavities(tags: NDArray[np.uint8], image: LabelImage, mend: bool) -> tuple[N
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """The parts of a label that are kept, by their numbers from 1, 0 elsewhere, and how much is not kept."""
+    """The parts of a label that are kept, numbered from 1 (0 elsewhere), and the size of the rest."""
 
     numbers: NDArray[np.uint8]
     count: int
@@ -129,7 +130,7 @@ class _Parts:
 
 
 def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> _Parts:
-    """The parts of at least so many voxels, largest first; whole if not to be split."""
+    """The parts of a mask with at least `smallest` voxels, largest first; without `split` the mask is one part."""
     if not split:
         count = int(np.count_nonzero(chosen))
         if count < smallest:
@@ -144,7 +145,7 @@ def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> _Parts
 
 
 def _check_names(names: list[str], added: list[str], label: str) -> None:
-    """Refuse a name that is there already, and more regions than tags can tell apart."""
+    """Raise a MeshError for a name that is taken, or for more regions than there are tags."""
     twice = next((name for name in added if name in names), None)
     if twice is not None:
         raise MeshError(

@@ -1,6 +1,7 @@
-"""The labels of interest of a scan, cut to their box, with their place in the patient."""
+"""The chosen labels of a scan, cropped to their bounding box, with their geometry in the patient."""
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,16 +9,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.image_geometry import ImageGeometry
-from surgsim_env.patient.label_names import LabelName
+from surgsim_env.patient.dicom_segmentation import open_segmentation
+from surgsim_env.patient.itk_labels import open_itk
+from surgsim_env.patient.label_source import ImageGeometry, LabelSource, checked_whole
+from surgsim_env.patient.materials import check_name
+from surgsim_env.patient.nifti_labels import open_nifti
 
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")
-# One byte each is held while an image is read.
-VOXELS_MOST = 1_000_000_000
-# So many are looked at together, of which some copies of eight bytes are made.
-RUN_VOXELS = 2_000_000
-# Of the labels' box, of which some copies of four bytes are made.
+# Largest bounding box of the labels [voxels]; meshing makes a few copies of it with four bytes a voxel.
 BOX_VOXELS_MOST = 200_000_000
+LABEL_LARGEST = 2**31 - 1
+LABELS_MOST = 32
+FORM = "--labels NAME=LABEL,... with the organ first, such as liver=1,lesion=2"
+
+
+@dataclass(frozen=True)
+class LabelName:
+    """A tissue's name and its label in the image."""
+
+    name: str
+    value: int
+
+
+def parse_labels(text: str) -> tuple[LabelName, ...]:
+    """The tissues of a text such as "liver=1,lesion=2", the organ first.
+
+    Raises:
+        MeshError: a part that breaks the form, a name or a label given twice, too many labels.
+    """
+    names = []
+    for part in text.split(","):
+        name, found, value = part.partition("=")
+        name = name.strip()
+        if not found or not re.fullmatch(r"\s*\d{1,10}\s*", value):
+            raise MeshError(f"--labels: {part!r} is no NAME=LABEL; give {FORM}")
+        if not 1 <= int(value) <= LABEL_LARGEST:
+            raise MeshError(f"--labels: {part!r}: labels are from 1 to {LABEL_LARGEST}, 0 is outside; give {FORM}")
+        names.append(LabelName(check_name(name, "--labels"), int(value)))
+    for what in ("name", "value"):
+        given = [getattr(one, what) for one in names]
+        twice = next((one for one in given if given.count(one) > 1), None)
+        if twice is not None:
+            raise MeshError(f"--labels: {twice!r} is given twice; each tissue has one label of its own")
+    if len(names) > LABELS_MOST:
+        raise MeshError(f"--labels: {len(names)} labels are given; at most {LABELS_MOST} are taken")
+    return tuple(names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +61,12 @@ class LabelImage:
     """Part of a label image.
 
     Fields:
-        tags: n for the n-th of `names`, counted from 1, 0 outside       (n_x, n_y, n_z) uint8
+        tags: n for the n-th of `names`, counted from 1; 0 outside       (n_x, n_y, n_z) uint8
         names: of the tissues, the organ first
         geometry: of this part
         corner: its first voxel in the whole image                       (3,)
-        shape: of the whole image
-        notes: what a reader should know of the file
+        shape: of the whole image                                        (3,)
+        notes: assumptions about the file, for the report
     """
 
     tags: NDArray[np.uint8]
@@ -46,36 +82,22 @@ class LabelImage:
         return float(np.prod(self.geometry.spacing))
 
 
-@dataclass(frozen=True, eq=False)
-class LabelSource:
-    """An image file that was looked into: its shape, geometry, and its voxels in runs, read anew each time.
-
-    `runs` gives (first voxel, values (n,)) in order, the first axis running fastest.
-    """
-
-    file: Path
-    shape: tuple[int, int, int]
-    geometry: ImageGeometry
-    runs: Callable[[], Iterator[tuple[int, NDArray]]]
-    notes: tuple[str, ...] = ()
-
-
 def is_image(file: Path) -> bool:
-    """Whether a file's name is that of an image."""
+    """Whether a file has an extension of label images."""
     return file.name.lower().endswith(IMAGE_SUFFIXES)
 
 
 def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
-    """The named labels of an image file, in memory of a byte a voxel and some of RUN_VOXELS.
+    """Read the named labels of an image file; needs one byte a voxel and a few runs of memory.
 
     Raises:
-        MeshError: names the file and what is wrong: missing, cut short, wrongly compressed, not three axes, sheared,
-            too large, numbers that are not whole, a label that is nowhere in it (says which are).
+        MeshError: a file that is missing, cut short, wrongly compressed, sheared, too large or not of three axes;
+            values that are not whole numbers; a label that is nowhere in it (lists those that are).
     """
     source = _source(file, [label.value for label in labels])
     found = np.zeros(source.shape, dtype=np.uint8, order="F")
     counts = np.zeros(len(labels) + 1, dtype=np.int64)
-    # A view, as `found` lies in this order.
+    # A view of `found`, which is stored in this order.
     line = found.reshape(-1, order="F")
     for first, values in source.runs():
         whole = checked_whole(values, file)
@@ -83,7 +105,7 @@ def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
         for tag, label in enumerate(labels, start=1):
             chosen = whole == label.value
             count = int(np.count_nonzero(chosen))
-            # Runs without labels are not written to: their memory is then never taken.
+            # Pages of `found` that are never written to take no memory.
             if count:
                 counts[tag] += count
                 part[chosen] = tag
@@ -96,56 +118,7 @@ def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
     return _cut(found, labels, source)
 
 
-def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
-    """Three counts of voxels of a header; further axes of length 1 are left out.
-
-    Raises:
-        MeshError: fewer or more axes, or an image that is too large.
-    """
-    counts = [int(count) for count in shape]
-    while len(counts) > 3 and counts[-1] == 1:
-        counts.pop()
-    if len(counts) != 3:
-        text = " x ".join(map(str, counts))
-        raise MeshError(
-            f"{file}: the image has {len(counts)} axes ({text}); the rule is three: export one volume of it"
-        )
-    if min(counts) < 1:
-        raise MeshError(f"{file}: the image has {' x '.join(map(str, counts))} voxels: export it again")
-    total = counts[0] * counts[1] * counts[2]
-    if total > VOXELS_MOST:
-        raise MeshError(
-            f"{file}: the image has {' x '.join(map(str, counts))} = {total:.3g} voxels; at most {VOXELS_MOST:.3g} are "
-            "read: crop it to the organ, or resample it"
-        )
-    return counts[0], counts[1], counts[2]
-
-
-def checked_kind(dtype: np.dtype, file: Path) -> None:
-    """Refuse values such as colours or complex numbers; MeshError names their type."""
-    if dtype.kind not in "iubf":
-        raise MeshError(f"{file}: the image's values are {dtype}; labels are whole numbers: export a label map")
-
-
-def checked_whole(values: NDArray, file: Path) -> NDArray:
-    """Label values; MeshError names the first that is not a whole number."""
-    checked_kind(values.dtype, file)
-    if values.dtype.kind != "f":
-        return values
-    wrong = values != np.rint(values)
-    if wrong.any():
-        raise MeshError(
-            f"{file}: the image holds {float(values[wrong][0]):g}, which is no whole number: labels are; is this the "
-            "scan itself, or resampled with interpolation? Export a label map, resampled by nearest neighbours"
-        )
-    return values
-
-
 def _source(file: Path, wanted: Sequence[int]) -> LabelSource:
-    from surgsim_env.patient.dicom_segmentation import open_segmentation
-    from surgsim_env.patient.itk_labels import open_itk
-    from surgsim_env.patient.nifti_labels import open_nifti
-
     if file.is_dir():
         raise MeshError(f"{file}: is a directory; give the path of a file in it")
     if not file.is_file():

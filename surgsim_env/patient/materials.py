@@ -1,10 +1,11 @@
-"""Materials of tissues by their names, each with its source; what has no entry takes the liver's, and says so."""
+"""Materials of tissues by their names, each with its source; an unknown tissue takes the liver's, and says so."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from msdm_core.regions import Material
+from msdm_core.errors import MeshError
+from msdm_core.material.regions import Material
 
 # A common textbook value for soft organs [kg/m^3], not checked against a source.
 DENSITY = 1060.0
@@ -14,7 +15,7 @@ POISSON_RATIO = 0.45
 
 @dataclass(frozen=True)
 class TissueMaterial:
-    """What a region is made of, and where its modulus comes from."""
+    """A region's material and the source of its modulus."""
 
     material: Material
     source: str
@@ -30,28 +31,39 @@ ORGANS: Mapping[str, tuple[float, str]] = {
     "stomach": (5000.0, "chosen as the liver's, filled with tissue; no source was looked up"),
     "spleen": (5000.0, "chosen as the liver's; no source was looked up"),
 }
-# How many times stiffer than the organ around it a lesion is.
+# Ratio of a lesion's modulus to that of the organ around it.
 LESIONS: Mapping[str, tuple[float, str]] = {
     "adenoma": (1.9, "1.91 +- 1.70 times the liver by elastography (PMID 26299323)"),
     "fnh": (7.9, "7.94 +- 6.43 times the liver by elastography (PMID 26299323)"),
     "lesion": (8.0, "chosen: HCC 51 kPa and metastases 50 kPa in liver of 6.6 kPa (doi 10.1177/8756479317733713)"),
 }
 KIDNEY_LESION = (4.0, "chosen: strain index of renal cell carcinoma 4.04 +- 0.72 (PMID 26880174)")
+# Names are written into mesh files, TOML and HTML.
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_ .-]{0,39}")
 LESION_WORD = re.compile(r"lesion|tumou?r|metastas|carcinoma|hcc|nodule|mass|cancer|adenoma|fnh", re.IGNORECASE)
 
 
+def check_name(name: str, option: str) -> str:
+    """The name, if a region may have it; raises a MeshError with the option and the rule otherwise."""
+    if not NAME.fullmatch(name) or name != name.strip():
+        raise MeshError(
+            f"{option}: {name!r} cannot be a region's name; use letters, digits, blanks and _ . - (at most 40)"
+        )
+    return name
+
+
 def is_lesion(name: str) -> bool:
-    """Whether a region's name is that of something a palpation looks for."""
+    """Whether a region's name is that of a lesion, which palpation looks for."""
     return LESION_WORD.search(name) is not None
 
 
 def without_number(name: str) -> str:
-    """A region's name less the number that tells the parts of one label apart: "lesion" of "lesion 2"."""
+    """A region's name without the number of its part: "lesion" for "lesion 2"."""
     return re.sub(r" \d+$", "", name)
 
 
 def organ_material(name: str, youngs_modulus: float | None = None) -> TissueMaterial:
-    """Material of the organ of a name such as "liver" or "left kidney", or with a given modulus [Pa]."""
+    """Material of an organ by its name, such as "liver" or "left kidney", or with a given modulus [Pa]."""
     if youngs_modulus is not None:
         return TissueMaterial(Material(youngs_modulus, DENSITY, POISSON_RATIO), "given on the command line")
     for word, (modulus, source) in ORGANS.items():
@@ -67,9 +79,9 @@ def region_material(name: str, organ_name: str, organ: Material, moduli: Mapping
 
     Args:
         name: of the region.
-        organ_name: of what is around it.
-        organ: its material.
-        moduli: given on the command line, by name or by the name before its number [Pa].
+        organ_name: of the organ around it.
+        organ: material of that organ.
+        moduli: given on the command line, by the region's name with or without its number [Pa].
     """
     given = moduli.get(name, moduli.get(without_number(name)))
     if given is not None:

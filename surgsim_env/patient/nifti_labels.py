@@ -9,23 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh_file import parsed
-from surgsim_env.patient.image_geometry import ImageGeometry
-from surgsim_env.patient.label_image import RUN_VOXELS, LabelSource, checked_kind, checked_shape
+from msdm_core.mesh_files.mesh_file import parsed
+from surgsim_env.patient.label_source import RUN_VOXELS, ImageGeometry, LabelSource, checked_kind, checked_shape
 
 ADVICE = "export or copy it again"
-# NIfTI's world is RAS, x to the right and y to the front.
+# NIfTI's axes are RAS: x to the right and y to the front.
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
-# So much may stand before the image's first voxel, and so much follow its last [bytes].
+# Most that may precede the image's first voxel, and follow its last one [bytes].
 HEADER_BYTES = TAIL_BYTES = 1_000_000
 
 
 def open_nifti(file: Path) -> LabelSource:
-    """Look into a NIfTI file.
+    """Read the header of a NIfTI file.
 
     Raises:
-        MeshError: names the file and what is wrong with it or its header.
+        MeshError: a damaged file or an unsupported header.
     """
     _check_compression(file)
     header = _header(file)
@@ -43,7 +42,7 @@ def open_nifti(file: Path) -> LabelSource:
     notes = []
     unit = str(parsed(file, lambda _: header.get_xyzt_units(), ADVICE)[0])
     if unit not in METRES:
-        notes.append("the header states no length unit: millimetres are taken, as NIfTI's readers do")
+        notes.append("the header states no length unit: millimetres are assumed, as NIfTI's readers do")
     if not int(header["sform_code"]) and not int(header["qform_code"]):
         notes.append("the header states no orientation: left and right, front and back may be swapped")
     affine = np.asarray(parsed(file, lambda _: header.get_best_affine(), ADVICE), dtype=np.float64)
@@ -65,7 +64,7 @@ def _check_compression(file: Path) -> None:
 
 
 def _header(file: Path) -> Any:
-    """The header without its extensions: their sizes come from the file, and nibabel.load reads as much as they say."""
+    """The header without its extensions, whose stated sizes nibabel.load would trust."""
     try:
         from nibabel.nifti1 import Nifti1Header
         from nibabel.nifti2 import Nifti2Header
@@ -74,7 +73,7 @@ def _header(file: Path) -> Any:
     raw = parsed(file, lambda _: _opened(file, Nifti2Header.template_dtype.itemsize), ADVICE)
     if len(raw) < Nifti1Header.template_dtype.itemsize:
         raise MeshError(f"{file}: is cut short: it ends within its header, after {len(raw)} bytes: {ADVICE}")
-    # The places of the magic words in the two versions of the format.
+    # Positions of the magic words in the two versions of the format.
     for kind, magic, place in ((Nifti1Header, b"n+1\0", 344), (Nifti2Header, b"n+2\0", 4)):
         if raw[place : place + 4] == magic:
             size = kind.template_dtype.itemsize
@@ -93,7 +92,7 @@ def _opened(file: Path, size: int) -> bytes:
 def _runs(
     file: Path, shape: tuple[int, int, int], dtype: np.dtype, offset: int, scaling: tuple[float, float]
 ) -> Iterator[tuple[int, NDArray]]:
-    """(first voxel, values); the whole file is read, so that gzip's checksum is looked at."""
+    """Runs of (first voxel, values); reads the whole file, so that gzip's checksum is verified."""
     from nibabel.openers import ImageOpener
 
     layer, total = shape[0] * shape[1], shape[0] * shape[1] * shape[2]

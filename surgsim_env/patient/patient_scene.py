@@ -1,4 +1,4 @@
-"""A scene for a patient's organ: tip, press, limits and hidden lesions in proportion to its cells and its tissue."""
+"""The palpation scene of a patient's organ: tip, press, limits and hidden lesions scaled to its cells and tissue."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.regions import Material
-from msdm_core.stability import stable_dt
-from surgsim_env.anatomy import Anatomy, anatomy_of
-from surgsim_env.levels import LEVELS
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Material
+from msdm_core.organ.stability import stable_dt
 from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, plan_sites
 from surgsim_env.palpation.surface_scene import (
     CONTACT_MODULI_PER_CELL,
@@ -22,26 +21,37 @@ from surgsim_env.palpation.surface_scene import (
 )
 from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material, without_number
 from surgsim_env.patient.patient_mesh import PatientMesh
-from surgsim_env.scenes import LesionDraw, Limits, MeshSource, Palpation, Scene, TetFile, Vector, make_scene
-from surgsim_env.timing import substeps_needed
-from surgsim_env.tissue_region import TissueRegion
+from surgsim_env.scene.anatomy import Anatomy, anatomy_of
+from surgsim_env.scene.levels import LEVELS
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import (
+    LesionDraw,
+    Limits,
+    MeshSource,
+    PalpationSettings,
+    Scene,
+    TetFile,
+    TissueRegion,
+    Vector,
+    substeps_needed,
+)
 
-# As in the scene liver, from where the organ's mesh is 0.85 of the contact radius sqrt(tip radius x press depth).
+# As in the scene liver, whose cells are 0.85 of the contact radius sqrt(tip radius x press depth).
 CELL_PER_CONTACT_RADIUS = 0.85
 DEPTH_PER_TIP = 7.0 / 12.0
 SPACING_PER_TIP = 13.0 / 12.0
 TIP_STEP, TIP_RANGE = 5e-4, (0.002, 0.015)
 DEPTH_STEP, SPACING_STEP = 1e-4, 5e-4
-# From the front and above in a patient's axes; along the third axis of files whose axes nobody stated.
+# From the front and above in a scan's axes; against the third axis of files whose axes have no stated meaning.
 APPROACH_SCAN: Vector = (0.0, math.sqrt(0.5), -math.sqrt(0.5))
 APPROACH_FILE: Vector = (0.0, 0.0, -1.0)
-# More raster sites than this cost minutes: the raster is then wider.
+# A raster of more sites takes minutes: its spacing is then enlarged.
 SITES_MOST = 60
-# Organ below a site, in press depths: the first that leaves sites to press is taken.
+# Least thickness of organ below a site, in press depths; the first that leaves any site is taken.
 THICKNESSES = (5.0, 3.0, 0.0)
-# Of a healthy press (Hertz), as in the scene liver.
+# Force limits over the force of a healthy press (Hertz), as in the scene liver.
 SOFT_PER_PRESS, HARD_PER_PRESS = 2.0, 4.0
-# Ranges of hidden lesions in tip radii, as in the scene liver; smaller ones where the organ has no room for those.
+# Ranges of hidden lesions in tip radii, as in the scene liver, and factors on them for organs without enough room.
 LESION_RADIUS, LESION_COVER, LESION_RIM = (1.5, 2.1), (0.25, 0.65), 2.1
 LESION_RATIO = (5.0, 8.0)
 LESION_SHRINKS = (1.0, 0.75, 0.55)
@@ -50,14 +60,14 @@ LESION_DRAWS = 40
 
 @dataclass(frozen=True, eq=False)
 class PatientScene:
-    """A patient's organ ready for every command and environment of palpation.
+    """A patient's organ with its palpation scene.
 
     Fields:
-        patient: its mesh and where that comes from
-        anatomy: the scene on its mesh, as it will be read again
+        patient: the mesh and its sources
+        anatomy: the scene on that mesh, as it will be read from the file
         organ, regions: materials with their sources, of the healthy tissue and of each region by name
-        site_count: sites of its raster
-        notes: what had to differ from the usual
+        site_count: number of sites of its raster
+        notes: remarks on choices that differ from the usual
     """
 
     patient: PatientMesh
@@ -82,18 +92,18 @@ def patient_scene(
     options: SurfaceOptions,
     moduli: Mapping[str, float],
 ) -> PatientScene:
-    """The scene of a patient's organ, whose mesh will be `mesh_file` in `folder`.
+    """Make the palpation scene of a patient's organ.
 
     Args:
         patient: the organ.
         name: of the scene.
-        folder: where its mesh will be read from.
-        mesh_file: the mesh's name there.
-        options: what is said of touch, anchors and healthy tissue.
+        folder: of the scene file and its mesh.
+        mesh_file: name of the mesh file.
+        options: touch, anchors and healthy tissue.
         moduli: of regions by name [Pa].
 
     Raises:
-        ValueError: a modulus of a region that is not there, a value that is impossible, no site to press.
+        ValueError: a modulus for a region that does not exist, a value out of range, no site to press.
     """
     organ = organ_material(patient.organ_name, options.youngs_modulus)
     regions = {
@@ -104,7 +114,7 @@ def patient_scene(
     notes: list[str] = []
     anatomy, sites = _with_sites(scene, patient, options, notes)
     anatomy = _with_lesions(anatomy, notes)
-    return PatientScene(patient, _with_substeps(anatomy), organ, regions, sites, tuple(notes))
+    return PatientScene(patient, _substeps_of_worst(anatomy), organ, regions, sites, tuple(notes))
 
 
 def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
@@ -122,7 +132,7 @@ def _first_scene(
     regions: Mapping[str, TissueMaterial],
     options: SurfaceOptions,
 ) -> Scene:
-    """All that follows from the cells and the tissue."""
+    """The scene with all values that follow from the cells and the tissue."""
     liver, cell = make_scene(PATTERN), patient.cell_size
     tip = options.tip_radius or _tip_radius(cell)
     depth = options.press_depth or _rounded(DEPTH_PER_TIP * tip, DEPTH_STEP)
@@ -139,7 +149,7 @@ def _first_scene(
         material=material,
         contact=replace(liver.contact, stiffness=_digits(CONTACT_MODULI_PER_CELL * material.youngs_modulus / cell, 3)),
         limits=_limits(material, tip, depth),
-        palpation=Palpation(
+        palpation=PalpationSettings(
             press_depth=depth,
             face_angle_deg=liver.palpation.face_angle_deg,
             face_margin=tip,
@@ -149,7 +159,7 @@ def _first_scene(
         demonstration=(),
         regions=tuple(TissueRegion(one, what.material, one in patient.lesions) for one, what in regions.items()),
     )
-    # Turns the approach into a unit vector, and refuses impossible values.
+    # Normalises the approach, and refuses values out of range.
     scene = with_options(scene, replace(options, approach=approach, tip_radius=tip, press_depth=depth))
     x, y, z = (round(part, 6) + 0.0 for part in scene.instrument.approach)
     direction = (x, y, z)
@@ -175,7 +185,20 @@ def _limits(material: Material, tip: float, depth: float) -> Limits:
 
 
 def _with_sites(scene: Scene, patient: PatientMesh, options: SurfaceOptions, notes: list[str]) -> tuple[Anatomy, int]:
-    """The anatomy with a raster that has sites, and not too many; and how many."""
+    """The anatomy with a raster of 1 to SITES_MOST sites, and their number."""
+    anatomy, count = _thick_enough(scene, patient, notes)
+    while count > SITES_MOST and options.spacing is None:
+        palpation = anatomy.scene.palpation
+        factor = max(math.sqrt(count / SITES_MOST), 1.02)
+        wider = math.ceil(palpation.site_spacing * factor / SPACING_STEP) * SPACING_STEP
+        palpation = replace(palpation, site_spacing=_rounded(wider, SPACING_STEP))
+        anatomy = anatomy_of(replace(scene, palpation=palpation), patient.mesh)
+        count = len(plan_sites(anatomy)[0])
+    return anatomy, count
+
+
+def _thick_enough(scene: Scene, patient: PatientMesh, notes: list[str]) -> tuple[Anatomy, int]:
+    """The anatomy with the first of THICKNESSES that leaves sites to press, and their number."""
     palpation = scene.palpation
     for thickness in THICKNESSES:
         thick = replace(palpation, thickness_smallest=_rounded(thickness * palpation.press_depth, DEPTH_STEP))
@@ -188,17 +211,12 @@ def _with_sites(scene: Scene, patient: PatientMesh, options: SurfaceOptions, not
             continue
         if thickness != THICKNESSES[0]:
             notes.append(f"the organ is thin: sites with {thickness:g} instead of 5 press depths of organ are pressed")
-        break
-    while count > SITES_MOST and options.spacing is None:
-        wider = math.ceil(thick.site_spacing * max(math.sqrt(count / SITES_MOST), 1.02) / SPACING_STEP) * SPACING_STEP
-        thick = replace(thick, site_spacing=_rounded(wider, SPACING_STEP))
-        anatomy = anatomy_of(replace(scene, palpation=thick), patient.mesh)
-        count = len(plan_sites(anatomy)[0])
-    return anatomy, count
+        return anatomy, count
+    raise AssertionError("THICKNESSES is empty")
 
 
 def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
-    """The anatomy with ranges of hidden lesions for which it has room; without where it has none."""
+    """The anatomy with ranges of hidden lesions that fit into it; without a lesion table if none fit."""
     tip = anatomy.scene.instrument.tip_radius
     for shrink in LESION_SHRINKS:
         draw = LesionDraw(
@@ -210,16 +228,14 @@ def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
         tried = replace(anatomy, scene=replace(anatomy.scene, lesion=draw))
         if _has_room(tried):
             if shrink != 1.0:
-                notes.append(
-                    f"hidden lesions are {shrink:g} times as large as the tip would ask for: the organ is small"
-                )
+                notes.append(f"hidden lesions are {shrink:g} times the size that suits the tip: the organ is small")
             return tried
     notes.append("the organ has no room for hidden lesions: there is no [lesion] table, and environments refuse it")
     return anatomy
 
 
 def _has_room(anatomy: Anatomy) -> bool:
-    """Whether every draw finds a place: the largest lesions under the thickest cover, and several of a level's."""
+    """Whether draws find a place: the largest lesions under the thickest cover, and the most lesions of each level."""
     draws, draw = np.random.default_rng(0), anatomy.scene.lesion
     assert draw is not None
     largest = replace(draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[1],) * 2)
@@ -233,8 +249,8 @@ def _has_room(anatomy: Anatomy) -> bool:
     return draw.radius[0] > 0.0
 
 
-def _with_substeps(anatomy: Anatomy) -> Anatomy:
-    """The anatomy with as many substeps as its worst organ needs: lesions, stiffer models, the worst hidden lesions."""
+def _substeps_of_worst(anatomy: Anatomy) -> Anatomy:
+    """The anatomy with the substeps of its stiffest organ: with segmented lesions, a stiffer model, hidden lesions."""
     scene = anatomy.scene
     organs = [anatomy.organ(anatomy.demonstration_lesions()), anatomy.organ(modulus_factor=1.0 + MODEL_MODULUS_ERROR)]
     if scene.lesion is not None:
@@ -243,13 +259,22 @@ def _with_substeps(anatomy: Anatomy) -> Anatomy:
             draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[0],) * 2, modulus_ratio=(draw.modulus_ratio[1],) * 2
         )
         organs += [anatomy.organ([anatomy.random_lesion(worst, hardest)]) for _ in range(2)]
-    step = min(stable_dt(organ, scene.contact.law) for organ in organs)
-    count = max(substeps_needed(scene.timing.haptic_step, step), 1)
+    anatomy = with_substeps(anatomy, organs)
+    count = anatomy.scene.timing.substep_count
     if count > SUBSTEPS_MOST:
+        step = min(stable_dt(organ, scene.contact.law) for organ in organs)
         raise ValueError(
             f"this organ needs {count} substeps in {scene.timing.haptic_step:g} s, its stable step is {step:.3g} s; at "
             f"most {SUBSTEPS_MOST} are allowed: are the moduli in pascals? Else use larger cells"
         )
+    return anatomy
+
+
+def with_substeps(anatomy: Anatomy, organs: Sequence[OrganModel]) -> Anatomy:
+    """The anatomy with the number of substeps that is stable for all of some organs in contact."""
+    scene = anatomy.scene
+    step = min(stable_dt(organ, scene.contact.law) for organ in organs)
+    count = max(substeps_needed(scene.timing.haptic_step, step), 1)
     return replace(anatomy, scene=replace(scene, timing=replace(scene.timing, substep_count=count)))
 
 
@@ -258,7 +283,7 @@ def _pair(share: tuple[float, float], length: float) -> tuple[float, float]:
 
 
 def _rounded(value: float, step: float) -> float:
-    """To whole steps [m], as a short decimal."""
+    """Rounded to a multiple of a step [m]."""
     return round(round(value / step) * step, 7)
 
 

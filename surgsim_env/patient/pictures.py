@@ -1,4 +1,4 @@
-"""Pictures of a patient's organ without GL: from three sides whole and cut open, and histograms of its tets."""
+"""Pictures of a patient's organ without OpenGL: three views, whole and cut open, and histograms of its tets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msdm_core.mesh import TET_EDGES, FloatArray, IntArray, TetMesh
-from msdm_core.quality import dihedral_angles, radius_ratios
-from msdm_core.regions import Lesion, lesion_extent
+from msdm_core.material.regions import Lesion, lesion_extent
+from msdm_core.mesh.quality import dihedral_angles, radius_ratios
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.palpation.surface_drawing import INK, PAPER, Patches, View, curved_patches, draw_patches
+from surgsim_env.rendering.cutting import cut_edges
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,14 +24,14 @@ TISSUE = np.array([0.72, 0.36, 0.30])
 PALPABLE = np.array([0.86, 0.56, 0.45])
 HELD = np.array([0.42, 0.47, 0.56])
 SECTION = np.array([0.90, 0.70, 0.62])
-# Of regions after the first; repeated where there are more.
+# Colours of the regions after the first, repeated cyclically.
 REGIONS = np.array([[0.95, 0.78, 0.18], [0.25, 0.55, 0.85], [0.35, 0.70, 0.45], [0.62, 0.42, 0.75], [0.92, 0.50, 0.20]])
 BLUE = "#3b6ea8"
 
 
 @dataclass(frozen=True)
 class Side:
-    """A direction to look along, what is up, and where that is seen from, in a scan's axes and in any others."""
+    """A viewing direction, its upward direction, and titles for the axes of a scan and for other axes."""
 
     along: tuple[float, float, float]
     up: tuple[float, float, float]
@@ -46,7 +47,7 @@ SIDES = (
 
 
 def organ_picture(found: PatientScene) -> bytes:
-    """PNG: three sides, above whole with the palpable face and where it is held, below cut open through its regions."""
+    """PNG of three views: above whole with the palpable face and the anchors, below cut open through a region."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.5, 8.6), dpi=100, facecolor=PAPER, layout="constrained")
@@ -92,7 +93,7 @@ def quality_picture(mesh: TetMesh) -> bytes:
 
 
 def _outer_colours(found: PatientScene) -> FloatArray:
-    """Of each boundary triangle, (n_triangle, 3)."""
+    """Colours of the boundary triangles (n_triangle, 3)."""
     mesh, anatomy = found.anatomy.mesh, found.anatomy
     triangles = mesh.boundary_triangles
     colours = np.broadcast_to(TISSUE, (len(triangles), 3)).copy()
@@ -110,7 +111,7 @@ def _region_colours(mesh: TetMesh) -> dict[int, FloatArray]:
 
 
 def _through(found: PatientScene) -> FloatArray:
-    """A point of the cuts [m]: the middle of the largest region, or of the organ."""
+    """A point on the cutting planes [m]: the centre of the largest region, lesions first, or of the organ."""
     mesh = found.anatomy.mesh
     inner = found.patient.volumes[1:]
     if not inner:
@@ -122,7 +123,7 @@ def _through(found: PatientScene) -> FloatArray:
 def _draw_cut(
     axes: Axes, mesh: TetMesh, patches: Patches, colours: FloatArray, through: FloatArray, view: View
 ) -> None:
-    """What lies behind the plane through a point that faces the viewer, and the section in its regions' colours."""
+    """Draw the part behind the plane through a point that faces the viewer, and the section in its regions' colours."""
     from matplotlib.collections import PolyCollection
 
     behind = (patches.corners.mean(axis=1) - through) @ view.towards < 0.0
@@ -137,22 +138,18 @@ def _draw_cut(
 
 
 def section(mesh: TetMesh, through: FloatArray, normal: FloatArray) -> tuple[list[FloatArray], IntArray]:
-    """Where a plane cuts tets: polygons of 3 or 4 points [m] and the regions' tags."""
+    """Sections of tets with a plane: polygons of 3 or 4 points [m] and the tets' region tags."""
     height = (mesh.points - through) @ normal
-    # A node on the plane counts as above it: no polygon then loses a corner.
-    above = height >= 0.0
-    cut = np.flatnonzero(above[mesh.tets].any(axis=1) & ~above[mesh.tets].all(axis=1))
-    first, second = (mesh.tets[cut][:, TET_EDGES[:, end]] for end in (0, 1))
-    crossed = above[first] != above[second]
-    share = np.where(crossed, height[first] / np.where(crossed, height[first] - height[second], 1.0), 0.0)
-    places = mesh.points[first] + share[..., None] * (mesh.points[second] - mesh.points[first])
-    across = np.linalg.svd(np.asarray(normal)[None])[2][1:]
-    polygons = []
-    for one, on in zip(places, crossed, strict=True):
-        corners = one[on]
-        u, v = ((corners - corners.mean(axis=0)) @ across.T).T
-        polygons.append(corners[np.argsort(np.arctan2(v, u))])
-    return polygons, mesh.region[cut]
+    polygons: list[FloatArray] = []
+    cut = []
+    for tets, edges in cut_edges(mesh.tets, height):
+        start, end = height[edges[..., 0]], height[edges[..., 1]]
+        share = (start / (start - end))[..., None]
+        polygons.extend(mesh.points[edges[..., 0]] * (1.0 - share) + mesh.points[edges[..., 1]] * share)
+        cut.append(tets)
+    owner = np.concatenate(cut)
+    order = np.argsort(owner)
+    return [polygons[one] for one in order], mesh.region[owner[order]]
 
 
 def _scale_bar(axes: Axes, mesh: TetMesh) -> None:

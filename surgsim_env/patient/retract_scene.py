@@ -1,4 +1,4 @@
-"""The scene in which a patient's organ is retracted: the organ turned so that a thin edge of it can be lifted."""
+"""The retraction scene of a patient's organ, turned so that a thin edge of it can be lifted."""
 
 import math
 from dataclasses import dataclass, replace
@@ -6,49 +6,63 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.ordering import in_sweep_order
-from msdm_core.stability import stable_dt
-from msdm_core.support import Support
-from surgsim_env.anatomy import Anatomy, anatomy_of
-from surgsim_env.anchors import Anchor, Box
-from surgsim_env.arms.port import Port
-from surgsim_env.patient.patient_scene import PatientScene
-from surgsim_env.patient.retract_view import find_endoscope
+from msdm_core.mesh.ordering import in_sweep_order
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from msdm_core.organ.support import Support
+from surgsim_env.patient.patient_scene import PatientScene, with_substeps
 from surgsim_env.patient.rim import HIDING, NoRim, Rim, find_rim
-from surgsim_env.retraction import Flap, Retraction
-from surgsim_env.scenes import MeshSource, Palpation, Scene, TetFile, Vector, make_scene
-from surgsim_env.timing import substeps_needed
+from surgsim_env.scene.anatomy import Anatomy, anatomy_of
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import (
+    Anchor,
+    Box,
+    Endoscope,
+    Flap,
+    MeshSource,
+    PalpationSettings,
+    Port,
+    Retraction,
+    Scene,
+    TetFile,
+    Vector,
+)
+from surgsim_env.tasks.visibility import Disc, uncovered
 
 PATTERN = "lobe"
-# Larger cells have no edge that fills a jaw evenly, and miss a bed of 24 mm [m].
+# Larger cells give no edge that fills a jaw evenly, and miss a bed of 24 mm [m].
 CELL_MOST = 0.011
-# Of the lobe: where its free edge and the middle of it are [m].
+# In the scene lobe: y of the free edge and x of its middle [m].
 LOBE_EDGE, LOBE_MIDDLE = 0.052, 0.040
-# What is free to move: so far inward from the edge, along it, below and above it [m]. All else is held.
+# The part that is free to move: its extent inward from the edge, along it, below and above it [m]. The rest is held.
 FLAP_DEPTH, FLAP_WIDTH, FLAP_BELOW, FLAP_ABOVE = 0.060, 0.140, 0.020, 0.080
 FLAP_BEYOND = 0.015
-# Of the flap, what is observed and measured: as high above the bed as an edge in the jaw may be [m].
+# Height above the bed up to which the flap is observed and measured, as an edge in the jaw may reach it [m].
 SEEN_HEIGHT = 0.025
-# The bed ends so far inside the edge, beyond the jaw that takes it, and so far below the lowest place above it [m].
+# Distance of the bed's border inside the edge, clear of the jaw, and of its top below the organ above it [m].
 BED_INSIDE, BED_GAP = 0.016, 0.002
 BED_WIDTH, BED_THICKNESS = 0.030, 0.040
-# The disc: its radius, and how far its middle's place is drawn, inward from the bed's border and along it [m].
+# The target disc: its radius, and the ranges of its centre, inward from the bed's border and along it [m].
 TARGET_RADIUS, TARGET_IN, TARGET_ALONG = 0.004, (0.005, 0.008), 0.003
-# Of a right arm's ball [m]: the neck behind it (3 mm) would else meet the bed before it.
+# Radius of a right arm's ball [m]; with a smaller one the neck behind it (3 mm) meets the bed first.
 RIGHT_TIP_RADIUS = 0.005
-# Healthy liver's spread over its mean, 1.65 of 6.63 kPa (doi 10.1177/8756479317733713).
+# Standard deviation over mean of a healthy liver's modulus, 1.65 of 6.63 kPa (doi 10.1177/8756479317733713).
 MODULUS_SPREAD = 0.25
+# Endoscope positions that are tried in turn: aside, outward and up from the middle of the edge [m].
+PLACES = tuple((aside, 0.075, up) for up in (0.045, 0.035, 0.055, 0.070) for aside in (0.038, -0.038, 0.0))
+# Largest visible share of any target at rest, and least visible share without the flap.
+HIDDEN_SHARE, SEEN_SHARE = 0.05, 0.95
+# Height of targets above the bed for the test of visibility [m].
+TARGET_LIFT = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class RetractScene:
-    """A patient's organ ready to be retracted.
+    """A patient's organ with its retraction scene.
 
     Fields:
         anatomy: the scene on the turned mesh
-        origin, frame: a place p of the patient's mesh is at (p - origin) @ frame here [m], (3,) and (3, 3)
-        rim: the edge that is lifted
+        origin, frame: a point p of the patient's mesh is at (p - origin) @ frame here [m], (3,) and (3, 3)
+        rim: the edge to be lifted
     """
 
     anatomy: Anatomy
@@ -58,7 +72,7 @@ class RetractScene:
 
 
 def find_retraction(found: PatientScene, folder: Path, mesh_file: str) -> RetractScene | str:
-    """The scene of an organ's retraction, whose mesh will be `mesh_file` in `folder`; or why there is none."""
+    """The retraction scene of an organ, with its mesh as `mesh_file` in `folder`; or the reason why there is none."""
     cell = found.patient.cell_size
     if cell > CELL_MOST:
         return (
@@ -70,7 +84,7 @@ def find_retraction(found: PatientScene, folder: Path, mesh_file: str) -> Retrac
 
 
 def retract_scene(found: PatientScene, rim: Rim, folder: Path, mesh_file: str) -> RetractScene | str:
-    """The scene in which a given edge is lifted; or why it cannot be."""
+    """The scene in which a given edge is lifted; or the reason why it cannot be lifted."""
     bed_top = rim.underside[0] - BED_GAP
     origin = rim.place - rim.frame @ np.array([0.5 * FLAP_WIDTH, FLAP_DEPTH, -bed_top])
     mesh = found.patient.mesh
@@ -90,11 +104,13 @@ def retract_scene(found: PatientScene, rim: Rim, folder: Path, mesh_file: str) -
             "under it without lifting it, or the rest of the organ stands before it"
         )
     anatomy = replace(anatomy, scene=replace(anatomy.scene, endoscope=endoscope))
-    return RetractScene(_with_substeps(anatomy), origin, rim.frame, rim)
+    return RetractScene(
+        with_substeps(anatomy, [anatomy.organ(modulus_factor=1.0 + MODULUS_SPREAD)]), origin, rim.frame, rim
+    )
 
 
 def told(made: RetractScene | str) -> str:
-    """What became of the search for an edge to lift, in a sentence."""
+    """The result of the search for an edge to lift, in a sentence."""
     if isinstance(made, str):
         return f"none: {made}"
     x, y, z = (made.rim.place * 1e3).round(1)
@@ -106,7 +122,7 @@ def told(made: RetractScene | str) -> str:
 
 
 def with_retraction(found: PatientScene, made: RetractScene | str, scene_file: str) -> PatientScene:
-    """The organ's scene, which names its scene of retraction or says why there is none."""
+    """The organ with a palpation scene that names its retraction scene, or the reason why there is none."""
     said = {"retract_refusal": made} if isinstance(made, str) else {"retract_scene": scene_file}
     return replace(found, anatomy=replace(found.anatomy, scene=replace(found.scene, **said)))
 
@@ -124,7 +140,7 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, folder: Path, mesh_file
         material=patient.material,
         capsule=patient.capsule,
         damping=patient.damping,
-        # A scan shows the organ under its weight: that is its rest, and what lifts it works against stiffness alone.
+        # A scan shows the organ under its weight: that is its rest, and lifting works against stiffness alone.
         gravity=(0.0, 0.0, 0.0),
         anchors=_anchors(mesh),
         supports=(_bed(bed_end),),
@@ -137,14 +153,14 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, folder: Path, mesh_file
         ),
         port=_port(lobe.port),
         ports=tuple(_port(port) for port in lobe.ports),
-        palpation=Palpation(press_depth=0.003, face_angle_deg=60.0),
+        palpation=PalpationSettings(press_depth=0.003, face_angle_deg=60.0),
         retract=_retract(found, bed_end),
         regions=tuple(replace(region, lesion=False) for region in patient.regions),
     )
 
 
 def _anchors(mesh: TetMesh) -> tuple[Anchor, ...]:
-    """Boxes around all but the flap, those that hold something."""
+    """Boxes around all but the flap, without those that hold no node."""
     low, high = mesh.points.min(axis=0) - 1e-3, mesh.points.max(axis=0) + 1e-3
     free_low = np.array([0.0, 0.0, -FLAP_BELOW])
     free_high = np.array([FLAP_WIDTH, FLAP_DEPTH + FLAP_BEYOND, FLAP_ABOVE])
@@ -196,17 +212,41 @@ def _port(port: Port | None) -> Port:
 
 
 def _moved(place: Vector) -> Vector:
-    """A place of the lobe's scene, at the same place before this edge [m]."""
+    """A point of the scene lobe at the same place relative to this edge [m]."""
     x, y, z = place
     return _vector(x - LOBE_MIDDLE + 0.5 * FLAP_WIDTH, y - LOBE_EDGE + FLAP_DEPTH, z)
 
 
-def _with_substeps(anatomy: Anatomy) -> Anatomy:
-    scene = anatomy.scene
-    assert scene.retract is not None
-    stiff = anatomy.organ(modulus_factor=1.0 + MODULUS_SPREAD)
-    count = max(substeps_needed(scene.timing.haptic_step, stable_dt(stiff, scene.contact.law)), 1)
-    return replace(anatomy, scene=replace(scene, timing=replace(scene.timing, substep_count=count)))
+def find_endoscope(anatomy: Anatomy, edge: Vector, fov_deg: float) -> Endoscope | None:
+    """The first of PLACES before an edge (3,) [m] from which targets are hidden, and visible without the flap."""
+    table, triangles = anatomy.scene.retract, anatomy.mesh.boundary_triangles
+    assert table is not None
+    held = triangles[np.isin(triangles, anatomy.anchors).all(axis=1)]
+    targets = _targets(table)
+    middle = np.mean([target.centre for target in targets], axis=0)
+    for shift in PLACES:
+        eye = np.array(edge) + shift
+        if all(
+            _visible_share(eye, target, anatomy.mesh.points, triangles) <= HIDDEN_SHARE
+            and _visible_share(eye, target, anatomy.mesh.points, held) >= SEEN_SHARE
+            for target in targets
+        ):
+            return Endoscope(_vector(*eye), _vector(*middle), fov_deg)
+    return None
+
+
+def _targets(table: Retraction) -> list[Disc]:
+    """Target discs at the corners of the range from which they are drawn."""
+    up = np.array([0.0, 0.0, 1.0])
+    return [
+        Disc(np.array([x, y, TARGET_LIFT]), up, table.target_radius)
+        for x in table.target_along
+        for y in table.target_distance
+    ]
+
+
+def _visible_share(eye: FloatArray, target: Disc, points: FloatArray, triangles: IntArray) -> float:
+    return float(uncovered(eye, target.points(), points, triangles).mean())
 
 
 def _vector(x: float, y: float, z: float) -> Vector:

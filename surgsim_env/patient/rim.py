@@ -1,4 +1,4 @@
-"""The edge of an organ that a jaw can take: where it is thin, which way it points, what it hides."""
+"""The edge of an organ that a jaw can grasp: its place, direction and thickness, and the side that hides a target."""
 
 import math
 from collections.abc import Iterator
@@ -6,42 +6,42 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray, TetMesh
-from surgsim_env.patient.organ_voxels import OrganVoxels
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from surgsim_env.patient.voxels import OrganVoxels
 
-# The grasper's jaw (scenes/instruments/grasper.xml): it opens so far, its pads are so wide [m]. So much of the
-# opening is left free, and the edge goes in so deep.
+# Opening and pad width of the grasper's jaw (scenes/instruments/grasper.xml), play that is left in the opening, and
+# least depth to which an edge is grasped [m].
 JAW_OPENING, PAD_WIDTH = 0.020, 0.016
 JAW_PLAY, OVERLAP_LEAST = 0.003, 0.012
-# Voxels [m], and the balls by whose filling edges are found: what a half space fills is no edge.
+# Edge of voxels; radii of the balls whose filled share finds edges (a half space fills 0.5) [m].
 VOXEL = 0.0015
 BALL, BALL_WIDE, FILLED_MOST = 0.015, 0.030, 0.45
-# So many of the most flexible places are looked at, on both sides.
+# Number of the thinnest places that are examined, on both sides.
 PLACES_TRIED = 60
-# Lines by which thickness is measured: along the edge, inward, across [m].
+# Sampling of the thickness: positions along the edge, inward, and across [m].
 ALONG = np.linspace(-0.012, 0.012, 9)
 DEPTHS = np.arange(0.001, 0.0365, 0.001)
 HEIGHTS = np.arange(-0.03, 0.0601, 0.001)
-# Between these depths lies what is hidden; the side that hides it is to be even to so much [m].
+# Depths between which the target is hidden, and largest unevenness of the side that hides it [m].
 HIDING = (0.012, 0.030)
 UNEVEN_MOST = 0.006
-# An edge's border may bend by so much over the width of a pad [m].
+# Largest bend of an edge's border over the width of a pad [m].
 BEND_MOST = 0.004
-# A side that is turned from the given upward direction by more than this is taken only if no other is found.
+# A side turned further from the given upward direction is taken only if there is no other.
 TURN_MOST = math.radians(60.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Rim:
-    """An edge of an organ that a jaw can take.
+    """An edge of an organ that a jaw can grasp.
 
     Fields:
-        place: on the edge [m], (3,)
+        place: a point on the edge (3,) [m]
         frame: columns are x along the edge, y outward, z up, normal to the side that hides (3, 3)
-        thickness: how wide a jaw must open to take it OVERLAP_LEAST deep [m]
-        underside: height of the side that hides over `place`, lowest and highest [m]
-        jaw: where the jaw points, in the frame, (3,)
-        stiffness: mean cube of the thickness above what it hides [m^3]; edges are compared by it
+        thickness: opening of a jaw that grasps it OVERLAP_LEAST deep [m]
+        underside: lowest and highest point of the side that hides, along z from `place` [m]
+        jaw: direction in which the jaw points, in the frame (3,)
+        stiffness: mean cubed thickness above the hidden area [m^3], to compare edges
     """
 
     place: FloatArray
@@ -54,13 +54,13 @@ class Rim:
 
 @dataclass(frozen=True)
 class NoRim:
-    """An organ without an edge to be lifted; `thickness` is how wide a jaw must open for its thinnest one [m]."""
+    """An organ without an edge to be lifted; `thickness` is the opening that its thinnest one needs [m]."""
 
     thickness: float
 
     @property
     def reason(self) -> str:
-        """Why it cannot be retracted, in a sentence."""
+        """The reason why the organ cannot be retracted, in a sentence."""
         jaw = f"the jaw opens {JAW_OPENING * 1e3:g} mm and needs {JAW_PLAY * 1e3:g} mm of play"
         if self.thickness <= JAW_OPENING - JAW_PLAY:
             return (
@@ -76,7 +76,7 @@ class NoRim:
 
 
 def find_rim(mesh: TetMesh, up: FloatArray) -> Rim | NoRim:
-    """The most flexible edge of an organ that fits in a jaw, lifted to the side nearest to `up` (3,)."""
+    """The most flexible edge of an organ that fits into a jaw, with z on the side of `up` (3,) if possible."""
     voxels, thinnest, found = OrganVoxels(mesh, VOXEL), math.inf, list[Rim]()
     for place, frame in _edges(mesh, voxels, up):
         thickness = _thickness(voxels, place, frame)
@@ -92,7 +92,7 @@ def find_rim(mesh: TetMesh, up: FloatArray) -> Rim | NoRim:
 
 
 def _edges(mesh: TetMesh, voxels: OrganVoxels, up: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Places on edges and frames: outward is away from the organ near by, z along its thinnest way, on up's side."""
+    """Points on edges with frames: y away from the organ nearby, z along its smallest extent, on the side of `up`."""
     places = mesh.points[mesh.boundary_nodes]
     sharp = np.flatnonzero(voxels.filled_share(places, BALL) < FILLED_MOST)
     flexible = sharp[np.argsort(voxels.filled_share(places[sharp], BALL_WIDE), kind="stable")]
@@ -109,22 +109,23 @@ def _edges(mesh: TetMesh, voxels: OrganVoxels, up: FloatArray) -> Iterator[tuple
 
 
 def _thickness(voxels: OrganVoxels, place: FloatArray, frame: FloatArray) -> float:
-    """How wide a jaw must open to take an edge OVERLAP_LEAST deep over its pads [m]; infinite where it bends."""
+    """Opening of a jaw that grasps an edge OVERLAP_LEAST deep over its pads [m]; infinite where the edge bends."""
     bottom, top = voxels.columns(place, frame, ALONG, DEPTHS, HEIGHTS)
     held = np.abs(ALONG) <= 0.5 * PAD_WIDTH + 1e-6
     border = DEPTHS[np.argmax(np.isfinite(bottom[held]), axis=1)]
     if not np.isfinite(bottom[held]).any(axis=1).all() or np.ptp(border) > BEND_MOST:
         return math.inf
-    # What has gone in before must fit, too.
+    # All tissue between the border and that depth must fit.
     within = DEPTHS <= border.min() + OVERLAP_LEAST + 1e-6
     return float(np.nanmax(top[held][:, within]) - np.nanmin(bottom[held][:, within]))
 
 
 def _rim(voxels: OrganVoxels, place: FloatArray, frame: FloatArray, thickness: float) -> Rim | None:
-    """The edge with its frame turned until the side below is level; None where that side is uneven or not there."""
+    """The edge with its frame turned until the side below is level; None where that side is uneven or missing."""
     hiding = (DEPTHS >= HIDING[0]) & (DEPTHS <= HIDING[1])
     x, depth = (part.ravel() for part in np.meshgrid(ALONG, DEPTHS[hiding], indexing="ij"))
-    turned, bottom, top = frame, np.zeros(0), np.zeros(0)
+    level = turned = frame
+    bottom, top = np.zeros(0), np.zeros(0)
     for _ in range(4):
         bottom, top = (side[:, hiding].ravel() for side in voxels.columns(place, turned, ALONG, DEPTHS, HEIGHTS))
         if not np.isfinite(bottom).all():
@@ -135,14 +136,14 @@ def _rim(voxels: OrganVoxels, place: FloatArray, frame: FloatArray, thickness: f
         return None
     jaw = level.T @ -frame[:, 1]
     jaw[0] = 0.0
-    # A plate bends by its thickness cubed.
+    # The bending stiffness of a plate grows with its thickness cubed.
     stiffness = float(((top - bottom) ** 3).mean())
     underside = (float(bottom.min()), float(bottom.max()))
     return Rim(place, level, thickness, underside, jaw / np.linalg.norm(jaw), stiffness)
 
 
 def _levelled(frame: FloatArray, up: FloatArray) -> FloatArray:
-    """The frame with another z, turned as little as can be about its x and y."""
+    """The frame with another z, turned by the smallest angle."""
     up = up / np.linalg.norm(up)
     outward = frame[:, 1] - (frame[:, 1] @ up) * up
     outward /= np.linalg.norm(outward)

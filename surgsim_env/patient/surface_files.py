@@ -1,4 +1,4 @@
-"""Surfaces of an organ and its regions from STL, OBJ and PLY files, one file a region."""
+"""Surfaces of an organ and its regions from STL, OBJ and PLY files, one file for each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
-from msdm_core.length_unit import LengthUnit
-from msdm_core.mesh import FloatArray
-from msdm_core.surface import check_surface, merge_vertices, surface_volume
-from surgsim_env.patient.label_names import check_name
-from surgsim_env.patient.materials import is_lesion
-from surgsim_env.patient.surface_voxels import voxels_inside
+from msdm_core.mesh.surface import check_surface, merge_vertices, surface_volume
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh_files.mesh_file import LengthUnit
+from surgsim_env.patient.materials import check_name, is_lesion
+from surgsim_env.patient.voxels import voxels_inside
 
 Triangles = NDArray[np.int64]
-# Voxels of a mended surface along one cell.
+# Voxels along one cell when a surface is rebuilt.
 MENDING_VOXELS = 6
 
 
@@ -39,7 +38,7 @@ class ClosedSurface:
 
 @dataclass(frozen=True, eq=False)
 class BrokenSurface:
-    """A surface that only `--mend` makes a body of: what is wrong with it, and its triangles [m]."""
+    """A surface that encloses no body unless it is rebuilt (`--mend`): vertices [m], triangles and its fault."""
 
     name: str
     vertices: FloatArray
@@ -48,7 +47,7 @@ class BrokenSurface:
 
 
 def region_name(file: Path) -> str:
-    """A region's name from its file's: its stem, with what no name may have made an underscore."""
+    """A region's name: the stem of its file, with underscores for characters that no name may have."""
     kept = "".join(one if one.isascii() and (one.isalnum() or one in "_ .-") else "_" for one in file.stem)[:40]
     return check_name(kept.strip(" .-") or "organ", str(file))
 
@@ -56,12 +55,12 @@ def region_name(file: Path) -> str:
 def read_organ_surface(
     file: Path, length_unit: LengthUnit, *, mend: bool
 ) -> tuple[ClosedSurface | BrokenSurface, list[str]]:
-    """The largest body of a surface file, and notes of what was left out.
+    """The largest body of a surface file, and notes on what was dropped.
 
     Raises:
-        MeshError: a surface that is open, crosses itself or is no manifold, unless it is to be mended.
+        MeshError: a surface that is open, crosses itself or is no manifold, unless `mend` is set.
     """
-    from msdm_core.mesh_io import read_surface
+    from msdm_core.mesh_files.surface_io import read_surface
 
     vertices, triangles = read_surface(file, length_unit=length_unit)
     bodies, name = bodies_of(vertices, triangles.astype(np.int64)), region_name(file)
@@ -85,9 +84,9 @@ def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list
     """The closed surfaces of a region, largest first; those of a lesion are numbered where there are several.
 
     Raises:
-        MeshError: names the file and what is wrong with a surface in it.
+        MeshError: a surface that is not closed, or several bodies of a region that is no lesion.
     """
-    from msdm_core.mesh_io import read_surface
+    from msdm_core.mesh_files.surface_io import read_surface
 
     vertices, triangles = read_surface(file, length_unit=length_unit)
     bodies = bodies_of(vertices, triangles.astype(np.int64))
@@ -106,7 +105,10 @@ def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list
 
 
 def mended_voxels(surface: BrokenSurface, cell_size: float) -> tuple[NDArray[np.uint8], FloatArray, FloatArray, str]:
-    """A broken surface as voxels of 1 inside (n_x, n_y, n_z), their spacing [m] and first centre [m] (3,), and a note.
+    """Rebuild a broken surface from voxels.
+
+    Returns:
+        Voxels, 1 inside and 0 outside (n_x, n_y, n_z); their spacing (3,) [m]; the first centre (3,) [m]; a note.
 
     Raises:
         MeshError: nothing in it is enclosed.
@@ -125,7 +127,7 @@ def mended_voxels(surface: BrokenSurface, cell_size: float) -> tuple[NDArray[np.
 
 
 def bodies_of(vertices: FloatArray, triangles: Triangles) -> list[tuple[FloatArray, Triangles]]:
-    """The parts of a surface that share no vertex, the one that encloses most first."""
+    """The connected parts of a surface, by falling volume."""
     edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
     graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
     count, part = connected_components(graph, directed=False)
@@ -137,7 +139,7 @@ def bodies_of(vertices: FloatArray, triangles: Triangles) -> list[tuple[FloatArr
 
 
 def checked_names(names: Sequence[str]) -> None:
-    """Refuse two regions of one name."""
+    """Raise a MeshError for two regions of one name."""
     for name in names:
         if list(names).count(name) > 1:
             raise MeshError(

@@ -8,32 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.meshing import largest_body_mesh
-from msdm_core.region_tags import voxels_at
-from msdm_core.segmentation_meshing import SmoothedShare, smoothed_share
-from msdm_core.surface import check_surface
-from surgsim_env.patient.image_geometry import CONVENTION
+from msdm_core.mesh.surface import check_surface
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.lattice_meshing import largest_body_mesh
+from msdm_core.meshing.region_tags import voxels_at
+from msdm_core.meshing.segmentation_meshing import SmoothedShare, smoothed_share
 from surgsim_env.patient.label_cleaning import CleanLabels
+from surgsim_env.patient.label_source import CONVENTION
 from surgsim_env.patient.patient_mesh import PatientMesh, region_volumes
 from surgsim_env.patient.surface_files import ClosedSurface, bodies_of
-from surgsim_env.patient.surface_voxels import voxels_inside
+from surgsim_env.patient.voxels import voxels_inside
 
-# Edge of fTetWild's tets over a lattice's cell: about as many tets.
+# Ratio of fTetWild's target edge to the lattice's cell that gives about as many tets.
 EDGE_PER_CELL = 0.9
-# How far its surface may leave the given one, as a share of the box's diagonal: its own default.
+# Largest distance of its surface from the given one over the bounding box's diagonal: fTetWild's default.
 EPSILON = 1e-3
-# Voxels along a region's longest extent, to tell which tets lie in it.
+# Voxels along a region's longest extent, by which its tets are found.
 REGION_VOXELS = 160
 
 
 def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh:
-    """Tets of the first surface, which holds the others; its regions are tagged from 2 in their order.
+    """Tets inside the first surface, which encloses the others; these are regions, tagged from 2 in their order.
 
-    fTetWild is not deterministic: twice the same surfaces give two meshes.
+    fTetWild is not deterministic: the same surfaces give a different mesh each time.
 
     Raises:
-        MeshError: it is not installed, or made nothing of the surfaces.
+        MeshError: fTetWild is not installed, or makes no tets.
     """
     try:
         import pytetwild  # pyright: ignore[reportMissingImports]
@@ -44,7 +44,7 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
     triangles = np.concatenate([one.triangles + start for one, start in zip(surfaces, starts, strict=False)])
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     share = EDGE_PER_CELL * cell_size / diagonal
-    # It leaves a file, __tracked_surface.stl, in the current folder.
+    # fTetWild leaves a file, __tracked_surface.stl, in the current folder.
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         nodes, tets = pytetwild.tetrahedralize(
             vertices, triangles.astype(np.int32), edge_length_fac=share, epsilon=EPSILON, optimize=True, quiet=True
@@ -63,7 +63,7 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
 
 
 def mesh_labels_conforming(labels: CleanLabels, source: str, cell_size: float) -> PatientMesh:
-    """The mesh of an image's labels: level sets of the smoothed labels as surfaces, filled by fTetWild."""
+    """Mesh an image's labels: level sets of the smoothed labels are the surfaces that fTetWild fills."""
     image = labels.image
     volumes = {tag: float(np.count_nonzero(labels.tags == tag)) * image.voxel_volume for tag in _tags(labels)}
     whole = sum(volumes.values())
@@ -97,13 +97,13 @@ def _tags(labels: CleanLabels) -> list[int]:
 
 
 def _smoothed(labels: CleanLabels, tag: int, cell_size: float) -> SmoothedShare:
-    """A label smoothed, the whole organ for tag 1."""
+    """A smoothed label; for tag 1 the whole organ."""
     mask = labels.tags > 0 if tag == 1 else labels.tags == tag
     return smoothed_share(mask, np.zeros(3, dtype=np.int64), labels.image.geometry.spacing, cell_size)
 
 
 def _level_surface(field: SmoothedShare, volume: float) -> tuple[FloatArray, NDArray[np.int64]]:
-    """The largest closed surface on which a smoothed share has the level that encloses a volume [m^3]."""
+    """The largest closed level set of a smoothed label, at the level that encloses a volume [m^3]."""
     try:
         from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
     except ImportError:

@@ -1,24 +1,25 @@
-"""Where the cameras stand: derived from the organ, its palpable face and the side from which the instrument comes."""
+"""Cameras of a scene, derived from the organ, its palpable face and the direction of the instrument."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.palpable_face import tangent_axes
-from surgsim_env.scenes import Endoscope
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.model import Endoscope
+from surgsim_env.scene.palpable_surface import tangent_axes
 
-# The organ takes this share of the overview's picture, which is aimed above its middle by a share of half its height.
+# Share of the overview's picture that the organ fills, and how far above its middle the view is aimed, as a share of
+# half the height.
 OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
-# Nothing of the organ comes nearer to the edge of that picture than this share of half its height.
+# The organ lies within this share of half that picture's height.
 EDGE = 0.96
-# How high the overview stands, and how far it goes round to the side [degrees].
+# Elevation and azimuth of the overview [degrees].
 OVERVIEW_HEIGHT, OVERVIEW_SIDE = 32.0, 28.0
-# How high the side view stands [degrees], and how far above the organ's middle it is aimed, likewise.
+# Elevation of the side view [degrees], and how far above the organ's middle it is aimed, as for the overview.
 SIDE_HEIGHT, SIDE_SHIFT = 10.0, 0.25
-# The endoscope looks at the palpable face from this far [m] (as far as the face is wide, within bounds) and so oblique.
+# The endoscope looks at the palpable face at this angle [degrees], from as far as the face is wide within bounds [m].
 ENDOSCOPE_FOV, ENDOSCOPE_TILT = 60.0, 38.0
 ENDOSCOPE_DISTANCES = (0.10, 0.20)
 
@@ -46,13 +47,13 @@ class Camera:
         back = (position - target) / np.linalg.norm(position - target)
         right = np.cross(up, back)
         if np.linalg.norm(right) < 1e-6:
-            # It looks along `up`: any other way round will do.
+            # It looks along `up`: any other upright direction will do.
             right, _ = tangent_axes(back)
         right /= np.linalg.norm(right)
         return cls(position, target, up, np.column_stack([right, np.cross(back, right), back]), fov)
 
     def sees_above_level(self) -> bool:
-        """Whether some ray of its picture rises against `up`: there the drape below ends."""
+        """Whether some ray of its picture does not meet the drape, which lies below: background is seen there."""
         climb = math.degrees(math.asin(float(np.clip(-self.rotation[:, 2] @ self.up, -1.0, 1.0))))
         return climb + 0.5 * self.fov > -1.0
 
@@ -64,7 +65,7 @@ class Camera:
 
 
 def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Camera]:
-    """The scene's cameras by name, those of `options.CAMERAS`, for pictures so many times as wide as high."""
+    """The scene's cameras by name, those of `options.CAMERAS`, for pictures of an aspect (width over height)."""
     points = anatomy.mesh.points
     up = -anatomy.downward
     across, along = tangent_axes(anatomy.downward)
@@ -89,7 +90,7 @@ def cut_direction(anatomy: Anatomy) -> FloatArray:
 def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, aspect: float, shift: float) -> Camera:
     """A camera in a direction that has all points in the middle OVERVIEW_SHARE of a picture.
 
-    It looks above their middle by a share of the picture's height, so that an instrument finds room.
+    It looks above their middle by a share of the picture's height, which leaves room for an instrument.
     """
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     camera = Camera.looking(middle + direction, middle, up, OVERVIEW_FOV)
@@ -99,7 +100,7 @@ def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, aspect: 
     half = math.tan(math.radians(0.5 * OVERVIEW_FOV))
     room = OVERVIEW_SHARE * half * np.array([aspect, 1.0])
     distance = float((np.abs(seen[:, :2]) / room + seen[:, 2:]).max())
-    # Aimed higher, it shall not lose the lower edge.
+    # Aimed higher, the picture still has to contain the lower edge.
     lowest = (EDGE * seen[:, 2] - seen[:, 1] / half) / (EDGE - shift)
     distance = max(distance, float(lowest.max()))
     target = middle + camera.rotation[:, 1] * shift * half * distance
@@ -112,7 +113,7 @@ def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
 
 
 def placed_endoscope(anatomy: Anatomy, place: Endoscope) -> Camera:
-    """The camera of an endoscope that stands somewhere, upright."""
+    """The upright camera of an endoscope whose pose the scene states."""
     up = -anatomy.downward
     return Camera.looking(np.asarray(place.position), np.asarray(place.target), up, place.fov_deg)
 

@@ -1,12 +1,12 @@
-"""Cutting meshes by a plane: what is left of a surface, and the section through tets; vertices are mixes of nodes."""
+"""Meshes cut by a plane: the rest of a surface, and the section through tets; vertices are mixes of nodes."""
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
-from msdm_core.mesh import FloatArray, IntArray, TetMesh
-from surgsim_env.rendering.surface import triangle_lattice
+from msdm_core.mesh.surface import triangle_lattice
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
-# Triangles of a section are split so often that a lesion's outline looks round.
+# Edges of a section's triangles are split into this number of parts, so that a lesion's outline looks round.
 SECTION_SPLITS = 3
 
 
@@ -18,12 +18,12 @@ def clip_triangles(faces: IntArray, values: FloatArray) -> tuple[csr_array, IntA
         values: of the function at each vertex                              (n_vertex,)
 
     Returns:
-        The mix of old vertices that each new one is (n_new, n_vertex), and the new triangles, which turn as the old.
+        The mix of old vertices that each new one is (n_new, n_vertex), and the new triangles, with the old orientation.
     """
     inside = values[faces] < 0.0
     count = inside.sum(axis=1)
     whole = faces[count == 3]
-    # Turned so that the one corner inside (or outside) comes first.
+    # Rotated so that the only corner inside (or outside) comes first.
     one = _turned(faces[count == 1], inside[count == 1])
     two = _turned(faces[count == 2], ~inside[count == 2])
     cut = np.stack([one[:, [0, 1]], one[:, [0, 2]]], axis=1), np.stack([two[:, [0, 1]], two[:, [0, 2]]], axis=1)
@@ -50,16 +50,8 @@ def cut_tets(mesh: TetMesh, values: FloatArray) -> tuple[csr_array, IntArray]:
     Returns:
         The mix of nodes that each vertex is (n_vertex, n_node), and the triangles, which face positive values.
     """
-    inside = values[mesh.tets] < 0.0
-    count = inside.sum(axis=1)
-    lone = np.where((count == 1)[:, None], inside, ~inside)
-    single, double = (count == 1) | (count == 3), count == 2
-    ordered = np.take_along_axis(mesh.tets, np.argsort(~lone, axis=1, kind="stable"), axis=1)
-    tri, quad = ordered[single], ordered[double]
-    pairs = np.concatenate(
-        [tri[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2), quad[:, [0, 2, 0, 3, 1, 3, 1, 2]].reshape(-1, 2)]
-    )
-    mix = _with_cut_points(pairs, values)
+    (_, tri), (_, quad) = cut_edges(mesh.tets, values)
+    mix = _with_cut_points(np.concatenate([tri.reshape(-1, 2), quad.reshape(-1, 2)]), values)
     first = len(values) + np.arange(len(tri))[:, None] * 3 + np.arange(3)
     corner = len(values) + 3 * len(tri) + np.arange(len(quad))[:, None] * 4 + np.arange(4)
     faces = np.concatenate([first, corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]])
@@ -70,8 +62,24 @@ def cut_tets(mesh: TetMesh, values: FloatArray) -> tuple[csr_array, IntArray]:
     return _split(*_without_unused(mix, faces))
 
 
+def cut_edges(tets: IntArray, values: FloatArray) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray]]:
+    """The edges of tets on which a function, linear in each tet and given at the nodes (n_node,), is 0.
+
+    Returns:
+        The tets where it is 0 in a triangle (n,) and the nodes of the three edges (n, 3, 2); those where it is 0 in a
+        quadrangle (m,) and the nodes of the four edges in turn (m, 4, 2). A node at 0 counts as positive.
+    """
+    inside = values[tets] < 0.0
+    count = inside.sum(axis=1)
+    lone = np.where((count == 1)[:, None], inside, ~inside)
+    ordered = np.take_along_axis(tets, np.argsort(~lone, axis=1, kind="stable"), axis=1)
+    single, double = np.flatnonzero((count == 1) | (count == 3)), np.flatnonzero(count == 2)
+    tri, quad = ordered[single][:, [[0, 1], [0, 2], [0, 3]]], ordered[double][:, [[0, 2], [0, 3], [1, 3], [1, 2]]]
+    return (single.astype(np.int32), tri), (double.astype(np.int32), quad)
+
+
 def most_tets_cut(mesh: TetMesh, direction: FloatArray) -> int:
-    """How many tets any plane across a direction cuts at most."""
+    """Largest number of tets that a plane across a direction cuts."""
     height = (mesh.points @ direction)[mesh.tets]
     lower, upper = np.sort(height.min(axis=1)), np.sort(height.max(axis=1))
     begun = np.arange(1, len(lower) + 1)
@@ -85,7 +93,7 @@ def _gradient(points: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def _turned(faces: IntArray, marked: np.ndarray) -> IntArray:
-    """Triangles turned so that their one marked corner comes first."""
+    """Triangles with their corners rotated so that the only marked one comes first."""
     start = marked.argmax(axis=1)[:, None]
     return np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
 

@@ -1,20 +1,20 @@
-"""A mesh of the drawn scene whose vertices, normals and triangles are set anew for each picture."""
+"""A mesh of the drawn scene whose vertices, normals and triangles are replaced for each picture."""
 
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from msdm_core.mesh import FloatArray, IntArray
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
-# MuJoCo takes no empty or flat mesh: until the first picture a mesh is this tetrahedron, over and over.
+# MuJoCo accepts no empty or flat mesh: until the first picture a mesh consists of copies of this tetrahedron.
 _TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.01]])
 _TETRAHEDRON_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What a mesh looks like in one picture, in the world's axes.
+    """The shape of a mesh in one picture, in the world's axes.
 
     Fields:
         vertices: [m]                                                               (n_vertex, 3)
@@ -28,7 +28,7 @@ class Shape:
 
 
 def add_mesh(spec: mujoco.MjSpec, name: str, material: str, vertex_count: int, face_count: int) -> None:
-    """Add a mesh and its geom, with room for so many vertices and triangles."""
+    """Add a mesh and its geom, with room for `vertex_count` vertices and `face_count` triangles."""
     corner = np.resize(np.arange(4), max(vertex_count, 4))
     faces = np.resize(_TETRAHEDRON_FACES.ravel(), 3 * max(face_count, 4))
     mesh = spec.add_mesh(name=name)
@@ -43,7 +43,7 @@ def add_mesh(spec: mujoco.MjSpec, name: str, material: str, vertex_count: int, f
 
 
 class DrawnMesh:
-    """One mesh of a compiled model, written to and uploaded."""
+    """One mesh of a compiled model, which can be changed and uploaded."""
 
     def __init__(self, model: mujoco.MjModel, name: str) -> None:
         self._model = model
@@ -54,11 +54,11 @@ class DrawnMesh:
         assert model.mesh_normalnum[self.mesh] == self._room[0]
 
     def holds(self, shape: Shape) -> bool:
-        """Whether a shape finds room."""
+        """Whether a shape fits into the mesh."""
         return len(shape.vertices) <= self._room[0] and len(shape.faces) <= self._room[1]
 
     def upload(self, shape: Shape, context: mujoco.MjrContext) -> None:
-        """Show a shape from now on; the geom's frame is the world's."""
+        """Replace the shape of the mesh; the geom's frame is the world's."""
         assert self.holds(shape)
         model, mesh, count = self._model, self.mesh, len(shape.vertices)
         for array, address, values in (

@@ -1,4 +1,4 @@
-"""What an environment renders with: pictures or a window, by its render_mode."""
+"""Rendering of an environment: pictures or a window, by its render_mode."""
 
 import ctypes.util
 import os
@@ -10,27 +10,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.regions import Lesion
+from msdm_core.material.regions import Lesion
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import placed_endoscope
 from surgsim_env.rendering.options import render_options
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.rendering.window import Window, WindowContext, require_display
-from surgsim_env.scenes import Endoscope
-from surgsim_env.simulation import Simulation
-from surgsim_env.visibility import Disc
+from surgsim_env.scene.model import Endoscope
+from surgsim_env.tasks.visibility import Disc
 
 RENDER_MODES = ("human", "rgb_array")
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What of an episode a picture cannot read off the simulation.
+    """Parts of an episode's picture that the simulation does not contain.
 
     Fields:
         lesions: hidden in the organ; shown where the options ask for them
-        target: a disc to be seen, None for none
-        endoscope: where the endoscope stands; None: where the scene puts it
+        target: a disc to be drawn, None for none
+        endoscope: pose of the endoscope; None: that of the scene
     """
 
     lesions: tuple[Lesion, ...] = ()
@@ -59,12 +59,12 @@ class EpisodeView:
         self._window: Window | None = None
 
     def metadata(self) -> dict[str, Any]:
-        """Gymnasium's: the modes that this machine offers (and the one asked for), and a picture for each step."""
+        """Gymnasium's metadata: the modes that this machine offers (and the current one), and one picture a step."""
         modes = [mode for mode in RENDER_MODES if mode == self.mode or mode in offered_modes()]
         return {"render_modes": modes, "render_fps": round(1.0 / self._simulation.anatomy.scene.timing.control_step)}
 
     def renderer(self, shown: Shown) -> OrganRenderer:
-        """The renderer, set to show what an episode has."""
+        """The renderer, with the lesions, target and endoscope of an episode."""
         if self._renderer is None:
             self._renderer = OrganRenderer(self._simulation, self.options)
         self._renderer.lesions = shown.lesions
@@ -74,11 +74,11 @@ class EpisodeView:
         return self._renderer
 
     def frame(self, shown: Shown) -> NDArray[np.uint8]:
-        """The picture of this moment, shape (height, width, 3)."""
+        """The picture of the current state, shape (height, width, 3)."""
         return self.renderer(shown).rgb()
 
     def show(self, shown: Shown) -> None:
-        """Show this moment in the window, which opens with the first."""
+        """Show the current state in the window, which opens at the first call."""
         if self._window is None:
             context = WindowContext("surgsim", self.options.width, self.options.height)
             self._renderer = OrganRenderer(self._simulation, self.options, gl_context=context)
@@ -89,11 +89,11 @@ class EpisodeView:
 
     @property
     def window(self) -> Window | None:
-        """The live window, once it is open."""
+        """The live window, None until it is open."""
         return self._window
 
     def close(self) -> None:
-        """Close what is open; more than once is no harm."""
+        """Close window and renderer; may be called more than once."""
         if self._window is not None:
             self._window.close()
         if self._renderer is not None:
@@ -101,7 +101,7 @@ class EpisodeView:
 
 
 def offered_modes() -> list[str]:
-    """The render modes that this machine offers, as far as can be told without loading OpenGL."""
+    """The render modes that this machine offers, as far as is known without loading OpenGL."""
     switched_on = os.environ.get(gl.VARIABLE, "").lower().strip() not in gl.SWITCHED_OFF
     offered = {"human": switched_on and gl.has_display(), "rgb_array": switched_on and _has_library()}
     return [mode for mode in RENDER_MODES if offered[mode]]
@@ -109,5 +109,5 @@ def offered_modes() -> list[str]:
 
 @cache
 def _has_library() -> bool:
-    """Whether the library is there that draws without a display."""
+    """Whether the library is installed that draws without a display."""
     return not sys.platform.startswith("linux") or ctypes.util.find_library("EGL") is not None

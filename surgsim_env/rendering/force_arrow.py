@@ -5,19 +5,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
-from msdm_core.mesh import FloatArray
+from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering.cameras import Camera
-from surgsim_env.simulation import Simulation
 
-# A force that would be written "0.00 N" is not drawn [N].
+# A force whose label would be "0.00 N" is not drawn [N].
 SMALLEST_FORCE = 0.005
 COLOUR, OUTLINE, LABEL_BACK = (255, 214, 10, 255), (25, 22, 0, 255), (10, 14, 18, 165)
 # Half width of the shaft, half width and length of the head, outline, at a picture height of 480 [pixels].
 SHAFT, HEAD_WIDTH, HEAD_LENGTH, EDGE, TEXT_SIZE = 3.0, 8.0, 16.0, 1.3, 15.0
 # Room for head and label beyond the arrow's ends: to the left and up, to the right and down, likewise [pixels].
 ROOM = np.array([[20.0, 36.0], [95.0, 36.0]])
-# The arrow is painted this many times as large and then made smaller, so that its edges are smooth.
+# The arrow is painted larger by this factor and scaled down, so that its edges are smooth.
 OVERSAMPLING = 3
 
 
@@ -30,13 +30,13 @@ def draw_forces(frame: NDArray[np.uint8], simulation: Simulation, camera: Camera
         start = contact_point(simulation, tool)
         ends = np.stack([start, start + force * mm_per_newton * 1e-3])
         pixels, depth = camera.project(ends, frame.shape[1], frame.shape[0])
-        # After a fault there may be no place to draw it.
+        # After a fault positions may not be finite.
         if (depth > 0.0).all() and np.isfinite(pixels).all():
             _paint(frame, pixels, f"{size:.2f} N")
 
 
 def contact_point(simulation: Simulation, tool: int) -> FloatArray:
-    """Middle of the surface that a tool touches [m], shape (3,); the tool's centre of mass where it touches none."""
+    """Middle of the surface that a tool touches [m], shape (3,); the tool's centre of mass without contact."""
     state, model, shapes = simulation.organ_state, simulation.organ_model, simulation.instrument.shapes
     engaged = state.contact_engaged[shapes.shape_tool == tool].any(axis=0).reshape(-1, QUADRATURE_COUNT)
     if not engaged.any():
@@ -70,7 +70,7 @@ def _paint(frame: NDArray[np.uint8], ends: FloatArray, label: str) -> None:
     place = end + np.array([14.0, 5.0 if end[1] > start[1] else -23.0]) * scale * many
     box = np.array(draw.textbbox(tuple(place), label, font=font))
     box += np.array([-5, -4, 5, 4]) * scale * many
-    # Back into the picture where it would be cut off.
+    # Moved back into the picture where it would be cut off.
     shift = np.maximum(-box[:2], 0.0) + np.minimum(size - box[2:], 0.0)
     draw.rounded_rectangle((box + np.tile(shift, 2)).tolist(), radius=4 * scale * many, fill=LABEL_BACK)
     draw.text(tuple(place + shift), label, font=font, fill=COLOUR)

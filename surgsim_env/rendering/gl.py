@@ -1,4 +1,4 @@
-"""OpenGL, loaded when the first picture is asked for: one context for all pictures of this process."""
+"""OpenGL, loaded with the first picture: one context for all pictures of this process."""
 
 import atexit
 import contextlib
@@ -8,12 +8,12 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-# What MuJoCo understands: the variable, its values that mean "no OpenGL", and the module of each kind of context.
+# MuJoCo's variable, its values that switch OpenGL off, and the module of each kind of context.
 VARIABLE = "MUJOCO_GL"
 SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
 MODULES = {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw", "glx": "mujoco.glfw"}
 
-# What says where windows go.
+# Variables of the environment that name a display for windows.
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 _context: Any = None
@@ -21,18 +21,18 @@ _owner = 0
 
 
 class NoGLError(RuntimeError):
-    """There is no OpenGL to draw with; the message says what is missing and how to get it."""
+    """There is no OpenGL; the message says what is missing and how to install it."""
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo, which loads OpenGL at once where MUJOCO_GL says so, and fails where that is missing.
+    """Import MuJoCo, which loads OpenGL at import where MUJOCO_GL is set, and explain a failure.
 
     Raises:
         ImportError: names the packages that are missing.
     """
     try:
         importlib.import_module("mujoco")
-    except Exception as error:  # what a missing library raises differs from library to library
+    except Exception as error:  # each library raises another error where it is missing
         kind = os.environ.get(VARIABLE, "").lower().strip()
         if kind not in MODULES:
             raise
@@ -40,7 +40,7 @@ def import_mujoco() -> None:
 
 
 def has_display() -> bool:
-    """Whether a window can be opened, as far as the environment says."""
+    """Whether a window can be opened, by the environment's variables."""
     return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in DISPLAYS)
 
 
@@ -48,7 +48,7 @@ def context() -> Any:
     """This process's context for drawing off screen, made at the first call.
 
     Raises:
-        NoGLError: it cannot be had; names the packages that are missing.
+        NoGLError: it cannot be made; names the packages that are missing.
     """
     global _context, _owner
     if _context is None:
@@ -64,7 +64,7 @@ def context() -> Any:
 
 @contextlib.contextmanager
 def current(gl_context: Any) -> Iterator[None]:
-    """Draw with a context, and leave the one that was there before as it was."""
+    """Make a context current; that of a window is released afterwards."""
     if hasattr(gl_context, "as_current"):
         with gl_context.as_current():
             yield
@@ -74,12 +74,12 @@ def current(gl_context: Any) -> Iterator[None]:
 
 
 def at_exit(close: Callable[[], None]) -> None:
-    """Call `close` when the interpreter ends, while OpenGL is still there."""
+    """Call `close` when the interpreter exits, while OpenGL is still loaded."""
     atexit.register(close)
 
 
 def _kind() -> str:
-    """What MUJOCO_GL asks for; where it is not set, EGL on Linux, which needs no display."""
+    """The kind of context that MUJOCO_GL names; if it is unset, EGL on Linux, which needs no display."""
     asked = os.environ.get(VARIABLE, "").lower().strip()
     if asked in SWITCHED_OFF:
         raise NoGLError(f"{VARIABLE} is {asked!r}, which switches OpenGL off: unset it, or set {VARIABLE}=egl")
@@ -95,12 +95,12 @@ def _make_context(kind: str) -> Any:
         module = importlib.import_module(MODULES.get(kind, "mujoco.gl_context"))
         # EGL asks for no size, the others make a window that is never shown.
         return module.GLContext(64, 64)
-    except Exception as error:  # what a missing library raises differs from library to library
+    except Exception as error:  # each library raises another error where it is missing
         raise NoGLError(no_gl_message(kind, error)) from error
 
 
 def no_gl_message(kind: str, error: Exception) -> str:
-    """What to do where a kind of context could not be made."""
+    """Message for a kind of context that could not be made, with the way out."""
     cause = f"{type(error).__name__}: {error}"
     if kind in ("glfw", "glx"):
         return f"no OpenGL through GLFW ({cause}): it needs a display; without one unset {VARIABLE} or set it to egl"

@@ -1,4 +1,4 @@
-"""What a picture shows and how large it is."""
+"""Options of pictures."""
 
 import math
 from dataclasses import dataclass, fields
@@ -7,13 +7,13 @@ from typing import Any
 
 # The cameras that every scene has.
 CAMERAS = ("overview", "endoscope", "side", "above")
-# The largest side of a picture [pixels]: what any OpenGL driver can draw.
+# Largest side of a picture [pixels] that any OpenGL driver can draw.
 PIXELS_MOST = 4096
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What `gym.make(..., render_mode=...)` takes besides the scene; every option has a default.
+    """Options of pictures, for `gym.make(..., render_mode=...)`; all have defaults.
 
     Args:
         camera: "overview" (organ and instrument), "endoscope" (the palpable face, near and oblique), "side" (level) or
@@ -56,7 +56,7 @@ class RenderOptions:
 
 
 def check_camera(camera: str) -> None:
-    """ValueError, listing the cameras, where there is none of that name."""
+    """Raise a ValueError that lists the cameras if there is none of that name."""
     if camera not in CAMERAS:
         raise ValueError(f"camera {camera!r} is unknown; the cameras are {', '.join(CAMERAS)}")
 

@@ -1,33 +1,38 @@
-"""Pictures of one simulation: what the environments' `render` draws with, for use by itself too."""
+"""The renderer of a simulation, used by the environments' `render` and for use by itself."""
 
+import contextlib
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.regions import Lesion
+from msdm_core.material.regions import Lesion
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, scene_cameras
+from surgsim_env.rendering.canvas import LOCK
+from surgsim_env.rendering.drawn_mesh import Shape
 from surgsim_env.rendering.force_arrow import draw_forces
-from surgsim_env.rendering.ground_shadow import ground_shadow
 from surgsim_env.rendering.options import RenderOptions, check_camera
-from surgsim_env.rendering.stage import LOCK, Picture, Stage, borrow_stage, give_back_stage
+from surgsim_env.rendering.stage import Instant, Stage, borrow_stage, give_back_stage
 from surgsim_env.rendering.tissue import Tissue
-from surgsim_env.simulation import Simulation
-from surgsim_env.visibility import Disc
+from surgsim_env.tasks.visibility import Disc
+
+# How far above the drape the shadow lies [m].
+SHADOW_GAP = 0.0002
 
 
 class OrganRenderer:
-    """Colour, depth and labels of what a simulation looks like now; the simulation is read and never changed.
+    """Colour, depth and labels of the current state of a simulation, which is read and never changed.
 
         renderer = OrganRenderer(simulation, RenderOptions(camera="endoscope"))
         frame = renderer.rgb()
 
-    `lesions` are those that are shown where the options ask for them: assign the ones of the episode; `target` is a
-    disc to be shown. OpenGL is loaded
-    with the first picture. Renderers of one anatomy and size share their meshes on the graphics side.
+    Assign the episode's lesions to `lesions`: they are shown where the options ask for them; `target` is a disc to be
+    shown. OpenGL is loaded with the first picture. Renderers of one anatomy and size share one stage.
     """
 
     def __init__(
@@ -38,7 +43,7 @@ class OrganRenderer:
         lesions: Sequence[Lesion] = (),
         gl_context: Any = None,
     ) -> None:
-        """Nothing is loaded yet; `gl_context` is a window's, None for pictures off screen."""
+        """Load nothing yet; `gl_context` is a window's, None for pictures off screen."""
         self.options = options or RenderOptions()
         aspect = self.options.width / self.options.height
         self.cameras: dict[str, Camera] = scene_cameras(simulation.anatomy, aspect)
@@ -57,15 +62,12 @@ class OrganRenderer:
             camera: the name of one of `cameras`, or a camera of your own; that of the options if left out.
 
         Raises:
-            ValueError: an unknown camera (lists those there are).
+            ValueError: an unknown camera; lists the known ones.
             NoGLError: there is no OpenGL; names the packages that are missing.
         """
         view = self._camera(camera)
-        with LOCK:
-            stage = self._ready_stage()
-            with gl.current(stage.gl_context):
-                stage.show(self._picture(stage), view)
-                frame = stage.colour()
+        with self._shown(view) as stage:
+            frame = stage.canvas.colour()
         if self.options.show_force:
             draw_forces(frame, self._simulation, view, self.options.force_mm_per_newton)
         return frame
@@ -75,27 +77,19 @@ class OrganRenderer:
 
         The surface of a translucent organ counts; the force arrow does not.
         """
-        view = self._camera(camera)
-        with LOCK:
-            stage = self._ready_stage()
-            with gl.current(stage.gl_context):
-                stage.show(self._picture(stage), view)
-                return stage.depth()
+        with self._shown(self._camera(camera)) as stage:
+            return stage.depth()
 
     def segmentation(self, camera: str | Camera | None = None) -> NDArray[np.uint8]:
-        """What each pixel shows, one of `stage.LABELS`, shape (height, width).
+        """Label of each pixel, one of `stage.LABELS`, shape (height, width).
 
         Lesions have pixels where the options show them; in a translucent organ those that are seen through it.
         """
-        view = self._camera(camera)
-        with LOCK:
-            stage = self._ready_stage()
-            with gl.current(stage.gl_context):
-                stage.show(self._picture(stage), view)
-                return stage.labels()
+        with self._shown(self._camera(camera)) as stage:
+            return stage.labels()
 
     def close(self) -> None:
-        """Give back the graphics; the next picture loads them again."""
+        """Free the graphics; the next picture loads them again."""
         if self._stage is not None:
             self._finalizer()
             self._stage = self._tissue = None
@@ -105,10 +99,19 @@ class OrganRenderer:
         return {**self.__dict__, "_stage": None, "_tissue": None, "_finalizer": None}
 
     def present(self, frame: NDArray[np.uint8]) -> None:
-        """Put a picture into the window whose context this renderer draws with."""
-        stage = self._ready_stage()
-        with LOCK, gl.current(stage.gl_context):
-            stage.present(frame)
+        """Show a picture in the window whose context this renderer uses."""
+        canvas = self._ready_stage().canvas
+        with LOCK, gl.current(canvas.gl_context):
+            canvas.present(frame)
+
+    @contextlib.contextmanager
+    def _shown(self, camera: Camera) -> Iterator[Stage]:
+        """The stage, showing the simulation as it is now to a camera, with its graphics context current."""
+        with LOCK:
+            stage = self._ready_stage()
+            with gl.current(stage.canvas.gl_context):
+                stage.show(self._instant(stage), camera)
+                yield stage
 
     def _camera(self, camera: str | Camera | None) -> Camera:
         if isinstance(camera, Camera):
@@ -125,7 +128,7 @@ class OrganRenderer:
             self._finalizer = weakref.finalize(self, give_back_stage, self._stage)
         return self._stage
 
-    def _picture(self, stage: Stage) -> Picture:
+    def _instant(self, stage: Stage) -> Instant:
         simulation, options = self._simulation, self.options
         shown = self.lesions if options.show_lesion or options.cut_away else ()
         if self._tissue is None or shown != self._tissue_lesions:
@@ -137,9 +140,20 @@ class OrganRenderer:
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
             shapes["shadow"] = ground_shadow(nodes, stage.surface.triangles, scene.light, scene.ground, up)
-        return Picture(
+        return Instant(
             shapes=shapes,
             lesions=list(zip(tissue.lesion_centres(nodes), axes)) if options.show_lesion else [],
             instrument=simulation.instrument.data,
             target=self.target,
         )
+
+
+def ground_shadow(
+    points: FloatArray, triangles: IntArray, light: FloatArray, ground: FloatArray, up: FloatArray
+) -> Shape:
+    """The lit triangles pushed along the light onto the plane through `ground` [m] across the unit direction `up`."""
+    height = (points - ground) @ up - SHADOW_GAP
+    flat = points - (height / (light @ up))[:, None] * light
+    corners = flat[triangles]
+    lit = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ up > 0.0
+    return Shape(flat, np.tile(up, (len(flat), 1)), triangles[lit])

@@ -1,26 +1,29 @@
-"""The drawn scene as a MuJoCo model of its own: organ, sections, instrument, drape, lights; it never runs."""
+"""The drawn scene as a MuJoCo model of its own, which is not simulated: organ, sections, instrument, drape, lights."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.palpable_face import tangent_axes
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.cutting import SECTION_SPLITS, most_tets_cut
 from surgsim_env.rendering.drawn_mesh import DrawnMesh, add_mesh
 from surgsim_env.rendering.instrument_geoms import InstrumentGeoms, add_instrument, find_instrument
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.surface import DrawnSurface
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.palpable_surface import tangent_axes
+
+Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Look:
-    """Colour (red, green, blue), how strong and how narrow highlights are, and how much it glows by itself."""
+    """Colour (red, green, blue), strength and narrowness of highlights, and light that a material emits."""
 
-    colour: tuple[float, float, float]
+    colour: Colour
     specular: float
     shininess: float
     emission: float = 0.0
@@ -36,7 +39,7 @@ LOOKS = {
 }
 LESION_COLOUR = (0.98, 0.84, 0.42)
 TARGET_COLOUR = (0.20, 0.75, 0.35)
-# The drape's squares are this wide [m]: a scale to read sizes off.
+# Width of the drape's squares [m], which serve as a scale.
 DRAPE_SQUARE = 0.02
 DRAPE_COLOURS = (0.115, 0.315, 0.355), (0.128, 0.345, 0.385)
 BACKGROUND_COLOUR = (0.045, 0.105, 0.120)
@@ -49,11 +52,11 @@ NEAR, FAR = 0.005, 5.0
 
 @dataclass(frozen=True, eq=False)
 class SceneModel:
-    """The compiled scene and where to find its parts.
+    """The compiled scene and its parts.
 
     Fields:
         model, data: MuJoCo's
-        meshes: what is set anew for each picture, by name: keys of LOOKS
+        meshes: the meshes that change with each picture, by name, a key of LOOKS
         instrument: the geoms that follow the instrument
         light: unit direction of the lamp's light                                   (3,)
         ground: a point of the drape [m]                                            (3,)
@@ -70,23 +73,47 @@ class SceneModel:
 def build_scene(
     anatomy: Anatomy, surface: DrawnSurface, instrument: mujoco.MjModel, options: RenderOptions
 ) -> SceneModel:
-    """The scene of an anatomy and an instrument's model, with room for what the options ask for."""
-    spec = mujoco.MjSpec()
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = options.width, options.height
-    spec.visual.quality.offsamples = 4 if options.smooth_edges else 0
-    spec.stat.extent = 1.0
-    spec.visual.map.znear, spec.visual.map.zfar = NEAR, FAR
-    light = _add_lights(spec, anatomy, options)
+    """The scene of an anatomy and an instrument's model, with room for the meshes that the options need."""
+    spec = empty_scene(options.width, options.height, BACKGROUND_COLOUR, samples=4 if options.smooth_edges else 0)
+    light = add_lights(spec, anatomy.downward, shadows=options.shadows)
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
     for name, (vertices, faces) in meshes.items():
-        look = LOOKS[name]
-        material = spec.add_material(name=name, specular=look.specular, shininess=look.shininess)
-        material.rgba = [*look.colour, TRANSLUCENT if options.show_lesion and name in ("organ", "held") else 1.0]
-        material.emission = look.emission
-        add_mesh(spec, name, name, vertices, faces)
+        opacity = TRANSLUCENT if options.show_lesion and name in ("organ", "held") else 1.0
+        add_tissue(spec, name, vertices, faces, opacity)
     add_instrument(spec, instrument)
+    model, data, drawn = compile_scene(spec, meshes)
+    return SceneModel(model, data, drawn, find_instrument(model, instrument), light, ground)
+
+
+def empty_scene(width: int, height: int, background: Colour, *, samples: int = 4, far: float = FAR) -> mujoco.MjSpec:
+    """A scene with a camera and nothing to see before a background; `far` is the far clipping plane [m]."""
+    spec = mujoco.MjSpec()
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.quality.offsamples = samples
+    spec.stat.extent = 1.0
+    spec.visual.map.znear, spec.visual.map.zfar = NEAR, far
+    # Where a camera sees beyond everything else.
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96)
+    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+    sky.rgb1 = sky.rgb2 = background
     spec.worldbody.add_camera(name="view")
+    return spec
+
+
+def add_tissue(spec: mujoco.MjSpec, name: str, vertex_count: int, face_count: int, opacity: float = 1.0) -> None:
+    """Add a mesh with the look of its name, with room for `vertex_count` vertices and `face_count` triangles."""
+    look = LOOKS[name]
+    material = spec.add_material(name=name, specular=look.specular, shininess=look.shininess)
+    material.rgba = [*look.colour, opacity]
+    material.emission = look.emission
+    add_mesh(spec, name, name, vertex_count, face_count)
+
+
+def compile_scene(
+    spec: mujoco.MjSpec, meshes: Iterable[str]
+) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, DrawnMesh]]:
+    """The compiled scene, its data, and its meshes by name, whose vertices are in the world's axes."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -95,34 +122,34 @@ def build_scene(
     for mesh in drawn.values():
         data.geom_xpos[mesh.geom] = 0.0
         data.geom_xmat[mesh.geom] = np.eye(3).ravel()
-    return SceneModel(model, data, drawn, find_instrument(model, instrument), light, ground)
+    return model, data, drawn
 
 
 def _room(anatomy: Anatomy, surface: DrawnSurface, options: RenderOptions) -> dict[str, tuple[int, int]]:
-    """The most vertices and triangles that each mesh of the scene may have."""
+    """Largest number of vertices and of triangles of each mesh of the scene."""
     many = 2 if options.cut_away else 1
     whole = many * surface.vertex_count, many * len(surface.faces)
     room = {"organ": whole, "held": whole}
     if options.cut_away:
-        # A cut tet is a quadrangle at most, whose triangles are split and may each be parted by a lesion's outline.
+        # A tet is cut in a quadrangle at most; its triangles are split, and a lesion's outline may divide each of them.
         small = 2 * SECTION_SPLITS**2 * most_tets_cut(anatomy.mesh, cut_direction(anatomy))
         room |= {"section": (6 * small, 2 * small), "section_lesion": (6 * small, 2 * small)}
     elif not (options.shadows or options.show_lesion or anatomy.scene.supports):
-        # Where it rests on something else, that is in the drape's way.
+        # An organ on supports does not lie on the drape and casts no shadow on it.
         room["shadow"] = (anatomy.mesh.node_count, len(surface.triangles))
     return room
 
 
-def _add_lights(spec: mujoco.MjSpec, anatomy: Anatomy, options: RenderOptions) -> FloatArray:
+def add_lights(spec: mujoco.MjSpec, down: FloatArray, *, shadows: bool = False) -> FloatArray:
     """A lamp above the surgeon's left shoulder, a faint one from behind, one at the camera; the lamp's direction."""
-    up = -anatomy.downward
-    across, along = tangent_axes(anatomy.downward)
+    up = -down
+    across, along = tangent_axes(down)
     directions = {"lamp": (0.30 * along + 0.38 * across - up, 0.60), "rim": (-along - 0.4 * across - 0.5 * up, 0.22)}
     for name, (towards, strength) in directions.items():
         light = spec.worldbody.add_light(name=name, dir=towards / np.linalg.norm(towards))
         light.pos = -0.8 * np.asarray(light.dir)
         light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-        light.castshadow = options.shadows and name == "lamp"
+        light.castshadow = shadows and name == "lamp"
         light.diffuse, light.specular, light.ambient = [strength] * 3, [strength] * 3, [0.0] * 3
     head = spec.visual.headlight
     head.ambient, head.diffuse, head.specular = [0.30] * 3, [0.36] * 3, [0.10] * 3
@@ -131,9 +158,9 @@ def _add_lights(spec: mujoco.MjSpec, anatomy: Anatomy, options: RenderOptions) -
 
 
 def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
-    """A cloth below the organ and what it rests on; a point of it [m].
+    """A cloth below the organ and its supports; returns a point of it [m].
 
-    A plane that the organ rests on stands in its place.
+    A plane that supports the organ replaces it.
     """
     points, down = anatomy.mesh.points, anatomy.downward
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -141,10 +168,6 @@ def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
     solids = [support for support in anatomy.scene.supports if support.kind != "plane"]
     lowest = max([float((points @ down).max()), *(solid.reach(down) for solid in solids)])
     ground = centre + (lowest + DRAPE_GAP - centre @ down) * down
-    # Where a camera sees beyond the drape.
-    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96)
-    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
-    sky.rgb1 = sky.rgb2 = BACKGROUND_COLOUR
     across, _ = tangent_axes(down)
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.column_stack([across, np.cross(-down, across), -down]).ravel())

@@ -1,4 +1,4 @@
-"""The organ's surface as it is drawn: creases kept, triangles split and bent, normals smooth."""
+"""The drawn surface of an organ: sharp creases, triangles split and bent, smooth normals."""
 
 from dataclasses import dataclass
 
@@ -6,16 +6,17 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from msdm_core.mesh import FloatArray, IntArray
+from msdm_core.mesh.surface import triangle_lattice
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
 # Neighbours whose resting normals differ by more than this meet at a crease, as the faces of a block do [degrees].
 CREASE_ANGLE = 50.0
-# Each triangle is drawn as splits^2 smaller ones; as many as stay below this number of triangles, or what is asked for.
+# Each triangle is drawn as splits^2 smaller ones, with the largest splits that stay below this number of triangles.
 TRIANGLES_MOST = 15_000
 SPLITS_MOST = 4
-# How far the small triangles are bent towards the tangent planes of their corners (Boubekeur & Alexa 2008).
+# Share by which small triangles are bent towards the tangent planes of their corners (Boubekeur & Alexa 2008).
 BEND = 0.6
-# No vertex is moved off its flat triangle by more than this [m]: that is what the simulation touches.
+# No vertex leaves its flat triangle, which the simulation touches, by more than this [m].
 BEND_MOST = 0.0008
 
 
@@ -47,11 +48,11 @@ class DrawnSurface:
 
     @property
     def vertex_count(self) -> int:
-        """How many vertices are drawn."""
+        """Number of vertices that are drawn."""
         return len(self.bend)
 
     def follow(self, node_position: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the nodes [m] (n_node, 3) take the vertices [m] and their unit outward normals, each (n_vertex, 3)."""
+        """Positions [m] and unit outward normals of the vertices, each (n_vertex, 3), for nodes [m] (n_node, 3)."""
         points = node_position[self.triangles]
         area_vector = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
         corner = node_position[self.corner_node]
@@ -71,7 +72,7 @@ def drawn_surface(points: FloatArray, triangles: IntArray, triangles_most: int =
     Args:
         points: node positions at rest [m], (n_node, 3).
         triangles: outward, (n_triangle, 3).
-        triangles_most: that splitting may lead to.
+        triangles_most: largest number of small triangles.
     """
     corner_of, corner_node = _corners(points, triangles)
     splits = max(k for k in range(1, SPLITS_MOST + 1) if k == 1 or len(triangles) * k * k <= triangles_most)
@@ -136,22 +137,6 @@ def _split(corner_of: IntArray, corner_count: int, splits: int) -> tuple[csr_arr
     entries = (unique[:, 3:].ravel()[used] / splits, (row[used], column[used]))
     faces = index.reshape(len(corner_of), -1)[:, small].reshape(-1, 3)
     return csr_array(coo_array(entries, shape=(len(unique), corner_count))), faces.astype(np.int32)
-
-
-def triangle_lattice(splits: int) -> tuple[IntArray, IntArray]:
-    """Lattice points of a triangle, three counts that sum up to `splits` each, and the small triangles between them."""
-    index: dict[tuple[int, int], int] = {}
-    for i in range(splits + 1):
-        for j in range(splits + 1 - i):
-            index[i, j] = len(index)
-    small = []
-    for i in range(splits):
-        for j in range(splits - i):
-            small.append((index[i, j], index[i + 1, j], index[i, j + 1]))
-            if i + j + 1 < splits:
-                small.append((index[i + 1, j], index[i + 1, j + 1], index[i, j + 1]))
-    points = [(splits - i - j, i, j) for i, j in index]
-    return np.array(points, dtype=np.int32), np.array(small, dtype=np.int32)
 
 
 def _seam_vertices(corner_of: IntArray, weights: csr_array) -> np.ndarray:

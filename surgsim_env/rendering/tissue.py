@@ -1,4 +1,4 @@
-"""What the organ and its lesions look like at one instant: drawn surface, cut-away section, lesions moved along."""
+"""Shapes of an organ and its lesions for a picture: drawn surface, cut-away section, lesions that move with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from msdm_core.mesh import FloatArray, IntArray, TetMesh
-from msdm_core.regions import Lesion, lesion_extent
-from surgsim_env.anatomy import Anatomy
+from msdm_core.material.regions import Lesion, lesion_extent
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.cutting import clip_triangles, cut_tets
 from surgsim_env.rendering.drawn_mesh import Shape
 from surgsim_env.rendering.surface import DrawnSurface, smooth_normals
+from surgsim_env.scene.anatomy import Anatomy
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,10 @@ class LesionBall:
 
 
 class Tissue:
-    """An organ with certain lesions, ready to be drawn wherever its nodes are."""
+    """The shapes of an organ with given lesions as functions of its node positions."""
 
     def __init__(self, anatomy: Anatomy, surface: DrawnSurface, lesions: Sequence[Lesion], cut_away: bool) -> None:
-        """Lesions are drawn as ellipsoids, tagged regions of the mesh too (`msdm_core.regions.lesion_extent`)."""
+        # Lesions are drawn as ellipsoids, tagged regions of the mesh too (`msdm_core.material.regions.lesion_extent`).
         self._rest, self._surface = anatomy.mesh.points, surface
         self.lesions = [lesion_ball(anatomy.mesh, lesion) for lesion in lesions]
         held = np.isin(surface.triangles, anatomy.anchors).all(axis=1)
@@ -48,12 +48,12 @@ class Tissue:
         return self._cut.surfaces(vertices, normals) | self._cut.sections(node_position)
 
     def lesion_centres(self, node_position: FloatArray) -> list[FloatArray]:
-        """Where the lesions' centres are now [m]."""
+        """Present centres of the lesions [m]."""
         return [lesion.centre_now(self._rest, node_position) for lesion in self.lesions]
 
 
 class _CutAway:
-    """The cut through an organ: an upright plane through its first lesion, made at rest and carried along."""
+    """The cut through an organ: an upright plane through its first lesion, computed at rest, moving with the nodes."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class _CutAway:
             self._sections[name] = csr_array(part @ mix), part_faces
 
     def surfaces(self, vertices: FloatArray, normals: FloatArray) -> dict[str, Shape]:
-        """What the cut leaves of the drawn surface."""
+        """The part of the drawn surface that the cut leaves."""
         shapes = {}
         for name, (mix, faces) in self._surfaces.items():
             turned = mix @ normals
@@ -94,13 +94,13 @@ class _CutAway:
 
 
 def cut_plane(anatomy: Anatomy, lesions: Sequence[LesionBall]) -> tuple[FloatArray, FloatArray]:
-    """A point of the plane [m] and its unit normal: the side to which it points is taken away."""
+    """A point of the cutting plane [m] and its unit normal, which points to the removed side."""
     face = anatomy.mesh.points[anatomy.face.triangles].mean(axis=(0, 1))
     return (lesions[0].centre if lesions else face), cut_direction(anatomy)
 
 
 def lesion_ball(mesh: TetMesh, lesion: Lesion) -> LesionBall:
-    """A lesion of an organ at rest as an ellipsoid; see `msdm_core.regions.lesion_extent`."""
+    """A lesion of an organ at rest as an ellipsoid; see `msdm_core.material.regions.lesion_extent`."""
     centre, half_axes = lesion_extent(mesh, lesion)
     distance = np.linalg.norm((mesh.points - centre) / half_axes, axis=1)
     nodes = np.flatnonzero(distance <= max(1.0, float(distance.min())))

@@ -8,23 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering.cameras import Camera
 from surgsim_env.rendering.gl import DISPLAYS, NoGLError, has_display
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.rendering.renderer import OrganRenderer
 
-# How far a drag over one pixel turns the view [rad], and what one notch of the wheel makes of the distance.
+# Rotation of the view for each pixel of a drag [rad], and factor of the distance for each notch of the wheel.
 TURN, ZOOM = 0.008, 0.9
-# The view stays this far from straight up and down [rad].
+# Smallest angle between the view and the vertical [rad].
 POLE = 0.05
-# Those that a person may play with; GLFW names a key by its letter's number.
+# Keys that a task may read; GLFW's code of a key is that of its letter.
 PLAYING_KEYS = "ADEFQRSW "
 KEYS = "drag: turn, wheel: zoom, C: next camera, Esc: close"
 
 
 def require_display() -> None:
-    """NoGLError where there is no display to open a window on."""
+    """Raise a NoGLError if there is no display for a window."""
     if not has_display():
         raise NoGLError(
             f'render_mode "human" opens a window, and there is no display ({" and ".join(DISPLAYS)} are not set): use '
@@ -56,7 +56,7 @@ class WindowContext:
 
     @contextlib.contextmanager
     def as_current(self) -> Iterator[None]:
-        """Draw in this window for as long as this lasts."""
+        """Make the window's context current within this block."""
         self._glfw.make_context_current(self.handle)
         yield
 
@@ -66,10 +66,10 @@ class WindowContext:
 
 
 class Window:
-    """Shows a renderer's pictures at the rate of the control steps; a closed window stays closed and says nothing."""
+    """A window with a renderer's pictures at the rate of control steps; once closed, it stays closed."""
 
     def __init__(self, renderer: OrganRenderer, context: WindowContext, period: float) -> None:
-        """Attach to an open window; pictures follow each other by a period [s] at least."""
+        """Attach to an open window; a period [s] at least lies between two pictures."""
         self._renderer, self._context, self._period = renderer, context, period
         self._camera_name = renderer.options.camera
         self._turn, self._zoom = np.zeros(2), 1.0
@@ -81,7 +81,7 @@ class Window:
         glfw.set_key_callback(handle, lambda _, key, __, action, ___: self._key(key, action))
 
     def show(self) -> None:
-        """Draw the scene as it is now, and wait until the next picture is due."""
+        """Draw the current state, and wait until the next picture is due."""
         glfw, handle = self._context._glfw, self._context.handle
         if self.closed:
             return
@@ -98,14 +98,14 @@ class Window:
         self._next = max(self._next, time.monotonic() - self._period) + self._period
 
     def held_keys(self) -> str:
-        """Letters (capital) and the space whose keys are held down, as of the last picture; none in a closed window."""
+        """Capital letters and space of the keys that were held down at the last picture; none in a closed window."""
         glfw, handle = self._context._glfw, self._context.handle
         if self.closed:
             return ""
         return "".join(key for key in PLAYING_KEYS if glfw.get_key(handle, ord(key)) == glfw.PRESS)
 
     def close(self) -> None:
-        """Close the window; more than once is no harm."""
+        """Close the window; may be called more than once."""
         if not self.closed:
             self.closed = True
             self._renderer.close()

@@ -1,46 +1,104 @@
-"""Scripts that know the truth and do each task right: what an environment can be expected to allow."""
+"""Oracles: scripts that know the truth and solve each task, as a bound on what an environment allows."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import gymnasium as gym
 import numpy as np
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.env import BimanualRetractEnv, PalpateEnv, RetractEnv
-from surgsim_env.scripting.bimanual_oracle import bimanual_steps
-from surgsim_env.scripting.retract_oracle import retraction_steps
-from surgsim_env.scripting.steps import AwaitEnd, Declare, Hold, MoveTo, PressUntil, Step
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.organ.support import Support
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scripting.steps import (
+    AwaitEnd,
+    CloseJaw,
+    Declare,
+    Hold,
+    MayEnd,
+    MoveTo,
+    OfArm,
+    Predicate,
+    PressSupport,
+    PressUntil,
+    Step,
+    Until,
+)
+from surgsim_env.scripting.view import View
+from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
+from surgsim_env.tasks.palpate import PalpateTask
+from surgsim_env.tasks.retract import RetractTask, lifted_box
 
 # The oracle presses with this share of the soft force limit.
 GENTLE_SHARE = 0.4
 # Between the tip ball and the tissue while it moves sideways, and where a press begins [m].
 TRAVEL_GAP = 0.004
-# A lobe is carried no farther once enough of the target was seen for so many control steps.
+# Control steps for which enough of the target has to be visible before the lobe is carried no farther.
 SEEN_STEPS = 5
-# Tissue this far beside the ball's way counts as under it [m].
+# Tissue this far beside the ball's path counts as under it [m].
 CORRIDOR = 0.004
+
+# Grasping an edge. Depth to which the middle of the pads goes over the edge, and distance before it at which the jaw
+# waits [m]; closest approach of the jaw to a support, and reach of its pads beyond the tip [m]; grip force at which the
+# jaw counts as closed [N]; speed of the approach [m/s].
+GRASP_DEPTH, WAITING_GAP = 0.0065, 0.016
+SUPPORT_GAP, PAD_REACH = 0.001, 0.008
+GRIP_FORCE, APPROACH_SPEED = 0.25, 0.015
+# Direction from the held edge to the free one.
+OUTWARD = np.array([0.0, 1.0, 0.0])
+
+# Folding a lobe. Waypoints of the tip in y and z as shares of the lobe's depth, first up, then over; rotation of the
+# edge on each of the two ways [rad]; speed [m/s].
+RISEN, FOLDED = (0.88, 0.50), (0.46, 0.84)
+TURNS = (math.radians(35.0), math.radians(40.0))
+CARRYING_SPEED = 0.015
+
+# Lifting a flap. Height [m] and speed [m/s] of the lift. A wedge of tissue that is pulled straight up moves outward by
+# OUTWARD_SHARE and turns by TURN_RATE [rad/m] for each metre up; the jaw follows, so that it does not pull on it.
+FLAP_LIFT, FLAP_SPEED = 0.025, 0.006
+OUTWARD_SHARE, TURN_RATE = 0.25, 30.0
+# Clearance in the open jaw at its narrowest [m]; spacing of the section's lines along y, and the thickness below which
+# the edge is skipped [m]; friction reserve at which the jaw stops [N].
+JAW_PLAY, SECTION_STEP, THIN, FRICTION_KEPT = 0.002, 0.0005, 0.001, 0.06
+
+# Two arms. Offset of the left jaw from the target along x, away from the right arm [m]; shares of the fold and of the
+# flap's lift: the right arm needs room, not the endoscope.
+BESIDE, FOLD_SHARE, LIFT_SHARE = -0.008, 0.66, 0.7
+# Waypoints of the right tip [m]: before the lobe (from the target in x, from the free edge in y, height), at its mouth
+# (from the target in x and y, height), over the target (free height).
+BEFORE, MOUTH, OVER = (0.010, 0.018, 0.022), (0.002, 0.012, 0.010), 0.0015
+# Force on the target [N], the middle of the range that counts as a touch, and speed [m/s].
+PRESSING_FORCE, REACHING_SPEED = 0.6, 0.015
 
 
 def oracle_script(env: gym.Env) -> list[Step]:
-    """The script that does the task of this episode, from where the environment is now; reset it first.
+    """The script that solves this episode from the environment's present state; reset the environment first.
+
+    A task of a user's own declares its oracle as a method `oracle(simulation)` that returns the steps.
 
     Raises:
         ValueError: nothing was reset yet, or no oracle is known for the environment.
     """
     inner = env.unwrapped
-    for kind, oracle in ORACLES.items():
-        if isinstance(inner, kind):
-            return oracle(inner)
+    if isinstance(inner, SurgicalEnv):
+        if hasattr(inner.task, "oracle"):
+            return list(inner.task.oracle(inner.simulation))
+        for kind in type(inner.task).__mro__:
+            if kind in ORACLES:
+                return ORACLES[kind](inner.task, inner.simulation)
     known = ", ".join(kind.__name__ for kind in ORACLES)
-    raise ValueError(f"no oracle is known for {type(inner).__name__}; there is one for {known}")
+    raise ValueError(
+        f"no oracle is known for {type(inner).__name__}; there is one for {known}: give the task a method "
+        "oracle(simulation) that returns the steps"
+    )
 
 
-def palpate_oracle(env: PalpateEnv) -> list[Step]:
+def palpate_oracle(task: PalpateTask, simulation: Simulation) -> list[Step]:
     """Rise, go over the lesion, press gently along the surface's normal, hold and declare."""
-    lesion, simulation = env.task.lesion, env.simulation
+    lesion = task.lesion
     if lesion is None or lesion.centre is None:
-        raise ValueError("the oracle looks for the lesion of an episode, and none has begun: call env.reset(seed=...)")
+        raise ValueError("the oracle presses on the lesion of an episode, and none has begun: call env.reset(seed=...)")
     anatomy = simulation.anatomy
     scene, approach = anatomy.scene, anatomy.face.approach
     site, normal = anatomy.face.project(lesion.centre)
@@ -58,32 +116,30 @@ def palpate_oracle(env: PalpateEnv) -> list[Step]:
     ]
 
 
-def retract_oracle(env: RetractEnv) -> list[Step]:
+def retract_oracle(task: RetractTask, simulation: Simulation) -> list[Step]:
     """Grasp the free edge beside the target, fold the lobe back and wait for success."""
-    target = env.task.target
+    target = task.target
     if target is None:
         raise ValueError("the oracle uncovers the target of an episode, and none has begun: call env.reset(seed=...)")
     return [
-        *retraction_steps(
-            env.simulation, target.centre, env.task.turning_size, lambda _: env.task.goal_count >= SEEN_STEPS
-        ),
+        *retraction_steps(simulation, target.centre, task.turning_size, lambda _: task.goal_count >= SEEN_STEPS),
         AwaitEnd(10.0, name="keep it open"),
     ]
 
 
-def bimanual_oracle(env: BimanualRetractEnv) -> list[Step]:
+def bimanual_oracle(task: BimanualRetractTask, simulation: Simulation) -> list[Step]:
     """Fold the lobe back with the left arm, reach under it with the right one and press on the target."""
-    task, radius = env.task, env.simulation.anatomy.scene.instrument.tip_radius
+    radius = simulation.anatomy.scene.instrument.tip_radius
     if task.target is None:
         raise ValueError("the oracle touches the target of an episode, and none has begun: call env.reset(seed=...)")
-    return bimanual_steps(env.simulation, task.target.centre, task.turning_size, radius)
+    return bimanual_steps(simulation, task.target.centre, task.turning_size, radius)
 
 
-# An oracle for each environment.
+# An oracle for each shipped task.
 ORACLES: dict[type, Callable[..., list[Step]]] = {
-    PalpateEnv: palpate_oracle,
-    RetractEnv: retract_oracle,
-    BimanualRetractEnv: bimanual_oracle,
+    PalpateTask: palpate_oracle,
+    RetractTask: retract_oracle,
+    BimanualRetractTask: bimanual_oracle,
 }
 
 
@@ -107,3 +163,184 @@ def _level(vectors: FloatArray, upward: FloatArray) -> FloatArray:
 def _at_height(place: FloatArray, approach: FloatArray, height: float) -> tuple[float, float, float]:
     x, y, z = (place - approach * (height + float(place @ approach))).tolist()
     return x, y, z
+
+
+def flap_steps(
+    simulation: Simulation,
+    target: FloatArray,
+    turning_size: int,
+    enough: Predicate,
+    *,
+    aside: float = 0.0,
+    share: float = 1.0,
+) -> list[Step]:
+    """Grasp the edge of a flap before a target [m] (3,) along the jaw and lift it; the organ as it rests now.
+
+    Args:
+        simulation: at rest, the jaw open before the edge.
+        target: what shall be seen.
+        turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
+        enough: whether the target is seen well enough to lift the edge no farther.
+        aside: how far beside the target the edge is grasped, along x [m].
+        share: of FLAP_LIFT, at most.
+    """
+    scene, rest = simulation.anatomy.scene, simulation.organ_model.node_rest_position
+    assert scene.retract is not None and scene.retract.flap is not None
+    along = float(target[0]) + aside
+    box, surface = lifted_box(scene.retract, rest), simulation.anatomy.mesh.boundary_triangles
+    free = surface[~np.isin(surface, simulation.anatomy.anchors).all(axis=1)]
+    place, sides = edge_section(simulation.organ_state.node_position, free, along, float(box[0][1]))
+    bed = max((float(one.reach(np.array([0.0, 1.0, 0.0]))) for one in scene.supports), default=-math.inf)
+    jaw = np.asarray(scene.instrument.tip_direction or (0.0, -1.0, 0.0))
+    jaw = jaw / np.linalg.norm(jaw)
+    # Across the jaw, which points along the middle of the edge.
+    thick = np.ptp(sides, axis=1) * abs(jaw[1])
+    grasped = simulation.grasp
+    assert grasped is not None
+    fits = float(place[thick <= grasped.opening - JAW_PLAY].min(initial=place[0])) + PAD_REACH
+    y = max(float(place[0]) - GRASP_DEPTH, bed + SUPPORT_GAP + PAD_REACH, fits)
+    grasp = np.array([along, y, float(np.interp(y, place[::-1], sides.mean(axis=1)[::-1]))])
+    waiting = grasp - jaw * (WAITING_GAP + float(place[0]) - y)
+    lift = share * FLAP_LIFT
+    risen = grasp + np.array([0.0, OUTWARD_SHARE * lift, lift])
+    return [
+        MoveTo(_point(waiting), tolerance=0.001, name="wait before it"),
+        MoveTo(_point(grasp), APPROACH_SPEED, 0.001, name="go around the edge"),
+        CloseJaw(GRIP_FORCE, name="grasp"),
+        MayEnd(
+            Until(
+                MoveTo(_point(risen), FLAP_SPEED, 0.001, _turn(TURN_RATE * lift, turning_size), name="lift"),
+                lambda view: enough(view) or _about_to_slip(view),
+            )
+        ),
+    ]
+
+
+def _about_to_slip(view: View) -> bool:
+    return view.grasp is not None and view.grasp.friction_left < FRICTION_KEPT
+
+
+def _turn(angle: float, size: int) -> float | tuple[float, ...]:
+    """A turn about x in the instrument's own terms; a hinge lifts the jaw's tip above 0, and here it goes down."""
+    return (angle, 0.0, 0.0) if size == 3 else -angle * float(size == 1)
+
+
+def _point(place: FloatArray) -> tuple[float, float, float]:
+    x, y, z = place.tolist()
+    return x, y, z
+
+
+def edge_section(nodes: FloatArray, triangles: IntArray, x: float, inner: float) -> tuple[FloatArray, FloatArray]:
+    """Section of an organ across its free edge at a place along it.
+
+    Args:
+        nodes: [m], (n_node, 3).
+        triangles: of the surface of what is lifted (n, 3).
+        x: place along the edge [m].
+        inner: how far inward it is wanted, a place along y [m].
+
+    Returns:
+        Places along y where there is tissue, the edge first [m] (n,); its lowest and highest point there [m] (n, 2).
+
+    Raises:
+        ValueError: nothing is there.
+    """
+    corners = nodes[triangles]
+    corners = corners[(corners[:, :, 0].min(axis=1) <= x) & (corners[:, :, 0].max(axis=1) >= x)]
+    ys, sides = [], []
+    for y in np.arange(corners[:, :, 1].max(initial=inner), inner, -SECTION_STEP):
+        heights = _heights(corners, x, float(y))
+        if len(heights) >= 2 and np.ptp(heights) >= THIN:
+            ys.append(float(y))
+            sides.append((heights.min(), heights.max()))
+    if not ys:
+        raise ValueError(f"there is no tissue at x = {x:g} m in retract.flap: set its corners around the edge")
+    return np.array(ys), np.array(sides)
+
+
+def _heights(corners: FloatArray, x: float, y: float) -> FloatArray:
+    """Where a vertical line meets triangles [m] (n, 3, 3), heights (m,)."""
+    a, b, c = (corners[:, corner] for corner in range(3))
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+    level = np.abs(area) > 1e-15
+    a, b, c, area = a[level], b[level], c[level], area[level]
+    beta = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (y - a[:, 1])) / area
+    gamma = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (x - a[:, 0]) * (b[:, 1] - a[:, 1])) / area
+    met = (beta >= 0.0) & (gamma >= 0.0) & (beta + gamma <= 1.0)
+    height = a[:, 2] + beta * (b[:, 2] - a[:, 2]) + gamma * (c[:, 2] - a[:, 2])
+    return height[met]
+
+
+def retraction_steps(
+    simulation: Simulation,
+    target: FloatArray,
+    turning_size: int,
+    enough: Predicate,
+    *,
+    aside: float = 0.0,
+    fold: float = 1.0,
+    lift: float = 1.0,
+) -> list[Step]:
+    """Grasp the free edge beside a target [m] (3,) and fold it back; the lobe as it rests now.
+
+    Args:
+        simulation: at rest, the jaw open on the free side.
+        target: what shall be seen.
+        enough: whether the target is seen well enough to carry the lobe no farther.
+        turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
+        aside: how far beside the target the edge is grasped, along x [m].
+        fold: share of the second way, on which the lifted edge is folded back.
+        lift: of a flap, which is not folded, the share of its one way.
+    """
+    table = simulation.anatomy.scene.retract
+    if table is not None and table.flap is not None:
+        return flap_steps(simulation, target, turning_size, enough, aside=aside, share=lift)
+    rest, nodes = simulation.organ_model.node_rest_position, simulation.organ_state.node_position
+    depth = float(rest[:, 1].max())
+    edge = rest[:, 1] > depth - 1e-6
+    along = float(target[0]) + aside
+    near = edge & (np.abs(rest[:, 0] - along) <= GRASP_DEPTH)
+    _, border, height = nodes[near].mean(axis=0).tolist()
+    bed = _reach_of_supports(simulation.anatomy.scene.supports, border)
+    grasp = (along, max(border - GRASP_DEPTH, bed + SUPPORT_GAP + PAD_REACH), height)
+    waiting = (along, border + WAITING_GAP, height)
+    turns = [_turn(angle, turning_size) for angle in (TURNS[0], fold * TURNS[1])]
+    shares = np.array([RISEN, np.array(RISEN) + fold * np.subtract(FOLDED, RISEN)])
+    risen, folded = ((along, y * depth, height + z * depth) for y, z in shares.tolist())
+    return [
+        MoveTo(waiting, tolerance=0.001, name="wait before it"),
+        MoveTo(grasp, APPROACH_SPEED, name="go around the edge"),
+        CloseJaw(GRIP_FORCE, name="grasp"),
+        MayEnd(Until(MoveTo(risen, CARRYING_SPEED, 0.002, turns[0], name="lift"), enough)),
+        MayEnd(Until(MoveTo(folded, CARRYING_SPEED, 0.001, turns[1], name="fold"), enough)),
+    ]
+
+
+def _reach_of_supports(supports: Sequence[Support], border: float) -> float:
+    """How far along y the supports reach that end before a place [m]."""
+    reaches = (support.reach(OUTWARD) for support in supports if support.kind != "plane")
+    return max((reach for reach in reaches if reach < border), default=-math.inf)
+
+
+def bimanual_steps(simulation: Simulation, target: FloatArray, turning_size: int, tip_radius: float) -> list[Step]:
+    """Fold the lobe back beside a target [m] (3,), all the way however much is seen, go under it, press on it.
+
+    Args:
+        simulation: at rest, with a pair of arms on the free side, the left jaw open.
+        target: on the bed.
+        turning_size: entries of an arm's turning.
+        tip_radius: of the right tip [m].
+    """
+    edge = float(simulation.organ_model.node_rest_position[:, 1].max())
+    x, y, z = target.tolist()
+    over = (x, y, z + tip_radius + OVER)
+    right = [
+        MoveTo((x + BEFORE[0], edge + BEFORE[1], BEFORE[2]), tolerance=0.001, name="come to its mouth"),
+        MoveTo((x + MOUTH[0], y + MOUTH[1], MOUTH[2]), REACHING_SPEED, 0.001, name="reach under"),
+        MoveTo(over, REACHING_SPEED, name="stand over the target"),
+        PressSupport(PRESSING_FORCE, over, name="touch it"),
+    ]
+    left = retraction_steps(
+        simulation, target, turning_size, lambda _: False, aside=BESIDE, fold=FOLD_SHARE, lift=LIFT_SHARE
+    )
+    return [*(MayEnd(OfArm(step, "left")) for step in left), *(MayEnd(OfArm(step, "right")) for step in right)]

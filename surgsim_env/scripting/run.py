@@ -1,4 +1,4 @@
-"""Run a script in an environment and keep what came of it."""
+"""Run a script in an environment and record it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,16 +8,16 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.haptic_record import HapticRecord
-from surgsim_env.scripting.steps import Control, Script, Step, StepFailed
+from surgsim_env.coupling.haptic_record import HapticRecord
+from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.scripting.steps import Control, MayEnd, Script, Step, StepFailed
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
-from surgsim_env.scripting.view import Action, ScriptedTask, View, look
-from surgsim_env.scripting.wrapped_steps import MayEnd
-from surgsim_env.surgical_env import SurgicalEnv
+from surgsim_env.scripting.view import Action, View, look
+from surgsim_env.tasks.task import Task
 
 
 class ScriptError(Exception):
-    """A script did not come to its end: the message names the step; `trace` is what happened up to there."""
+    """A script did not reach its end: the message names the step; `trace` is the run up to there."""
 
     def __init__(self, message: str, trace: Trace) -> None:
         super().__init__(message)
@@ -27,20 +27,20 @@ class ScriptError(Exception):
 def run_script(
     env: gym.Env, script: Script, *, seed: int | None = None, observation: NDArray[np.floating] | None = None
 ) -> Trace:
-    """Run the steps of a script one after the other and record all of it; recording changes no bit of the episode.
+    """Run the steps of a script one after the other and record everything; recording changes no bit of the episode.
 
-    The episode may end in a step that is made for that (Declare, Control, AwaitEnd) if it is the last one, and come to
-    its success in one that says so (MayEnd), which ends the script. Anything else that keeps the script from its end is
-    an error; so are a force limit and a fault in any step.
+    The episode may end in the last step if that is one of those made for it (Declare, Control, AwaitEnd), and may end
+    in success in a step that allows it (MayEnd), which ends the script. Any other end before the last step is an error;
+    so are a force limit and a fault in any step.
 
     Args:
         env: one environment of this project, wrapped or not.
         script: steps; those without a name of their own are called after their class, from the second on "Hold 2".
-        seed: resets the environment first; without it the run goes on from where the environment is.
-        observation: what a controller sees first where nothing is reset and a wrapper changes observations.
+        seed: resets the environment first; without it the run continues from the environment's present state.
+        observation: the first one of a controller, where nothing is reset and a wrapper changes observations.
 
     Raises:
-        ScriptError: a step ran out of time or depth, or the episode ended too soon; its `trace` is what was reached.
+        ScriptError: a step ran out of time or depth, or the episode ended too soon; its `trace` is the run so far.
         TypeError: not an environment of this project, several in one, or one whose task scripts cannot command.
         ValueError: an empty script, two steps of one name, a speed or an action beyond what the environment takes.
     """
@@ -72,11 +72,11 @@ def run_script(
 
 @dataclass
 class _Run:
-    """What a run gathers, control step by control step."""
+    """The state of a run, extended in each control step."""
 
     env: gym.Env
     inner: SurgicalEnv
-    task: ScriptedTask
+    task: Task
     record: HapticRecord
     observation: NDArray[np.floating]
     start: float
@@ -88,11 +88,11 @@ class _Run:
     steps: list[StepInterval] = field(default_factory=list)
     terminated: bool = False
     truncated: bool = False
-    # Whether the episode came to an end that the script meant.
+    # Whether the episode ended as the script intended.
     ended: bool = False
 
     def make(self, step: Step, name: str, *, last: bool) -> str:
-        """Make one step of the script; "" or why it failed."""
+        """Run one step of the script; returns "" or why it failed."""
         began, first = self.inner.simulation.time, len(self.record)
         view = self._look(began, first)
         plan = step.actions(view)
@@ -120,7 +120,7 @@ class _Run:
             plan.close()
 
     def trace(self, failure: str) -> Trace:
-        """Everything gathered."""
+        """The trace of the run so far."""
         record, simulation = self.record, self.inner.simulation
         shapes = self.inner.observation_space.shape, self.inner.action_space.shape
         assert shapes[0] is not None and shapes[1] is not None
@@ -192,13 +192,14 @@ def _inner(env: gym.Env) -> SurgicalEnv:
     return inner
 
 
-def _scripted(inner: SurgicalEnv) -> ScriptedTask:
-    if not isinstance(inner.task, ScriptedTask):
+def _scripted(inner: SurgicalEnv) -> Task:
+    task: Task = inner.task
+    if "velocity" not in task.action_slices or "contact_force" not in task.observation_slices:
         raise TypeError(
-            f"{type(inner.task).__name__} does not say how its actions are laid out: give it `speed_limit`, `action` "
-            "and `sensed_force`, as `ScriptedTask` asks"
+            f"{type(task).__name__} cannot be scripted: steps command `velocity` and sense `contact_force`; declare a "
+            "command and a channel of these names"
         )
-    return inner.task
+    return task
 
 
 def _names(script: Sequence[Step]) -> list[str]:
@@ -219,7 +220,7 @@ def _names(script: Sequence[Step]) -> list[str]:
     return names
 
 
-def _check_speeds(script: Sequence[Step], names: Sequence[str], task: ScriptedTask) -> None:
+def _check_speeds(script: Sequence[Step], names: Sequence[str], task: Task) -> None:
     for step, name in zip(script, names, strict=True):
         if step.speed > task.speed_limit * (1.0 + 1e-9):
             raise ValueError(

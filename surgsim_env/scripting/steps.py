@@ -1,32 +1,33 @@
-"""Steps of a script: each a small policy, written down as plain values; a script is a sequence of them.
+"""The steps of a script: motions of the tip, presses, the jaw, controllers, and steps that wrap others."""
 
-A step's `actions` is a generator: it yields an action, is sent the view after it, and returns when it is done. What it
-must remember lives in its local variables, so that the step itself never changes and can be run again.
-"""
-
+import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.scripting.checks import above_zero, callable_for, point_of, unit_vector
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scripting.view import Action, View
 
 Plan = Generator[Action, View, None]
 Predicate = Callable[[View], bool]
 
-# Share of the way left that a step asks for in one control step: the tip lags behind what is asked.
+# Share of the remaining distance that a step commands for one control step: the tip lags behind its command.
 APPROACH_GAIN = 0.6
-# A press counts as having used up its depth this close to it [m].
+# A press has used up its depth within this distance of it [m].
 DEPTH_SLACK = 2e-5
-# Stiffness is read off motions longer than this [m]: over shorter ones the sensor's noise would pass for it.
+# Stiffness is estimated over motions longer than this [m]: over shorter ones the sensor's noise dominates.
 TRAVEL_READ = 1e-4
+# Tip speed over the error of the force on a support [m/s per N]: 60 % of it in a control step of 50 ms at 2000 N/m.
+GAIN = 0.006
+# Rate at which a press on a support returns to its place across the press [1/s].
+HOMING = 2.0
 
 
 class StepFailed(Exception):
-    """A step cannot reach what it is for; the message says how far it came."""
+    """A step cannot reach its goal; the message says how far it came."""
 
 
 class Step(Protocol):
@@ -122,7 +123,7 @@ class PressUntil:
             )
 
     def actions(self, view: View) -> Plan:
-        """Into the tissue, in steps that shall not pass the force."""
+        """Into the tissue, in steps that are not meant to exceed the force."""
         along = view.approach if self.direction is None else np.array(self.direction)
         stiffness = 0.0
         while (felt := view.pressing_force(along, sensed=self.sensed)) < self.force - self.tolerance:
@@ -179,7 +180,7 @@ class Lift:
         along = -view.approach if self.direction is None else np.array(self.direction)
         goal = view.tip_position + along * self.height
         while (left := float((goal - view.tip_position) @ along)) > 0.0:
-            # A little further than asked: the tip lags behind, and the step shall end.
+            # A little further than the goal: the tip lags behind its command, and the step has to end.
             view = yield view.action(along * min(self.speed, (left + 0.0002) / view.control_step))
 
 
@@ -216,7 +217,7 @@ class Declare:
         above_zero(self, "timeout")
 
     def actions(self, view: View) -> Plan:
-        """Declare on and on: the episode's end ends it."""
+        """Declare in every control step: the episode's end ends it."""
         while True:
             view = yield view.still(declare=True)
 
@@ -261,7 +262,7 @@ class Control:
         above_zero(self, "timeout")
 
     def actions(self, view: View) -> Plan:
-        """What the controller says."""
+        """The controller's actions."""
         reset = getattr(self.controller, "reset", None)
         if reset is not None:
             reset()
@@ -278,3 +279,211 @@ def _towards(gap: FloatArray, speed: float, control_step: float) -> FloatArray:
     """Velocity along a gap [m] that does not overshoot it [m/s], shape (3,)."""
     distance = float(np.linalg.norm(gap))
     return gap / distance * min(speed, APPROACH_GAIN * distance / control_step)
+
+
+@dataclass(frozen=True)
+class CloseJaw:
+    """Close the jaw, the tip still, until it grips tissue with `force` [N]; its target stays closed afterwards."""
+
+    force: float
+    timeout: float = 3.0
+    name: str = ""
+    ends_episode: bool = field(default=False, init=False, repr=False)
+    speed: float = field(default=0.0, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        above_zero(self, "force", "timeout")
+
+    def actions(self, view: View) -> Plan:
+        """Close."""
+        while view.grasped(self).grip_force < self.force:
+            view = yield view.still(jaw=-1.0)
+
+
+@dataclass(frozen=True)
+class OpenJaw:
+    """Open the jaw, the tip still, until its pads are `gap` [m] apart and hold nothing."""
+
+    gap: float
+    timeout: float = 3.0
+    name: str = ""
+    ends_episode: bool = field(default=False, init=False, repr=False)
+    speed: float = field(default=0.0, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        above_zero(self, "gap", "timeout")
+
+    def actions(self, view: View) -> Plan:
+        """Open."""
+        while view.grasped(self).opening < self.gap or view.grasped(self).holds:
+            view = yield view.still(jaw=1.0)
+
+
+@dataclass(frozen=True)
+class PressSupport:
+    """Press on a support at a point [m] with `force` [N] until the episode ends; fails after `timeout` [s].
+
+    The tip's speed is proportional to the error of the force.
+    """
+
+    force: float
+    point: tuple[float, float, float]
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    speed: float = 0.005
+    timeout: float = 5.0
+    name: str = ""
+    ends_episode: bool = field(default=True, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        above_zero(self, "force", "speed", "timeout")
+        object.__setattr__(self, "direction", unit_vector(self, "direction", self.direction))
+
+    def actions(self, view: View) -> Plan:
+        """Towards the support, or away from it where the force is too large."""
+        along = np.array(self.direction)
+        while True:
+            missing = self.force - view.support_force
+            speed = float(np.clip(GAIN * missing, -self.speed, self.speed))
+            aside = np.array(self.point) - view.tip_position
+            aside -= (aside @ along) * along
+            view = yield view.action(speed * along + HOMING * aside)
+
+
+@dataclass(frozen=True)
+class _Wrapped:
+    """Another step; its name, its timeout and its speed are that step's."""
+
+    step: Step
+
+    @property
+    def name(self) -> str:
+        """The step's own, or its class's."""
+        return self.step.name or type(self.step).__name__
+
+    @property
+    def timeout(self) -> float:
+        """The step's own [s]."""
+        return self.step.timeout
+
+    @property
+    def speed(self) -> float:
+        """The step's own [m/s]."""
+        return self.step.speed
+
+    @property
+    def ends_episode(self) -> bool:
+        """As the step says."""
+        return self.step.ends_episode
+
+    def actions(self, view: View) -> Plan:
+        """The step's actions."""
+        yield from self.step.actions(view)
+
+
+@dataclass(frozen=True)
+class MayEnd(_Wrapped):
+    """Another step, in which the episode may end in success; the rest of the script is then skipped."""
+
+    @property
+    def ends_episode(self) -> bool:
+        """It may."""
+        return True
+
+
+@dataclass(frozen=True)
+class OfArm(_Wrapped):
+    """Another step, made by one of several arms; the others stay where they are."""
+
+    arm: str
+
+    def actions(self, view: View) -> Plan:
+        """The step's actions, from that arm's view."""
+        plan = self.step.actions(view.of(self.arm))
+        try:
+            action = next(plan)
+            while True:
+                view = yield action
+                action = plan.send(view.of(self.arm))
+        except StopIteration:
+            return
+
+
+@dataclass(frozen=True)
+class Until(_Wrapped):
+    """Another step, which is over as soon as `predicate(view)` is true, or by itself."""
+
+    predicate: Predicate = field(repr=False)
+
+    def __post_init__(self) -> None:
+        callable_for(self, "predicate", "a function of the view")
+
+    def actions(self, view: View) -> Plan:
+        """The step's actions until the predicate is true."""
+        if self.predicate(view):
+            return
+        plan = self.step.actions(view)
+        try:
+            action = next(plan)
+            while not self.predicate(view := (yield action)):
+                action = plan.send(view)
+        except StopIteration:
+            return
+
+
+# ---- checks of the fields -------------------------------------------------------------------------------------------
+
+
+def above_zero(step: Any, *fields: str) -> None:
+    """Each field is a finite number above 0.
+
+    Raises:
+        ValueError: names the step, the field and the value.
+    """
+    for name in fields:
+        value = getattr(step, name)
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value < math.inf:
+            raise ValueError(
+                f"{type(step).__name__}: {name} is {value!r}; it must be a finite number above 0, in SI units "
+                "(metres, newtons, seconds)"
+            )
+
+
+def point_of(step: Any, field: str, value: ArrayLike) -> tuple[float, float, float]:
+    """Three finite coordinates.
+
+    Raises:
+        ValueError: names the step, the field and the value.
+    """
+    try:
+        point = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        point = np.zeros(0)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(f"{type(step).__name__}: {field} is {value!r}; it must be three finite numbers, x, y and z")
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def unit_vector(step: Any, field: str, value: ArrayLike) -> tuple[float, float, float]:
+    """A direction at length 1.
+
+    Raises:
+        ValueError: not three finite numbers, or all of them 0.
+    """
+    vector = np.array(point_of(step, field, value))
+    length = float(np.linalg.norm(vector))
+    if not 0.0 < length < math.inf:
+        raise ValueError(f"{type(step).__name__}: {field} is {value!r}; it must point somewhere: (0, 0, -1) is down")
+    x, y, z = (vector / length).tolist()
+    return x, y, z
+
+
+def callable_for(step: Any, field: str, what: str) -> None:
+    """The field can be called.
+
+    Raises:
+        TypeError: names the step, the field and the value.
+    """
+    value = getattr(step, field)
+    if not callable(value):
+        raise TypeError(f"{type(step).__name__}: {field} is {value!r}; it must be callable: {what}")

@@ -1,5 +1,9 @@
-"""What came of a script: forces and poses at haptic rate, observations and rewards at control rate, the steps."""
+"""The record of a run: forces and poses at haptic rate, observations at control rate, steps; its tables and plot."""
 
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -7,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +43,7 @@ class Trace:
         steps: when each step of the script ran
         tool_names: of the bodies that tissue feels
         terminated, truncated: whether the episode ended with the run
-        failure: "" or which step failed, why, and what was reached
+        failure: "" or which step failed, why, and what the run had reached
     """
 
     start: float
@@ -89,7 +93,7 @@ class Trace:
         """The info of the last control step; empty where there was none."""
         return self.infos[-1] if self.infos else {}
 
-    def between(self, first: str, last: str | None = None) -> "Trace":
+    def between(self, first: str, last: str | None = None) -> Trace:
         """The part of the run from step `first` to the end of step `last` (or of the same), by their names.
 
         Raises:
@@ -115,14 +119,10 @@ class Trace:
 
         Columns name their units; numbers are written in full, so that reading them gives the same bits.
         """
-        from surgsim_env.scripting.trace_csv import write_csv
-
         return write_csv(self, Path(path))
 
-    def plot(self, where: "str | Path | tuple[Axes, Axes]") -> None:
+    def plot(self, where: str | Path | tuple[Axes, Axes]) -> None:
         """Draw force and depth over time, the steps marked: into a picture file, or into two axes of your own."""
-        from surgsim_env.scripting.trace_plot import draw, write_picture
-
         if isinstance(where, str | Path):
             write_picture(self, Path(where))
         else:
@@ -158,3 +158,148 @@ def contact_depth(wrench: FloatArray, tip_position: FloatArray, approach: FloatA
 def _within(times: FloatArray, start: float, stop: float) -> slice:
     """Which of the rising times [s] lie after start and not after stop, to rounding."""
     return slice(int(np.searchsorted(times, start + 1e-9)), int(np.searchsorted(times, stop + 1e-9)))
+
+
+# ---- tables --------------------------------------------------------------------------------------------------------
+
+POSE_COLUMNS = ("tip_x_m", "tip_y_m", "tip_z_m", "tip_qw", "tip_qx", "tip_qy", "tip_qz")
+WRENCH_COLUMNS = ("force_x_N", "force_y_N", "force_z_N", "torque_x_Nm", "torque_y_Nm", "torque_z_Nm")
+
+
+def write_csv(trace: Trace, path: Path) -> tuple[Path, Path]:
+    """Write both tables of a trace; returns their paths.
+
+    Raises:
+        ValueError: the path does not end in ".csv".
+    """
+    if path.suffix != ".csv":
+        raise ValueError(f'{str(path)!r} does not end in ".csv"; a second table is written beside it: name it run.csv')
+    beside = path.with_name(f"{path.stem}_control.csv")
+    _write(path, haptic_columns(trace), haptic_rows(trace))
+    _write(beside, control_columns(trace), control_rows(trace))
+    return path, beside
+
+
+def haptic_columns(trace: Trace) -> list[str]:
+    """Time, step, pose, depth, size of the total force, and a wrench for each tool."""
+    wrenches = [f"{tool}_{column}" for tool in trace.tool_names for column in WRENCH_COLUMNS]
+    return ["time_s", "step", *POSE_COLUMNS, "depth_m", "force_size_N", *wrenches]
+
+
+def haptic_rows(trace: Trace) -> Iterable[list]:
+    """One row a haptic step."""
+    names, sizes = trace.step_names(trace.haptic_time), trace.force_size.tolist()
+    for row, time in enumerate(trace.haptic_time.tolist()):
+        pose = [*trace.tip_position[row].tolist(), *trace.tip_orientation[row].tolist()]
+        yield [time, names[row], *pose, float(trace.depth[row]), sizes[row], *trace.wrench[row].ravel().tolist()]
+
+
+def control_columns(trace: Trace) -> list[str]:
+    """Time, step, each entry of observation (none of a picture) and action, reward, the info's entries by name."""
+    observation = [f"observation_{index}" for index in range(_numbers(trace).shape[1])]
+    action = [f"action_{index}" for index in range(trace.action.shape[1])]
+    return ["time_s", "step", *observation, *action, "reward", *sorted(trace.info)]
+
+
+def control_rows(trace: Trace) -> Iterable[list]:
+    """One row a control step."""
+    names, keys, numbers = trace.step_names(trace.control_time), sorted(trace.info), _numbers(trace)
+    for row, time in enumerate(trace.control_time.tolist()):
+        info = [trace.infos[row].get(key, "") for key in keys]
+        yield [
+            time,
+            names[row],
+            *numbers[row].tolist(),
+            *trace.action[row].tolist(),
+            float(trace.reward[row]),
+            *info,
+        ]
+
+
+def _numbers(trace: Trace) -> NDArray[np.floating]:
+    """Observations (m, n_obs); (m, 0) where they are pictures."""
+    return trace.observation if trace.observation.ndim == 2 else np.zeros((len(trace.observation), 0))
+
+
+def _write(path: Path, columns: list[str], rows: Iterable[list]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+# ---- picture -------------------------------------------------------------------------------------------------------
+
+FORCE, DEPTH, INK, BAND = "#b5322a", "#2b5f8a", "#20242c", "#eef1f5"
+# A step's name is upright where the step takes less than this share of the run's time.
+NARROW = 0.12
+
+
+def write_picture(trace: Trace, path: Path) -> None:
+    """Write the picture of a trace to a file; its ending says which kind."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 5.6), dpi=110, facecolor="white", layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.25, 1.0))
+    draw(trace, upper, lower)
+    figure.savefig(path)
+
+
+def draw(trace: Trace, force: Axes, depth: Axes) -> None:
+    """Draw the force [N] into one pair of axes and the depth [mm] into another, the steps as bands with names."""
+    if "visible" in trace.info:
+        _draw_retraction(trace, force, depth)
+        return
+    force.plot(trace.haptic_time, trace.force_size, color=FORCE, linewidth=1.3)
+    force.set_ylabel("contact force [N]")
+    force.set_ylim(0.0, max(1.15 * trace.peak_force, 0.01))
+    depth.plot(trace.haptic_time, trace.depth * 1e3, color=DEPTH, linewidth=1.3)
+    depth.axhline(0.0, color=INK, linewidth=0.6, linestyle=":")
+    depth.set_ylabel("depth past contact [mm]")
+    depth.set_xlabel("time since the reset [s]")
+    if len(trace.haptic_time):
+        depth.set_xlim(trace.start, float(trace.haptic_time[-1]))
+    _mark_steps(trace, force, depth)
+    if trace.failure:
+        force.set_xlabel(trace.failure, color=FORCE, fontsize=8, wrap=True)
+
+
+def _draw_retraction(trace: Trace, force: Axes, seen: Axes) -> None:
+    """Draw the jaw's grip and pull [N], and the visible share of the target [%]."""
+    grip, pull, share = (
+        np.array([info[name] for info in trace.infos]) for name in ("grip_force", "pull_force", "visible")
+    )
+    force.plot(trace.control_time, grip, color=DEPTH, linewidth=1.3, label="grip, the weaker pad")
+    force.plot(trace.control_time, pull, color=FORCE, linewidth=1.3, label="pull")
+    force.set_ylabel("force [N]")
+    force.set_ylim(0.0, 1.15 * max(float(grip.max()), float(pull.max()), 0.01))
+    force.legend(loc="upper left", frameon=False)
+    seen.plot(trace.control_time, 100.0 * share, color=INK, linewidth=1.3)
+    seen.set_ylabel("target seen [%]")
+    seen.set_ylim(-3.0, 103.0)
+    seen.set_xlabel("time since the reset [s]")
+    seen.set_xlim(trace.start, float(trace.control_time[-1]))
+    _mark_steps(trace, force, seen)
+    if trace.failure:
+        force.set_xlabel(trace.failure, color=FORCE, fontsize=8, wrap=True)
+
+
+def _mark_steps(trace: Trace, force: Axes, depth: Axes) -> None:
+    for index, step in enumerate(trace.steps):
+        for axes in (force, depth):
+            axes.axvspan(step.start, step.end, facecolor=BAND if index % 2 else "white", edgecolor="none", zorder=0)
+        narrow = step.end - step.start < NARROW * trace.duration
+        force.annotate(
+            step.name,
+            ((step.start + step.end) / 2.0, 1.0),
+            xycoords=force.get_xaxis_transform(),
+            xytext=(0.0, 4.0),
+            textcoords="offset points",
+            rotation=60.0 if narrow else 0.0,
+            rotation_mode="anchor",
+            horizontalalignment="left" if narrow else "center",
+            verticalalignment="bottom",
+            color=INK,
+            fontsize=9,
+            annotation_clip=False,
+        )

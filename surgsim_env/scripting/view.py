@@ -1,36 +1,19 @@
-"""What a step of a script sees between two control steps; nothing in it can be written to."""
+"""The state that a step of a script sees between two control steps; read-only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh import FloatArray
-from surgsim_env.arms.pair import SIDES, Pair
-from surgsim_env.grasp import Grasp
-from surgsim_env.simulation import Simulation
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.arm.pair import SIDES, Pair
+from surgsim_env.instruments.jaw import Grasp
+from surgsim_env.tasks.task import Task
 
 Action = NDArray[np.floating]
-
-
-@runtime_checkable
-class ScriptedTask(Protocol):
-    """What a script asks of a task: how its actions and observations are laid out."""
-
-    @property
-    def speed_limit(self) -> float:
-        """The fastest that an action can ask the tip to move along an axis [m/s]."""
-        ...
-
-    def action(self, velocity: FloatArray) -> Action:
-        """The action that asks for a tip velocity [m/s] (3,); tasks take more commands by keyword."""
-        ...
-
-    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
-        """The force sensor's reading in an observation [N], shape (3,)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +32,8 @@ class View:
         approach: unit vector along which the instrument comes                              (3,)
         grasp: what the jaw holds and how; None without a jaw
         task: how actions are laid out
-        support_force: with which the tool presses on what the organ rests on [N]; told for arms of several
-        arm: which of several arms this is a view of; "" for all or the only one
+        support_force: of the tool on the organ's supports [N]; for the arms of a pair
+        arm: the arm of a pair whose view this is; "" for both or the only one
         arms: views of each of several arms, by name
     """
 
@@ -65,7 +48,7 @@ class View:
     contact_position: FloatArray | None
     approach: FloatArray
     grasp: Grasp | None
-    task: ScriptedTask
+    task: Task
     support_force: float = 0.0
     arm: str = ""
     arms: Mapping[str, "View"] = field(default_factory=dict)
@@ -131,7 +114,7 @@ class View:
 
 def look(
     simulation: Simulation,
-    task: ScriptedTask,
+    task: Task,
     observation: NDArray[np.floating],
     task_observation: NDArray[np.floating],
     began: float,

@@ -1,56 +1,162 @@
-"""Retraction with two hands: the left arm exposes the target, the right one touches it."""
+"""Retraction with two arms: the left one exposes the target, the right one touches it."""
 
 import json
 import math
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.arms.pair import Pair
-from surgsim_env.grasp import Grasp
-from surgsim_env.instrument import Instrument
-from surgsim_env.rewards import BIMANUAL_WEIGHTS
-from surgsim_env.sensors import ForceReading
-from surgsim_env.simulation import Simulation
-from surgsim_env.tasks.retract import (
-    FORCE_BOUND,
-    POSITION_SLACK,
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.arm.pair import Pair
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.retract import AXIS_BOUND, FORCE_BOUND, SUCCESS_SHARE, TURNING_FULL_SCALE, RetractTask
+from surgsim_env.tasks.task import (
     SPEED_BOUND,
     SPEED_FULL_SCALE,
-    SUCCESS_SHARE,
-    TURNING_FULL_SCALE,
-    RetractTask,
+    TIP_POSITION,
+    InfoValue,
+    Start,
+    soft_force_share,
 )
-from surgsim_env.tasks.task import Bounds, InfoValue, Start
 
-# The right tip touches the target with such a force [N].
+# Force of the right tip on the target [N].
 TOUCH_FORCE = (0.3, 1.0)
-# And with its ball, not with the neck behind it: nothing of the ball is farther above the target than this [m].
+# Largest height of the lowest point of its ball above the target [m]: the neck behind the ball does not touch.
 TOUCH_GAP = 0.0002
-# The arms may press each other with no more than this [N].
+# Largest force between the arms [N].
 COLLISION_FORCE = 2.0
-# The right tip is near the target within this distance: what nearness pays is measured by it [m].
+# Distance of the right tip from the target at which nearness begins to pay [m].
 NEAR = 0.10
-# Bounds of the arms' distance [m], of which no more than 50 mm is looked at.
+# Bound of the arms' distance [m], which is computed up to 50 mm.
 DISTANCE_BOUND = 0.1
 # Entries of an action: the left arm's velocity, turning and jaw, then the right one's velocity and turning.
 LEFT_SIZE, RIGHT_SIZE = 7, 6
 
 
-class BimanualRetractTask(RetractTask):
-    """SurgSim/BimanualRetract-v0 on one anatomy with a pair of arms.
+def _right(simulation: Simulation) -> Any:
+    return _pair(simulation).arms["right"]
 
-    The target counts as exposed where the left jaw holds tissue and the organ leaves SUCCESS_SHARE of it uncovered,
-    seen from the endoscope; instruments do not count, as the right tip itself stands before what it touches. It counts
-    as touched where the centre of the right tip is above the disc and the tip presses what lies under it with
-    TOUCH_FORCE.
+
+class BimanualRetractTask(RetractTask):
+    """Lift a lobe with one arm and touch with the other what lay under it.
+
+    ## Description
+    The lobe of `SurgSim/Retract-v0` hides a disc on its bed. The left of two robot arms grasps the lobe and folds it
+    back; the right one reaches under it and touches the disc gently for half a second. Tissue, bed and arms exchange
+    forces 1000 times a second; one agent commands both arms 20 times a second. `surgsim_env.envs.bimanual_parallel` is
+    the same for two agents.
+
+    ## Action Space
+    `Box(-1, 1, (13,), float32)`
+
+    ## Observation Space
+    `Box((74,), float32)`, all bounds finite: the 56 numbers of `SurgSim/Retract-v0` with the left arm, then those of
+    the right one. `env.unwrapped.observation_slices` has the entries of each channel by its name.
+
+    ## Rewards
+    `info["reward_<term>"]` shows what each term paid. What is reached pays by its changes. An episode that ends in
+    failure pays less than any that runs its time.
+
+    ## Starting State
+    That of `SurgSim/Retract-v0`, and the right tip at a random place on the free side.
+
+    ## Episode End
+    Terminated: for 0.5 s, at the end of each control step, the left jaw held tissue, the organ left at least 80 % of
+    the target uncovered as seen from the endoscope (instruments do not count, as the right tip itself stands before the
+    target), and the right ball, its centre above the disc, pressed what lies under it with 0.3 to 1.0 N (success); in a
+    haptic step the contact force on the tissue exceeded the hard limit, or the jaw's pull the strength of the tissue;
+    at the end of a control step the right arm pressed the bed with more than the hard limit, or the left arm with more
+    than 2 N; the simulation faulted. Truncated: 600 control steps (30 s).
+
+    ## Info
+    That of `SurgSim/Retract-v0`, and `collided`, `touches` (bool), `uncovered` (share), `touch_force`,
+    `collision_force` [N].
+
+    ## Arguments
+    Those of `SurgSim/Retract-v0`; `instrument` is "psm_pair", or two arms (names or TOML files) as "LEFT+RIGHT":
+    the left one has a jaw with flat pads, the right one a ball at its tip, as "psm_retractor+six_axis".
+
+    ## Version History
+    * v0: first version.
     """
 
-    weights = BIMANUAL_WEIGHTS
-    failures = ("fault", "torn", "hard_force", "collided")
+    commands: ClassVar[tuple[Command, ...]] = (
+        Command("velocity", 3, SPEED_FULL_SCALE, "m/s", "left tip's velocity along x, y, z"),
+        Command("turning", 3, TURNING_FULL_SCALE, "rad/s", "rotation of the left tip"),
+        Command("jaw", 1, meaning="target of the left jaw, which moves at its limited speed: -1 closed, 1 open"),
+        Command("right", 3, SPEED_FULL_SCALE, "m/s", "right tip's velocity"),
+        Command("right_turning", 3, TURNING_FULL_SCALE, "rad/s", "rotation of the right tip"),
+    )
+    channels: ClassVar[tuple[Channel, ...]] = (
+        *RetractTask.channels,
+        replace(
+            TIP_POSITION, name="right_position", bounds_text="the lobe's bounding box with a margin",
+            read=lambda task, simulation: _right(simulation).tip_position,
+            meaning="right tip's position: the centre of its ball",
+        ),
+        Channel(
+            "right_velocity", 3, "m/s", -SPEED_BOUND, SPEED_BOUND,
+            read=lambda task, simulation: _right(simulation).tip_velocity, meaning="right tip's velocity",
+        ),
+        Channel(
+            "right_axes", 6, "", -AXIS_BOUND, AXIS_BOUND,
+            read=lambda task, simulation: _right(simulation).tip_rotation[:, [0, 2]].T,
+            meaning="the right tip's x and z axes in the world",
+        ),
+        Channel(
+            "right_force", 3, "N", sensor=1.0,
+            read=lambda task, simulation: _pair(simulation).contact_force("right", simulation.contact_wrench),
+            meaning="the tissue's force on the right arm, through the sensor model",
+        ),
+        Channel(
+            "touch_force", 1, "N", 0.0, FORCE_BOUND, felt=True, read=lambda task, simulation: task.touch_force,
+            meaning="force between the right arm and the bed",
+        ),
+        Channel(
+            "uncovered", 1, "", 0.0, 1.0, read=lambda task, simulation: task.uncovered_share,
+            meaning="share of the target that the organ leaves uncovered, seen from the endoscope",
+        ),
+        Channel(
+            "arm_distance", 1, "m", -DISTANCE_BOUND, DISTANCE_BOUND,
+            read=lambda task, simulation: _pair(simulation).distance, meaning="distance of the arms, at most 0.05 m",
+        ),
+    )  # fmt: skip
+    # By the inequality of RetractTask; `near` may begin as high as 1, so that the margin is
+    #   -0.4 - 1 - 6 - 4 - 1 - 1 - 1 + 15  =  0.6  at least.
+    rewards: ClassVar[tuple[Reward, ...]] = (
+        Reward("time", -0.005, "step", "each control step"),
+        Reward(
+            "soft_force", -0.010, "step", "largest force of the step, 0 at the soft and 1 at the hard limit",
+            soft_force_share,
+        ),
+        Reward(
+            "visible", 4.0, "change", "share of the target that the organ leaves uncovered",
+            lambda task, step: task.uncovered_share,
+        ),
+        Reward("grasped", 1.0, "change", "1 while tissue is between the pads", lambda task, step: task.grasp.holds),
+        Reward(
+            "near", 1.0, "change", "nearness of the right tip to the target: 1 on it, 0 from 0.1 m on",
+            lambda task, step: task.nearness(step.simulation),
+        ),
+        Reward(
+            "touched", 1.0, "change", "1 while the right tip touches the target as it should",
+            lambda task, step: task.touches(step.simulation),
+        ),
+        Reward("success", 10.0, "success", "touched, while exposed, for long enough"),
+        Reward("torn", -15.0, "failure", "the jaw pulled harder than the tissue bears"),
+        Reward("hard_force", -15.0, "failure", "the force exceeded the hard limit: a safety stop"),
+        Reward("collided", -15.0, "failure", "the arms pressed each other"),
+        Reward("fault", -15.0, "failure", "the simulation could not go on"),
+        Reward("forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less"),
+    )  # fmt: skip
+    default_instrument = "psm_pair"
+    lanes = False
     takes_pair = True
 
     def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
@@ -72,139 +178,98 @@ class BimanualRetractTask(RetractTask):
                 f"scene {anatomy.scene.name!r}: two hands need retract.right_start_lower, right_start_upper and "
                 "[[supports]] that bear the target: add them, or take a scene that has them, such as 'lobe'"
             )
-        self.action_size = LEFT_SIZE + RIGHT_SIZE
-        self.jaw_place = LEFT_SIZE - 1
-        self.right_reading = ForceReading(anatomy.scene.sensor)
         self.touch_force = self.uncovered_share = 0.0
-
-    def bounds(self, instrument: Instrument) -> Bounds:
-        """Bounds of the observation: those of one arm, then the right arm's."""
-        left = super().bounds(instrument)
-        speed, axes = np.full(3, SPEED_BOUND), np.full(6, 1.0 + 1e-6)
-        force = np.full(3, self.right_reading.sensor.range)
-        low = [instrument.lower - POSITION_SLACK, -speed, -axes, -force, [0.0, 0.0, -DISTANCE_BOUND]]
-        high = [instrument.upper + POSITION_SLACK, speed, axes, force, [FORCE_BOUND, 1.0, DISTANCE_BOUND]]
-        return Bounds(np.concatenate([left.low, *low]), np.concatenate([left.high, *high]))
-
-    def action(
-        self,
-        velocity: FloatArray,
-        *,
-        turning: FloatArray | None = None,
-        jaw: float | None = None,
-        right: FloatArray | None = None,
-        right_turning: FloatArray | None = None,
-    ) -> FloatArray:
-        """The action that asks for the left tip's velocity [m/s] (3,), turning [rad/s] and jaw, and the right one's.
-
-        What is left out stays still.
-        """
-        still = np.zeros(3)
-        return np.concatenate(
-            [
-                super().action(velocity, turning=turning, jaw=jaw),
-                (still if right is None else np.asarray(right)) / SPEED_FULL_SCALE,
-                (still if right_turning is None else np.asarray(right_turning)) / TURNING_FULL_SCALE,
-            ]
-        )
 
     def right_force(self, observation: NDArray[np.floating]) -> FloatArray:
         """The right arm's force reading in an observation [N], shape (3,)."""
-        return np.asarray(observation[-6:-3], dtype=np.float64)
+        return np.asarray(observation[self.observation_slices["right_force"]], dtype=np.float64)
+
+    def command(self, action: FloatArray, instrument: Instrument) -> None:
+        """Set both tips' velocities and rotations, and the left jaw's target."""
+        velocity, turning = (
+            np.stack([self.commanded(action, left), self.commanded(action, right)])
+            for left, right in (("velocity", "right"), ("turning", "right_turning"))
+        )
+        instrument.command_velocity(velocity, turning)
+        self.command_jaw(float(action[self.jaw_place]), instrument)
 
     def reset(self, rng: np.random.Generator) -> Start:
         """Draw an episode of retraction, and the right arm's start and bias."""
         start = super().reset(rng)
         assert self.table.right_start_lower is not None and self.table.right_start_upper is not None
         right = rng.uniform(self.table.right_start_lower, self.table.right_start_upper)
-        self.right_reading.reset(rng)
+        self.sensors["right_force"].reset(rng)
         self.touch_force = self.uncovered_share = 0.0
         return Start(start.organ, np.stack([start.tip_position, right]))
 
-    def command(self, action: FloatArray, instrument: Instrument) -> None:
-        """Set both tips' velocities and turnings, and the left jaw's target."""
-        left, right = action[:LEFT_SIZE], action[LEFT_SIZE:]
-        instrument.command_velocity(
-            np.stack([left[:3], right[:3]]) * SPEED_FULL_SCALE, np.stack([left[3:6], right[3:6]]) * TURNING_FULL_SCALE
-        )
-        self.command_jaw(float(left[6]), instrument)
-
-    def observe(self, simulation: Simulation, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """What the table of `BimanualRetractEnv` says; and whether a sensor saturated."""
-        values, cut = super().observe(simulation, rng)
-        pair = _pair(simulation)
-        arm = pair.arms["right"]
+    def look(self, simulation: Simulation) -> None:
+        """As `RetractTask.look`; also what the organ leaves uncovered and what the right tip presses."""
+        super().look(simulation)
         self._feel(simulation)
-        force, right_cut = self.right_reading.read(pair.contact_force("right", simulation.contact_wrench), rng)
-        more = [arm.tip_position, arm.tip_velocity, arm.tip_rotation[:, [0, 2]].T.ravel(), force]
-        measures = [self.touch_force, self.uncovered_share, pair.distance]
-        return np.concatenate([values, *more, measures]), cut or right_cut
-
-    def get_state(self) -> str:
-        """Draw, biases, counters and measures as JSON, exact."""
-        right = {"bias": self.right_reading.bias.tolist(), "felt": [self.uncovered_share, self.touch_force]}
-        return json.dumps({"left": super().get_state(), **right})
-
-    def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the lobe of that episode."""
-        table = json.loads(text)
-        self.right_reading.bias = np.array(table["bias"])
-        self.uncovered_share, self.touch_force = table["felt"]
-        return super().set_state(table["left"])
 
     def _feel(self, simulation: Simulation) -> None:
-        """Look at what the organ leaves uncovered and at what the right tip presses."""
         pair, supports = _pair(simulation), self.anatomy.scene.supports
         self.uncovered_share = self._look(simulation, past_instruments=False)
         self.touch_force = max(pair.touch_force("right", support.name) for support in supports)
 
-    def _harm(self, simulation: Simulation, force_peak: float, fault: str) -> str:
-        harm = super()._harm(simulation, force_peak, fault)
+    def harm(self, step: ControlStep) -> str:
+        """As `RetractTask.harm`; also a hard touch of the bed, and arms that press each other."""
+        harm = super().harm(step)
         if harm:
             return harm
         if self.touch_force > self.force_limit:
             return "hard_force"
-        return "collided" if _pair(simulation).collision_force > COLLISION_FORCE else ""
+        return "collided" if _pair(step.simulation).collision_force > COLLISION_FORCE else ""
 
-    def _progress(self, simulation: Simulation, grasp: Grasp) -> dict[str, float]:
-        self._feel(simulation)
-        away = np.linalg.norm(self._from_target(simulation))
-        return {
-            "visible": self.uncovered_share,
-            "grasped": float(grasp.holds),
-            "near": max(1.0 - float(away) / NEAR, 0.0),
-            "touched": float(self._touches(simulation)),
-        }
+    def at_goal(self, simulation: Simulation) -> bool:
+        """The jaw holds tissue, the target is exposed and the right tip touches it."""
+        assert self.grasp is not None
+        return self.grasp.holds and self.uncovered_share >= SUCCESS_SHARE and self.touches(simulation)
 
-    def _at_goal(self, simulation: Simulation, grasp: Grasp) -> bool:
-        return grasp.holds and self.uncovered_share >= SUCCESS_SHARE and self._touches(simulation)
-
-    def _touches(self, simulation: Simulation) -> bool:
+    def touches(self, simulation: Simulation) -> bool:
+        """Whether the right ball is above the disc and presses what lies under it with TOUCH_FORCE."""
         x, y, height = self._from_target(simulation)
         above = math.hypot(x, y) <= self.table.target_radius and float(height) <= TOUCH_GAP
         return above and TOUCH_FORCE[0] <= self.touch_force <= TOUCH_FORCE[1]
+
+    def nearness(self, simulation: Simulation) -> float:
+        """Nearness of the right tip to the target: 1 on it, 0 from NEAR on."""
+        away = np.linalg.norm(self._from_target(simulation))
+        return max(1.0 - float(away) / NEAR, 0.0)
 
     def _from_target(self, simulation: Simulation) -> FloatArray:
         """From the target's centre to the right tip's lowest point [m], (3,)."""
         target = self.target
         assert target is not None
-        lowest = _pair(simulation).arms["right"].tip_position - target.normal * self.anatomy.scene.instrument.tip_radius
+        lowest = _right(simulation).tip_position - target.normal * self.anatomy.scene.instrument.tip_radius
         return lowest - target.centre
 
-    def _info(
-        self, simulation: Simulation | None, grasp: Grasp | None, force_peak: float, harm: str
-    ) -> dict[str, InfoValue]:
-        touches, collision = False, 0.0
-        if simulation is not None and grasp is not None:
-            touches, collision = self._touches(simulation), _pair(simulation).collision_force
+    def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
+        """As `RetractTask.info`, and what the right arm does; nothing of it after a reset or a fault."""
+        simulation = step.simulation if step is not None and not step.fault else None
         return {
-            **super()._info(simulation, grasp, force_peak, harm),
-            "collided": harm == "collided",
+            **super().info(step, end),
+            "collided": end == "collided",
             "uncovered": self.uncovered_share,
             "touch_force": self.touch_force,
-            "touches": touches,
-            "collision_force": collision,
+            "touches": simulation is not None and self.touches(simulation),
+            "collision_force": 0.0 if simulation is None else _pair(simulation).collision_force,
         }
+
+    def get_state(self) -> str:
+        """Draw, biases, counters and measures as JSON, exact."""
+        right = {
+            "bias": self.sensors["right_force"].bias.tolist(),
+            "felt": [self.uncovered_share, self.touch_force],
+        }
+        return json.dumps({"left": super().get_state(), **right})
+
+    def set_state(self, text: str) -> OrganModel:
+        """Restore what `get_state` gave; returns the lobe of that episode."""
+        table = json.loads(text)
+        self.sensors["right_force"].bias = np.array(table["bias"])
+        self.uncovered_share, self.touch_force = table["felt"]
+        return super().set_state(table["left"])
 
 
 def _check_tips(pair: Pair) -> None:

@@ -1,37 +1,37 @@
 """Palpation: find one hidden lesion by touch and declare it while pressing on it."""
 
 import json
-import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.instrument import Instrument
-from surgsim_env.levels import DrawnOrgan, Level
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Lesion
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import make_chart
 from surgsim_env.palpation.touch_memory import Indenter, TouchMemory
-from surgsim_env.rewards import PALPATE_WEIGHTS, weighted
-from surgsim_env.scenes import Endoscope
-from surgsim_env.sensors import ForceReading
-from surgsim_env.simulation import Simulation
-from surgsim_env.tasks.task import Bounds, InfoValue, Start, Verdict
-from surgsim_env.visibility import Disc
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.levels import DrawnOrgan
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.task import (
+    CONTACT_FORCE,
+    SPEED_FULL_SCALE,
+    TIME_LEFT,
+    TIP_POSITION,
+    TIP_VELOCITY,
+    InfoValue,
+    Task,
+    soft_force_share,
+)
 
 EPISODE_STEPS = 600
-SPEED_FULL_SCALE = 0.02
 DECLARE_VALUE = 0.8
 DECLARE_STEPS = 3
 SUCCESS_DISTANCE = 0.010
 
-# The tip starts this far above the surface [m].
+# Height of the tip ball above the surface at the start [m].
 START_GAP = (0.002, 0.006)
-# Bounds of the observation beyond the workspace [m] and on speed [m/s]; leaving them is a fault.
-POSITION_SLACK = 0.005
-SPEED_BOUND = 0.5
 
 
 def touch_memory(anatomy: Anatomy) -> TouchMemory:
@@ -45,186 +45,181 @@ def touch_memory(anatomy: Anatomy) -> TouchMemory:
     )
 
 
-class PalpateTask:
-    """SurgSim/Palpate-v0 on one anatomy."""
+def _site_count(task: "PalpateTask") -> int:
+    return 0 if task.memory is None else task.memory.chart.side_count**2
 
-    action_size = 4
-    weights = PALPATE_WEIGHTS
-    pull_limit = math.inf
-    target: Disc | None = None
-    endoscope: Endoscope | None = None
 
-    def __init__(self, anatomy: Anatomy, level: Level | None = None, *, memory: bool = False) -> None:
-        """Palpate an anatomy.
+def _stiffest_bound(task: "PalpateTask", instrument: Instrument) -> FloatArray:
+    assert task.memory is not None
+    return np.array([1.0, 1.0, task.memory.bound])
 
-        Args:
-            anatomy: of a scene, or of what `level.scene` made of one.
-            level: what an episode draws, but for the number of lesions, which is one; the scene's ranges by default.
-            memory: whether the observation holds what was felt so far.
+
+class PalpateTask(Task):
+    """Find a hidden lesion by touch.
+
+    ## Description
+    A robot's ball tip presses a soft organ (a tetrahedral mass-spring-damper model, Sala et al. 2011) with one stiff
+    lesion hidden under its surface. Tissue and tip exchange forces 1000 times a second; the agent acts 20 times a
+    second. It succeeds by pressing on the lesion and declaring it.
+
+    ## Action Space
+    `Box(-1, 1, (4,), float32)`
+
+    ## Observation Space
+    `Box((10,), float32)`, all bounds finite. With `memory=True` `Box((13 + 2 n,), float32)`: what the sensor felt so
+    far (`surgsim_env.palpation.touch_memory`) on a grid of n sites over the palpable face
+    (`surgsim_env.palpation.chart`); n is 169 on `phantom`. `env.unwrapped.observation_slices` has the entries of each
+    channel by its name.
+
+    ## Rewards
+    `info["reward_<term>"]` shows what each term paid. A failure (a wrong declaration, the hard limit, a fault) also
+    costs as much as the most expensive control step for each one left, so that it never pays more than searching on.
+
+    ## Starting State
+    Radius, cover and modulus ratio of the lesion, its place on the palpable face, the sensor's bias and the tip's place
+    2 to 6 mm above the surface are drawn for each episode from the ranges of the scene file. The organ is at rest. With
+    a `level` the organ's modulus and a capsule are drawn too, and lesions and sensor have the level's ranges
+    (`surgsim_env.scene.levels`).
+
+    ## Episode End
+    Terminated: the lesion was declared (success within 10 mm of its centre, measured along the surface); the contact
+    force exceeded the hard limit in a haptic step; the simulation faulted (`info["sim_fault"]` says how, the
+    observation is the last finite one). Truncated: 600 control steps (30 s).
+
+    ## Info
+    Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited` (by the box, or by an
+    arm's joint and speed limits), `hard_limit`, `declared`, `success` (bool), `force_peak` [N], `cost` (force above the
+    soft limit, 1 at the hard one: a constraint for safe learning), `error_mm` (-1 if nothing was declared),
+    `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through none),
+    `added_mass` [kg] (by mass scaling, 0 without), one `reward_<term>` each.
+
+    ## Arguments
+    * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
+    * `instrument`: "probe", the name of an arm (`surgsim_env.list_arms()`, such as "psm_palpator") or the path of an
+      arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
+      its tip points along the scene's approach as far as its joints allow.
+    * `level`: "easy", "standard" or "hard" (`surgsim_env.scene.levels`); None, the default: the scene's own ranges.
+    * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
+
+    ## Version History
+    * v0: first version.
+    """
+
+    commands = (
+        Command("velocity", 3, SPEED_FULL_SCALE, "m/s", "tip velocity along x, y, z"),
+        Command("declare", 1, meaning='above 0.8 for 3 successive control steps, in contact: "the lesion is here"'),
+    )
+    channels = (
+        TIP_POSITION,
+        TIP_VELOCITY,
+        CONTACT_FORCE,
+        TIME_LEFT,
+        Channel(
+            "contrast", _site_count,
+            low=lambda task, instrument: -task.memory.bound,
+            high=lambda task, instrument: task.memory.bound,
+            read=lambda task, simulation: task.memory.contrast,
+            meaning="with `memory`: force over healthy tissue's at that depth, for each site; 0 where nothing was felt",
+            felt=True, size_text="n or 0", bounds_text="+-bound",
+        ),
+        Channel(
+            "visited", _site_count, "", 0.0, 1.0,
+            read=lambda task, simulation: task.memory.visited,
+            meaning="with `memory`: 1 for each site where something was felt", size_text="n or 0",
+        ),
+        Channel(
+            "stiffest", lambda task: 0 if task.memory is None else 3,
+            low=lambda task, instrument: -_stiffest_bound(task, instrument), high=_stiffest_bound,
+            read=lambda task, simulation: task.memory.stiffest(),
+            meaning="with `memory`: the place on the face's chart where it was stiffest, and the contrast there",
+            felt=True, size_text="3 or 0", bounds_text="+-1, +-bound",
+        ),
+    )  # fmt: skip
+    rewards = (
+        Reward("time", -0.005, "step", "each control step"),
+        Reward(
+            "soft_force", -0.010, "step", "largest force of the step, 0 at the soft and 1 at the hard limit",
+            soft_force_share,
+        ),
+        Reward("found", 10.0, "success", "declared within the success distance"),
+        Reward("wrong", -5.0, "failure", "declared elsewhere"),
+        Reward("hard_force", -5.0, "failure", "the force exceeded the hard limit: a safety stop"),
+        Reward("fault", -5.0, "failure", "the simulation could not go on"),
+        Reward("forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less"),
+    )  # fmt: skip
+    episode_steps = EPISODE_STEPS
+    drawn: DrawnOrgan | None
+
+    def __init__(self, anatomy: Anatomy, instrument: Instrument | None = None, *, memory: bool = False) -> None:
+        """Palpate an anatomy; with `memory` the observation holds what was felt so far.
 
         Raises:
-            ValueError: the scene says of no lesion how it is drawn.
+            ValueError: the scene does not say how a lesion is drawn.
         """
         if anatomy.scene.lesion is None:
             raise ValueError(
                 f"scene {anatomy.scene.name!r} has no [lesion] table, so that there is nothing to find in it: "
                 "add one, or take a scene that has it, such as 'phantom'"
             )
-        self.anatomy = anatomy
-        self.limits = anatomy.scene.limits
-        self.reading = ForceReading(anatomy.scene.sensor)
-        self.level = level
-        self.drawn: DrawnOrgan | None = None
+        super().__init__(anatomy, instrument)
         self.memory = touch_memory(anatomy) if memory else None
-        self.step_count = 0
         self.declare_count = 0
         self._declare_value = 0.0
-
-    @property
-    def lesions(self) -> tuple[Lesion, ...]:
-        """The lesion of the episode; none before the first."""
-        return () if self.drawn is None else self.drawn.lesions
+        self._error: float | None = None
 
     @property
     def lesion(self) -> Lesion | None:
         """The lesion of the episode; None before the first."""
         return self.lesions[0] if self.lesions else None
 
-    def bounds(self, instrument: Instrument) -> Bounds:
-        """Bounds of the observation, from the tip's workspace [m]."""
-        speed, force = np.full(3, SPEED_BOUND), np.full(3, self.anatomy.scene.sensor.range)
-        low = np.concatenate([instrument.lower - POSITION_SLACK, -speed, -force, [0.0]])
-        high = np.concatenate([instrument.upper + POSITION_SLACK, speed, force, [1.0]])
-        if self.memory is None:
-            return Bounds(low, high)
-        felt = np.full(self.memory.chart.side_count**2, self.memory.bound)
-        still = np.zeros_like(felt)
-        return Bounds(
-            np.concatenate([low, -felt, still, [-1.0, -1.0, -self.memory.bound]]),
-            np.concatenate([high, felt, still + 1.0, [1.0, 1.0, self.memory.bound]]),
-        )
-
-    @property
-    def force_entries(self) -> list[int]:
-        """Numbers of the observation that come from the force sensor: the reading, what memory makes of it."""
-        felt = 0 if self.memory is None else self.memory.chart.side_count**2
-        last = [] if self.memory is None else [10 + 2 * felt + index for index in range(3)]
-        return [6, 7, 8, *range(10, 10 + felt), *last]
-
-    def reset(self, rng: np.random.Generator) -> Start:
-        """Draw the lesion (and what else the level draws), the sensor's bias and the tip's start."""
+    def draw_organ(self, rng: np.random.Generator) -> DrawnOrgan:
+        """Draw one lesion, and what else the level draws."""
         if self.level is None:
-            self.drawn = DrawnOrgan((self.anatomy.random_lesion(rng),))
-        else:
-            self.drawn = self.level.draw(self.anatomy, rng, lesion_count=1)
-        self.reading.reset(rng)
-        self.step_count = 0
+            return DrawnOrgan((self.anatomy.random_lesion(rng),))
+        return self.level.draw(self.anatomy, rng, lesion_count=1)
+
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Draw the tip's place above the palpable face, and forget the last episode."""
         self.declare_count = 0
         self._declare_value = 0.0
         if self.memory is not None:
             self.memory.forget()
         above, outward = self.anatomy.face.random_point(rng, self.anatomy.scene.palpation.face_margin)
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
-        return Start(self.drawn.compiled(self.anatomy), above + outward * gap)
-
-    def accepts(self, simulation: Simulation) -> bool:
-        """Every drawn lesion can be found."""
-        return True
-
-    def command(self, action: FloatArray, instrument: Instrument) -> None:
-        """Set the tip velocity that an action asks for."""
-        instrument.command_velocity(self.velocity(action))
-
-    def velocity(self, action: FloatArray) -> FloatArray:
-        """The tip velocity that an action asks for [m/s], shape (3,)."""
-        return np.asarray(action[:3], dtype=np.float64) * SPEED_FULL_SCALE
-
-    def action(self, velocity: FloatArray, *, declare: bool = False) -> FloatArray:
-        """The action that asks for a tip velocity [m/s] (3,): `velocity` the other way round; shape (4,)."""
-        return np.append(np.asarray(velocity, dtype=np.float64) / SPEED_FULL_SCALE, float(declare))
-
-    @property
-    def speed_limit(self) -> float:
-        """The fastest that an action can ask the tip to move along an axis [m/s]."""
-        return SPEED_FULL_SCALE
-
-    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
-        """The force sensor's reading in an observation [N], shape (3,)."""
-        return np.asarray(observation[6:9], dtype=np.float64)
+        return above + outward * gap
 
     def begin(self, action: FloatArray) -> None:
-        """Begin a control step: count it and note what the action declares."""
-        self.step_count += 1
-        self._declare_value = float(action[3])
+        """Begin a control step: count it and keep what the action declares."""
+        super().begin(action)
+        self._declare_value = float(self.commanded(action, "declare")[0])
 
-    @property
-    def force_limit(self) -> float:
-        """A control step ends with the haptic step whose force passes this, and the episode with it [N]."""
-        return self.limits.hard_force
-
-    def observe(self, simulation: Simulation, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """Tip position, tip velocity, force reading, time left, what is remembered; whether the sensor saturated."""
-        reading, saturated = self.reading.read(simulation.contact_force, rng)
-        left = 1.0 - self.step_count / EPISODE_STEPS
-        instrument = simulation.instrument
-        seen = [instrument.tip_position, instrument.tip_velocity, reading, [left]]
-        if self.memory is not None:
-            self._remember(self.memory, instrument.tip_position, reading)
-            seen += [self.memory.contrast, self.memory.visited, self.memory.stiffest()]
-        return np.concatenate(seen), saturated
-
-    def _remember(self, memory: TouchMemory, tip: FloatArray, reading: FloatArray) -> None:
-        """Take a reading in, at the depth of the ball below the resting surface."""
+    def look(self, simulation: Simulation) -> None:
+        """Add the force reading to the memory, at the depth of the ball below the resting surface."""
+        memory = self.memory
+        if memory is None:
+            return
+        tip = simulation.instrument.tip_position
         surface, normal = self.anatomy.face.project(tip)
         depth = memory.indenter.radius - float((tip - surface) @ normal)
-        memory.feel(memory.chart.place(surface), depth, float(reading @ normal))
+        memory.feel(memory.chart.place(surface), depth, float(self.sensed["contact_force"] @ normal))
 
-    def judge(self, simulation: Simulation, force_peak: float, fault: str) -> Verdict:
-        """End a control step: see whether something was declared, and say how it ends.
+    def end(self, step: ControlStep) -> str:
+        """A fault, the hard limit, or a declaration: "found" or "wrong"."""
+        end = super().end(step)
+        declared = not end and self._declares(step.simulation)
+        self._error = self.declared_error(step.simulation) if declared else None
+        if self._error is None:
+            return end
+        return "found" if self._error <= SUCCESS_DISTANCE else "wrong"
 
-        Args:
-            simulation: as the step left it.
-            force_peak: largest contact force of its haptic steps [N].
-            fault: what the simulation came to, or an empty string.
-        """
-        hard = not fault and force_peak > self.force_limit
-        declared = not fault and not hard and self._declares(simulation)
-        error = self.declared_error(simulation) if declared else None
-        found = error is not None and error <= SUCCESS_DISTANCE
-        terminated = bool(fault) or hard or declared
-        excess = self.limits.excess(force_peak)
-        terms = {
-            "time": 1.0,
-            "soft_force": min(max(excess, 0.0), 1.0),
-            "found": float(found),
-            "wrong": float(declared and not found),
-            "hard_force": float(hard),
-            "fault": float(bool(fault)),
-            "forgone": float(EPISODE_STEPS - self.step_count) if terminated and not found else 0.0,
-        }
-        return Verdict(
-            terminated=terminated,
-            truncated=not terminated and self.step_count >= EPISODE_STEPS,
-            rewards=weighted(terms, PALPATE_WEIGHTS),
-            info={
-                "force_peak": force_peak,
-                "cost": max(excess, 0.0),
-                "hard_limit": hard,
-                "declared": declared,
-                "success": found,
-                "error_mm": -1.0 if error is None else error * 1000.0,
-            },
-        )
-
-    def blank_info(self) -> dict[str, InfoValue]:
-        """The info of a reset: the same keys and types as a verdict's."""
+    def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
+        """As `Task.info`, and what was declared."""
+        declared = end in ("found", "wrong")
+        assert not declared or self._error is not None
         return {
-            "force_peak": 0.0,
-            "cost": 0.0,
-            "hard_limit": False,
-            "declared": False,
-            "success": False,
-            "error_mm": -1.0,
+            **super().info(step, end),
+            "declared": declared,
+            "error_mm": self._error * 1000.0 if declared and self._error is not None else -1.0,
         }
 
     def _declares(self, simulation: Simulation) -> bool:
@@ -245,7 +240,7 @@ class PalpateTask:
         return json.dumps(
             {
                 "drawn": self.drawn.to_json(),
-                "bias": self.reading.bias.tolist(),
+                "bias": self.sensors["contact_force"].bias.tolist(),
                 "counts": [self.step_count, self.declare_count],
                 "declare_value": self._declare_value,
                 "memory": None if self.memory is None else [self.memory.product.tolist(), self.memory.square.tolist()],
@@ -256,7 +251,7 @@ class PalpateTask:
         """Restore what `get_state` gave; returns the organ of that episode."""
         table = json.loads(text)
         self.drawn = DrawnOrgan.from_json(table["drawn"], self.anatomy)
-        self.reading.bias = np.array(table["bias"])
+        self.sensors["contact_force"].bias = np.array(table["bias"])
         self.step_count, self.declare_count = table["counts"]
         self._declare_value = table["declare_value"]
         if self.memory is not None:

@@ -1,65 +1,187 @@
-"""Palpation press by press: choose sites to press on; what was felt there is made an estimate of the lesions below."""
+"""Palpation press by press: choose sites to press on; an estimator locates the lesions from what was felt."""
 
 import json
 import math
+from typing import Any, Self
 
 import numpy as np
 
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.instrument import Instrument
-from surgsim_env.levels import REFERENCE_TIP, DrawnOrgan, Level
-from surgsim_env.palpation.charted_face import Site
-from surgsim_env.palpation.healthy_map import HealthyMap, charted_face
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.sensors import ForceReading
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.palpation.chart import Site
+from surgsim_env.palpation.healthy_map import HealthyMap, charted_face, healthy_map
 from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
-from surgsim_env.palpation.ospa import ospa, ospa_cutoff
-from surgsim_env.palpation.site_press import PressResult
+from surgsim_env.palpation.press import PressResult
+from surgsim_env.palpation.scores import ospa, ospa_cutoff
 from surgsim_env.palpation.site_touches import LOG_CONTRAST_BOUND, SiteTouches, Touch
-from surgsim_env.rewards import PALPATE_SITES_WEIGHTS, weighted
-from surgsim_env.scenes import Endoscope
-from surgsim_env.sensors import ForceReading
-from surgsim_env.simulation import Simulation
-from surgsim_env.tasks.task import Bounds, InfoValue, Start, Verdict
-from surgsim_env.visibility import Disc
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
+from surgsim_env.scene.load import make_scene, with_instrument
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.task import InfoValue, Start, Task, soft_force_share
 
-# Presses of an episode; BUDGET_WIDE where the chart's longer side is above so many tip radii.
+# Presses of an episode; BUDGET_WIDE where the chart's longer side exceeds WIDE tip radii.
 BUDGET, BUDGET_WIDE, WIDE = 25, 60, 10.0
-# A lesion is found where an estimate is so near to it [m], and an episode succeeds where OSPA ends so small [m], under
-# a tip of 8 mm, in proportion under others.
+# Distance of an estimate at which a lesion is found [m], and OSPA at which an episode succeeds [m], under a tip of
+# 8 mm; in proportion under others.
 FOUND_DISTANCE = 0.010
 SUCCESS_ERROR = 0.005
 # Bound of the observed depth over the scene's press depth.
 DEPTH_BOUND = 2.0
 
 
-class PalpateSitesTask:
-    """SurgSim/PalpateSites-v0 on one anatomy; a press is simulated or looked up, all else is here.
+def _map_size(task: "PalpateSitesTask") -> int:
+    return task.site_count**2 if task.memory else 0
 
-    An episode: `reset` (or `begin_episode` with an organ that was drawn elsewhere); for each press `begin`, `site`,
-    `take` with what the press came to, `observe`, `judge`.
 
-    Fields that agents and scores may read:
-        estimator: the benchmark's common estimator, on the lengths of `charted.chart`
-        site_count: sites on a side of the observation's grid
-        budget, step_count: presses of an episode, and those made
-        felt: what the presses told
-        estimate, estimated: what that makes one believe, and where it is on the face [m] (k, 3)
-        truth: the face's points nearest to the lesions' centres [m] (n_lesion, 3)
-        error, found: OSPA [m], and the share of lesions with an estimate near them
+def _force_bound(task: "PalpateSitesTask") -> float:
+    return math.sqrt(3.0) * task.anatomy.scene.sensor.range / task.limits.hard_force
+
+
+class PalpateSitesTask(Task):
+    """Find hidden lesions by choosing where to press, one press a step.
+
+    ## Description
+    Up to three stiff lesions, or none, lie hidden under the surface of a soft organ. The agent names sites on its
+    palpable face; the environment presses each with the scene's ball tip, through the force exchange of
+    `SurgSim/Palpate-v0`, 1000 times a second, and observes the force. One estimator, the same for every agent, locates
+    the lesions from all presses (`surgsim_env.palpation.lesion_estimator`); the agent chooses where to press.
+
+    A press: the organ at rest, the tip a clearance above the site; down along the surface normal at 40 mm/s to the
+    scene's depth, or until the force is half way from the soft to the hard limit; rest for 0.1 s; force and depth are
+    the means of the last 40 ms. The way from site to site is not simulated: its time is counted at 20 mm/s.
+
+    ## Action Space
+    `Box(-1, 1, (2,), float32)`: a place on the chart of the palpable face, the rectangle across the scene's approach
+    that holds all sites which keep the face's margin. A place that may not be pressed is moved to the nearest site of
+    the chart's grid that may.
+
+    ## Observation Space
+    With `memory=True` `Box((2 n n + 6,), float32)`, n x n sites of a fixed grid over the chart, row by row along its
+    second axis (n is odd, 13 to 25, sites about half a tip's radius apart; phantom 13, so 344 numbers); with
+    `memory=False` the last six alone: a true POMDP, for agents with a memory of their own. All bounds finite.
+    `env.unwrapped.observation_slices` has the entries of each channel by its name.
+
+    Contrast is stiffness (force over depth) over that of the scene's healthy organ of nominal modulus at this place, a
+    map that is made once for each scene and kept on disk (`surgsim_env.palpation.healthy_map`).
+
+    ## Rewards
+    `info["reward_<term>"]` shows what each term paid. Each press costs in proportion to the error of the estimate after
+    it; lesions found pay once. An episode that ends in failure pays less than any that makes all its presses.
+
+    ## Starting State
+    As the level says (`surgsim_env.scene.levels`): number, places, sizes, covers and modulus ratios of the lesions, the
+    modulus of the tissue around them, a capsule, the sensor's bias.
+
+    ## Episode End
+    Terminated: the presses of the budget are made (success where the error is at most 5 mm under a tip of 8 mm); the
+    contact force exceeded the hard limit; the simulation faulted. Never truncated: the budget is the task's.
+
+    ## Info
+    Fixed keys and types. Of the press: `sim_fault` (str), `sensor_saturated`, `workspace_limited`, `hard_limit`,
+    `stopped_by_force`, `contrast_cut` (bool), `force`, `force_peak` [N], `depth` [m], `stiffness` [N/m], `contrast`,
+    `moved_mm`, `cost` (force over the soft limit, 1 at the hard one: a constraint for safe learning),
+    `trocar_error_mm`, `added_mass` [kg], one `reward_<term>` each. Of the episode so far: `seconds`, `path_length` [m],
+    `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm under a tip of 8 mm),
+    `found` (share of lesions with an estimate within 10 mm, likewise; without lesions 1 where none is claimed),
+    `lesion_count_estimated`, `success`.
+
+    ## Arguments
+    * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "phantom".
+    * `level`: "easy", "standard" (default) or "hard".
+    * `memory`: observe all presses (default), or the last one alone.
+    * `budget`: presses of an episode; by default 25, or 60 where the chart is longer than ten tip radii.
+    * `instrument`: "probe", the name of an arm or the path of an arm's TOML file; by default the scene's own.
+
+    ## Version History
+    * v0: first version.
     """
 
-    action_size = 2
-    weights = PALPATE_SITES_WEIGHTS
-    pull_limit = math.inf
-    target: Disc | None = None
-    endoscope: Endoscope | None = None
+    commands = (Command("place", 2, meaning="the place to press on the chart of the palpable face"),)
+    channels = (
+        Channel(
+            "contrast_map", _map_size, "", -LOG_CONTRAST_BOUND, LOG_CONTRAST_BOUND, felt=True,
+            read=lambda task, simulation: task.felt.maps()[: _map_size(task)],
+            meaning="log contrast of the latest press nearest to each site, 0 without one", size_text="n n or 0",
+        ),
+        Channel(
+            "pressed_map", _map_size, "", 0.0, 1.0, read=lambda task, simulation: task.felt.maps()[_map_size(task) :],
+            meaning="1 for each site where there was one", size_text="n n or 0",
+        ),
+        Channel(
+            "last_place", 2, "", -1.0, 1.0, read=lambda task, simulation: task.felt.last.place,
+            meaning="place of the last press on the chart",
+        ),
+        Channel(
+            "last_force", 1, "",
+            lambda task, instrument: -_force_bound(task), lambda task, instrument: _force_bound(task),
+            read=lambda task, simulation: task.felt.last.force / task.limits.hard_force, felt=True,
+            meaning="its force along the normal, through the sensor model, over the hard limit",
+            bounds_text="+-sqrt(3) range",
+        ),
+        Channel(
+            "last_depth", 1, "", -DEPTH_BOUND, DEPTH_BOUND,
+            read=lambda task, simulation: task.felt.last.depth / task.anatomy.scene.palpation.press_depth,
+            meaning="its depth over the scene's press depth",
+        ),
+        Channel(
+            "last_contrast", 1, "", -LOG_CONTRAST_BOUND, LOG_CONTRAST_BOUND, felt=True,
+            read=lambda task, simulation: task.felt.last.log_contrast, meaning="its log contrast",
+        ),
+        Channel(
+            "presses_left", 1, "", 0.0, 1.0, read=lambda task, simulation: 1.0 - task.step_count / task.budget,
+            meaning="share of the presses left",
+        ),
+    )  # fmt: skip
+    # `error`, `soft_force` and `forgone` are in [0, 1] per press and count as shares of the budget of n presses: 0.04,
+    # 0.01 and 0.05 a press for n = 25.
+    #
+    # `found` is the CHANGE of a number in [0, 1] and sums to its last value less the first (1 where there is nothing to
+    # find and nothing is claimed, else 0): it cannot be earned twice. The worst full episode returns at least
+    # error + soft_force - f, one that fails after k presses at most (1 - f) found + failure + (n - k) / n forgone,
+    # where f is the first value of `found`. As forgone = error + soft_force, the first is larger by
+    #   -f + k / n (error + soft_force) - (1 - f) - failure  >=  -1 - 1.25 + 2.5  =  0.25  at least:
+    # a failed, faulted or aborted episode never returns more than the worst full one.
+    rewards = (
+        Reward(
+            "error", -1.0, "step", "distance of the estimates from the truth (OSPA) over its cutoff and the budget",
+            lambda task, step: task.error / task.cutoff / task.budget,
+        ),
+        Reward(
+            "found", 1.0, "change", "share of the lesions with an estimate near them", lambda task, step: task.found
+        ),
+        Reward(
+            "soft_force", -0.25, "step",
+            "largest force of the press, 0 at the soft and 1 at the hard limit, over the budget",
+            lambda task, step: soft_force_share(task, step) / task.budget,
+        ),
+        Reward("hard_force", -2.5, "failure", "the force exceeded the hard limit: a safety stop"),
+        Reward("fault", -2.5, "failure", "the simulation could not go on"),
+        Reward(
+            "forgone", -1.25, "step left", "share of the budget that is left after a failure",
+            lambda task, step: 1.0 - task.step_count / task.budget,
+        ),
+    )  # fmt: skip
+    # The budget ends an episode.
+    episode_steps = None
+    drawn: DrawnOrgan | None
 
     def __init__(
         self, anatomy: Anatomy, level: Level, healthy: HealthyMap, *, memory: bool = True, budget: int | None = None
     ) -> None:
-        """Palpate an anatomy.
+        """Palpate an anatomy; a press is simulated or looked up, everything else is computed here.
+
+        An episode: `reset` (or `begin_episode` with an organ that was drawn elsewhere); for each press `begin`, `site`,
+        `take` with the result of the press, `observe`, `judge`.
+
+        Attributes that agents and scores may read: `estimator` (the benchmark's common estimator, on the lengths of
+        `charted.chart`), `site_count` (sites on a side of the observation's grid), `budget`, `step_count`, `felt`
+        (record of the presses), `estimate`, `estimated` (where it is on the face [m] (k, 3)), `truth` (the face's
+        points nearest to the lesions' centres [m] (n_lesion, 3)), `error` (OSPA [m]), `found` (share of the lesions
+        with an estimate near them).
 
         Args:
             anatomy: of a scene that `level.scene` gave.
@@ -71,8 +193,9 @@ class PalpateSitesTask:
         Raises:
             ValueError: a budget that is no whole number above 0.
         """
+        super().__init__(anatomy)
         scene = anatomy.scene
-        self.anatomy, self.level, self.memory = anatomy, level, memory
+        self.level, self.memory = level, memory
         self.charted = charted_face(anatomy)
         chart, tip = self.charted.chart, scene.instrument.tip_radius
         if budget is None:
@@ -80,13 +203,11 @@ class PalpateSitesTask:
         if isinstance(budget, bool) or not isinstance(budget, int) or budget < 1:
             raise ValueError(f"budget is {budget!r}; it must be a whole number of presses, at least 1")
         self.budget, self.site_count = budget, chart.side_count
-        self.limits = scene.limits
         self.reading = ForceReading(scene.sensor)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
         healthy_force = float(healthy.grid.mean()) * scene.palpation.press_depth
         self.estimator = LesionEstimator(chart.extent, tip_radius=tip, noise=scene.sensor.noise / healthy_force)
         self.cutoff, self.tip_scale = ospa_cutoff(tip), tip / REFERENCE_TIP
-        self.drawn: DrawnOrgan | None = None
         self.truth = np.zeros((0, 3))
         self._clear()
 
@@ -95,22 +216,30 @@ class PalpateSitesTask:
         self.step_count = 0
         self._pending: tuple[Site, PressResult] | None = None
         self._believe()
-        self._found_before = self.found
+        self._reached = {"found": self.found}
 
     # ---- the episode ------------------------------------------------------------------------------------------------
 
-    @property
-    def lesions(self) -> tuple[Lesion, ...]:
-        """The lesions of the episode; none before the first."""
-        return () if self.drawn is None else self.drawn.lesions
-
-    @property
-    def force_limit(self) -> float:
-        """The episode ends with a press whose force passes this [N]."""
-        return self.limits.hard_force
+    @classmethod
+    def make(
+        cls,
+        scene: str,
+        instrument: str | None = None,
+        *,
+        level: str | None = "standard",
+        memory: bool = True,
+        budget: int | None = None,
+        **settings: Any,
+    ) -> tuple[Simulation, Self]:
+        """As `Task.make`, with the map of the scene's healthy organ."""
+        chosen, plain = find_level(level or "standard"), make_scene(scene)
+        anatomy = load_anatomy(chosen.scene(with_instrument(plain, instrument)))
+        task = cls(anatomy, chosen, healthy_map(plain), memory=memory, budget=budget, **settings)
+        return Simulation(anatomy), task
 
     def reset(self, rng: np.random.Generator) -> Start:
         """Draw the organ and the sensor's bias; the tip waits above the middle of the chart."""
+        assert self.level is not None
         drawn = self.level.draw(self.anatomy, rng)
         self.begin_episode(drawn, rng)
         middle, scene = self.charted.site(np.zeros(2)), self.anatomy.scene
@@ -124,34 +253,27 @@ class PalpateSitesTask:
         self.reading.reset(rng)
         self._clear()
 
-    def accepts(self, simulation: Simulation) -> bool:
-        """Every draw is an episode."""
-        return True
-
     def command(self, action: FloatArray, instrument: Instrument) -> None:
-        """Nothing: a press commands the instrument as it goes."""
-
-    def begin(self, action: FloatArray) -> None:
-        """Count a press."""
-        self.step_count += 1
+        """Nothing: a press commands the instrument itself."""
 
     def site(self, action: FloatArray) -> Site:
         """The site that an action (2,) asks to press, or the nearest that may be pressed."""
         return self.charted.site(np.clip(action, -1.0, 1.0))
 
     def take(self, site: Site, result: PressResult) -> None:
-        """Take what a press at a site came to; `observe` reads the sensor."""
+        """Take the result of a press at a site; `observe` reads the sensor."""
         self._pending = (site, result)
 
     def observe(self, simulation: Simulation | None, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """The observation after the press that was taken last, and whether the sensor saturated."""
+        """The observation after the last press that was taken, and whether the sensor saturated."""
         saturated = False
         if self._pending is not None:
             (site, result), self._pending = self._pending, None
             reading, saturated = self.reading.read(result.force, rng)
             self.felt.add(site, result, float(reading @ site.normal))
             self._believe()
-        return self._observation(), saturated
+        # A press that was looked up has no simulation, and no channel reads it.
+        return super().observe(simulation, rng)[0], saturated  # type: ignore[arg-type]
 
     def _believe(self) -> None:
         """Estimate the lesions from all touches, and compare with the truth."""
@@ -167,58 +289,18 @@ class PalpateSitesTask:
         distance = np.sqrt(((self.truth[:, None] - self.estimated) ** 2).sum(axis=2))
         return float((distance <= FOUND_DISTANCE * self.tip_scale).any(axis=1).mean())
 
-    # ---- observation and judgement ----------------------------------------------------------------------------------
+    # ---- judgement --------------------------------------------------------------------------------------------------
 
-    @property
-    def force_entries(self) -> list[int]:
-        """Entries of the observation that come from the force sensor."""
-        sites = self.site_count**2 if self.memory else 0
-        return [*range(sites), 2 * sites + 2, 2 * sites + 4]
+    def end(self, step: ControlStep) -> str:
+        """A fault, the hard limit, or the end of the budget: "success" or "done"."""
+        if harm := super().end(step):
+            return harm
+        if self.step_count < self.budget:
+            return ""
+        return "success" if self.error <= SUCCESS_ERROR * self.tip_scale else "done"
 
-    def bounds(self, instrument: Instrument | None) -> Bounds:
-        """Bounds of the observation; leaving them is a fault."""
-        sites = self.site_count**2 if self.memory else 0
-        force = math.sqrt(3.0) * self.anatomy.scene.sensor.range / self.limits.hard_force
-        last = [1.0, 1.0, force, DEPTH_BOUND, LOG_CONTRAST_BOUND]
-        high = [*[LOG_CONTRAST_BOUND] * sites, *[1.0] * sites, *last, 1.0]
-        low = [*[-LOG_CONTRAST_BOUND] * sites, *[0.0] * sites, *[-value for value in last], 0.0]
-        return Bounds(np.array(low), np.array(high))
-
-    def _observation(self) -> FloatArray:
-        touch = self.felt.last
-        force = touch.force / self.limits.hard_force
-        depth = touch.depth / self.anatomy.scene.palpation.press_depth
-        left = 1.0 - self.step_count / self.budget
-        last = np.array([*touch.place, force, depth, touch.log_contrast, left])
-        return np.concatenate([self.felt.maps(), last]) if self.memory else last
-
-    def judge(self, simulation: Simulation | None, force_peak: float, fault: str) -> Verdict:
-        """End a press: say what it was worth and whether it was the last; `simulation` is not looked at."""
-        hard = not fault and force_peak > self.limits.hard_force
-        done, failed = self.step_count >= self.budget, bool(fault) or hard
-        over = max(self.limits.excess(force_peak), 0.0)
-        terms = {
-            "error": self.error / self.cutoff / self.budget,
-            "found": self.found - self._found_before,
-            "soft_force": min(over, 1.0) / self.budget,
-            "hard_force": float(hard),
-            "fault": float(bool(fault)),
-            "forgone": 1.0 - self.step_count / self.budget if failed else 0.0,
-        }
-        self._found_before = self.found
-        success = done and not failed and self.error <= SUCCESS_ERROR * self.tip_scale
-        return Verdict(
-            terminated=failed or done,
-            truncated=False,
-            rewards=weighted(terms, PALPATE_SITES_WEIGHTS),
-            info={**self._told(), "hard_limit": hard, "success": success, "force_peak": force_peak, "cost": over},
-        )
-
-    def blank_info(self) -> dict[str, InfoValue]:
-        """The info of a reset: the same keys and types as a verdict's."""
-        return {**self._told(), "hard_limit": False, "success": False, "force_peak": 0.0, "cost": 0.0}
-
-    def _told(self) -> dict[str, InfoValue]:
+    def measures(self) -> dict[str, InfoValue]:
+        """The last press, and the estimate so far."""
         last: Touch = self.felt.last
         return {
             "force": last.force,
@@ -247,7 +329,7 @@ class PalpateSitesTask:
                 "felt": self.felt.get_state(),
                 "step_count": self.step_count,
                 "budget": self.budget,
-                "found_before": self._found_before,
+                "found_before": self._reached["found"],
             }
         )
 
@@ -270,5 +352,5 @@ class PalpateSitesTask:
         self.step_count = table["step_count"]
         self._pending = None
         self._believe()
-        self._found_before = table["found_before"]
+        self._reached = {"found": table["found_before"]}
         return self.drawn.compiled(self.anatomy)

@@ -1,60 +1,203 @@
 """Retraction: grasp a lobe near its free edge and fold it back, so that the endoscope sees what lies under it."""
 
 import json
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import Anatomy
-from surgsim_env.arms.pair import Pair
-from surgsim_env.grasp import Grasp
-from surgsim_env.instrument import Instrument
-from surgsim_env.retraction import Retraction
-from surgsim_env.rewards import RETRACT_WEIGHTS, weighted
-from surgsim_env.scenes import Endoscope, ForceSensor
-from surgsim_env.sensors import ForceReading
-from surgsim_env.simulation import Simulation
-from surgsim_env.tasks.retraction_draw import RetractionDraw, draw_retraction, drawn_organ, lifted_box
-from surgsim_env.tasks.retraction_record import RetractionRecord, region_strains
-from surgsim_env.tasks.task import Bounds, InfoValue, Start, Verdict
-from surgsim_env.visibility import Disc, hiding_geoms, visible
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Capsule, Lesion
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.arm.pair import Pair
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.jaw import Grasp
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_retract_scene, with_instrument
+from surgsim_env.scene.model import Endoscope, Range, Retraction, RetractionCamera
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.task import (
+    SPEED_FULL_SCALE,
+    TIME_LEFT,
+    TIP_POSITION,
+    TIP_VELOCITY,
+    InfoValue,
+    Start,
+    Task,
+    soft_force_share,
+)
+from surgsim_env.tasks.visibility import Disc, hiding_geoms, visible
 
 EPISODE_STEPS = 600
-SPEED_FULL_SCALE = 0.02
-# The wrist's turning [rad/s].
+# Full scale of a command to turn the wrist [rad/s].
 TURNING_FULL_SCALE = 0.5
-# Success: this share of the target is seen for so long [s].
+# Success: this share of the target is visible for this time [s].
 SUCCESS_SHARE = 0.8
 SUCCESS_TIME = 0.5
-# No more of it is seen when an episode begins.
+# Largest share of it that is visible when an episode begins.
 HIDDEN_SHARE = 0.1
 
-# The torque sensor is as good as the force sensor at this lever [m].
+# The torque sensor is the force sensor times this lever [m].
 TORQUE_LEVER = 0.01
-# Bounds of the observation beyond workspace and lobe [m], on speed [m/s], opening [m] and forces [N]; leaving them is a
-# fault.
-POSITION_SLACK = 0.005
+# Bounds of the observation beyond the lobe [m], on unit vectors, on the jaw's opening [m] and on forces [N].
 LOBE_SLACK = 0.1
-SPEED_BOUND = 0.5
+AXIS_BOUND = 1.0 + 1e-6
 OPENING_BOUND = 0.1
 FORCE_BOUND = 200.0
-# Places of the lobe whose nodes are observed: shares of its length along the edge, its depth and its thickness.
-TRACKED = tuple((along, depth, 1.0) for depth in (1.0, 0.5) for along in (0.0, 0.25, 0.5, 0.75, 1.0))
+# Points of the lobe whose nodes are observed, as shares of its length along the edge, its depth and its thickness: a
+# row on the free edge, and one half way to the held edge.
+ALONG = (0.0, 0.25, 0.5, 0.75, 1.0)
+TRACKED = tuple((along, depth, 1.0) for depth in (1.0, 0.5) for along in ALONG)
 
 
-class RetractTask:
-    """SurgSim/Retract-v0 on one anatomy with one instrument that has a jaw."""
+def _lobe_lower(task: "RetractTask", instrument: Instrument) -> FloatArray:
+    return np.tile(task.anatomy.mesh.points.min(axis=0) - LOBE_SLACK, len(ALONG))
 
-    weights = RETRACT_WEIGHTS
-    # Reward terms of what ends an episode in harm; the first that is true counts.
-    failures: tuple[str, ...] = ("fault", "torn", "hard_force")
-    lesions: tuple[Lesion, ...] = ()
+
+def _lobe_upper(task: "RetractTask", instrument: Instrument) -> FloatArray:
+    return np.tile(task.anatomy.mesh.points.max(axis=0) + LOBE_SLACK, len(ALONG))
+
+
+class RetractTask(Task):
+    """Grasp a lobe and fold it back until the endoscope sees what it hides.
+
+    ## Description
+    A lobe of soft tissue, held along one edge, lies on its bed and hides a disc. A robot's jaw grasps it near its free
+    edge, with friction alone, and lifts or folds it until the endoscope sees at least 80 % of the disc for half a
+    second. Tissue and jaw exchange forces 1000 times a second; the agent acts 20 times a second.
+
+    ## Action Space
+    `Box(-1, 1, (4 + n,), float32)`; n numbers turn the wrist: 0 for an instrument that does not turn, 1 or 3.
+
+    ## Observation Space
+    `Box((50,), float32)`, all bounds finite; 6 more (`tip_axes`) for an instrument that turns.
+    `env.unwrapped.observation_slices` has the entries of each channel by its name. With `obs_mode="rgb"` it is the
+    endoscope's picture instead: `Box(0, 255, (84, 84, 3), uint8)`.
+
+    ## Rewards
+    `info["reward_<term>"]` shows what each term paid. What is visible and what is grasped pay by their changes, so that
+    neither can be earned twice. An episode that ends in failure pays less than any that runs its time.
+
+    ## Starting State
+    The lobe's size and stiffness, its capsule, the held share of its edge, the target's place, the endoscope's pose,
+    the sensors' biases and the tip's place are drawn for each episode from the ranges of the scene file. The lobe rests
+    settled on its bed, the jaw is open, and at most 10 % of the target is visible: other draws are repeated.
+
+    ## Episode End
+    Terminated: 80 % of the target were visible for 0.5 s (success); in a haptic step the contact force exceeded the
+    hard limit, or the jaw's pull the strength of the tissue; the simulation faulted (`info["sim_fault"]` says how, the
+    observation is the last finite one). Truncated: 600 control steps (30 s).
+
+    ## Info
+    Fixed keys and types. Of the step: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`,
+    `hard_limit`, `torn`, `success`, `holds` (bool), `visible` (share), `grip_force`, `pull_force`, `friction_left`
+    (what friction could still hold) and `force_peak` [N], `trocar_error_mm`, `added_mass` [kg], one `reward_<term>`
+    each. Of the episode so far: `grip_force_peak`, `grip_force_mean`, `pull_force_peak`, `pull_force_mean` [N] (means
+    over the steps that held something), `pull_impulse` [N s], `slips` (holds that began to slip, or were lost while the
+    jaw was commanded to close), `path_length` of the tip [m], `strain_held`, `strain_middle`, `strain_free`: largest
+    strain of an edge of the mesh in the lobe's thirds, from the held edge to the free one.
+
+    ## Arguments
+    * `scene`: a scene's name or the path of a scene file with a `[retract]` table, or that names such a file, as
+      those of `surgsim organ` do; default "lobe".
+    * `instrument`: the scene's own by default, or the name of an arm with a jaw, or the path of its TOML file.
+
+    ## Version History
+    * v0: first version.
+    """
+
+    commands: ClassVar[tuple[Command, ...]] = (
+        Command("velocity", 3, SPEED_FULL_SCALE, "m/s", "tip velocity along x, y, z"),
+        Command(
+            "turning", lambda task: task.turning_size, TURNING_FULL_SCALE, "rad/s", "rotation of the tip",
+            size_text="0, 1 or 3",
+        ),
+        Command("jaw", 1, meaning="target of the jaw, which moves at its limited speed: -1 closed, 1 open"),
+    )  # fmt: skip
+    channels: ClassVar[tuple[Channel, ...]] = (
+        replace(TIP_POSITION, bounds_text="the lobe's bounding box with a margin"),
+        TIP_VELOCITY,
+        Channel(
+            "tip_axes", lambda task: 6 if task.turning_size else 0, "", -AXIS_BOUND, AXIS_BOUND,
+            read=lambda task, simulation: tip_axes(simulation.instrument),
+            meaning="the tip's x and z axes in the world, of an instrument that turns", size_text="6 or 0",
+        ),
+        Channel(
+            "opening", 1, "m", -OPENING_BOUND, OPENING_BOUND,
+            read=lambda task, simulation: task.grasp.opening, meaning="gap between the pads",
+        ),
+        Channel(
+            "contact_force", 3, "N", sensor=1.0, read=lambda task, simulation: jaw_wrench(simulation)[0],
+            meaning="contact force on the jaw, mean of the last haptic step, through the sensor model",
+        ),
+        Channel(
+            "contact_torque", 3, "N m", sensor=TORQUE_LEVER, read=lambda task, simulation: jaw_wrench(simulation)[1],
+            meaning="its torque about the tip, likewise; its range is the force sensor's times 10 mm",
+        ),
+        Channel(
+            "grip_force", 1, "N", 0.0, FORCE_BOUND, felt=True, read=lambda task, simulation: task.grasp.grip_force,
+            meaning="the smaller of the two pads' normal forces",
+        ),
+        Channel(
+            "pull_force", 1, "N", 0.0, FORCE_BOUND, felt=True, read=lambda task, simulation: task.grasp.pull_force,
+            meaning="size of the sum of both fingers' forces",
+        ),
+        Channel(
+            "holds", 1, "", 0.0, 1.0, read=lambda task, simulation: float(task.grasp.holds),
+            meaning="1 where both pads press tissue",
+        ),
+        Channel(
+            "edge_points", 3 * len(ALONG), "m", _lobe_lower, _lobe_upper,
+            read=lambda task, simulation: simulation.organ_state.node_position[task.tracked_nodes[: len(ALONG)]],
+            meaning="five points of the free edge, on top, along x", bounds_text="the lobe's box and 0.1 m",
+        ),
+        Channel(
+            "middle_points", 3 * len(ALONG), "m", _lobe_lower, _lobe_upper,
+            read=lambda task, simulation: simulation.organ_state.node_position[task.tracked_nodes[len(ALONG) :]],
+            meaning="five points half way to the held edge, likewise", bounds_text="the lobe's box and 0.1 m",
+        ),
+        Channel(
+            "visible", 1, "", 0.0, 1.0, read=lambda task, simulation: task.visible_share,
+            meaning="share of the target that the endoscope sees",
+        ),
+        Channel(
+            "target_place", 2, "m",
+            low=lambda task, instrument: [task.table.target_along[0], task.table.target_distance[0]],
+            high=lambda task, instrument: [task.table.target_along[1], task.table.target_distance[1]],
+            read=lambda task, simulation: task.drawn.target[:2],
+            meaning="x and y of the target", bounds_text="the scene's ranges",
+        ),
+        TIME_LEFT,
+    )  # fmt: skip
+    # `visible` and `grasped` are CHANGES of numbers in [0, 1]: over an episode they sum to the last value less the
+    # first (at most 0.1 visible, nothing grasped), however often it is won and lost again. The worst full episode of n
+    # steps returns at least n (time + soft_force) - 0.1 visible; one that fails after k steps at most
+    # k time + visible + grasped + failure + (n - k) forgone. As forgone = time + soft_force, the first is larger by
+    #   -0.1 visible + k soft_force - visible - grasped - failure  >=  -0.4 - 600 x 0.01 - 4 - 1 + 12  =  0.6  at least:
+    # a failed, faulted or aborted episode never returns more than the worst full one.
+    rewards: ClassVar[tuple[Reward, ...]] = (
+        Reward("time", -0.005, "step", "each control step"),
+        Reward(
+            "soft_force", -0.010, "step", "largest force of the step, 0 at the soft and 1 at the hard limit",
+            soft_force_share,
+        ),
+        Reward("visible", 4.0, "change", "share of the target that is visible", lambda task, step: task.visible_share),
+        Reward("grasped", 1.0, "change", "1 while tissue is between the pads", lambda task, step: task.grasp.holds),
+        Reward("success", 10.0, "success", "visible for long enough"),
+        Reward("torn", -12.0, "failure", "the jaw pulled harder than the tissue bears"),
+        Reward("hard_force", -12.0, "failure", "the force exceeded the hard limit: a safety stop"),
+        Reward("fault", -12.0, "failure", "the simulation could not go on"),
+        Reward("forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less"),
+    )  # fmt: skip
+    default_scene = "lobe"
+    episode_steps = EPISODE_STEPS
     # Whether two arms do it.
-    takes_pair = False
+    takes_pair: ClassVar[bool] = False
+    drawn: "RetractionDraw | None"
 
     def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
         """Retract the lobe of an anatomy.
@@ -74,194 +217,156 @@ class RetractTask:
                 f"scene {scene.name!r}: instrument {scene.instrument.model!r} has no jaw to grasp with; "
                 'take one that has, such as instrument="psm_retractor"'
             )
-        self.anatomy = anatomy
-        self.limits = scene.limits
+        super().__init__(anatomy, instrument)
         self.turning_size = instrument.turning_size
-        self.action_size = 3 + self.turning_size + 1
-        # Where an action has the jaw's target.
-        self.jaw_place = 3 + self.turning_size
-        sensor = scene.sensor
-        self.force_reading = ForceReading(sensor)
-        self.torque_reading = ForceReading(
-            ForceSensor(sensor.noise * TORQUE_LEVER, sensor.bias * TORQUE_LEVER, sensor.range * TORQUE_LEVER)
-        )
         self.tracked_nodes = _nearest_nodes(anatomy.mesh.points, lifted_box(self.table, anatomy.mesh.points))
         self._hiding = hiding_geoms(instrument.model)
-        self.drawn: RetractionDraw | None = None
+        self.grasp: Grasp | None = None
         self.record = RetractionRecord()
-        self.step_count = 0
         self.goal_count = 0
         self.jaw_target = 1.0
         self.visible_share = 0.0
-        self._reached = dict[str, float]()
 
-    # What the environment and pictures ask ---------------------------------------------------------------------------
+    @classmethod
+    def make(cls, scene: str, instrument: str | None = None, **settings: Any) -> tuple[Simulation, Self]:
+        """As `Task.make`, from the scene of retraction that a scene is or names; there are no levels."""
+        anatomy = load_anatomy(with_instrument(make_retract_scene(scene), instrument))
+        simulation = Simulation(anatomy)
+        return simulation, cls(anatomy, simulation.instrument, **settings)
 
     @property
-    def force_limit(self) -> float:
-        """A control step ends with the haptic step whose force passes this, and the episode with it [N]."""
-        return self.limits.hard_force
+    def lesions(self) -> tuple[Lesion, ...]:
+        """A lobe has none."""
+        return ()
 
     @property
     def pull_limit(self) -> float:
-        """Likewise with the pull of the jaw: tissue tears [N]."""
+        """Pull of the jaw at which tissue tears [N]."""
         return self.limits.tear_force
 
     @property
     def target(self) -> Disc | None:
-        """The disc that is to be seen; None before the first episode."""
+        """The disc to uncover; None before the first episode."""
         if self.drawn is None:
             return None
         return Disc(np.array(self.drawn.target), np.array([0.0, 0.0, 1.0]), self.table.target_radius)
 
     @property
     def endoscope(self) -> Endoscope | None:
-        """Where the endoscope stands in this episode; None before the first."""
+        """Pose of the endoscope in this episode; None before the first."""
         if self.drawn is None:
             return None
         return Endoscope(self.drawn.eye, self.drawn.looks_at, self._endoscope.fov_deg)
 
-    def bounds(self, instrument: Instrument) -> Bounds:
-        """Bounds of the observation, from the tip's workspace and the lobe's box [m]."""
-        points = self.anatomy.mesh.points
-        sensor = self.force_reading.sensor
-        wrench = np.repeat([sensor.range, self.torque_reading.sensor.range], 3)
-        tracked = np.tile(points.min(axis=0) - LOBE_SLACK, len(TRACKED))
-        tracked_high = np.tile(points.max(axis=0) + LOBE_SLACK, len(TRACKED))
-        along, distance = self.table.target_along, self.table.target_distance
-        speed, axes = np.full(3, SPEED_BOUND), np.full(6 if self.turning_size else 0, 1.0 + 1e-6)
-        low = [instrument.lower - POSITION_SLACK, -speed, -axes, [-OPENING_BOUND], -wrench, np.zeros(3), tracked]
-        high = [instrument.upper + POSITION_SLACK, speed, axes, [OPENING_BOUND], wrench]
-        high += [[FORCE_BOUND, FORCE_BOUND, 1.0], tracked_high]
-        return Bounds(
-            np.concatenate([*low, [0.0, along[0], distance[0], 0.0]]),
-            np.concatenate([*high, [1.0, along[1], distance[1], 1.0]]),
-        )
-
-    # What scripts ask ------------------------------------------------------------------------------------------------
+    # ---- actions -----------------------------------------------------------------------------------------------
 
     @property
-    def speed_limit(self) -> float:
-        """The fastest that an action can ask the tip to move along an axis [m/s]."""
-        return SPEED_FULL_SCALE
+    def jaw_place(self) -> int:
+        """Index of the jaw's target in an action."""
+        return self.action_slices["jaw"].start
 
-    def action(
-        self, velocity: FloatArray, *, turning: FloatArray | None = None, jaw: float | None = None
-    ) -> FloatArray:
-        """The action that asks for a tip velocity [m/s] (3,), turning [rad/s] and a jaw target; shape (action_size,).
+    def action(self, velocity: FloatArray | None = None, **commands: Any) -> FloatArray:
+        """As `Task.action`; a jaw target that is left out (or None) is the last one."""
+        if commands.get("jaw") is None:
+            commands["jaw"] = self.jaw_target
+        return super().action(velocity, **commands)
 
-        The tip does not turn, and the jaw goes on to its last target, where nothing else is said.
-        """
-        turn = np.zeros(self.turning_size) if turning is None else np.asarray(turning) / TURNING_FULL_SCALE
-        return np.concatenate(
-            [np.asarray(velocity, dtype=np.float64) / SPEED_FULL_SCALE, turn, [self.jaw_target if jaw is None else jaw]]
-        )
+    def command(self, action: FloatArray, instrument: Instrument) -> None:
+        """Set the tip's velocity and rotation, and the jaw's target."""
+        turning = self.commanded(action, "turning") if self.turning_size else None
+        instrument.command_velocity(self.commanded(action, "velocity"), turning)
+        self.command_jaw(float(action[self.jaw_place]), instrument)
 
-    @property
-    def force_entries(self) -> tuple[int, ...]:
-        """The entries of the observation that are forces: the jaw's wrench, its grip and its pull."""
-        first = self._first_force
-        return tuple(range(first, first + 8))
+    def command_jaw(self, target: float, instrument: Instrument) -> None:
+        """Set the jaw's target, limited to [-1, 1]: an action may exceed that by rounding."""
+        self.jaw_target = min(max(target, -1.0), 1.0)
+        instrument.command_jaw(self.jaw_target)
 
-    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
-        """The force sensor's reading in an observation [N], shape (3,)."""
-        first = self._first_force
-        return np.asarray(observation[first : first + 3], dtype=np.float64)
-
-    # An episode ------------------------------------------------------------------------------------------------------
+    # ---- an episode --------------------------------------------------------------------------------------------
 
     def reset(self, rng: np.random.Generator) -> Start:
-        """Draw the lobe, the target, the endoscope, the sensor's bias and the tip's start."""
+        """Draw the lobe, the target, the endoscope, the sensors' biases and the tip's start."""
         self.drawn = draw_retraction(self.table, self._endoscope, rng)
-        self.force_reading.reset(rng)
-        self.torque_reading.reset(rng)
+        for name in ("contact_force", "contact_torque"):
+            self.sensors[name].reset(rng)
         self.record = RetractionRecord()
         self.step_count = self.goal_count = 0
         self.jaw_target = 1.0
         return Start(drawn_organ(self.anatomy, self.drawn), np.array(self.drawn.start))
 
     def accepts(self, simulation: Simulation) -> bool:
-        """Whether the lobe hides the target: at most HIDDEN_SHARE of it is seen."""
+        """Whether the lobe hides the target: at most HIDDEN_SHARE of it is visible."""
+        self.look(simulation)
+        return super().accepts(simulation) and self.visible_share <= HIDDEN_SHARE
+
+    def look(self, simulation: Simulation) -> None:
+        """Read what the jaw holds and how much of the target is visible."""
+        self.grasp = self._grasp(simulation)
         self.visible_share = self._look(simulation)
-        self._reached = self._progress(simulation, self._grasp(simulation))
-        return self.visible_share <= HIDDEN_SHARE
 
-    def command(self, action: FloatArray, instrument: Instrument) -> None:
-        """Set the tip's velocity and turning, and the jaw's target."""
-        turning = action[3:-1] * TURNING_FULL_SCALE if self.turning_size else None
-        instrument.command_velocity(action[:3] * SPEED_FULL_SCALE, turning)
-        self.command_jaw(float(action[-1]), instrument)
+    def update(self, step: ControlStep) -> None:
+        """Add a control step to the record."""
+        simulation = step.simulation
+        self.grasp = self._grasp(simulation)
+        box = lifted_box(self.table, simulation.organ_model.node_rest_position)
+        strain = region_strains(simulation.organ_model, simulation.organ_state.node_position, box)
+        tip = simulation.instrument.tip_position
+        duration = self.anatomy.scene.timing.control_step
+        self.record.note(self.grasp, simulation.pull_peak, tip, strain, self.jaw_target < 0.0, duration)
 
-    def command_jaw(self, target: float, instrument: Instrument) -> None:
-        """Set the jaw's target from -1 to 1; actions may leave that by rounding, the jaw's own command may not."""
-        self.jaw_target = min(max(target, -1.0), 1.0)
-        instrument.command_jaw(self.jaw_target)
+    def end(self, step: ControlStep) -> str:
+        """Harm, or success where the goal has lasted for SUCCESS_TIME."""
+        harm = self.harm(step)
+        self.goal_count = self.goal_count + 1 if not harm and self.at_goal(step.simulation) else 0
+        lasted = self.goal_count >= round(SUCCESS_TIME / self.anatomy.scene.timing.control_step)
+        return harm or ("success" if lasted else "")
 
-    def begin(self, action: FloatArray) -> None:
-        """Begin a control step: count it."""
-        self.step_count += 1
+    def harm(self, step: ControlStep) -> str:
+        """Name of the failure that a control step caused; "" for none."""
+        if step.fault:
+            return "fault"
+        if step.simulation.pull_peak > self.pull_limit:
+            return "torn"
+        return "hard_force" if step.force_peak > self.force_limit else ""
 
-    def observe(self, simulation: Simulation, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """What the table of `RetractEnv` says; and whether a sensor saturated."""
-        instrument, drawn = simulation.instrument, self.drawn
-        assert drawn is not None
-        grasp = self._grasp(simulation)
-        self.visible_share = self._look(simulation)
-        force, torque = self._jaw_wrench(simulation)
-        force, force_cut = self.force_reading.read(force, rng)
-        torque, torque_cut = self.torque_reading.read(torque, rng)
-        values = np.concatenate(
-            [
-                instrument.tip_position,
-                instrument.tip_velocity,
-                self._tip_axes(instrument),
-                [grasp.opening],
-                force,
-                torque,
-                [grasp.grip_force, grasp.pull_force, float(grasp.holds)],
-                simulation.organ_state.node_position[self.tracked_nodes].ravel(),
-                [self.visible_share, drawn.target[0], drawn.target[1], 1.0 - self.step_count / EPISODE_STEPS],
-            ]
-        )
-        return values, force_cut or torque_cut
+    def at_goal(self, simulation: Simulation) -> bool:
+        """Whether the state is the one that has to last for SUCCESS_TIME."""
+        return self.visible_share >= SUCCESS_SHARE
 
-    def judge(self, simulation: Simulation, force_peak: float, fault: str) -> Verdict:
-        """End a control step: see what is seen, what was grasped and what it took.
-
-        Args:
-            simulation: as the step left it.
-            force_peak: largest contact force of its haptic steps [N].
-            fault: what the simulation came to, or an empty string.
-        """
-        harm = self._harm(simulation, force_peak, fault)
-        before, grasp = self._reached, None
-        if not fault:
-            grasp = self._grasp(simulation)
-            self._note(simulation, grasp)
-            self._reached = self._progress(simulation, grasp)
-        at_goal = grasp is not None and not harm and self._at_goal(simulation, grasp)
-        self.goal_count = self.goal_count + 1 if at_goal else 0
-        success = self.goal_count >= round(SUCCESS_TIME / self.anatomy.scene.timing.control_step)
-        terminated = bool(harm) or success
-        excess = self.limits.excess(force_peak)
-        terms = {
-            "time": 1.0,
-            "soft_force": min(max(excess, 0.0), 1.0),
-            **{name: self._reached[name] - before[name] for name in before},
-            "success": float(success),
-            **{name: float(harm == name) for name in self.failures},
-            "forgone": float(EPISODE_STEPS - self.step_count) if harm else 0.0,
+    def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
+        """Forces, the grasp, the visible share and the record; without a grasp after a reset or a fault."""
+        grasp = self.grasp if step is not None and not step.fault else None
+        return {
+            "force_peak": 0.0 if step is None else step.force_peak,
+            "hard_limit": end == "hard_force",
+            "torn": end == "torn",
+            "visible": self.visible_share,
+            "holds": grasp is not None and grasp.holds,
+            "grip_force": 0.0 if grasp is None else grasp.grip_force,
+            "pull_force": 0.0 if grasp is None else grasp.pull_force,
+            "friction_left": 0.0 if grasp is None else grasp.friction_left,
+            **self.record.info(),
+            "success": end == "success",
         }
-        return Verdict(
-            terminated=terminated,
-            truncated=not terminated and self.step_count >= EPISODE_STEPS,
-            rewards=weighted(terms, self.weights),
-            info={**self._info(simulation, grasp, force_peak, harm), "success": success},
-        )
 
-    def blank_info(self) -> dict[str, InfoValue]:
-        """The info of a reset: the same keys and types as a verdict's."""
-        return {**self._info(None, None, 0.0, ""), "success": False}
+    def _look(self, simulation: Simulation, *, past_instruments: bool = True) -> float:
+        """Share of the target that the endoscope sees; hidden by the organ alone where instruments do not count."""
+        instrument, target, drawn = simulation.instrument, self.target, self.drawn
+        assert target is not None and drawn is not None
+        triangles = self.anatomy.mesh.boundary_triangles
+        nodes = simulation.organ_state.node_position
+        hiding = self._hiding if past_instruments else self._hiding[:0]
+        seen = visible(
+            np.array(drawn.eye), target.points(), nodes, triangles, instrument.model, instrument.data, hiding
+        )
+        return float(seen.mean())
+
+    def _grasp(self, simulation: Simulation) -> Grasp:
+        grasp = simulation.grasp
+        assert grasp is not None
+        return grasp
+
+    # ---- saved states ------------------------------------------------------------------------------------------
 
     def get_state(self) -> str:
         """Draw, biases, counters and measures as JSON, exact."""
@@ -270,7 +375,7 @@ class RetractTask:
             {
                 "drawn": self.drawn.to_json(),
                 "record": self.record.to_json(),
-                "bias": [self.force_reading.bias.tolist(), self.torque_reading.bias.tolist()],
+                "bias": [self.sensors[name].bias.tolist() for name in ("contact_force", "contact_torque")],
                 "counts": [self.step_count, self.goal_count],
                 "jaw_target": self.jaw_target,
                 "visible": self.visible_share,
@@ -283,90 +388,30 @@ class RetractTask:
         table = json.loads(text)
         self.drawn = RetractionDraw.from_json(table["drawn"])
         self.record = RetractionRecord.from_json(table["record"])
-        self.force_reading.bias, self.torque_reading.bias = map(np.array, table["bias"])
+        for name, bias in zip(("contact_force", "contact_torque"), table["bias"], strict=True):
+            self.sensors[name].bias = np.array(bias)
         self.step_count, self.goal_count = table["counts"]
         self.jaw_target = table["jaw_target"]
         self.visible_share, self._reached = table["visible"], table["reached"]
         return drawn_organ(self.anatomy, self.drawn)
 
-    # Its parts -------------------------------------------------------------------------------------------------------
 
-    def _harm(self, simulation: Simulation, force_peak: float, fault: str) -> str:
-        """Which of `failures` a control step came to; "" for none."""
-        if fault:
-            return "fault"
-        if simulation.pull_peak > self.pull_limit:
-            return "torn"
-        return "hard_force" if force_peak > self.force_limit else ""
+def jaw_wrench(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
+    """The tissue's force [N] and torque about the tip [N m] on both fingers of a jaw, (3,) each."""
+    instrument = simulation.instrument
+    assert instrument.jaw is not None
+    tools = instrument.jaw.tools
+    wrench = simulation.contact_wrench[tools]
+    levers = instrument.shapes.tool_centre[tools] - instrument.tip_position
+    torque = (wrench[:, 3:] + np.cross(levers, wrench[:, :3])).sum(axis=0)
+    return wrench[:, :3].sum(axis=0), torque
 
-    def _progress(self, simulation: Simulation, grasp: Grasp) -> dict[str, float]:
-        """What is reached, each from 0 to 1: its changes pay."""
-        return {"visible": self.visible_share, "grasped": float(grasp.holds)}
 
-    def _at_goal(self, simulation: Simulation, grasp: Grasp) -> bool:
-        """Whether this is what shall last for SUCCESS_TIME."""
-        return self.visible_share >= SUCCESS_SHARE
-
-    def _look(self, simulation: Simulation, *, past_instruments: bool = True) -> float:
-        """Share of the target that the endoscope sees; past the organ alone where instruments shall not count."""
-        instrument, target, drawn = simulation.instrument, self.target, self.drawn
-        assert target is not None and drawn is not None
-        triangles = self.anatomy.mesh.boundary_triangles
-        nodes = simulation.organ_state.node_position
-        hiding = self._hiding if past_instruments else self._hiding[:0]
-        seen = visible(
-            np.array(drawn.eye), target.points(), nodes, triangles, instrument.model, instrument.data, hiding
-        )
-        return float(seen.mean())
-
-    @property
-    def _first_force(self) -> int:
-        return 7 + (6 if self.turning_size else 0)
-
-    def _grasp(self, simulation: Simulation) -> Grasp:
-        grasp = simulation.grasp
-        assert grasp is not None
-        return grasp
-
-    def _jaw_wrench(self, simulation: Simulation) -> tuple[FloatArray, FloatArray]:
-        """Tissue's force [N] and torque about the tip [N m] on both fingers, (3,) each."""
-        instrument = simulation.instrument
-        assert instrument.jaw is not None
-        tools = instrument.jaw.tools
-        wrench = simulation.contact_wrench[tools]
-        levers = instrument.shapes.tool_centre[tools] - instrument.tip_position
-        torque = (wrench[:, 3:] + np.cross(levers, wrench[:, :3])).sum(axis=0)
-        return wrench[:, :3].sum(axis=0), torque
-
-    def _tip_axes(self, instrument: Instrument) -> FloatArray:
-        """Two axes of the tip in the world, (6,), where it turns; nothing (0,) where it does not."""
-        if not self.turning_size:
-            return np.zeros(0)
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, instrument.tip_pose_in(instrument.data)[1])
-        return rotation.reshape(3, 3)[:, [0, 2]].T.ravel()
-
-    def _note(self, simulation: Simulation, grasp: Grasp) -> None:
-        box = lifted_box(self.table, simulation.organ_model.node_rest_position)
-        strain = region_strains(simulation.organ_model, simulation.organ_state.node_position, box)
-        tip = simulation.instrument.tip_position
-        duration = self.anatomy.scene.timing.control_step
-        self.record.note(grasp, simulation.pull_peak, tip, strain, self.jaw_target < 0.0, duration)
-
-    def _info(
-        self, simulation: Simulation | None, grasp: Grasp | None, force_peak: float, harm: str
-    ) -> dict[str, InfoValue]:
-        return {
-            "force_peak": force_peak,
-            "hard_limit": harm == "hard_force",
-            "torn": harm == "torn",
-            "visible": self.visible_share,
-            "holds": grasp is not None and grasp.holds,
-            "grip_force": 0.0 if grasp is None else grasp.grip_force,
-            "pull_force": 0.0 if grasp is None else grasp.pull_force,
-            "friction_left": 0.0 if grasp is None else grasp.friction_left,
-            **self.record.info(),
-        }
+def tip_axes(instrument: Instrument) -> FloatArray:
+    """The x and z axes of the tip in the world, one after the other, (6,)."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, instrument.tip_pose_in(instrument.data)[1])
+    return rotation.reshape(3, 3)[:, [0, 2]].T.ravel()
 
 
 def _checked_scene(anatomy: Anatomy) -> tuple[Retraction, Endoscope]:
@@ -387,3 +432,227 @@ def _nearest_nodes(points: FloatArray, box: tuple[FloatArray, FloatArray]) -> ND
     low, high = box
     places = low + np.array(TRACKED) * (high - low)
     return np.array([int(np.argmin(((points - place) ** 2).sum(axis=1))) for place in places])
+
+
+# ---- what an episode draws -------------------------------------------------------------------------------------
+
+Vector = tuple[float, float, float]
+
+# A drawn capsule is this thick [m]; what counts is its modulus times this.
+CAPSULE_THICKNESS = 1e-4
+# A target lies this far above its bed [m], so that the bed does not hide it.
+TARGET_LIFT = 1e-4
+
+
+@dataclass(frozen=True)
+class RetractionDraw:
+    """One episode's draw, SI units.
+
+    Args:
+        scale: factor on the whole lobe.
+        youngs_modulus: of its tissue [Pa].
+        capsule_stiffness: modulus times thickness of its capsule [N/m], 0 without one.
+        held_share: which share of the anchored edge is held.
+        target: centre of the disc on the bed [m].
+        eye, looks_at: where the endoscope stands and looks [m].
+        start: the tip's place [m].
+    """
+
+    scale: float
+    youngs_modulus: float
+    capsule_stiffness: float
+    held_share: float
+    target: Vector
+    eye: Vector
+    looks_at: Vector
+    start: Vector
+
+    def to_json(self) -> str:
+        """All of it, exact (numbers are written in full)."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> "RetractionDraw":
+        """What `to_json` wrote."""
+        table: dict[str, Any] = json.loads(text)
+        vectors: dict[str, Any] = {name: tuple(value) for name, value in table.items() if isinstance(value, list)}
+        return cls(**table | vectors)
+
+
+def draw_retraction(table: Retraction, endoscope: Endoscope, rng: np.random.Generator) -> RetractionDraw:
+    """Draw an episode from the ranges of a scene's table, around the scene's endoscope."""
+    scale, modulus = float(rng.uniform(*table.scale)), float(rng.uniform(*table.youngs_modulus))
+    capsule = float(rng.uniform(*table.capsule_stiffness)) if rng.uniform() < table.capsule_share else 0.0
+    held = float(rng.uniform(*table.held_share))
+    target = (_even(table.target_along, rng), _even(table.target_distance, rng), TARGET_LIFT)
+    eye, looks_at = _moved(endoscope, table.camera, rng)
+    start = rng.uniform(table.start_lower, table.start_upper)
+    return RetractionDraw(scale, modulus, capsule, held, target, _vector(eye), _vector(looks_at), _vector(start))
+
+
+def drawn_organ(anatomy: Anatomy, drawn: RetractionDraw) -> OrganModel:
+    """The scene's lobe as an episode has it."""
+    plain = anatomy.specification()
+    mesh = anatomy.mesh
+    capsule = plain.capsule
+    if drawn.capsule_stiffness > 0.0:
+        capsule = Capsule(drawn.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
+    specification = replace(
+        plain,
+        mesh=TetMesh(mesh.points * drawn.scale, mesh.tets, mesh.region, mesh.region_names),
+        materials=replace(anatomy.scene.material, youngs_modulus=drawn.youngs_modulus),
+        capsule=capsule,
+        anchors=held_nodes(mesh.points, anatomy.anchors, drawn.held_share),
+    )
+    return anatomy.compiled(specification)
+
+
+def lifted_box(table: Retraction, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners of the box of what is lifted, of an organ whose nodes are at some places [m]: two of shape (3,)."""
+    if table.flap is None:
+        return points.min(axis=0), points.max(axis=0)
+    return np.array(table.flap.lower), np.array(table.flap.upper)
+
+
+def held_nodes(points: FloatArray, anchors: IntArray, share: float) -> IntArray:
+    """Those of the anchored nodes that lie in the middle share of the edge, along x."""
+    along = points[anchors, 0]
+    middle, half = 0.5 * (along.min() + along.max()), 0.5 * np.ptp(along)
+    # A node that lies on the border by rounding is held.
+    return anchors[np.abs(along - middle) <= share * half * (1.0 + 1e-9)]
+
+
+def _moved(endoscope: Endoscope, camera: RetractionCamera, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """An endoscope moved evenly within a ball, its view turned about an axis across it: where it stands and looks."""
+    way = rng.normal(size=3)
+    shift = way / np.linalg.norm(way) * camera.shift * rng.uniform() ** (1.0 / 3.0)
+    view = np.subtract(endoscope.target, endoscope.position)
+    across = np.cross(view, rng.normal(size=3))
+    across /= np.linalg.norm(across)
+    angle = math.radians(camera.turn_deg) * rng.uniform()
+    # The axis lies across the view, so that turning it (Rodrigues) needs no third term.
+    turned = view * math.cos(angle) + np.cross(across, view) * math.sin(angle)
+    eye = np.asarray(endoscope.position) + shift
+    return eye, eye + turned
+
+
+def _even(bounds: Range, rng: np.random.Generator) -> float:
+    return float(rng.uniform(*bounds))
+
+
+def _vector(values: FloatArray) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+# ---- what is measured over an episode ---------------------------------------------------------------------------
+
+# The lobe's thirds, from the anchored edge to the free one.
+REGIONS = ("held", "middle", "free")
+# A hold slips where friction has less than this share of what it could bear left.
+SLIP_SHARE = 0.02
+
+
+@dataclass
+class RetractionRecord:
+    """Running measures of an episode; `info` names them.
+
+    Fields:
+        steps: control steps so far
+        held_steps: of these, with tissue between the pads
+        grip_peak, pull_peak: largest grip force and pull [N]; the pull's of every haptic step
+        grip_sum, pull_sum: summed over the steps that held something [N]
+        impulse: the pull's integral over time [N s]
+        slips: holds that began to slip, or were lost while the jaw was commanded to close
+        path: length of the path of the tip [m]
+        strain: largest strain of an edge in each of REGIONS, lengthening over length at rest
+    """
+
+    steps: int = 0
+    held_steps: int = 0
+    grip_peak: float = 0.0
+    pull_peak: float = 0.0
+    grip_sum: float = 0.0
+    pull_sum: float = 0.0
+    impulse: float = 0.0
+    slips: int = 0
+    path: float = 0.0
+    strain: list[float] = field(default_factory=lambda: [0.0] * len(REGIONS))
+    slipping: bool = False
+    held: bool = False
+    tip: list[float] | None = None
+
+    def note(
+        self, grasp: Grasp, pull_peak: float, tip: FloatArray, strain: list[float], closing: bool, duration: float
+    ) -> None:
+        """Take in a control step.
+
+        Args:
+            grasp: at its end.
+            pull_peak: largest pull of its haptic steps [N].
+            tip: position at its end [m], (3,).
+            strain: largest strain of each region at its end.
+            closing: whether the jaw's target is nearer to closed than to open.
+            duration: of the step [s].
+        """
+        self.steps += 1
+        if grasp.holds:
+            self.held_steps += 1
+            self.grip_sum += grasp.grip_force
+            self.pull_sum += grasp.pull_force
+        self.grip_peak = max(self.grip_peak, grasp.grip_force)
+        self.pull_peak = max(self.pull_peak, pull_peak, grasp.pull_force)
+        self.impulse += grasp.pull_force * duration
+        slipping = grasp.holds and grasp.friction_left <= SLIP_SHARE * grasp.grip_force
+        lost = self.held and not grasp.holds and closing
+        self.slips += int((slipping and not self.slipping) or lost)
+        self.slipping, self.held = slipping, grasp.holds
+        if self.tip is not None:
+            self.path += float(np.linalg.norm(tip - self.tip))
+        self.tip = tip.tolist()
+        self.strain = [max(one, other) for one, other in zip(self.strain, strain)]
+
+    def info(self) -> dict[str, bool | float | str]:
+        """The measures so far, by the names that `info` has."""
+        held = max(self.held_steps, 1)
+        return {
+            "grip_force_peak": self.grip_peak,
+            "grip_force_mean": self.grip_sum / held,
+            "pull_force_peak": self.pull_peak,
+            "pull_force_mean": self.pull_sum / held,
+            "pull_impulse": self.impulse,
+            "slips": float(self.slips),
+            "path_length": self.path,
+            **{f"strain_{region}": value for region, value in zip(REGIONS, self.strain)},
+        }
+
+    def to_json(self) -> str:
+        """All of it, exact."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> "RetractionRecord":
+        """What `to_json` wrote."""
+        return cls(**json.loads(text))
+
+
+def region_strains(model: OrganModel, node_position: FloatArray, box: tuple[FloatArray, FloatArray]) -> list[float]:
+    """Largest strain of an edge in each third of what is lifted, by the middle of the edge at rest along y.
+
+    The strain of an edge is its lengthening over its length at rest; shortening counts as 0.
+
+    Args:
+        model: the organ.
+        node_position: of its nodes now [m], (n_node, 3).
+        box: corners of the box of what is lifted [m], (3,) each; other edges do not count.
+    """
+    first, second = model.spring_nodes.T
+    lengths = np.linalg.norm(node_position[first] - node_position[second], axis=1)
+    strain = lengths / model.spring_rest_length - 1.0
+    rest = model.node_rest_position
+    middle = 0.5 * (rest[first] + rest[second])
+    lifted = ((middle >= box[0]) & (middle <= box[1])).all(axis=1)
+    low, high = float(box[0][1]), float(box[1][1])
+    share = (len(REGIONS) * (middle[:, 1] - low) / (high - low)).astype(np.int64)
+    third = np.where(lifted, np.minimum(share, len(REGIONS) - 1), -1)
+    return [float(strain[third == region].max(initial=0.0)) for region in range(len(REGIONS))]

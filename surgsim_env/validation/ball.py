@@ -1,13 +1,14 @@
-"""The probe's ball pressed into the phantom by the whole product, against axisymmetric elements."""
+"""End-to-end ball indentation of the phantom against axisymmetric finite elements."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.palpation.scan import press
-from surgsim_env.scenes import BlockMesh, MeshSource, Scene, make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.palpation.press import press
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import BlockMesh, MeshSource, Scene
 from surgsim_env.validation.layer_fem import ball_force, layer
 from surgsim_env.validation.punch import DISC, SIZE
 from surgsim_env.validation.row import Curve, Outcome, compare
@@ -39,7 +40,7 @@ def held_forces(scene: Scene, depths: tuple[float, ...]) -> list[float]:
 
 
 def phantom(cells: int) -> Scene:
-    """The scene `phantom` with so many cells along 6 cm, and substeps to bear them."""
+    """The scene `phantom` with `cells` cells along 6 cm and as many substeps as these need."""
     scene = make_scene("phantom")
     mesh = MeshSource(block=BlockMesh(SIZE, (cells, cells, cells // 2)))
     return replace(scene, mesh=mesh, timing=replace(scene.timing, substep_count=max(4, cells // 3)))
@@ -71,7 +72,7 @@ def ball_on_layer(cells: int, depths: tuple[float, ...]) -> Outcome:
         ),
     )  # fmt: skip
     millimetres = tuple(1e3 * depth for depth in depths)
-    # The reference is the same for every cell size: one line of it will do.
+    # The reference is the same for every cell size and is drawn once.
     lines = ((f"cell {1e3 * cell:.1f} mm", measured), ("reference", reference))[: 2 if cells == 12 else 1]
     labels = ("depth [mm]", "force [N]", False)
     return Outcome(rows, tuple(Curve("ball", label, millimetres, tuple(force), *labels) for label, force in lines))

@@ -1,15 +1,14 @@
-"""A 2 x 2 x 10 cm beam held at one end: bent by a force, swinging, and shaken along its length."""
+"""A 2 x 2 x 10 cm beam held at one end: bending under a force, bending vibration, vibration along its length."""
 
 import math
 
 import numpy as np
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ
-from msdm_core.regions import Material
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Damping, Material
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ
 from surgsim_env.validation.fem import cantilever
 from surgsim_env.validation.motion import fitted_oscillation, released
 from surgsim_env.validation.row import Curve, Outcome, Row, compare, falling
@@ -27,7 +26,7 @@ ALPHA = 4.0 * math.pi  # [1/s] ratio 0.1 at 10 Hz
 
 
 def beam(across: int, alpha: float = 0.0, rule: str = "lloyd") -> tuple[TetMesh, OrganModel]:
-    """The beam with so many cells across, its root z = 0 held."""
+    """The beam with `across` cells across, its root z = 0 held."""
     mesh = box_mesh(SIZE, np.array((2, 2, 10)) * across // 2)
     root = np.flatnonzero(mesh.points[:, 2] < 1e-9)
     material = Material(MODULUS, DENSITY)
@@ -97,7 +96,7 @@ def rod_case(rule: str = "lloyd") -> Outcome:
                 "sqrt(E / rho) / (4 L)", expected=expected, measured=found, tolerance=ROD_TOLERANCE[rule], unit="Hz",
             )
         )  # fmt: skip
-    # Fitted springs leave an error of another sign and origin, which need not fall.
+    # The error of fitted springs has another sign and origin; it need not fall with the cell size.
     return _ordered([("rod, frequency", rows)]) if rule == "lloyd" else Outcome(tuple(rows))
 
 

@@ -6,12 +6,12 @@ capsule, whichever rule makes it.
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray, IntArray, TetMesh
-from msdm_core.meshing import box_mesh, mesh_surface
-from msdm_core.organ import OrganSpec, compile_organ
-from msdm_core.regions import Capsule, Material, boundary_layer
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.scenes import make_scene
+from msdm_core.material.regions import Capsule, Material, boundary_layer
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
+from msdm_core.organ.compile import OrganSpec, compile_organ
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 from surgsim_env.validation.lattice import uniaxial_modulus
 from surgsim_env.validation.membrane import MODULUS, THICKNESS, inflated, patch_around, patch_stiffness, vector_areas
 from surgsim_env.validation.row import Curve, Outcome, Row, compare
@@ -84,7 +84,7 @@ def _ellipsoid(radii: tuple[float, float, float]) -> tuple[FloatArray, IntArray]
 
 
 def _spread(mesh: TetMesh) -> str:
-    """What patches of a surface show along one direction, over E_c h_c."""
+    """Stiffness of patches of a surface along one direction, over E_c h_c, as text."""
     area = np.linalg.norm(vector_areas(mesh.points, mesh.boundary_triangles), axis=1)
     chosen = np.random.default_rng(0).choice(len(area), PATCH_COUNT, replace=False, p=area / area.sum())
     found = [patch_stiffness(mesh, patch_around(mesh.boundary_triangles, one)) for one in chosen.tolist()]
@@ -97,7 +97,7 @@ def _spread(mesh: TetMesh) -> str:
 
 
 def pulled() -> Outcome:
-    """What either rule adds to a pulled block, as a membrane stiffness, at three cell sizes."""
+    """Stiffness that each rule adds to a pulled block, as a membrane stiffness, at three cell sizes."""
     sizes = [SIZE / cells for cells in CELLS]
     meshes = [box_mesh((SIZE,) * 3, (cells,) * 3) for cells in CELLS]
     rows: list[Row] = []

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from msdm_core.meshing import box_mesh
+from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.validation.row import Curve, Outcome, Row, compare
 from surgsim_env.validation.statics import assemble_stiffness, linear_organ, nodal_dofs, solve_displacement
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import eigsh
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.validation.statics import solve_displacement
 
 MISSING = "scikit-fem is not installed (pip install 'surgsim[dev]')"

@@ -1,6 +1,6 @@
 """Springs fitted to the mesh: test A's prism, pulled and twisted, at three Poisson's ratios."""
 
-from msdm_core.fitting import spring_fit
+from msdm_core.material.fitting import spring_fit
 from surgsim_env.validation.fem import clamped_torsion
 from surgsim_env.validation.prism import (
     MODULUS,

@@ -3,18 +3,18 @@
 import mujoco
 import numpy as np
 
-from msdm_core.damping import Damping
-from msdm_core.errors import OrganError
-from msdm_core.kernels import ContactLaw, OrganModel, OrganState
-from msdm_core.measure import contact_energy, kinetic_energy, potential_energy
-from msdm_core.mesh import FloatArray
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Material
-from msdm_core.stability import stable_dt
-from surgsim_env.exchange import haptic_step
-from surgsim_env.timing import substeps_needed
-from surgsim_env.tool_bodies import ToolBodies
+from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel, OrganState
+from msdm_core.material.regions import Damping, Material
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import contact_energy, kinetic_energy, potential_energy
+from msdm_core.organ.stability import stable_dt
+from surgsim_env.coupling.exchange import haptic_steps
+from surgsim_env.coupling.mujoco_library import runs_compiled
+from surgsim_env.instruments.tool_bodies import ToolBodies
+from surgsim_env.scene.model import substeps_needed
 
 HAPTIC_STEP = 1e-3  # [s]
 GRAVITY = 9.81  # [m/s^2], on the tool alone
@@ -63,10 +63,10 @@ def free_ball(mass: float, radius: float, drop: float, *, joint: str = FREE, gra
 
 
 class Coupled:
-    """An organ and a free ball."""
+    """An organ and a free ball that exchange forces."""
 
     def __init__(self, model: OrganModel, ball: ToolBodies, contact: ContactLaw = ELASTIC) -> None:
-        """The organ at rest, the ball as it is."""
+        """Start with the organ at rest and the ball as it is."""
         self.model, self.ball, self.contact = model, ball, contact
         mujoco.mj_forward(ball.model, ball.data)  # its inertia, which `energy` reads
         self.state: OrganState = rest_state(model, shape_count=1)
@@ -75,15 +75,22 @@ class Coupled:
         self._count = substeps_needed(HAPTIC_STEP, stable_dt(model, contact))
 
     def step(self) -> None:
-        """One haptic step."""
-        haptic_step(
-            self.model, self.state, self.ball, self.contact, HAPTIC_STEP / self._count, self._count, self.wrench
+        """Advance by one haptic step.
+
+        Raises:
+            OrganDivergedError: an inverted tet, a number that is not finite, or a force beyond FORCE_CAP.
+        """
+        dt, compiled = HAPTIC_STEP / self._count, runs_compiled()
+        taken = haptic_steps(
+            self.model, self.state, self.ball, self.contact, dt, self._count, self.wrench, compiled=compiled
         )
+        if taken.fault:
+            raise OrganDivergedError(taken.fault)
 
     def energy(self) -> float:
         """Kinetic and potential energy of ball and organ and that of contact, all of the same instant [J].
 
-        After `haptic_step` coordinates and velocities of both are those of the step's end; the shapes are read anew,
+        After a haptic step coordinates and velocities of both are those of the step's end; the shapes are read anew,
         because MuJoCo has placed the ball anew. The ball's height counts from where it would touch the block at rest.
         """
         ball, mass = self.ball, float(self.ball.model.body_mass[1])

@@ -1,7 +1,7 @@
-"""Graded lattices: what the seams between cells h and 2 h cost, and how few nodes and how sound tets they leave.
+"""Graded lattices: what the seams between cells h and 2 h cost, their number of nodes and the quality of their tets.
 
 At a seam tets are not those of a BCC lattice and formula (6) is not isotropic. Fitted springs do not mend that: they
-would leave nodes loose there, and fall back to formula (6) times a scalar (`msdm_core.fitting`).
+would leave nodes loose there, and fall back to formula (6) times a scalar (`msdm_core.material.fitting`).
 """
 
 from dataclasses import replace
@@ -9,11 +9,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.mesh import TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.quality import dihedral_angles
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.scenes import MeshSource, make_scene
+from msdm_core.mesh.quality import dihedral_angles
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import MeshSource
 from surgsim_env.validation import prism, punch
 from surgsim_env.validation.fem import clamped_torsion
 from surgsim_env.validation.lattice import affine_modulus, uniaxial_modulus

@@ -1,18 +1,16 @@
-"""A strip held between the two pads of a jaw: what it carries, how far it stretches and where it slips."""
+"""A strip held between the two pads of a jaw: reaction force, stretch, and the load at which it slips."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Material
-from msdm_core.shapes import round_shapes
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import advance_organ, describe_fault
+from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material.regions import Damping, Material
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import advance_organ, describe_fault, round_shapes
 from surgsim_env.validation.row import Outcome, compare
 
 WIDTH, LENGTH = 0.010, 0.060  # [m]
@@ -25,15 +23,15 @@ PAD_RADIUS = 0.0015  # [m]
 LAW = ContactLaw(stiffness=3e7, damping=100.0, friction=0.2, tangential_stiffness=1.5e7)
 # Of the pads, which are rougher than the law.
 FRICTION = 0.4
-# The load grows by this share at a time until the strip slips: so well is it known where.
+# The load grows in steps of this share until the strip slips: the resolution of the slip load.
 LOAD_STEP = 0.02
-# Sticking springs give by less than 2 mm; a strip that slips falls and falls [m].
+# A sticking strip moves by less than 2 mm; a strip that slips goes on falling [m].
 SLIPPED = 0.002
 
 
 @dataclass(frozen=True, eq=False)
 class HangingStrip:
-    """A strip between two pads that close along x; gravity is told run by run.
+    """A strip between two pads that close along x; each run has its own gravity.
 
     Args:
         model, state: of the strip.
@@ -49,7 +47,7 @@ class HangingStrip:
     def run(
         self, duration: float, *, gravity: float = 0.0, tilt: float = 0.0, closing: float = 0.0, turning: float = 0.0
     ) -> FloatArray:
-        """Go on for a time and give the last wrenches on the pads [N, N m], shape (2, 6).
+        """Advance by a time; returns the last wrenches on the pads [N, N m], shape (2, 6).
 
         Args:
             duration: [s].
@@ -59,7 +57,7 @@ class HangingStrip:
             turning: of both about x, around their middle [rad/s].
 
         Raises:
-            ValueError: the strip came to a fault.
+            ValueError: the simulation of the strip ended with a fault.
         """
         pull = -gravity * np.array([0.0, -np.sin(tilt), np.cos(tilt)])
         pull.setflags(write=False)
@@ -77,7 +75,7 @@ class HangingStrip:
         return wrench
 
     def height(self, level: float) -> float:
-        """Where the nodes that rest at a level are now, on average [m]."""
+        """Mean present position of the nodes that rest at a level [m]."""
         nodes = np.abs(self.model.node_rest_position[:, 2] - level) < 1e-6
         return float(self.state.node_position[nodes, 2].mean())
 
@@ -100,7 +98,7 @@ def grip(wrench: FloatArray) -> float:
 
 
 def gripped_strip(friction: float = FRICTION) -> HangingStrip:
-    """A strip 10 x 10 x 60 mm, its lowest 5 mm heavier by 4 g, gripped with 0.33 N in no gravity and come to rest."""
+    """A strip 10 x 10 x 60 mm, its lowest 5 mm heavier by 4 g, gripped with 0.33 N without gravity, at rest."""
     box = box_mesh((WIDTH, WIDTH, LENGTH), (4, 4, 24))
     low = box.points[box.tets].mean(axis=1)[:, 2] < WEIGHT_HEIGHT
     mesh = TetMesh(box.points, box.tets, np.where(low, 1, 0), {0: "strip", 1: "weight"})
@@ -119,7 +117,7 @@ def gripped_strip(friction: float = FRICTION) -> HangingStrip:
 
 
 def slip(strip: HangingStrip, gravity: float) -> tuple[float, float]:
-    """The largest load that the jaw held and the grip that it had then [N]; it begins with a gravity [m/s^2].
+    """Largest load that the jaw held and the grip at that load [N], starting from a gravity [m/s^2].
 
     Raises:
         ValueError: the strip never slipped.

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.sparse import csr_array
 
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.stiffness import spring_network
+from msdm_core.material.stiffness import spring_network
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.validation.row import Outcome, Row, compare
 from surgsim_env.validation.statics import (
     assemble_stiffness,
@@ -60,7 +60,7 @@ def _cell_tensor(mesh: TetMesh, edges: np.ndarray, stiffness: FloatArray) -> Flo
 
 
 def thick_block(cells: int) -> Outcome:
-    """Uniaxial, shear and bulk modulus of a cube of so many cells at nu 0.25, 0.40 and 0.45."""
+    """Uniaxial, shear and bulk modulus of a cube of cells^3 cells at nu 0.25, 0.40 and 0.45."""
     tolerance = 0.03 if cells >= 12 else 0.04
     size = cells * CELL
     mesh = box_mesh((size,) * 3, (cells,) * 3)

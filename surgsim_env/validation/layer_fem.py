@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import spsolve
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray
 
 Field = Callable[[FloatArray, FloatArray], FloatArray]
 
@@ -68,7 +68,7 @@ def punch_stiffness(body: Layer, radius: float) -> float:
 
 
 def ball_force(body: Layer, radius: float, depth: float, contact_stiffness: float) -> float:
-    """Force of a frictionless ball pressed in [N], small strains, the product's law of contact.
+    """Force of a frictionless ball pressed in [N], small strains, the contact law of this package.
 
     Pressure per undeformed area k_p g (s / R), g = s (s + t) / R, where s^2 = R^2 - r^2 and t is the height of the
     surface over the ball's centre; its points are engaged where s + t > 0 (Newton on the set of these).

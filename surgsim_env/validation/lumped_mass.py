@@ -1,10 +1,10 @@
-"""Masses: Table I of the paper and the sum."""
+"""Lumped masses: Table I of the paper, and the total mass."""
 
 import numpy as np
 
-from msdm_core.lumping import lump_mass, voronoi_fractions
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.meshing import box_mesh
+from msdm_core.material.lumping import lump_mass, voronoi_fractions
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.validation.row import Outcome, Row, compare
 
 PAPER = "Sala 2011, Table I"
@@ -73,7 +73,7 @@ def mass_sum() -> Outcome:
     """Sum of the node masses against density x volume of the block, on a mesh without symmetry."""
     size = np.array([0.02, 0.05, 0.10])
     lattice = box_mesh(size, (4, 10, 20))
-    # A map that keeps the block's faces in place: the volume stays, every tet changes.
+    # This map keeps the faces of the block in place: the volume stays the same, every tet changes.
     inner = np.prod(np.sin(np.pi * lattice.points / size), axis=1)
     mesh = TetMesh(lattice.points + inner[:, None] * np.array([1e-3, -8e-4, 6e-4]), lattice.tets)
     expected = 1060.0 * float(size.prod())

@@ -1,10 +1,10 @@
-"""The springs of a membrane capsule alone: how stiff they are as a sheet, nodes free to move along the surface."""
+"""Stiffness of a membrane capsule's springs alone as a sheet, with nodes free to move along the surface."""
 
 import numpy as np
 from scipy.sparse import block_diag, csr_array
 
-from msdm_core.mesh import FloatArray, IntArray, TetMesh
-from msdm_core.stiffness import membrane_stiffness
+from msdm_core.material.stiffness import membrane_stiffness
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.validation.statics import nodal_dofs, outer_products, solve_displacement
 
 MODULUS, THICKNESS = 1.0e6, 2.0e-5  # [Pa], [m]: those of the scene `liver`
@@ -60,7 +60,7 @@ def patch_stiffness(mesh: TetMesh, triangles: IntArray) -> tuple[float, FloatArr
     moved = stretch[:, free].reshape(len(edges), -1) * np.sqrt(stiffness)[:, None]
     turn = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     strains = [np.eye(2), *(np.outer(v, v) for v in np.stack([np.cos(turn), np.sin(turn)], axis=1))]
-    # What is left of the stretches of the affine strain after the best displacement of the free nodes.
+    # The stretches of the affine strain that remain after the free nodes have relaxed (least squares).
     wanted = np.stack([np.einsum("ei,ij,ej->e", along, strain, span) for strain in strains], axis=1)
     wanted *= np.sqrt(stiffness)[:, None]
     left = wanted - moved @ np.linalg.lstsq(moved, wanted, rcond=None)[0]

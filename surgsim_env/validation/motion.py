@@ -1,14 +1,14 @@
-"""The organ set moving by the product's kernels, and the frequency and decay of what it does."""
+"""Free motion of an organ, computed by the kernels; frequency and decay rate of a signal."""
 
 from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import curve_fit
 
-from msdm_core.kernels import FAULT_NONE, OrganModel, OrganState
-from msdm_core.mesh import FloatArray
-from msdm_core.organ import rest_state
-from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
+from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 
 SAMPLES = 400
 

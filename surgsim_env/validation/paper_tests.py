@@ -1,26 +1,34 @@
-"""Tests A and B of the paper run again: the twisted prism of figure 4, the pressed block of figure 5."""
+"""Tests A and B of the paper, repeated and drawn: the twisted prism of figure 4, the pressed block of figure 5."""
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msdm_core.kernels import FAULT_NONE
-from msdm_core.mesh import FloatArray
-from msdm_core.organ import rest_state
-from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.palpation.scan import press
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from msdm_core.kernels.structure_kernels import FAULT_NONE
+from msdm_core.material.regions import boundary_layer
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.palpation.press import press
+from surgsim_env.palpation.surface_drawing import View
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
 from surgsim_env.validation.prism import torsion_stiffness
-from surgsim_env.validation.row import Outcome, Picture, compare
+from surgsim_env.validation.row import Drawing, Outcome, compare
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 TWIST = math.radians(60.0)  # chosen by eye after the paper's figure 4; the text gives no angle
 TWIST_TIME, REST_TIME = 1.0, 1.0  # [s]
-
 FAR, FAR_TOLERANCE = 0.1, 0.05  # [m] the block's width; share of the displacement beside the tip
+RING = 0.04  # [m] radius of the white circle around the press
+STROMA, PARENCHYMA, GEL = (0.25, 0.40, 0.80), (0.80, 0.25, 0.25), (0.86, 0.80, 0.62)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +56,7 @@ class Deformed:
 
 
 def twist_prism(angle: float = TWIST) -> Deformed:
-    """Test A: turn the top of the prism about its axis, slowly, with the bottom held, and let it come to rest."""
+    """Test A: turn the top of the prism slowly about its axis with the bottom held, then wait until it is at rest."""
     anatomy = load_anatomy(make_scene("agarose_prism"))
     model = anatomy.organ()
     rest = model.node_rest_position
@@ -100,24 +108,22 @@ def run_test_a() -> Outcome:
     row = compare(
         "test A, torque per angle at 5 degrees", "matrix assembled apart, solved by CG", expected=torsion_stiffness(2),
         measured=twist_prism(small).load / small, tolerance=0.01, unit="N m/rad",
-        note="the kernels at rest after a slow twist; how far formula (6) is from a solid says `clamped torsion`",
+        note="the kernels at rest after a slow twist; `clamped torsion` compares formula (6) with a solid",
     )  # fmt: skip
     twisted = twist_prism()
 
     def draw(path: Path) -> None:
-        from surgsim_env.validation.paper_figures import write_figure_4
-
         write_figure_4(twisted, math.degrees(TWIST), path)
 
     caption = (
         f"Test A (the paper's figure 4): the scene `agarose_prism` turned by {math.degrees(TWIST):.0f} degrees, "
         f"{1e3 * twisted.load:.1f} mN m, smallest volume ratio of a tet {twisted.volume_ratio_smallest:.2f}."
     )
-    return Outcome((row,), (), (Picture("paper_figure_4", caption, draw),))
+    return Outcome((row,), (), (Drawing("paper_figure_4", caption, draw),))
 
 
 def run_test_b() -> Outcome:
-    """How little of the block moves with the press, and figure 5."""
+    """The share of the press that the block's far part moves by, and figure 5."""
     pressed = press_block()
     distance, share = settling(pressed)
     depth = pressed.anatomy.scene.palpation.press_depth
@@ -131,8 +137,6 @@ def run_test_b() -> Outcome:
     )  # fmt: skip
 
     def draw(path: Path) -> None:
-        from surgsim_env.validation.paper_figures import write_figure_5
-
         write_figure_5(pressed, path)
 
     caption = (
@@ -140,4 +144,117 @@ def run_test_b() -> Outcome:
         f"{pressed.load:.1f} N, smallest volume ratio of a tet {pressed.volume_ratio_smallest:.2f}; on the upper side, "
         f"displacements of a tenth of that beside the tip end {1e3 * near:.0f} mm away."
     )
-    return Outcome((row,), (), (Picture("paper_figure_5", caption, draw),))
+    return Outcome((row,), (), (Drawing("paper_figure_5", caption, draw),))
+
+
+def oblique(azimuth_deg: float, elevation_deg: float) -> View:
+    """The view from an azimuth about z (0 is from +x) and an elevation [degrees]."""
+    a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
+    eye = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    return View(right, np.cross(eye, right), eye)
+
+
+def draw_triangles(
+    axes: "Axes",
+    corners: FloatArray,
+    colours: FloatArray,
+    view: View,
+    *,
+    wire: bool = False,
+    light: tuple[float, float, float] = (0.3, -0.5, 0.8),
+) -> None:
+    """Triangles (n, 3, 3) [m] from back to front, shaded, or as their edges only."""
+    from matplotlib.collections import PolyCollection
+
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    seen = np.arange(len(corners)) if wire else np.flatnonzero(normal @ view.towards > 0.0)
+    order = seen[np.argsort(corners[seen].mean(axis=1) @ view.towards, kind="stable")]
+    plane = view.flat(corners[order])
+    if wire:
+        lines = PolyCollection(list(plane), facecolors="none", edgecolors=(0.2, 0.3, 0.5), linewidths=0.35)
+        axes.add_collection(lines)
+    else:
+        bright = 0.65 + 0.35 * np.clip(normal[order] @ (np.array(light) / np.linalg.norm(light)), 0.0, 1.0)
+        shaded = np.clip(colours[order] * bright[:, None], 0.0, 1.0)
+        axes.add_collection(PolyCollection(list(plane), facecolors=shaded, edgecolors=(0, 0, 0, 0.35), linewidths=0.3))
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.set_axis_off()
+
+
+def write_figure_4(twisted: Deformed, angle_deg: float, path: Path) -> None:
+    """The prism twisted, as a wireframe and as a body."""
+    from matplotlib.figure import Figure
+
+    mesh = twisted.anatomy.mesh
+    figure = Figure(figsize=(8.0, 6.0), layout="constrained")
+    view = oblique(-60.0, 15.0)
+    left, right = figure.subplots(1, 2)
+    edges = twisted.position[_faces(mesh.tets)]
+    draw_triangles(left, edges, np.zeros((len(edges), 3)), view, wire=True)
+    body = twisted.position[mesh.boundary_triangles]
+    draw_triangles(right, body, np.tile(GEL, (len(body), 1)), view)
+    left.set_title("(a) the network")
+    right.set_title("(b) the body")
+    figure.suptitle(
+        f"Test A: 2 x 5 x 10 cm, E 20 kPa, top turned by {angle_deg:.0f} degrees, both ends held\n"
+        f"{mesh.node_count} nodes, {mesh.tet_count} tets; torque {1e3 * twisted.load:.1f} mN m"
+    )
+    _save(figure, path)
+
+
+def write_figure_5(pressed: Deformed, path: Path) -> None:
+    """The block cut open to show its layer of stroma, pressed, and how its upper side moves away from the press."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    mesh = pressed.anatomy.mesh
+    figure = Figure(figsize=(9.0, 7.5), layout="constrained")
+    structure, body, curve = figure.subplots(3, 1, height_ratios=[1.0, 1.0, 0.9])
+    view = oblique(-75.0, 25.0)
+    half = np.flatnonzero(mesh.points[mesh.tets, 1].mean(axis=1) > pressed.site[1])
+    faces, owner = _outer_faces(mesh.tets[half])
+    layer = boundary_layer(mesh)[half][owner]
+    colours = np.where(layer[:, None], np.array(STROMA), np.array(PARENCHYMA))
+    draw_triangles(structure, mesh.points[faces], colours, view)
+    structure.set_title("(a) cut open: stroma (blue, 60 kPa) and parenchyma (red, 20 kPa)")
+    triangles = mesh.boundary_triangles
+    moved = pressed.displacement[triangles].mean(axis=1) / pressed.displacement.max()
+    draw_triangles(body, pressed.position[triangles], colormaps["viridis"](moved)[:, :3], view)
+    depth = pressed.anatomy.scene.palpation.press_depth
+    ring = np.array([[np.cos(t), np.sin(t), 0.0] for t in np.linspace(0.0, 2.0 * np.pi, 61)]) * RING + pressed.site
+    body.plot(*view.flat(ring).T, "w-", linewidth=2.0)
+    body.set_title(
+        f"(b) pressed {1e3 * depth:.0f} mm with {pressed.load:.1f} N; colour: displacement (dark 0, yellow "
+        f"{1e3 * pressed.displacement.max():.0f} mm); white: {1e2 * RING:.0f} cm around"
+    )
+    distance, share = settling(pressed)
+    curve.plot(1e3 * distance, 100.0 * share, "o", markersize=3)
+    curve.set_xlabel("distance from the press on the upper side [mm]")
+    curve.set_ylabel("displacement\n[% of that beside the tip]")
+    curve.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _faces(tets: IntArray) -> IntArray:
+    """Every face of every tet, once each (n, 3)."""
+    faces = tets[:, TET_FACES].reshape(-1, 3)
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return faces[first]
+
+
+def _outer_faces(tets: IntArray) -> tuple[IntArray, IntArray]:
+    """Faces that belong to one of these tets only, outward (n, 3), and that tet (n,)."""
+    faces = tets[:, TET_FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = first[count == 1]
+    return faces[outer], (outer // 4).astype(np.int32)
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -1,31 +1,30 @@
-"""Whether organ and tool together are passive: a free ball's bounces without losses, and the work of many presses."""
+"""Passivity of organ and tool together: bounces of a free ball without losses, and the work of many presses."""
 
 import numpy as np
 
-from msdm_core.damping import Damping
 from msdm_core.errors import OrganDivergedError
-from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel
-from msdm_core.mesh import FloatArray
-from msdm_core.organ import rest_state
-from msdm_core.shapes import round_shapes
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import advance_organ, describe_fault
-from surgsim_env.timing import substeps_needed
+from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel
+from msdm_core.material.regions import Damping
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import advance_organ, describe_fault, round_shapes
+from surgsim_env.scene.model import substeps_needed
 from surgsim_env.validation.free_tool import BLOCK, FREE, HAPTIC_STEP, UPRIGHT, Coupled, free_ball, small_block
 from surgsim_env.validation.row import Curve, Outcome, Row, compare
 
 RADIUS = 0.010  # [m]
 WINDOW = 100  # [haptic steps]
-# What a scene has switched on.
+# The losses of a scene.
 LOSSY = ContactLaw(stiffness=2e7, damping=100.0, friction=0.2, tangential_stiffness=1e7)
 ALPHA = 25.0  # [1/s]
-# Mass [kg] and height [m]. A low fall has little energy to lose before tissue vibrating under the resting ball could
-# gain some; a high one bounces.
+# Mass [kg] and height [m]. After a low fall little energy is lost before vibrating tissue under the resting ball could
+# gain some; after a high fall the ball bounces.
 OTHER_FALLS = ((0.005, 0.005), (0.02, 0.0005), (0.02, 0.005), (0.1, 0.0005), (0.1, 0.005))
 
 
 def bounces(falls: tuple[tuple[float, float], ...], duration: float = 10.0) -> Outcome:
-    """Balls of a mass [kg] let fall from a height [m]: alpha, friction and contact damping off, for 10 s.
+    """Balls of a mass [kg] that fall from a height [m] for 10 s, without alpha, friction and contact damping.
 
     Energy is that of ball, organ and contact together, from the ball's touching height on: m g h at the start. A ball
     that has sunk in is far below that, so the second row asks that no energy comes back later either.

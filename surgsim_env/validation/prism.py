@@ -5,8 +5,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csr_array
 
-from msdm_core.mesh import TetMesh
-from msdm_core.meshing import box_mesh
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.validation.fem import clamped_torsion
 from surgsim_env.validation.row import Curve, Outcome, Row, compare, falling
 from surgsim_env.validation.statics import (
@@ -27,13 +27,13 @@ TORSION_TOLERANCE = (0.55, 0.31, 0.31 * 2.0 / 3.0)
 
 
 def cell_size(across: int) -> float:
-    """Edge of a cell [m] with so many across the thickness."""
+    """Edge of a cell [m] with `across` cells across the thickness."""
     return SIZE[0] / across
 
 
 @lru_cache(maxsize=4)
 def prism_mesh(across: int) -> TetMesh:
-    """The prism with so many cubic cells along its thickness."""
+    """The prism with `across` cubic cells across its thickness."""
     return box_mesh(SIZE, np.array((2, 5, 10)) * across // 2)
 
 

@@ -5,9 +5,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.regions import Lesion, Material
+from msdm_core.material.regions import Lesion, Material
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.validation.layer_fem import layer, punch_stiffness
 from surgsim_env.validation.row import Curve, Outcome, Row, compare
 from surgsim_env.validation.statics import (
@@ -39,13 +39,13 @@ class Hidden:
 
     @property
     def name(self) -> str:
-        """As the rows call it."""
+        """The sphere in the names of rows."""
         return f"{self.ratio:g} x, cover {1e3 * self.cover:g} mm, radius {1e3 * self.radius:g} mm"
 
 
 @lru_cache(maxsize=32)
 def block_stiffness(cells: int, nu: float, hidden: Hidden | None = None) -> float:
-    """Force per depth of the punch on the block with so many cells along 6 cm [N/m]."""
+    """Force per depth of the punch on the block with `cells` cells along 6 cm [N/m]."""
     return pressed(box_mesh(SIZE, (cells, cells, cells // 2)), nu, hidden)
 
 
@@ -100,7 +100,7 @@ def hayes(counts: tuple[int, ...]) -> Outcome:
 
 
 def reference_check() -> Outcome:
-    """The elements that contrasts and the ball are held against, on a wide disc without inclusion, against Hayes."""
+    """The reference elements of contrasts and ball, on a wide disc without inclusion, against Hayes."""
     return Outcome(
         tuple(
             compare(

@@ -55,7 +55,7 @@ def _share(value: float, row: Row) -> str:
 
 
 def summary(validation: Validation) -> str:
-    """How many rows have which verdict, in one line."""
+    """Number of rows of each verdict, in one line."""
     count: dict[str, int] = dict.fromkeys(("met", "known", "not met", "skipped"), 0)
     for row in validation.rows:
         count[verdict(validation, row)] += 1
@@ -66,7 +66,7 @@ def summary(validation: Validation) -> str:
 
 
 def print_report(validation: Validation, console: Console) -> None:
-    """The table, the reasons of what is not met, and the sum."""
+    """Print the table, the reasons of rows that are not met, and the summary."""
     table = Table()
     for heading in HEADINGS:
         table.add_column(heading, justify="right" if heading in HEADINGS[2:6] else "left", overflow="fold")
@@ -95,16 +95,16 @@ def write_report(validation: Validation, folder: Path) -> Path:
         name = f"validation_{figure}.png"
         write_plot([curve for curve in validation.curves if curve.figure == figure], images / name)
         lines.append(f"\n![{figure.replace('_', ' ')}](images/{name})")
-    for picture in validation.pictures:
-        picture.draw(images / f"{picture.name}.png")
-        lines.append(f"\n{picture.caption}\n\n![{picture.name.replace('_', ' ')}](images/{picture.name}.png)")
+    for drawing in validation.drawings:
+        drawing.draw(images / f"{drawing.name}.png")
+        lines.append(f"\n{drawing.caption}\n\n![{drawing.name.replace('_', ' ')}](images/{drawing.name}.png)")
     path = folder / REPORT_NAME
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
 def write_plot(curves: list[Curve], path: Path) -> None:
-    """One plot of some curves."""
+    """Write a plot of curves."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -113,7 +113,7 @@ def write_plot(curves: list[Curve], path: Path) -> None:
     axes = figure.add_subplot()
     colour = "C0"
     for curve in curves:
-        # A reference is dashed in the colour of what is held against it, the line before.
+        # A reference is dashed and has the colour of the line before it, which is compared with it.
         dashed = curve.label.startswith(REFERENCES)
         (line,) = axes.plot(
             curve.x,

@@ -1,16 +1,15 @@
-"""A free block on what supports it: weight on a plane, rest and sliding on an incline."""
+"""A free block on a support: weight on a plane, rest and sliding on an incline."""
 
 import numpy as np
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import OrganModel, OrganState
-from msdm_core.measure import momentum, support_forces
-from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Material
-from msdm_core.stepping import advance
-from msdm_core.support import Support, SupportLaw
+from msdm_core.kernels.structure_kernels import OrganModel, OrganState
+from msdm_core.material.regions import Damping, Material
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import momentum, support_forces
+from msdm_core.organ.stepping import advance
+from msdm_core.organ.support import Support, SupportLaw
 from surgsim_env.validation.row import Outcome, Row, compare
 
 GRAVITY = 9.81  # [m/s^2]
@@ -79,7 +78,7 @@ def slid(tilt: float, friction: float) -> tuple[float, float]:
 
 
 def crept(tilt: float, friction: float) -> float:
-    """The farthest that any node creeps in half a second on an incline that holds the block [m].
+    """Largest creep of any node in half a second on an incline that holds the block [m].
 
     Half a second before, friction becomes that of the incline: what lies near its limit gives, and the block swings.
     """

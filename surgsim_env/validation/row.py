@@ -1,4 +1,4 @@
-"""What a validation case gives: rows of the table and curves for its plots."""
+"""Results of a validation case: rows of the table, curves of plots, drawings."""
 
 import math
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class Row:
         verdict: "met", "not met" or "skipped".
         unit: SI, empty for a ratio.
         absolute: whether error and tolerance are in `unit` instead of shares of the expected value.
-        note: what a reader should know.
+        note: remark for the reader of the table.
     """
 
     case: str
@@ -53,8 +53,8 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture of its own: file name without ending, what it shows, and what draws it to a path."""
+class Drawing:
+    """A picture that a case draws itself: file name without suffix, caption, and a function that draws it to a path."""
 
     name: str
     caption: str
@@ -63,16 +63,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that one case found."""
+    """All results of one case."""
 
     rows: tuple[Row, ...]
     curves: tuple[Curve, ...] = ()
-    pictures: tuple[Picture, ...] = ()
+    drawings: tuple[Drawing, ...] = ()
 
 
 @dataclass(frozen=True)
 class Case:
-    """A named computation; `slow` ones are left out of a quick run."""
+    """A named computation; a quick run leaves out `slow` ones; `needs_fem` ones need scikit-fem."""
 
     name: str
     run: Callable[[], Outcome]
@@ -121,7 +121,7 @@ def convergence_order(sizes: list[float], errors: list[float]) -> float:
 
 
 def falling(case: str, sizes: list[float], errors: list[float], *, note: str = "") -> Row:
-    """Whether the error's size falls with every finer mesh, and with what order (sizes from coarse to fine)."""
+    """A row that is met if the error falls on every finer mesh; it shows the order (sizes from coarse to fine)."""
     order = convergence_order(sizes, errors)
     falls = bool(np.all(np.diff(np.abs(errors)) < 0.0))
     verdict: Verdict = "met" if falls else "not met"
@@ -140,5 +140,5 @@ def falling(case: str, sizes: list[float], errors: list[float], *, note: str = "
 
 
 def skipped(case: str, source: str, reason: str) -> Row:
-    """A row that could not be worked out here, and why."""
+    """A row of a case that cannot run here, with the reason."""
     return Row(case, source, math.nan, math.nan, math.nan, math.nan, "skipped", note=reason)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from msdm_core.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_WEIGHT
-from msdm_core.kernels import ContactShapes, OrganState
-from msdm_core.mesh import FloatArray
-from msdm_core.organ import rest_state
+from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_WEIGHT
+from msdm_core.kernels.structure_kernels import ContactShapes, OrganState
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.compile import rest_state
 from surgsim_env.validation.row import Outcome, Row, compare
 from surgsim_env.validation.touch import Touch, ball, block
 
@@ -24,7 +24,7 @@ FRICTION_TOLERANCE = 0.05
 
 
 def slide(touch: Touch, line: str, depth: float) -> tuple[FloatArray, OrganState, ContactShapes]:
-    """Forces of the steady part [N] (n, 3), and what is left at its end."""
+    """Forces of the steady part [N] (n, 3), and the simulation at its end."""
     start, direction, count = LINES[line]
     state, shapes = rest_state(touch.model, shape_count=1), ball(start, RADIUS)
     touch.move(state, shapes, (0.0, 0.0, -0.02), round(depth / 2e-5))
@@ -34,7 +34,7 @@ def slide(touch: Touch, line: str, depth: float) -> tuple[FloatArray, OrganState
 
 
 def coulomb(touch: Touch, state: OrganState, shapes: ContactShapes, direction: FloatArray) -> tuple[float, float]:
-    """Friction along the motion as the memory holds it, and mu times the local pressure along it, summed [N].
+    """Friction along the motion from the stored stick-slip state, and mu times the local pressure along it, summed [N].
 
     On a point with the ball's normal e, sliding drags along the motion without its part along e. The pressure is that
     of the law of contact, k_p g (s / r) with g = s (s + t) / r, from the deformed surface.
@@ -104,7 +104,7 @@ def deep_friction(touch: Touch) -> Row:
 
 
 def sticking() -> Row:
-    """Drawn aside below the limit of friction and held: change of the force in half a second over the normal force."""
+    """A ball moved aside below the friction limit: change of the force in half a second over the normal force."""
     soft = block(12)
     touch = Touch.on(soft.model, soft.law._replace(friction=0.8))
     state, shapes = rest_state(touch.model, shape_count=1), ball((0.03, 0.03), RADIUS)

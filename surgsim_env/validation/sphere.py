@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray, IntArray
-from msdm_core.meshing import box_mesh
-from msdm_core.regions import Lesion, Material
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Lesion, Material
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.validation.lattice import affine_modulus
 from surgsim_env.validation.row import Curve, Outcome, Row, compare
 from surgsim_env.validation.statics import DENSITY, assemble_stiffness, linear_organ, nodal_dofs, solve_displacement
@@ -15,7 +15,7 @@ TOLERANCE = 0.05
 SIZE = 0.12  # [m]
 CENTRE = (0.5 * SIZE, 0.5 * SIZE, 0.5 * SIZE)
 PLACE_COUNT = 12
-PLACE_TOLERANCE = 0.02  # no figure is given; the noise that a lesion of contrast 0.2 and more stands out of
+PLACE_TOLERANCE = 0.02  # chosen: a lesion of contrast 0.2 or more stands out of this noise
 REACH = 4.0  # half the body's edge over the sphere's radius
 
 
@@ -84,7 +84,7 @@ def _strain_shares(model: OrganModel, boundary: IntArray, radius: float) -> Floa
 
 
 def anywhere() -> Outcome:
-    """How much what a lesion adds to a sheared block depends on its place within a cell."""
+    """How much the stiffness that a lesion adds to a sheared block depends on its place within a cell."""
     size, cells = 0.5 * SIZE, 12
     mesh = box_mesh((size,) * 3, (cells,) * 3)
     stiff = Material(5.0 * MODULUS, DENSITY)

@@ -1,16 +1,15 @@
-"""The organ linearised at rest as a sparse matrix, put together independently of the kernels, and its solution."""
+"""The organ linearised at rest as a sparse matrix, assembled independently of the kernels, and its solution."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import TET_FACES, FloatArray, TetMesh
-from msdm_core.organ import OrganSpec, compile_organ
-from msdm_core.regions import Lesion, Material
-from msdm_core.stability import apply_stiffness
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Damping, Lesion, Material
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
+from msdm_core.organ.compile import OrganSpec, compile_organ
+from msdm_core.organ.stability import apply_stiffness
 
 DENSITY = 1060.0  # [kg/m^3]
 RESIDUAL = 1e-8  # of the linear solution, relative; energies are then right to its square
@@ -24,7 +23,7 @@ def linear_organ(
     lesions: tuple[Lesion, ...] = (),
     stiffness_rule: str = "lloyd",
 ) -> OrganModel:
-    """A free, undamped organ of one tissue, as the product compiles it."""
+    """A free, undamped organ of one tissue."""
     material = Material(youngs_modulus, DENSITY, poisson_ratio)
     still = Damping(alpha=0.0)
     return compile_organ(OrganSpec(mesh, material, lesions=lesions, damping=still, stiffness_rule=stiffness_rule))
@@ -108,7 +107,7 @@ def solve_displacement(
         right += load[free]
     inner = csr_array(stiffness[free][:, free])
     inverse = 1.0 / np.asarray(inner.diagonal(), dtype=np.float64)
-    # scipy's stubs do not know the factory form of LinearOperator.
+    # scipy's stubs lack the factory form of LinearOperator.
     jacobi = LinearOperator(inner.shape, matvec=lambda x: inverse * x, dtype=np.float64)  # pyright: ignore[reportCallIssue]
     found, code = cg(inner, right, rtol=RESIDUAL, maxiter=20000, M=jacobi)
     if code != 0:

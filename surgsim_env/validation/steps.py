@@ -6,15 +6,14 @@ import numpy as np
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import eigsh
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import OrganModel
-from msdm_core.measure import kinetic_energy, potential_energy
-from msdm_core.mesh import FloatArray
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Capsule, Lesion, Material
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Capsule, Damping, Lesion, Material
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import kinetic_energy, potential_energy
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
 from surgsim_env.validation.motion import followed
 from surgsim_env.validation.row import Outcome, Row, compare
 from surgsim_env.validation.statics import DENSITY, assemble_stiffness
@@ -64,7 +63,7 @@ def largest_growth(model: OrganModel, shape: FloatArray, dt: float, count: int) 
 
 
 def stable_step() -> Outcome:
-    """Stable at 0.95 and unstable at 1.1 of the true limit; the product's own limit just below it."""
+    """Stable at 0.95 and unstable at 1.1 of the true limit; the limit that this package uses lies just below it."""
     rows: list[Row] = []
     for name, model in organs().items():
         omega, shape = fastest_mode(model)
@@ -75,7 +74,7 @@ def stable_step() -> Outcome:
         rows += [
             compare(
                 f"stable step, {name}", "2 / omega_max of the assembled matrix", expected=limit,
-                measured=stable_dt(model), tolerance=0.01, unit="s", note="the product's own figure",
+                measured=stable_dt(model), tolerance=0.01, unit="s", note="the value that this package uses",
             ),
             compare(
                 f"stable at 0.95, {name}", "|z| = 1", expected=1.0, measured=float(calm < 10.0), tolerance=0.0,

@@ -10,14 +10,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from surgsim_env.validation.catalogue import CASES
 from surgsim_env.validation.fem import MISSING, has_fem
-from surgsim_env.validation.row import Case, Curve, Outcome, Picture, Row, skipped
+from surgsim_env.validation.row import Case, Curve, Drawing, Outcome, Row, skipped
 
 SHORTFALLS = Path(__file__).with_name("known_shortfalls.toml")
 
 
 @dataclass(frozen=True)
 class Shortfall:
-    """Why a case is not met, and the largest size of its error for which that reason holds."""
+    """A known shortfall: why a case is not met, and the largest error for which that reason holds."""
 
     reason: str
     error: float
@@ -25,11 +25,11 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Validation:
-    """What a run found: rows, curves and pictures of its cases, whether it was the quick subset, known shortfalls."""
+    """Results of a run: rows, curves and drawings of its cases, whether it was the quick subset, known shortfalls."""
 
     rows: tuple[Row, ...]
     curves: tuple[Curve, ...]
-    pictures: tuple[Picture, ...]
+    drawings: tuple[Drawing, ...]
     quick: bool
     shortfalls: dict[str, Shortfall]
 
@@ -72,7 +72,7 @@ def load_shortfalls(path: Path = SHORTFALLS) -> dict[str, Shortfall]:
 
 
 def run_case(case: Case) -> Outcome:
-    """One case, or a row that says why it was left out."""
+    """The results of one case, or a row with the reason why it was left out."""
     if case.needs_fem and not has_fem():
         return Outcome((skipped(case.name, "scikit-fem", MISSING),))
     return case.run()
@@ -92,5 +92,5 @@ def run_cases(*, quick: bool, console: Console, cases: Sequence[Case] = CASES) -
             progress.advance(task)
     rows = tuple(row for outcome in outcomes for row in outcome.rows)
     curves = tuple(curve for outcome in outcomes for curve in outcome.curves)
-    pictures = tuple(picture for outcome in outcomes for picture in outcome.pictures)
-    return Validation(rows, curves, pictures, quick, shortfalls)
+    drawings = tuple(drawing for outcome in outcomes for drawing in outcome.drawings)
+    return Validation(rows, curves, drawings, quick, shortfalls)

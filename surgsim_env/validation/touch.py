@@ -1,4 +1,4 @@
-"""A ball at rest on the phantom: force from site to site, over a lesion and with depth, and that it is never lost."""
+"""A ball at rest on the phantom: force from site to site, over a lesion and with depth; contact never lets go."""
 
 import math
 from dataclasses import dataclass
@@ -7,14 +7,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.mesh import FloatArray
-from msdm_core.organ import rest_state
-from msdm_core.regions import Lesion
-from msdm_core.shapes import round_shapes
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import advance_organ
-from surgsim_env.anatomy import load_anatomy
+from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material.regions import Lesion
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import advance_organ, round_shapes
+from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.validation.ball import phantom
 from surgsim_env.validation.layer_fem import ball_force, layer
 from surgsim_env.validation.punch import DISC, SIZE, Hidden
@@ -44,7 +43,7 @@ class LostError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """A ball moved as told on an organ: the organ, its law of contact, the substeps in a haptic step."""
+    """A ball with prescribed motion on an organ: the organ, its contact law, the substeps in a haptic step."""
 
     model: OrganModel
     law: ContactLaw
@@ -52,7 +51,7 @@ class Touch:
 
     @classmethod
     def on(cls, model: OrganModel, law: ContactLaw) -> "Touch":
-        """With as many substeps as the organ needs."""
+        """The organ with as many substeps as it needs."""
         return cls(model, law, math.ceil(STEP / (0.95 * stable_dt(model, law))))
 
     def move(self, state: OrganState, shapes: ContactShapes, velocity: ArrayLike, count: int) -> FloatArray:
@@ -88,7 +87,7 @@ def ball(site: ArrayLike, radius: float) -> ContactShapes:
 def block(
     cells: int, *, alpha: float | None = ALPHA, lesions: tuple[Lesion, ...] = (), friction: float | None = None
 ) -> Touch:
-    """The phantom with so many cells along 6 cm; `alpha` [1/s] and `friction` instead of the scene's."""
+    """The phantom with `cells` cells along 6 cm; `alpha` [1/s] and `friction` replace those of the scene."""
     scene = phantom(cells)
     model, law = load_anatomy(scene).organ(lesions), scene.contact.law
     return Touch.on(
@@ -176,7 +175,7 @@ def deep_presses(target: float = 1.2) -> Outcome:
                 touched = force[np.argmax(force > 0.0) :]
                 if fault:
                     faults.append(name)
-                # What lets go without a fault is lost; so is a force that has fallen by a fifth when the fault comes.
+                # Contact is lost if it lets go without a fault, or if the force fell by a fifth before the fault.
                 if force[-1] < 0.8 * force.max() or not (fault or force[-1] >= target):
                     lost.append(name)
                 if speed < 0.1 and (np.diff(touched[9::10]) <= 0.0).any():

@@ -65,7 +65,7 @@ def test_a_policy_is_cloned_in_one_script(dataset, tmp_path, capsys):
 
 def test_a_clone_does_what_was_recorded(dataset):
     from agents.behaviour_cloning import clone_dataset
-    from agents.cloning import CloningOptions
+    from agents.training.cloning import CloningOptions
 
     options = CloningOptions(epochs=300, patience=300, batch_size=32, learning_rate=3e-3)
     policy, curve = clone_dataset(dataset, width=32, options=options)
@@ -80,7 +80,7 @@ def test_a_clone_does_what_was_recorded(dataset):
 
 def test_a_policy_with_a_memory_is_cloned(dataset, tmp_path):
     from agents.behaviour_cloning import clone_dataset
-    from agents.cloning import CloningOptions
+    from agents.training.cloning import CloningOptions
 
     options = CloningOptions(epochs=30, batch_size=1, learning_rate=3e-3)
     policy, curve = clone_dataset(dataset, recurrent=True, width=16, options=options)
@@ -128,7 +128,7 @@ def test_what_cannot_be_recorded_is_refused(folder):
     from agents.record_demonstrations import player, record, write_dataset
 
     env = gym.make("SurgSim/Palpate-v0")
-    with pytest.raises(ValueError, match="seed 1000000 is kept for scores"):
+    with pytest.raises(ValueError, match="seed 1000000 is reserved for scores"):
         record(env, lambda env, seed: None, [1_000_000])
     with pytest.raises(ValueError, match="there is no episode to write"):
         write_dataset([], env, "surgsim/palpate/none-v0", algorithm_name="nobody")

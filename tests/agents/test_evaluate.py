@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents import evaluate, leaderboard
-from agents.results_files import Result, load_results
-from surgsim_env.evaluation.palpation import Figure
+from agents import evaluate
+from agents.scoring import leaderboard
+from agents.scoring.results_files import Result, load_results
+from surgsim_env.palpation.scores import Figure
 
 pytestmark = pytest.mark.agents
 
@@ -120,7 +121,7 @@ def test_a_policy_is_filmed(tmp_path: Path) -> None:
         pytest.skip(f"no pictures on this machine: {error}")
     from moviepy import VideoFileClip
 
-    from agents.policy_video import PICTURE_SIZE, PRESS_PICTURES, RATE, film
+    from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, RATE, film
 
     film(MiddleOfAll(), {"scene": "phantom", "budget": 2}, [5], tmp_path / "out.mp4")
     clip = VideoFileClip(str(tmp_path / "out.mp4"))

@@ -17,7 +17,7 @@ ID = "SurgSim/Palpate-v0"
 
 
 def surrogate(count: int, **settings):
-    from agents.palpate_surrogate import PalpateSurrogate
+    from agents.training.palpate_surrogate import PalpateSurrogate
 
     return PalpateSurrogate(count, **settings)
 
@@ -129,7 +129,7 @@ def test_the_expert_refuses_what_it_cannot_do():
 
     with pytest.raises(ValueError, match="make the environment with memory=True"):
         PalpateExpert(gym.make(ID))
-    with pytest.raises(ValueError, match="scene 'liver' is none: use phantom"):
+    with pytest.raises(ValueError, match="'liver' is not a block: use phantom"):
         PalpateExpert(gym.make(ID, scene="liver", memory=True))
 
 

@@ -10,10 +10,11 @@ from gymnasium.utils.env_checker import check_env
 
 import agents
 from agents import press_library
-from agents.press_library import FIRST_SEED, KEPT, PressLibraryEnv, load_library, make_library
-from surgsim_env.levels import LEVELS
+from agents.press_library import FIRST_SEED, make_library
+from agents.training.press_library import KEPT, PressLibraryEnv, load_library
+from surgsim_env.scene.levels import LEVELS
 
-SAMPLE = Path(agents.__file__).parent / "press_library_sample.npz"
+SAMPLE = Path(agents.__file__).parent / "training" / "press_library_sample.npz"
 
 
 def test_what_is_looked_up_is_what_would_be_simulated(tmp_path, monkeypatch):
@@ -82,7 +83,7 @@ def test_the_sample_is_an_environment_to_learn_on():
 def test_what_is_refused(tmp_path):
     (tmp_path / "no.npz").write_bytes(b"nothing")
     for path in (tmp_path / "no.npz", tmp_path / "gone.npz"):
-        with pytest.raises(ValueError, match="is no library of presses"):
+        with pytest.raises(ValueError, match="is not a library of presses"):
             PressLibraryEnv(path)
     sample = load_library(SAMPLE)
     empty = replace(sample, organs=(), presses=sample.presses[:0])

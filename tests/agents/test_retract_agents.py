@@ -25,7 +25,7 @@ def envs(count: int, mode: str = "Disabled", **settings) -> gym.vector.VectorEnv
 def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
     """Three seeds on two environments: each record is that of a single environment, to the bit; all succeed."""
     from agents.expert_retract import RetractExpert, run_episode
-    from agents.task_episodes import play_tasks, task_figures
+    from agents.scoring.task_episodes import play_tasks, task_figures
 
     seeds = [21, 22, 23]
     records = play_tasks(RetractExpert().act_all, envs(2), seeds)
@@ -64,7 +64,7 @@ def test_forces_are_those_entries_of_the_observation():
     env = gym.make(ID)
     observation, _ = env.reset(seed=3)
     task = env.unwrapped.task  # type: ignore[attr-defined]
-    assert task.force_entries == tuple(range(13, 21))
+    assert task.force_entries == list(range(13, 21))
     np.testing.assert_array_equal(observation[13:16], task.sensed_force(observation).astype(np.float32))
     assert observation[19] == observation[20] == 0.0 and observation[21] == 0.0
 
@@ -73,7 +73,7 @@ def test_forces_are_those_entries_of_the_observation():
 def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypatch, capsys):
     """Two rounds of a few steps; without force the policy sees zeros there, the expert does not."""
     from agents import learn_retract
-    from agents.task_episodes import play_tasks
+    from agents.scoring.task_episodes import play_tasks
     from agents.training.policy_files import load_policy
 
     asked = []

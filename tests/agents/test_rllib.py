@@ -58,7 +58,7 @@ def test_two_workers_learn_and_go_on(tmp_path):
     ("change", "said"),
     [
         ({"steps": 3}, "'steps' is unknown; known are name, algorithm, env_id"),
-        ({"sections": {"runners": {}}}, "section 'runners' is no method of RLlib's AlgorithmConfig"),
+        ({"sections": {"runners": {}}}, "section 'runners' is not a method of RLlib's AlgorithmConfig"),
     ],
 )
 def test_what_the_file_says_is_checked(tmp_path, change, said):

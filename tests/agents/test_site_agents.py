@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents.roster import AGENTS, WORDS, find_agent
-from agents.site_agent import SiteFacts
+from agents.roster import AGENTS, REFERENCES, find_agent
+from agents.scoring.site_agent import SiteFacts
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
 pytestmark = pytest.mark.agents
 FACTS = SiteFacts(extent=(0.04, 0.04), site_count=13, tip_radius=0.008, noise=0.05, budget=25)
-NAMES = [name for name in AGENTS if name not in WORDS]
+NAMES = [name for name in AGENTS if name not in REFERENCES]
 
 
 class Chart:

@@ -10,15 +10,21 @@ import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
 
-from agents.site_agent import SiteFacts
-from agents.site_belief import BeliefSettings, SiteBelief
-from agents.site_policy import CURIOSITY, SHARPNESS, SitePolicy
-from agents.site_process import LENGTH_SHARE, SiteProcess
+from agents.roster import POLICIES
+from agents.scoring.site_agent import LENGTH_SHARE, SiteFacts, SiteProcess
 from agents.training.policy_files import PolicyDescription, load_policy, save_policy
-from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_LENGTH, EXCESS_SPREAD, LesionEstimator
+from agents.training.site_belief import SiteBelief
+from agents.training.site_policy import CURIOSITY, SHARPNESS, SitePolicy
+from surgsim_env.palpation.gaussian_process import (
+    BACKGROUND_SPREAD,
+    EXCESS_LENGTH,
+    EXCESS_SPREAD,
+    MODEL_SPREAD,
+    contrast_process,
+)
 
 pytestmark = pytest.mark.agents
-SETTINGS = BeliefSettings(extent=(0.04, 0.03), site_count=7, tip_radius=0.008, noise=0.04)
+SETTINGS = SiteFacts(extent=(0.04, 0.03), site_count=7, tip_radius=0.008, noise=0.04)
 SITES = SETTINGS.site_count**2
 OUTERMOST = np.pad(np.zeros((5, 5), dtype=bool), 1, constant_values=True).ravel()
 
@@ -37,22 +43,34 @@ def place(site: int) -> tuple[float, float]:
     return column / 6 * SETTINGS.extent[0], row / 6 * SETTINGS.extent[1]
 
 
-def test_belief_is_that_of_the_gaussian_process_agents():
-    """They have it from scikit-learn."""
-    observation = observed({3: 0.1, 17: 0.5, 24: -0.2, 40: 0.05})
-    features = SiteBelief(SETTINGS).features(observation[None])[0].reshape(-1)
-    process = SiteProcess(SiteFacts(SETTINGS.extent, SETTINGS.site_count, SETTINGS.tip_radius, SETTINGS.noise, 25))
-    belief = process.belief(observation)
-    np.testing.assert_allclose(features[:SITES][process.candidates] * EXCESS_SPREAD, belief.excess, atol=1e-6)
-    np.testing.assert_allclose(
-        features[SITES : 2 * SITES][process.candidates] * EXCESS_SPREAD, belief.spread, atol=1e-5
+@pytest.mark.parametrize("pressed", [{3: 0.1, 17: 0.5, 24: -0.2, 40: 0.05}, {24: 0.3}])
+def test_belief_is_that_of_scikit_learn(pressed):
+    """Its process predicts background plus excess; mean and variance of the excess follow from its fitted weights."""
+    from scipy.linalg import solve_triangular
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+    observation = observed(pressed).astype(np.float64)
+    excess = ConstantKernel(EXCESS_SPREAD**2) * RBF(LENGTH_SHARE * EXCESS_LENGTH)
+    peer = GaussianProcessRegressor(
+        ConstantKernel(BACKGROUND_SPREAD**2) + excess,
+        alpha=SETTINGS.noise**2 + MODEL_SPREAD**2,
+        optimizer=None,  # pyright: ignore[reportArgumentType]  (None is documented)
     )
+    sites = np.array([place(site) for site in range(SITES)])
+    peer.fit(sites[list(pressed)], observation[list(pressed)])
+    covariance = excess(sites, peer.X_train_)
+    explained = solve_triangular(peer.L_, covariance.T, lower=True)
+    belief = SiteProcess(SETTINGS).belief(observation)
+    np.testing.assert_allclose(belief.excess, covariance @ peer.alpha_, atol=1e-12)
+    np.testing.assert_allclose(belief.spread, np.sqrt(EXCESS_SPREAD**2 - (explained**2).sum(axis=0)), atol=1e-10)
+    features = SiteBelief(SETTINGS).features(observation[None])[0]
+    np.testing.assert_allclose(features[:SITES] * EXCESS_SPREAD, belief.excess, atol=1e-7)
+    np.testing.assert_allclose(features[SITES : 2 * SITES] * EXCESS_SPREAD, belief.spread, atol=1e-7)
     # A belief of the estimator's own length is another one.
-    estimator = LesionEstimator(SETTINGS.extent, tip_radius=0.008, noise=0.04)
-    estimator.axes = tuple(np.linspace(0.0, extent, 7) for extent in SETTINGS.extent)
-    pressed = [3, 17, 24, 40]
-    _, excess = estimator.posterior(np.array([place(site) for site in pressed]), observation[pressed])
-    assert np.abs(features[:SITES] * EXCESS_SPREAD - excess.ravel()).max() > 0.01
+    longer = contrast_process(SETTINGS.axes, tip_radius=SETTINGS.tip_radius, noise=SETTINGS.noise)
+    _, other = longer.mean(sites[list(pressed)], observation[list(pressed)])
+    assert np.abs(belief.excess - other.ravel()).max() > 0.01
 
 
 def test_doubt_is_that_of_the_joint_normal_distribution():
@@ -69,7 +87,7 @@ def test_doubt_is_that_of_the_joint_normal_distribution():
     prior[-1, -1] = BACKGROUND_SPREAD**2
     seen = np.eye(SITES + 1)[visited]
     seen[:, -1] = 1.0
-    posterior = np.linalg.inv(np.linalg.inv(prior) + seen.T @ seen / belief.noise_variance)
+    posterior = np.linalg.inv(np.linalg.inv(prior) + seen.T @ seen / belief.process.process.noise_variance)
     np.testing.assert_allclose(doubt, np.sqrt(np.diag(posterior)[:-1]), atol=1e-4)
 
 
@@ -93,6 +111,16 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
         np.testing.assert_allclose(one[~hidden], one[~hidden][0], atol=1e-4)
     chosen, _ = policy.predict(features, deterministic=True)
     assert chosen.tolist() == np.where(touched, -np.inf, bound).argmax(axis=1).tolist()
+
+
+@pytest.mark.parametrize("path", sorted(POLICIES.glob("sites_*.zip")), ids=lambda path: path.stem)
+def test_shipped_policies_load(path):
+    """Each zip names its policy's class by module; here in a process that knows none but today's modules."""
+    policy = load_policy(path)
+    assert isinstance(policy.model.policy, SitePolicy) and policy.belief is not None
+    count = policy.belief.site_count**2
+    actions = policy.act(np.zeros((1, 2 * count + 6), dtype=np.float32), np.ones(1, dtype=bool))
+    assert (np.abs(actions) < 1.0).all()
 
 
 def test_a_saved_policy_presses_what_its_scores_say(tmp_path):

@@ -17,13 +17,13 @@ def vector(mode: str = "SameStep"):
 
 
 def adapted():
-    from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
     return VectorEnvForStableBaselines(vector())
 
 
 def test_other_ways_of_resetting_are_refused():
-    from surgsim_env.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
     with pytest.raises(ValueError, match="autoreset_mode is 'NextStep'"):
         VectorEnvForStableBaselines(vector("NextStep"))
@@ -56,8 +56,8 @@ def test_seeds_actions_and_ends_go_through():
 
 
 def test_pictures_go_through():
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
     from surgsim_env.rendering import gl
-    from surgsim_env.stable_baselines import VectorEnvForStableBaselines
 
     try:
         gl.context()

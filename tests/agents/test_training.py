@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,9 +41,9 @@ def table(algorithm: str = "PPO", **changes) -> dict:
 
 def config(algorithm: str = "PPO", **changes):
     from agents.training.config import TrainingConfig
-    from surgsim_env.toml_tables import fill
+    from surgsim_env.scene.load import fill
 
-    return fill(TrainingConfig, table(algorithm, **changes), "test", ())
+    return fill(TrainingConfig, table(algorithm, **changes), "test")
 
 
 # ---- configurations ---------------------------------------------------------------------------------------------
@@ -121,34 +120,39 @@ def test_a_run_leaves_checkpoints_curves_and_policies_that_play(tmp_path: Path, 
     assert train(settings, tmp_path) == 320
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
-def test_a_killed_run_goes_on_and_ends_with_the_same_number_of_steps(tmp_path: Path, algorithm: str):
-    """SIGKILL as soon as a checkpoint is there, as often as it takes to come near the end."""
-    # 30 rollouts of 4 x 16 steps, or of 4 x 4, and a bit: the end is the first whole rollout beyond.
-    told = table(algorithm, total_steps=1930, evaluation={"every": 0})
+# Dies as by SIGKILL from outside, as soon as a checkpoint is there.
+KILLED = """
+import os, signal
+from agents import train
+from agents.training.run import Run
+
+def save_and_die(run, notes, save=Run.save_checkpoint):
+    save(run, notes)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+Run.save_checkpoint = save_and_die
+train.main()
+"""
+
+
+@pytest.mark.parametrize(("algorithm", "kills"), [("PPO", 2), ("SAC", 1)])
+def test_a_killed_run_goes_on_and_ends_with_the_same_number_of_steps(tmp_path: Path, algorithm: str, kills: int):
+    """A run that is killed with its first checkpoint, perhaps with its next one too, comes to its end."""
+    # 5 rollouts of 4 x 16 steps, or of 4 x 4, and a bit: the end is the first whole rollout beyond.
+    told = table(algorithm, total_steps=330, evaluation={"every": 0})
     file, folder = tmp_path / "killed.yaml", tmp_path / "run"
     file.write_text(yaml.safe_dump(told))
-    command = [sys.executable, "-m", "agents.train", str(file), "--out", str(folder), "--no-progress"]
+    given = [str(file), "--out", str(folder), "--no-progress"]
     here = Path(__file__).parents[2]
     settings = {"cwd": here, "env": {**os.environ, "PYTHONPATH": str(here)}, "stdout": subprocess.PIPE, "text": True}
-    seen, kills = set(), 0
-    for _ in range(2):
-        process = subprocess.Popen(command, **settings)
-        while process.poll() is None:
-            there = {path.name for path in (folder / "checkpoints").glob("*") if not path.suffix}
-            if there - seen:
-                process.send_signal(signal.SIGKILL)
-                process.wait()
-                seen |= there
-                kills += process.returncode == -signal.SIGKILL
-                break
-            time.sleep(0.005)
-    assert kills == 2, "the run was over before it was killed"
+    for _ in range(kills):
+        killed = subprocess.run([sys.executable, "-c", KILLED, *given], **settings)
+        assert killed.returncode == -signal.SIGKILL
     # A checkpoint that was being written when it was killed.
     (folder / "checkpoints" / "999999999999.unfinished").mkdir()
-    last = subprocess.run(command, check=True, **settings)
-    assert "going on from" in last.stdout
-    wanted = 1984 if algorithm == "PPO" else 1936
+    last = subprocess.run([sys.executable, "-m", "agents.train", *given], check=True, **settings)
+    assert "resuming from" in last.stdout
+    wanted = 384 if algorithm == "PPO" else 336
     assert f"{wanted} steps" in last.stdout
     assert sorted(path.name for path in (folder / "final").iterdir()) == [f"{wanted:012d}"]
     assert not list((folder / "checkpoints").glob("*.unfinished"))

@@ -4,10 +4,11 @@ import re
 
 import pytest
 
-from surgsim_env.bench import effort, newton_peer, side_by_side, start
-from surgsim_env.bench.effort import Effort
-from surgsim_env.bench.figures import AbsentError
-from surgsim_env.cli import main
+from surgsim_env.bench import measurement as effort
+from surgsim_env.bench import newton_peer, side_by_side, start
+from surgsim_env.bench.measurement import Effort
+from surgsim_env.bench.report import AbsentError
+from surgsim_env.cli.main import main
 
 TINY = Effort(
     blocks=((4, 4, 4), (7, 7, 5), (8, 8, 5)), substep_rounds=1, scenes=("bovine_liver_block",), haptic_steps=20,

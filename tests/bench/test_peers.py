@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from surgsim_env.bench import newton_peer, side_by_side
-from surgsim_env.bench.figures import AbsentError
 from surgsim_env.bench.flex import Flex, contact_force, fastest_within
 from surgsim_env.bench.newton_peer import Newton
 from surgsim_env.bench.presses import DEPTH, Contender, DivergedError, Pressed, ball_height, step_count
+from surgsim_env.bench.report import AbsentError
 
 BALL = """<mujoco><option gravity="0 0 -9.81" timestep="0.001"/><worldbody><geom type="plane" size="1 1 1"/>
 <body pos="0 0 0.01"><freejoint/><geom type="sphere" size="0.01" mass="0.2"/></body></worldbody></mujoco>"""

@@ -1,8 +1,6 @@
 """Figures as lines and tables: names without blanks, what is absent said with its reason, notes kept."""
 
-from surgsim_env.bench.figures import Figure, Section, absent
-from surgsim_env.bench.machine import describe, version
-from surgsim_env.bench.report import NOTES_NAME, REPORT_NAME, write_report
+from surgsim_env.bench.report import NOTES_NAME, REPORT_NAME, Figure, Section, absent, describe, version, write_report
 
 SECTION = Section(
     "press",

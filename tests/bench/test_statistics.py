@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from surgsim_env.bench.statistics import exponent, interleaved, median, quantile, seconds_per_call, spread
+from surgsim_env.bench.measurement import exponent, interleaved, median, quantile, seconds_per_call, spread
 
 
 def test_median():

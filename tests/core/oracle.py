@@ -1,6 +1,7 @@
 """The organ's forces, step and contact energy again, in plain numpy straight from the equations; small organs.
 
-Slow on purpose: one spring, one tet, one surface triangle at a time, no code shared with msdm_core/kernels.py.
+Slow on purpose: one spring, one tet, one surface triangle at a time, no code shared with
+msdm_core/kernels/substep_kernels.py.
 """
 
 import math
@@ -8,16 +9,14 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.mesh import TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.ordering import spring_order
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Material
-from msdm_core.shapes import round_shapes
-from msdm_core.stability import largest_frequency, step_limit
-from msdm_core.stepping import advance_organ
+from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material.regions import Damping, Material
+from msdm_core.mesh.ordering import spring_order
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.stability import largest_frequency, step_limit
+from msdm_core.organ.stepping import advance_organ, round_shapes
 
 FloatArray = NDArray[np.float64]
 

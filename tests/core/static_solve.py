@@ -11,7 +11,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay
 
-from msdm_core.mesh import TetMesh, tet_volumes
+from msdm_core.mesh.tet_mesh import TetMesh, tet_volumes
 
 FloatArray = NDArray[np.float64]
 

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from msdm_core.damping import Damping
 from msdm_core.errors import OrganError
-from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.measure import inverted_tets
-from msdm_core.organ import rest_state
-from msdm_core.regions import Material
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import advance
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.scenes import make_scene
+from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material.regions import Damping, Material
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.measure import inverted_tets
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import advance
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
 from tests.core import oracle
 
 

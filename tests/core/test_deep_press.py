@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from msdm_core.errors import OrganDivergedError
-from msdm_core.kernels import OrganModel, OrganState
-from msdm_core.measure import inverted_tets, volume_ratios
-from msdm_core.organ import rest_state
-from msdm_core.stepping import advance
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from msdm_core.kernels.structure_kernels import OrganModel, OrganState
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.measure import inverted_tets, volume_ratios
+from msdm_core.organ.stepping import advance
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
 from tests.core import oracle
 
 HAPTIC_STEP = 1e-3  # [s]

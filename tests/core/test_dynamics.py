@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msdm_core.damping import Damping
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import ContactLaw, OrganModel, OrganState
-from msdm_core.measure import (
+from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel, OrganState
+from msdm_core.material.regions import Damping, Material
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import (
     angular_momentum,
     internal_forces,
     inverted_tets,
@@ -18,10 +20,7 @@ from msdm_core.measure import (
     potential_energy,
     volume_ratios,
 )
-from msdm_core.mesh import TetMesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Material
-from msdm_core.stepping import advance
+from msdm_core.organ.stepping import advance
 from tests.core import oracle
 
 EXACT = 1e-12

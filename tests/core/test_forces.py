@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import SCRATCH_FIELDS, ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.measure import internal_forces, potential_energy, volume_ratios
-from msdm_core.organ import rest_state
-from msdm_core.stepping import advance, advance_organ
+from msdm_core.kernels.structure_kernels import SCRATCH_FIELDS, ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material.regions import Damping
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.measure import internal_forces, potential_energy, volume_ratios
+from msdm_core.organ.stepping import advance, advance_organ
 from tests.core import oracle
 
 SEEDS = (0, 1, 2)

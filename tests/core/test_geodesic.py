@@ -3,8 +3,8 @@
 import numpy as np
 import trimesh
 
-from msdm_core.geodesic import surface_distance
-from msdm_core.meshing import box_mesh
+from msdm_core.mesh.geodesic import surface_distance
+from msdm_core.meshing.lattice_meshing import box_mesh
 
 # Paths between Steiner points are never shorter than the geodesic and, over several triangles, at most 2 % longer.
 LONGEST = 1.02

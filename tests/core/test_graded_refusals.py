@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from msdm_core.errors import MeshError
-from msdm_core.meshing import box_mesh, mesh_surface
+from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 
 
 @pytest.mark.parametrize(

@@ -13,17 +13,17 @@ from msdm_core import numba_cache
 
 USE = """
 import msdm_core
-from msdm_core.tissue_kernels import set_node_tension
+from msdm_core.kernels.tissue_kernels import set_node_tension
 import numpy as np
 total = np.array([48.0])
-set_node_tension(total, np.ones(1), np.ones(1))
+set_node_tension((), total, np.ones(1), np.ones(1))
 print(total[0], sum(set_node_tension.stats.cache_hits.values()))
 """
 
 
 USE_HAPTIC = """
 import numpy as np
-from surgsim_env.haptic_kernels import total_force
+from surgsim_env.coupling.haptic_kernels import total_force
 print(total_force(np.full((1, 6), 2.0)) ** 2, sum(total_force.stats.cache_hits.values()))
 """
 
@@ -44,7 +44,7 @@ def test_an_edit_in_another_file_is_seen(tmp_path):
     # (48 / 24 - 1) is the strain of a volume twice as large as at rest.
     assert run(tmp_path) == ["1.0", "0"]
     assert run(tmp_path) == ["1.0", "1"], "the second start compiled again"
-    equations = package / "element_kernels.py"
+    equations = package / "kernels" / "element_kernels.py"
     text = equations.read_text(encoding="utf-8")
     assert text.count("24.0)) - 1.0)") == 1
     equations.write_text(text.replace("24.0)) - 1.0)", "24.0)) - 0.5)"), encoding="utf-8")
@@ -58,7 +58,7 @@ def test_the_environments_kernels_see_an_edit_in_the_organs(tmp_path):
         shutil.copytree(source, tmp_path / source.name, ignore=shutil.ignore_patterns("__pycache__"))
     assert run(tmp_path, USE_HAPTIC)[1] == "0"
     assert run(tmp_path, USE_HAPTIC)[1] == "1", "the second start compiled again"
-    with (tmp_path / "msdm_core" / "element_kernels.py").open("a", encoding="utf-8") as equations:
+    with (tmp_path / "msdm_core" / "kernels" / "element_kernels.py").open("a", encoding="utf-8") as equations:
         equations.write("# edited\n")
     assert run(tmp_path, USE_HAPTIC)[1] == "0", "stale machine code would be run"
 

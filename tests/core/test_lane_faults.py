@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from msdm_core.kernels import (
+from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
     FAULT_INVERTED_TET,
     FAULT_NONE,
     FAULT_NOT_FINITE,
+    LANE_EMPTY,
     ContactShapes,
     OrganModel,
     OrganState,
     ToolResponse,
 )
-from msdm_core.lane_organs import set_lane
-from msdm_core.lane_view_kernels import LANE_EMPTY
-from msdm_core.lanes import advance_lanes, get_lane, lane_shapes, put_lane
-from msdm_core.organ import rest_state
-from msdm_core.stepping import advance_organ, describe_fault, unyielding
+from msdm_core.lanes.lane_organs import set_lane
+from msdm_core.lanes.lanes import advance_lanes, get_lane, lane_shapes, put_lane
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stepping import advance_organ, describe_fault, unyielding
 from tests.core.test_lanes import LAW, SUBSTEP, SUBSTEPS, pressed_organs, pressing, same, tool, varied, yielding
 
 

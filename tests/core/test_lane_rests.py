@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels import ContactShapes, OrganModel, OrganState
-from msdm_core.lane_organs import same_rest, set_lane, stack_organs
-from msdm_core.lane_view_kernels import LaneModel, LaneState
-from msdm_core.lanes import advance_lanes, get_lane, lane_shapes, put_lane, rest_lanes, stack_shapes
-from msdm_core.mesh import TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Material
-from msdm_core.stepping import advance_organ, describe_fault
-from msdm_core.support import Support, SupportLaw
+from msdm_core.kernels.structure_kernels import ContactShapes, LaneModel, LaneState, OrganModel, OrganState
+from msdm_core.lanes.lane_organs import same_rest, set_lane, stack_organs
+from msdm_core.lanes.lanes import advance_lanes, get_lane, lane_shapes, put_lane, rest_lanes, stack_shapes
+from msdm_core.material.regions import Material
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.stepping import advance_organ, describe_fault
+from msdm_core.organ.support import Support, SupportLaw
 from tests.core import oracle
 from tests.core.test_lanes import DAMPED, LAW, SUBSTEP, SUBSTEPS, same, varied
 

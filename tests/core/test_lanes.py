@@ -10,22 +10,22 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys
 from numpy.typing import NDArray
 
-from msdm_core.damping import Damping
 from msdm_core.errors import OrganError
-from msdm_core.kernels import (
+from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
+    LANE_EMPTY,
     SCRATCH_FIELDS,
     ContactLaw,
     ContactShapes,
+    LaneModel,
+    LaneState,
     OrganModel,
     OrganState,
     ToolResponse,
-    evaluate_forces,
 )
-from msdm_core.lane_kernels import advance_lane_substeps, evaluate_lane_forces
-from msdm_core.lane_organs import set_lane, stack_organs
-from msdm_core.lane_view_kernels import LANE_EMPTY, LaneModel, LaneState
-from msdm_core.lanes import (
+from msdm_core.kernels.substep_kernels import advance_substeps, evaluate_forces
+from msdm_core.lanes.lane_organs import set_lane, stack_organs
+from msdm_core.lanes.lanes import (
     advance_lanes,
     get_lane,
     lane_responses,
@@ -34,8 +34,9 @@ from msdm_core.lanes import (
     rest_lanes,
     stack_shapes,
 )
-from msdm_core.organ import rest_state
-from msdm_core.stepping import advance_organ, unyielding
+from msdm_core.material.regions import Damping
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stepping import advance_organ, unyielding
 from tests.core import oracle
 
 LAW = ContactLaw(stiffness=2e7, damping=500.0, friction=0.4, tangential_stiffness=1e7)
@@ -109,7 +110,7 @@ def test_forces_are_those_of_the_organ_alone(term: str, beta: float, gravity: fl
     for lane, state in enumerate(states):
         put_lane(lanes, lane, state)
     lanes.moving[:] = 1.0
-    evaluate_lane_forces(model, lanes)
+    evaluate_forces(model, lanes)
     for lane, (organ, state) in enumerate(zip(organs, states)):
         evaluate_forces(organ, state)
         assert np.abs(state.node_force).max() > 1e-4
@@ -282,9 +283,9 @@ def test_the_loop_allocates_nothing(substeps: int):
     model, state, shapes, response, wrench = pressing(pressed_organs())
     reference = shapes.tool_centre.copy()
     given = (model, state, shapes, LAW, response, SUBSTEP, 1.0, substeps, reference, wrench)
-    advance_lane_substeps(*given)
+    advance_substeps(*given)
     arrays = sum(isinstance(value, np.ndarray) for part in (model, state, shapes, response) for value in part) + 2
-    assert allocations(advance_lane_substeps, *given) == arrays
+    assert allocations(advance_substeps, *given) == arrays
     assert state.contact_engaged.any(axis=(1, 2)).all() and not state.lane_fault.any()
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh import TetMesh
+from msdm_core.mesh.tet_mesh import TetMesh
 
 TET = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TWO = np.vstack([TET, [[1.0, 1, 1]]])

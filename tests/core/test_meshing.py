@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from msdm_core import stuffing
 from msdm_core.errors import MeshError
-from msdm_core.mesh import TetMesh
-from msdm_core.meshing import box_mesh, mesh_surface
-from msdm_core.quality import dihedral_angles, mesh_quality, radius_ratios
+from msdm_core.mesh.quality import dihedral_angles, mesh_quality, radius_ratios
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.meshing import stuffing
+from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 
 ANATOMY = Path(__file__).parents[3] / "shared" / "data" / "anatomy"
 

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import OrganDivergedError
-from msdm_core.kernels import OrganModel, OrganState
-from msdm_core.organ import rest_state
+from msdm_core.kernels.structure_kernels import OrganModel, OrganState
+from msdm_core.organ.compile import rest_state
 from tests.core import oracle
 from tests.core.test_contact import phantom, phantom_organ, rises, step
 

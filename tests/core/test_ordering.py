@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
-from msdm_core.mesh import TetMesh, tet_volumes
-from msdm_core.meshing import box_mesh
-from msdm_core.ordering import EDGE_FIRST, GAP, in_sweep_order, spring_order, swept
-from msdm_core.organ import OrganSpec, compile_organ
+from msdm_core.mesh.ordering import EDGE_FIRST, GAP, in_sweep_order, spring_order, swept
+from msdm_core.mesh.tet_mesh import TetMesh, tet_volumes
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ
 from tests.core import oracle
 
 BLOCK = box_mesh((0.06, 0.06, 0.03), (12, 12, 6))

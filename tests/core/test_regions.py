@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import MeshError, OrganError
-from msdm_core.lumping import lump_mass
-from msdm_core.mesh import TET_FACES, TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ
-from msdm_core.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
-from msdm_core.stiffness import spring_network
+from msdm_core.material.lumping import lump_mass
+from msdm_core.material.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
+from msdm_core.material.stiffness import spring_network
+from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ
 from tests.core import oracle
 
 HEALTHY = Material(youngs_modulus=5000.0, density=1060.0, poisson_ratio=0.45)

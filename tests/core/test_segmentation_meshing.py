@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh import TetMesh
-from msdm_core.quality import mesh_quality
-from msdm_core.regions import Lesion, Material, lesion_extent
-from msdm_core.segmentation_meshing import fill_labels, mesh_segmentation
+from msdm_core.material.regions import Lesion, Material, lesion_extent
+from msdm_core.mesh.quality import mesh_quality
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.meshing.segmentation_meshing import fill_labels, mesh_segmentation
 
 HALF_AXES = np.array([0.040, 0.030, 0.025])
 NAMES = {1: "liver", 2: "lesion"}
@@ -79,7 +79,7 @@ def test_regions_keep_volume_and_place():
 
 def test_extent_of_a_region_that_is_an_ellipsoid_of_whole_tets():
     """Variances of tets are exact: a block of them has L^2 / 12 along each axis, an ellipsoid a^2 / 5."""
-    from msdm_core.meshing import box_mesh
+    from msdm_core.meshing.lattice_meshing import box_mesh
 
     block = box_mesh((0.06, 0.04, 0.02), (6, 4, 2))
     mesh = TetMesh(block.points, block.tets, np.full(block.tet_count, 7), {7: "all"})

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msdm_core.element_kernels import SQUEEZED_RATIO
-from msdm_core.mesh import tet_volumes
-from msdm_core.squeeze_kernels import hold_squeezed
+from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
+from msdm_core.kernels.squeeze_kernels import hold_squeezed
+from msdm_core.mesh.tet_mesh import tet_volumes
 from tests.core.test_deep_press import SITES, organ, press
 
 DT = 3e-4

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.organ import rest_state
-from msdm_core.regions import Material
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material.regions import Damping, Material
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
 from tests.core import oracle
 
 KNOCK = 1e-11  # [m]

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
-from msdm_core.measure import internal_forces
-from msdm_core.mesh import TetMesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.stability import apply_stiffness, contact_node_area, contact_node_stiffness, stable_dt, step_limit
-from msdm_core.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import internal_forces
+from msdm_core.organ.stability import apply_stiffness, contact_node_area, contact_node_stiffness, stable_dt, step_limit
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
 from tests.core import oracle
 
 

@@ -8,13 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels import OrganModel
-from msdm_core.measure import potential_energy
-from msdm_core.mesh import TetMesh
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from msdm_core.regions import Capsule, Material
-from msdm_core.stiffness import membrane_stiffness, spring_network
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Capsule, Material
+from msdm_core.material.stiffness import membrane_stiffness, spring_network
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import potential_energy
 from tests.core import oracle
 
 MODULUS = 4000.0  # [Pa]

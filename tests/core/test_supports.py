@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msdm_core import settling
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
-from msdm_core.lane_organs import stack_organs
-from msdm_core.lanes import advance_lanes, get_lane, rest_lanes, stack_shapes
-from msdm_core.measure import kinetic_energy, momentum, potential_energy, support_forces
-from msdm_core.organ import rest_state
-from msdm_core.stability import stable_dt
-from msdm_core.stepping import advance, advance_organ
-from msdm_core.support import Support, SupportLaw
+from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
+from msdm_core.lanes.lane_organs import stack_organs
+from msdm_core.lanes.lanes import advance_lanes, get_lane, rest_lanes, stack_shapes
+from msdm_core.organ import settling
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.measure import kinetic_energy, momentum, potential_energy, support_forces
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import advance, advance_organ
+from msdm_core.organ.support import Support, SupportLaw
 from surgsim_env.validation.resting import FLOOR, GRAVITY, crept, free_block, on_incline, run, slid
 from tests.core import oracle
 from tests.core.test_stable_step import growth

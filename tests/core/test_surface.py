@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from msdm_core.errors import MeshError
-from msdm_core.surface import check_surface, line_hits, merge_vertices, surface_volume
+from msdm_core.mesh.surface import check_surface, line_hits, merge_vertices, surface_volume
 
 ANATOMY = Path(__file__).parents[3] / "shared" / "data" / "anatomy"
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh_io import read_surface
+from msdm_core.mesh_files.surface_io import read_surface
 
 CORNERS = np.array([[0.0, 0, 0], [60, 0, 0], [0, 60, 0], [0, 0, 60]])
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, compile_organ
-from msdm_core.regions import Material
-from msdm_core.volume import averaged_volume_modulus, nodal_average
+from msdm_core.material.regions import Material, averaged_volume_modulus, nodal_average
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, compile_organ
 
 BLOCK = box_mesh((0.04, 0.03, 0.03), (4, 3, 3))
 

@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.arms.port import Port
-from surgsim_env.scenes import Anchor, BlockMesh, Box, Instrument, MeshSource, Scene, make_scene
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Anchor, BlockMesh, Box, MeshSource, Port, Scene, SceneInstrument
 
 SIZE = (0.040, 0.024, 0.012)
 # The middle of the jaw's hold: 8 mm behind the free edge y = 24 mm, at half height.
@@ -27,7 +27,7 @@ def slab_scene(model: str) -> Scene:
         anchors=(Anchor("wall", box=wall),),
         timing=replace(phantom.timing, substep_count=5),
         palpation=replace(phantom.palpation, face_margin=0.0),
-        instrument=Instrument(model, 0.008, approach=(0.0, -1.0, -0.3), tip_direction=(0.0, -1.0, 0.0)),
+        instrument=SceneInstrument(model, 0.008, approach=(0.0, -1.0, -0.3), tip_direction=(0.0, -1.0, 0.0)),
         port=PORTS[model],
     )
 

@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from msdm_core.errors import OrganDivergedError
-from msdm_core.kernels import FAULT_NONE
-from surgsim_env.exchange import compiled_steps, haptic_step
-from surgsim_env.haptic_kernels import (
+from msdm_core.kernels.structure_kernels import FAULT_NONE
+from surgsim_env.coupling.exchange import haptic_steps, step_outcome
+from surgsim_env.coupling.haptic_kernels import (
     FAULT_FORCE_CAP,
     FAULT_WRENCH_NOT_FINITE,
+    StepPlan,
     end_step,
-    factorise,
-    yield_tool,
 )
-from surgsim_env.tool_bodies import ToolBodies
+from surgsim_env.instruments.tool_bodies import ToolBodies
+from surgsim_env.instruments.tool_kernels import factorise, tool_mobility
 from tests.coupling.test_exchange import LAW, driven_probe, free_ball, free_organ, lopsided_body
 from tests.coupling.test_passivity import damped_arm
 
@@ -203,7 +202,7 @@ TOOLS = [free_ball, lopsided_body, driven_probe, damped_arm, two_arms]
 
 @pytest.mark.parametrize("tool", TOOLS, ids=[tool.__name__ for tool in TOOLS])
 def test_any_tools_move_the_same(tool):
-    """Free, jointed, driven, one or two, on a block that flies: exchange.haptic_step in a loop, to the bit."""
+    """Free, jointed, driven, one or two, on a block that flies: as step by step in Python, to the bit."""
     tools, others = tool(), tool()
     model, state = free_organ()
     state = state._replace(
@@ -215,10 +214,10 @@ def test_any_tools_move_the_same(tool):
     wrench, wanted = np.zeros((tools.tool_count, 6)), np.zeros((tools.tool_count, 6))
     peak = 0.0
     for _ in range(60):
-        haptic_step(model, reference, others, LAW, 2e-4, 5, wanted)
+        assert not haptic_steps(model, reference, others, LAW, 2e-4, 5, wanted, compiled=False).fault
         peak = max(peak, float(np.linalg.norm(wanted[:, :3].sum(axis=0))))
-    taken = compiled_steps(model, state, tools, LAW, 2e-4, 5, wrench, 60, np.inf)
-    assert (taken.count, taken.fault) == (60, "")
+    taken = haptic_steps(model, state, tools, LAW, 2e-4, 5, wrench, 60, compiled=True)
+    assert (taken.step_count, taken.fault) == (60, "")
     assert taken.force_peak == pytest.approx(peak, rel=1e-14)
     assert wrench.tobytes() == wanted.tobytes()
     assert tools.data.qpos.tobytes() == others.data.qpos.tobytes()
@@ -233,11 +232,11 @@ def test_any_tools_move_the_same(tool):
 def test_a_step_beyond_the_limit_is_the_last():
     model, state = free_organ()
     tools, wrench = free_ball(), np.zeros((1, 6))
-    taken = compiled_steps(model, state, tools, LAW, 2e-4, 5, wrench, 100, 0.05)
-    assert 1 < taken.count < 100
+    taken = haptic_steps(model, state, tools, LAW, 2e-4, 5, wrench, 100, force_limit=0.05, compiled=True)
+    assert 1 < taken.step_count < 100
     assert taken.force_peak > 0.05
     assert taken.force_peak == pytest.approx(np.linalg.norm(wrench[0, :3]), rel=1e-14)
-    assert tools.data.time == pytest.approx(taken.count * 1e-3)
+    assert tools.data.time == pytest.approx(taken.step_count * 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -253,13 +252,16 @@ def test_a_bad_wrench_never_reaches_mujoco(value, fault):
     """Nor the wrench that is kept; a good one reaches both."""
     probe = driven_probe()
     mujoco.mj_step1(probe.model, probe.data)
-    tools, kept, place = probe.views(), np.full((1, 6), 0.25), probe.data.qpos.copy()
-    tools.wrench[0, 1] = value
-    assert end_step(tools, kept) == fault
+    outcome, place = step_outcome(1, 1), probe.data.qpos.copy()
+    outcome.mean[0, 0, 1], outcome.wrench[:] = value, 0.25
+    end_step(probe.views(), FAULT_NONE, StepPlan(1e-3, 1.0, 1, 1, np.inf, np.inf), outcome, 0)
+    assert outcome.fault[0] == fault
     reached = fault == FAULT_NONE
     assert probe.data.xfrc_applied.any() == reached
     assert (probe.data.qpos != place).any() == reached
-    np.testing.assert_array_equal(kept[0], [0.0, value, 0.0, 0.0, 0.0, 0.0] if reached else np.full(6, 0.25))
+    np.testing.assert_array_equal(
+        outcome.wrench[0, 0], [0.0, value, 0.0, 0.0, 0.0, 0.0] if reached else np.full(6, 0.25)
+    )
 
 
 def test_the_solve_is_that_of_linear_algebra():
@@ -273,7 +275,7 @@ def test_the_solve_is_that_of_linear_algebra():
         factors, yielded = matrix.copy(), np.zeros((count, 6))
         mobilities, rates = np.zeros((2, 2, 6, 6)), np.zeros((2, 6))
         factorise(factors)
-        yield_tool(factors, np.stack([other, jacobian]), 1, force, yielded, mobilities, rates)
+        tool_mobility(factors, np.stack([other, jacobian]), 1, force, yielded, mobilities, rates)
         wanted, mobility, rate = np.linalg.solve(matrix, jacobian.T), mobilities[1, 1], rates[1]
         accuracy = 1e-13 * np.linalg.cond(matrix)
         np.testing.assert_allclose(yielded, wanted, rtol=0, atol=accuracy * np.abs(wanted).max())
@@ -301,8 +303,8 @@ def test_a_copy_goes_on_by_itself():
     ("stiffness", "message"),
     [(np.nan, "no longer finite"), (np.inf, "no longer finite|not finite"), (1e11, "beyond the physical cap of 100 N")],
 )
-def test_a_fault_raised_by_one_is_told_by_the_other(stiffness, message):
-    """The words of `haptic_step`'s error are those of `compiled_steps`; an organ that cannot yield meets the cap."""
+def test_both_loops_describe_a_fault_alike(stiffness, message):
+    """In the same words, before MuJoCo moves; an organ that cannot yield meets the cap."""
     model, state = free_organ()
     if stiffness == 1e11:
         held = np.zeros_like(model.node_inverse_mass)
@@ -312,11 +314,11 @@ def test_a_fault_raised_by_one_is_told_by_the_other(stiffness, message):
     tools, others = driven_probe(), driven_probe()
     for probe in (tools, others):
         probe.place(np.array([0.014, 0.016, 0.0215]))
-    with pytest.raises(OrganDivergedError, match=message) as raised:
-        haptic_step(model, state, others, bad, 2e-4, 5, np.zeros((1, 6)))
+    wanted = haptic_steps(model, state, others, bad, 2e-4, 5, np.zeros((1, 6)), 10, compiled=False)
+    assert wanted.ended and re.search(message, wanted.fault), wanted.fault
     _, state = free_organ()
     wrench = np.full((1, 6), 0.5)
-    taken = compiled_steps(model, state, tools, bad, 2e-4, 5, wrench, 10, np.inf)
-    assert (taken.count, taken.fault) == (0, str(raised.value))
+    taken = haptic_steps(model, state, tools, bad, 2e-4, 5, wrench, 10, compiled=True)
+    assert taken.step_count == 0 and taken == wanted
     assert (wrench == 0.5).all()
     assert not tools.data.xfrc_applied.any() and tools.data.time == others.data.time == 0.0

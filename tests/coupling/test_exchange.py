@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
-from msdm_core.measure import angular_momentum, momentum
-from msdm_core.organ import OrganSpec, compile_organ, rest_state
-from surgsim_env import exchange
-from surgsim_env.anatomy import Anatomy, load_anatomy
-from surgsim_env.exchange import FORCE_CAP, haptic_step
-from surgsim_env.instrument import Probe
-from surgsim_env.scenes import Scene, make_scene
-from surgsim_env.simulation import Simulation
-from surgsim_env.tool_bodies import ToolBodies
+from msdm_core.errors import OrganError
+from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import angular_momentum, momentum
+from surgsim_env.coupling import haptic_kernels
+from surgsim_env.coupling.exchange import haptic_steps
+from surgsim_env.coupling.haptic_kernels import FORCE_CAP
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.cartesian import Probe
+from surgsim_env.instruments.tool_bodies import ToolBodies
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Scene
 from tests.core import oracle
 
 DT, SUBSTEPS = 1e-3, 5
@@ -96,7 +98,7 @@ def test_organs_change_of_momentum_is_minus_the_wrench(name: str):
     impulse = twist_impulse = 0.0
     for _ in range(150):
         linear, angular = momentum(model, state), angular_momentum(model, state, POINT)
-        haptic_step(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+        assert not haptic_steps(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench).fault
         centre = tool.data.xipos[tool.model.nbody - 1].copy()  # mj_step2 leaves the poses of the step's start
         force, torque = wrench[0, :3], wrench[0, 3:]
         turn = torque + np.cross(centre - POINT, force)
@@ -120,7 +122,7 @@ def test_organ_and_free_ball_keep_their_momentum():
     wrench = np.zeros((1, 6))
     before = momentum(model, state) + 0.02 * tool.data.qvel[:3]
     for _ in range(150):
-        haptic_step(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+        assert not haptic_steps(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench).fault
     moved = np.abs(momentum(model, state) - momentum(*free_organ())).max()
     assert moved > 1e-4
     after = momentum(model, state) + 0.02 * tool.data.qvel[:3]
@@ -133,16 +135,16 @@ def test_the_reading_is_of_the_current_step(monkeypatch: pytest.MonkeyPatch):
     probe = driven_probe()
     seen = []
 
-    def spy(_model, _state, shapes, _law, _dt, _count, wrench, _response) -> int:
+    def spy(_model, _state, shapes, _law, _response, _dt, _decay, _count, _reference, wrench) -> int:
         seen.append((shapes.shape_ends[0, 0].copy(), shapes.tool_centre[0].copy(), shapes.tool_twist[0].copy()))
         wrench[:] = 0.0
         return FAULT_NONE
 
-    monkeypatch.setattr(exchange, "advance_organ", spy)
+    monkeypatch.setattr(haptic_kernels, "advance_substeps", spy)
     wrench = np.zeros((1, 6))
     for _ in range(20):
         place, speed = probe.data.qpos[:3].copy(), probe.data.qvel[:3].copy()
-        haptic_step(model, state, probe, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+        assert not haptic_steps(model, state, probe, LAW, DT / SUBSTEPS, SUBSTEPS, wrench).fault
         ball, centre, twist = seen[-1]
         np.testing.assert_allclose(ball, place, rtol=0, atol=1e-15)
         np.testing.assert_allclose(centre, place + np.array([0.0, 0.0, 0.02]), rtol=0, atol=1e-15)
@@ -155,14 +157,14 @@ def test_the_wrench_acts_in_the_same_step(monkeypatch: pytest.MonkeyPatch):
     model, state = free_organ()
     tool = FreeBody(BALL, (0.0, 0.0, 0.5), np.zeros(6))
 
-    def push(_model, _state, _shapes, _law, _dt, _count, wrench, _response) -> int:
+    def push(_model, _state, _shapes, _law, _response, _dt, _decay, _count, _reference, wrench) -> int:
         wrench[:] = [0.02, 0.0, -0.04, 0.0, 0.0, 0.0]
         return FAULT_NONE
 
-    monkeypatch.setattr(exchange, "advance_organ", push)
+    monkeypatch.setattr(haptic_kernels, "advance_substeps", push)
     wrench = np.zeros((1, 6))
     for count in (1, 2, 3):
-        haptic_step(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench)
+        assert not haptic_steps(model, state, tool, LAW, DT / SUBSTEPS, SUBSTEPS, wrench).fault
         np.testing.assert_allclose(tool.data.qvel[:3], count * np.array([1e-3, 0.0, -2e-3]), rtol=1e-12, atol=1e-15)
 
 
@@ -179,8 +181,8 @@ def test_a_force_that_is_not_finite_never_reaches_mujoco():
     probe = driven_probe()
     probe.place(np.array([0.014, 0.016, 0.0215]))
     bad = LAW._replace(stiffness=float("nan"))
-    with pytest.raises(OrganDivergedError, match="no longer finite"):
-        haptic_step(model, state, probe, bad, DT / SUBSTEPS, SUBSTEPS, np.zeros((1, 6)))
+    taken = haptic_steps(model, state, probe, bad, DT / SUBSTEPS, SUBSTEPS, np.zeros((1, 6)))
+    assert taken.ended and "no longer finite" in taken.fault
     assert untouched(probe)
 
 
@@ -195,15 +197,15 @@ def test_a_force_that_is_not_finite_never_reaches_mujoco():
 def test_a_bad_wrench_never_reaches_mujoco(value: float, message: str, monkeypatch: pytest.MonkeyPatch):
     """Even where every node is finite."""
 
-    def push(_model, _state, _shapes, _law, _dt, _count, wrench, _response) -> int:
+    def push(_model, _state, _shapes, _law, _response, _dt, _decay, _count, _reference, wrench) -> int:
         wrench[:] = [0.0, 0.0, value, 0.0, 0.0, 0.0]
         return FAULT_NONE
 
-    monkeypatch.setattr(exchange, "advance_organ", push)
+    monkeypatch.setattr(haptic_kernels, "advance_substeps", push)
     model, state = free_organ()
     probe = driven_probe()
-    with pytest.raises(OrganDivergedError, match=message):
-        haptic_step(model, state, probe, LAW, DT / SUBSTEPS, SUBSTEPS, np.zeros((1, 6)))
+    taken = haptic_steps(model, state, probe, LAW, DT / SUBSTEPS, SUBSTEPS, np.zeros((1, 6)))
+    assert taken.ended and re.search(message, taken.fault)
     assert untouched(probe)
 
 

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surgsim_env.grasp import read_grasp
-from surgsim_env.lane_group import LaneGroup
-from surgsim_env.simulation import Simulation
+from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.jaw import read_grasp
 from tests.coupling.slab import HOLD, slab
 
 JAWS = ["grasper.xml", "psm_retractor"]
@@ -139,15 +139,15 @@ def test_what_a_grasp_tells():
     wrench[2] = [0.03, 0.04, 0.5, 9.0, 9.0, 9.0]  # the upper pad: pushed up by 0.5, dragged by 0.05
     wrench[0] = [0.0, 0.12, -0.3, 9.0, 9.0, 9.0]
     wrench[1] = 7.0  # a shaft, no business of the jaw's
-    grasp = read_grasp(instrument, wrench, friction=0.2)
+    grasp = read_grasp(instrument.jaw, wrench, friction=0.2)
     assert (grasp.opening, grasp.holds) == (0.009, True)
     assert grasp.grip_force == pytest.approx(0.3)
     assert grasp.pull_force == pytest.approx(np.sqrt(0.03**2 + 0.16**2 + 0.2**2))
     assert grasp.friction_left == pytest.approx(0.2 * (3.0 * 0.5 + 2.0 * 0.3) - 0.05 - 0.12)
     wrench[0, 2] = 0.1  # sticks to the lower pad's back: it does not press
-    grasp = read_grasp(instrument, wrench, friction=0.2)
+    grasp = read_grasp(instrument.jaw, wrench, friction=0.2)
     assert not grasp.holds and grasp.grip_force == 0.0
-    assert read_grasp(SimpleNamespace(jaw=None), wrench, friction=0.2) is None
+    assert read_grasp(None, wrench, friction=0.2) is None
 
 
 def pulled(one: Simulation, pull_limit: float) -> int:

@@ -4,14 +4,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from msdm_core.damping import Damping
-from msdm_core.kernels import ContactLaw, OrganModel
-from msdm_core.measure import contact_energy
-from msdm_core.organ import rest_state
-from msdm_core.stepping import advance_organ
-from surgsim_env.instrument import Probe
-from surgsim_env.scenes import make_scene
-from surgsim_env.tool_bodies import ToolBodies
+from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel
+from msdm_core.material.regions import Damping
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.measure import contact_energy
+from msdm_core.organ.stepping import advance_organ
+from surgsim_env.instruments.cartesian import Probe
+from surgsim_env.instruments.tool_bodies import ToolBodies
+from surgsim_env.scene.load import make_scene
 from surgsim_env.validation.free_tool import BLOCK, ELASTIC, FREE, Coupled, free_ball, small_block
 from surgsim_env.validation.passivity import bounces
 from tests.core import oracle

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels import OrganState
-from msdm_core.organ import rest_state
-from msdm_core.stepping import advance_organ
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
-from surgsim_env.tool_bodies import ToolBodies
-from surgsim_env.tool_mass import check_tool_masses, tool_masses
+from msdm_core.kernels.structure_kernels import OrganState
+from msdm_core.organ.compile import rest_state
+from msdm_core.organ.stepping import advance_organ
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.tool_bodies import ToolBodies
+from surgsim_env.instruments.tool_mass import check_tool_masses, tool_masses
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 from surgsim_env.validation.free_tool import ELASTIC, UPRIGHT, free_ball
 from tests.core import oracle
 from tests.coupling.test_passivity import resting, static_force
@@ -63,7 +63,7 @@ def test_mass_is_felt_at_the_lightest_end():
     assert rod.mass == pytest.approx(1.0 / (1.0 / 0.02 + 0.05**2 / 8e-6), rel=1e-9)
     assert rod.stiffness == pytest.approx(2e7 * (np.pi * 0.003**2 + 2.0 * 0.003 * 0.08))
     assert slider.mass == pytest.approx(0.005, rel=1e-9)
-    assert slider.braked_mass == pytest.approx(0.005 + 0.5 * DT * 3.0, rel=1e-9)
+    assert slider.damped_mass == pytest.approx(0.005 + 0.5 * DT * 3.0, rel=1e-9)
     assert rod.least_damping == pytest.approx(rod.stiffness * DT - 2.0 * rod.mass / DT)
 
 

@@ -1,5 +1,6 @@
 """The built site, once for all tests of a run."""
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -29,9 +30,17 @@ def build() -> Build:
 
 @pytest.fixture(scope="session")
 def site_folder(build, tmp_path_factory) -> Path:
-    """Where the project's site was built, without a warning."""
-    folder = tmp_path_factory.mktemp("site")
-    done = build(folder)
-    assert done.returncode == 0, done.stderr
-    assert "WARNING" not in done.stderr
+    """Where the project's site was built, without a warning; workers side by side share it."""
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    folder, said = shared / "site", shared / "site.txt"
+    with (shared / "site.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not said.exists():
+            done = build(folder)
+            said.write_text(f"{done.returncode}\n{done.stderr}", encoding="utf-8")
+    text = said.read_text(encoding="utf-8")
+    assert text.startswith("0\n"), text
+    assert "WARNING" not in text
     return folder

@@ -2,7 +2,7 @@
 
 import pytest
 
-from surgsim_env.env import RetractEnv
+from surgsim_env.envs.ids import RetractEnv
 
 
 @pytest.fixture(scope="module")

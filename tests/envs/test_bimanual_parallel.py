@@ -7,8 +7,8 @@ import pytest
 pettingzoo = pytest.importorskip("pettingzoo", reason="needs the `pettingzoo` extra")
 from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
 
-from surgsim_env.bimanual_parallel import BimanualRetractParallelEnv  # noqa: E402
-from surgsim_env.env import BimanualRetractEnv  # noqa: E402
+from surgsim_env.envs.bimanual_parallel import BimanualRetractParallelEnv  # noqa: E402
+from surgsim_env.envs.ids import BimanualRetractEnv  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,7 @@ def env():
 
 
 def test_passes_pettingzoos_own_test(env):
-    parallel_api_test(env, num_cycles=60)
+    parallel_api_test(env, num_cycles=20)
 
 
 def test_seeds_repeat():

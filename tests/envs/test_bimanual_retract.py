@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.arms.pair import Pair
-from surgsim_env.env import BimanualRetractEnv
-from surgsim_env.grasp import Grasp
-from surgsim_env.rewards import BIMANUAL_WEIGHTS
-from surgsim_env.scenes import make_scene, pair_names, with_instrument
-from surgsim_env.simulation import Simulation
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.envs.ids import BimanualRetractEnv
+from surgsim_env.instruments.arm.pair import Pair
+from surgsim_env.instruments.jaw import Grasp
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene, pair_names, with_instrument
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE
 
@@ -103,7 +102,7 @@ def test_harm_ends_it_and_is_named(told, harm, key):
 
 def test_the_weights_put_every_failure_below_every_full_episode():
     """The inequality of the table's comment."""
-    w = BIMANUAL_WEIGHTS
+    w = BimanualRetractTask.weights
     gains = w["visible"] + w["grasped"] + w["near"] + w["touched"]
     assert w["forgone"] == pytest.approx(w["time"] + w["soft_force"])
     for failure in ("torn", "hard_force", "collided", "fault"):
@@ -136,8 +135,10 @@ def test_both_arms_go_as_told_and_only_the_left_jaw_closes(env):
     moved = [pair.arms[side].tip_position - tip for side, tip in zip(("left", "right"), tips)]
     np.testing.assert_allclose(moved[0], [0.0, 0.002, 0.0], atol=2e-4)
     np.testing.assert_allclose(moved[1], [0.001, 0.0, 0.002], atol=2e-4)
-    np.testing.assert_allclose(observation[56:59], pair.arms["right"].tip_position, atol=1e-7)
-    assert observation[12] < 0.010 and observation[73] == pytest.approx(pair.distance, abs=1e-6)
+    slices = env.observation_slices
+    np.testing.assert_allclose(observation[slices["right_position"]], pair.arms["right"].tip_position, atol=1e-7)
+    assert observation[slices["opening"]] < 0.010
+    assert observation[slices["arm_distance"]] == pytest.approx(pair.distance, abs=1e-6)
 
 
 def test_a_touch_beside_the_lobe_is_felt(env):
@@ -151,7 +152,7 @@ def test_a_touch_beside_the_lobe_is_felt(env):
         if info["touch_force"] > 0.2:
             break
     assert not terminated and 0.2 < info["touch_force"] < 1.5 and not info["touches"]
-    assert observation[71] == pytest.approx(info["touch_force"], rel=1e-6)
+    assert observation[env.observation_slices["touch_force"]] == pytest.approx(info["touch_force"], rel=1e-6)
     assert info["touch_force"] == env.simulation.instrument.touch_force("right", "bed")
 
 
@@ -205,4 +206,4 @@ def test_target_is_touched_with_the_ball_alone(env, monkeypatch, offset, force, 
     env.reset(seed=0)
     monkeypatch.setattr(env.task, "_from_target", lambda _: np.array(offset))
     monkeypatch.setattr(env.task, "touch_force", force)
-    assert env.task._touches(env.simulation) is touches
+    assert env.task.touches(env.simulation) is touches

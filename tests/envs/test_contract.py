@@ -1,4 +1,7 @@
-"""Every environment id under the same contract: checkers, bit-exact replay, save and restore, seeds that matter."""
+"""Every environment id under the same contract: checkers, bit-exact replay, save and restore, seeds that matter.
+
+One of them is the task of docs/tutorials/own_task.md, a file outside the package.
+"""
 
 import io
 import warnings
@@ -9,12 +12,15 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.scene_files import scenes_folder
+from surgsim_env.scene.load import scenes_folder
+from tests.envs.own_task import load_own_task
 from tests.envs.walks import rollout
 
-IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
-# A press a step: enough of them for the walks below.
-SETTINGS = {"SurgSim/PalpateSites-v0": {"budget": 50}}
+OWN = load_own_task()
+IDS = [*sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/")), OWN]
+# A press a step, which takes as long as some ten steps of the other ids: enough of them for walks that are shorter.
+SETTINGS = {"SurgSim/PalpateSites-v0": {"budget": 20}}
+SHORTER = {"SurgSim/PalpateSites-v0": 5}
 # Every id with its scene's own instrument, and some with an arm.
 CASES = [(env_id, SETTINGS.get(env_id, {})) for env_id in IDS] + [
     ("SurgSim/Palpate-v0", {"instrument": "psm_palpator"}),
@@ -26,14 +32,17 @@ SCENES = {
     "SurgSim/PalpateSites-v0": ("phantom", "[12, 12, 6]", "[6, 6, 3]"),
     "SurgSim/Retract-v0": ("lobe", "[20, 13, 3]", "[20, 13, 2]"),
     "SurgSim/BimanualRetract-v0": ("lobe", "[20, 13, 3]", "[20, 13, 2]"),
+    OWN: ("phantom_small", "[8, 8, 4]", "[6, 6, 3]"),
 }
 # Entries of an observation that a walk of some steps leaves as they are: the axis of a wrist that is a hinge, what is
 # grasped and what is seen.
 # (Of the sites of a chart's grid a walk presses some.)
+HINGE = {f"tip_axes[{entry}]" for entry in range(4)}
+UNSEEN = {"grip_force[0]", "holds[0]", "visible[0]"}
 STILL = {
-    "SurgSim/PalpateSites-v0": set(range(2 * 13**2)),
-    "SurgSim/Retract-v0": {6, 7, 8, 9, 19, 21, 52},
-    "SurgSim/BimanualRetract-v0": {19, 21, 52, 71, 72},
+    "SurgSim/PalpateSites-v0": {f"{name}[{site}]" for name in ("contrast_map", "pressed_map") for site in range(13**2)},
+    "SurgSim/Retract-v0": HINGE | UNSEEN,
+    "SurgSim/BimanualRetract-v0": UNSEEN | {"touch_force[0]", "uncovered[0]"},
 }
 
 
@@ -75,10 +84,11 @@ def test_passes_stable_baselines3s_checker_without_a_warning(made):
 
 def test_same_seed_repeats_to_the_bit_also_after_other_episodes(made):
     env = made()
-    first = rollout(env, seed=3, steps=30)
-    rollout(env, seed=11, steps=12, action_seed=8)
-    assert_same(first, rollout(env, seed=3, steps=30))
-    assert_same(first, rollout(made(), seed=3, steps=30))
+    steps = 30 // SHORTER.get(env.spec.id, 1)
+    first = rollout(env, seed=3, steps=steps)
+    rollout(env, seed=11, steps=5, action_seed=8)
+    assert_same(first, rollout(env, seed=3, steps=steps))
+    assert_same(first, rollout(made(), seed=3, steps=steps))
     assert any(record[-1]["force_peak"] > 0.0 for record in first), "the walk must touch the organ to prove anything"
 
 
@@ -92,9 +102,10 @@ def test_seeds_that_differ_differ(made):
 
 def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(made):
     env = made().unwrapped
-    rollout(env, seed=5, steps=25)
+    shorter = SHORTER.get(env.spec.id, 1)
+    rollout(env, seed=5, steps=25 // shorter)
     saved = env.save_state()
-    actions = np.random.default_rng(1).uniform(-0.4, 0.4, (15, *env.action_space.shape)).astype(np.float32)
+    actions = np.random.default_rng(1).uniform(-0.4, 0.4, (10 // shorter, *env.action_space.shape)).astype(np.float32)
 
     def go_on(one):
         return [one.step(action) for action in actions]
@@ -152,8 +163,64 @@ def test_info_has_fixed_keys_and_types(made):
 def test_observation_has_no_constant_entry(made):
     env = made()
     # Two episodes: what is drawn stays as it is within one.
-    observations = np.array([record[0] for seed in (4, 5) for record in rollout(env, seed=seed, steps=40)])
-    assert set(np.flatnonzero(np.ptp(observations, axis=0) == 0.0)) <= STILL.get(env.spec.id, set())
+    steps = 40 // SHORTER.get(env.spec.id, 1)
+    observations = np.array([record[0] for seed in (4, 5) for record in rollout(env, seed=seed, steps=steps)])
+    constant = np.flatnonzero(np.ptp(observations, axis=0) == 0.0)
+    assert {env.unwrapped.task.entry_name(int(entry)) for entry in constant} <= STILL.get(env.spec.id, set())
+
+
+def test_channels_make_up_the_observation_in_their_order(made):
+    env = made().unwrapped
+    task, slices = env.task, env.observation_slices
+    ends = [0, *(part.stop for part in slices.values())]
+    assert [part.start for part in slices.values()] == ends[:-1] and ends[-1] == env.observation_space.shape[0]
+    declared = [channel.name for channel in task.channels]
+    assert [name for name in declared if name in slices] == list(slices)
+    assert list(task.action_slices.values())[-1].stop == env.action_space.shape[0]
+    # What was read is what is observed: the tip, where the task observes it.
+    observation, info = env.reset(seed=1)
+    if "tip_position" in slices:
+        tip = env.simulation.instrument.tip_position.astype(np.float32)
+        np.testing.assert_array_equal(observation[slices["tip_position"]], tip)
+    assert [key for key in info if key.startswith("reward_")] == [f"reward_{one.name}" for one in task.rewards]
+
+
+def test_documentation_names_every_command_channel_and_reward(made):
+    env = made().unwrapped
+    for part in (*env.task.commands, *env.task.channels, *env.task.rewards):
+        assert f"| `{part.name}` |" in env.__doc__ and part.meaning in env.__doc__
+
+
+def test_without_force_the_felt_channels_are_zero_and_all_else_is_the_same(made):
+    """Observed only: the episode, its rewards and its saved state stay."""
+    seeing, blind = made(), made(observe_force=False)
+    felt = seeing.unwrapped.task.force_entries
+    assert felt
+    steps = 12 // SHORTER.get(seeing.spec.id, 1)
+    first, second = rollout(seeing, seed=3, steps=steps), rollout(blind, seed=3, steps=steps)
+    assert any(np.any(one[0][felt]) for one in first)
+    for one, other in zip(first, second, strict=True):
+        expected = one[0].copy()
+        expected[felt] = 0.0
+        np.testing.assert_array_equal(other[0], expected)
+        assert one[1:] == other[1:]
+    assert seeing.unwrapped.save_state() == blind.unwrapped.save_state()
+
+
+def test_lanes_give_what_single_environments_give(made):
+    if not made().unwrapped.task.lanes:
+        with pytest.raises(gym.error.Error, match="vector"):
+            made(num_envs=2, vectorization_mode="vector_entry_point")
+        return
+    lanes, singles = (made(num_envs=2, vectorization_mode=mode) for mode in ("vector_entry_point", "sync"))
+    assert lanes.unwrapped.observation_slices == made().unwrapped.observation_slices
+    actions = np.random.default_rng(2).uniform(-0.3, 0.3, (4, *lanes.action_space.shape)).astype(np.float32)
+    for envs in (lanes, singles):
+        envs.reset(seed=[5, 6])
+    for action in actions:
+        for one, other in zip(lanes.step(action)[:4], singles.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(one, other)
+    lanes.close()
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])

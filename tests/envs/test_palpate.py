@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.rewards import PALPATE_WEIGHTS
-from surgsim_env.tasks.palpate import EPISODE_STEPS, SUCCESS_DISTANCE
+from surgsim_env.tasks.palpate import EPISODE_STEPS, SUCCESS_DISTANCE, PalpateTask
 
 SPEED = 0.02
 STEP = 0.05
@@ -161,10 +160,10 @@ def test_a_fault_ends_the_episode_with_a_finite_observation_and_a_clean_reset(en
 
 def test_ending_without_finding_never_pays_more_than_searching_on():
     # Whatever was paid so far, the worst way to go on is the dearest step to the end; each failure must be below it.
-    dearest = -(PALPATE_WEIGHTS["time"] + PALPATE_WEIGHTS["soft_force"])
-    assert -PALPATE_WEIGHTS["forgone"] >= dearest - 1e-12
+    dearest = -(PalpateTask.weights["time"] + PalpateTask.weights["soft_force"])
+    assert -PalpateTask.weights["forgone"] >= dearest - 1e-12
     for failure in ("wrong", "hard_force", "fault"):
-        assert PALPATE_WEIGHTS[failure] < 0.0
+        assert PalpateTask.weights[failure] < 0.0
 
 
 def test_a_blind_declare_pays_less_than_an_honest_search_that_finds_nothing(env):
@@ -176,7 +175,7 @@ def test_a_blind_declare_pays_less_than_an_honest_search_that_finds_nothing(env)
         (_, _, _, _, info), total = press_and_declare(env, x, y)
         found += info["success"]
         returns.append(total)
-    honest = 600 * PALPATE_WEIGHTS["time"]
+    honest = 600 * PalpateTask.weights["time"]
     assert 0 < found < 15
     assert np.mean(returns) < honest
 
@@ -184,12 +183,12 @@ def test_a_blind_declare_pays_less_than_an_honest_search_that_finds_nothing(env)
 def test_force_reading_is_noisy_biased_and_flags_saturation(env):
     env.reset(seed=7)
     still = np.array([act(env)[0][6:9] for _ in range(60)])
-    bias = env.task.reading.bias
+    bias = env.task.sensors["contact_force"].bias
     assert (np.abs(bias) <= 0.01).all()
     # Mean of 60 readings: 0.005 / sqrt(60) N each; five of those.
     np.testing.assert_allclose(still.mean(axis=0), bias, atol=5 * 0.005 / np.sqrt(60))
     assert still.std(axis=0) == pytest.approx(0.005, rel=0.4)
-    env.task.reading.bias = np.array([0.0, 0.0, 3.0])
+    env.task.sensors["contact_force"].bias = np.array([0.0, 0.0, 3.0])
     observation, _, _, _, info = act(env)
     assert info["sensor_saturated"] is True
     assert observation[8] == np.float32(2.0)

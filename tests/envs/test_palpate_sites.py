@@ -8,18 +8,14 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.levels import LEVELS, DrawnOrgan
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation import healthy_map as healthy_module
-from surgsim_env.palpation.chart import make_chart
-from surgsim_env.palpation.charted_face import ChartedFace, interpolated
+from surgsim_env.palpation.chart import ChartedFace, interpolated, make_chart
 from surgsim_env.palpation.healthy_map import charted_face, healthy_map
-from surgsim_env.palpation.scan import press
-from surgsim_env.palpation.site_press import SitePress, press_alone, press_phases, stop_force
-from surgsim_env.rewards import PALPATE_SITES_WEIGHTS
-from surgsim_env.scene_files import scenes_folder
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.palpation.press import SitePress, press, press_alone, press_phases, stop_force
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.levels import LEVELS, DrawnOrgan
+from surgsim_env.scene.load import make_scene, scenes_folder
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from tests.envs.test_vector_env import assert_equal
 
@@ -252,7 +248,7 @@ def test_what_is_found_pays_by_its_change():
 
 def test_harm_never_pays():
     """The reckoning that stands beside the weights, for every number of presses made of the budget."""
-    weights = PALPATE_SITES_WEIGHTS
+    weights = PalpateSitesTask.weights
     assert weights["forgone"] == weights["error"] + weights["soft_force"]
     for done in np.linspace(0.0, 1.0, 11):
         for found_first in (0.0, 1.0):

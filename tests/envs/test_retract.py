@@ -6,10 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from surgsim_env.env import PalpateEnv, RetractEnv
-from surgsim_env.scenes import make_scene
-from surgsim_env.tasks.retract import EPISODE_STEPS
-from surgsim_env.tasks.retraction_record import RetractionRecord, region_strains
+from surgsim_env.envs.ids import PalpateEnv, RetractEnv
+from surgsim_env.scene.load import make_scene
+from surgsim_env.tasks.retract import EPISODE_STEPS, RetractionRecord, region_strains
 from tests.envs.retract_steps import EMPTY, HELD, STEP, act
 
 # ---- what it observes and measures --------------------------------------------------------------------------------
@@ -26,7 +25,7 @@ def test_the_observation_is_what_its_table_says(retract_env):
     axes = observation[6:12].reshape(2, 3)
     np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-6)
     assert observation[12] == pytest.approx(retract_env.simulation.instrument.opening, abs=1e-6)
-    bias = retract_env.task.force_reading.bias
+    bias = retract_env.task.sensors["contact_force"].bias
     np.testing.assert_allclose(observation[13:16], bias, atol=6 * retract_env.scene.sensor.noise)
     np.testing.assert_array_equal(observation[13:16], retract_env.task.sensed_force(observation).astype(np.float32))
     np.testing.assert_array_equal(observation[19:22], 0.0)

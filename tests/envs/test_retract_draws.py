@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.scenes import make_scene
+from surgsim_env.scene.load import make_scene
 from surgsim_env.tasks.retract import HIDDEN_SHARE
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surgsim_env.env import RetractEnv
+from surgsim_env.envs.ids import RetractEnv
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.stage import LABELS
 from surgsim_env.scripting import Hold, Until, run_script
@@ -98,7 +98,7 @@ def test_scripts_feel_forces_where_pictures_are_observed(tmp_path):
     wait = Until(Hold(0.2), lambda view: felt.append(view.sensed_force) or False)
     trace = run_script(env, [wait], seed=6)
     assert trace.observation.shape == (4, 84, 84, 3)
-    bias, noise = env.task.force_reading.bias, env.scene.sensor.noise
+    bias, noise = env.task.sensors["contact_force"].bias, env.scene.sensor.noise
     np.testing.assert_allclose(np.array(felt), np.tile(bias, (len(felt), 1)), atol=6 * noise)
     _, table = trace.to_csv(tmp_path / "run.csv")
     columns = table.read_text().splitlines()[0].split(",")
@@ -126,6 +126,6 @@ except Exception as error:
 """
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", code], cwd=REPOSITORY, env={**os.environ, gl.VARIABLE: "off"},
-        capture_output=True, text=True, timeout=300,
+        capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert done.stdout.strip() == "NoGLError", done.stderr

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.rewards import RETRACT_WEIGHTS
-from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE, SPEED_FULL_SCALE, SUCCESS_SHARE
+from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE, SUCCESS_SHARE, RetractTask
+from surgsim_env.tasks.task import SPEED_FULL_SCALE
 from tests.envs.retract_steps import EMPTY, HELD, STEP, act
 
 
@@ -39,7 +39,7 @@ def told(retract_env, monkeypatch):
 
 def test_the_weights_put_every_failure_below_every_full_episode():
     """The inequality of the table's comment."""
-    w = RETRACT_WEIGHTS
+    w = RetractTask.weights
     assert w["forgone"] == pytest.approx(w["time"] + w["soft_force"])
     for failure in ("torn", "hard_force", "fault"):
         margin = -HIDDEN_SHARE * w["visible"] + EPISODE_STEPS * w["soft_force"] - w["visible"] - w["grasped"]
@@ -70,7 +70,7 @@ def test_no_failed_episode_returns_more_than_the_worst_full_one(told, failure):
             # Never for SUCCESS_TIME on end.
             assert not told.step(visible=float(before % 10 > 0), holds=True).terminated
         verdict = told.step(visible=1.0, holds=True, **FAILURES[failure])
-        assert verdict.terminated and verdict.rewards[failure] == RETRACT_WEIGHTS[failure]
+        assert verdict.terminated and verdict.rewards[failure] == RetractTask.weights[failure]
         assert told.returned < worst
 
 
@@ -78,10 +78,10 @@ def test_seen_and_grasped_pay_once_however_often_they_come_and_go(told):
     for _ in range(40):
         told.step(visible=0.7, holds=True)
         told.step(visible=0.1, holds=False)
-    assert told.returned == pytest.approx(80 * RETRACT_WEIGHTS["time"] + 0.1 * RETRACT_WEIGHTS["visible"])
+    assert told.returned == pytest.approx(80 * RetractTask.weights["time"] + 0.1 * RetractTask.weights["visible"])
     told.step(visible=0.7, holds=True)
-    assert told.verdict.rewards["visible"] == pytest.approx(0.6 * RETRACT_WEIGHTS["visible"])
-    assert told.verdict.rewards["grasped"] == RETRACT_WEIGHTS["grasped"]
+    assert told.verdict.rewards["visible"] == pytest.approx(0.6 * RetractTask.weights["visible"])
+    assert told.verdict.rewards["grasped"] == RetractTask.weights["grasped"]
 
 
 def test_success_is_a_half_second_on_end(told):
@@ -100,14 +100,14 @@ def test_soft_force_costs_by_its_share_of_the_way_to_the_hard_limit(told):
     limits = told.task.limits
     middle = 0.5 * (limits.soft_force + limits.hard_force)
     for force, share in ((limits.soft_force, 0.0), (middle, 0.5), (limits.hard_force, 1.0)):
-        assert told.step(force=force).rewards["soft_force"] == pytest.approx(share * RETRACT_WEIGHTS["soft_force"])
+        assert told.step(force=force).rewards["soft_force"] == pytest.approx(share * RetractTask.weights["soft_force"])
 
 
 def test_time_runs_out_after_600_steps(told):
     for step in range(1, EPISODE_STEPS + 1):
         verdict = told.step()
         assert verdict.truncated == (step == EPISODE_STEPS)
-    assert told.returned == pytest.approx(EPISODE_STEPS * RETRACT_WEIGHTS["time"], abs=0.5)
+    assert told.returned == pytest.approx(EPISODE_STEPS * RetractTask.weights["time"], abs=0.5)
 
 
 # ---- what ends it -----------------------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ def test_a_step_that_tears_ends_in_its_very_haptic_step(shared_retract):
     finally:
         task.limits = limits
     assert info["torn"] and not info["hard_limit"] and not info["success"]
-    assert info["reward_torn"] == RETRACT_WEIGHTS["torn"]
+    assert info["reward_torn"] == RetractTask.weights["torn"]
     assert 0.08 < info["pull_force_peak"] < 0.085
     steps = shared_retract.simulation.time / STEP
     assert abs(steps - round(steps)) > 0.01
@@ -163,5 +163,5 @@ def test_a_fault_ends_it_with_the_last_finite_observation_and_a_clean_reset(retr
     observation, reward, terminated, _, info = act(retract_env)
     assert terminated and "no longer finite" in info["sim_fault"]
     np.testing.assert_array_equal(observation, before)
-    assert reward < RETRACT_WEIGHTS["fault"] + 598 * RETRACT_WEIGHTS["forgone"] + 1e-9
+    assert reward < RetractTask.weights["fault"] + 598 * RetractTask.weights["forgone"] + 1e-9
     np.testing.assert_array_equal(retract_env.reset(seed=6)[0], expected)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.vector_env import LaneVectorEnv, PalpateVectorEnv, RetractVectorEnv
+from surgsim_env.envs.ids import PalpateEnv, RetractEnv
+from surgsim_env.envs.vector_env import LaneVectorEnv, vector_class
 from tests.envs.test_vector_env import assert_equal
 
 ID = "SurgSim/Retract-v0"
@@ -47,7 +48,7 @@ def test_equals_environments_one_after_the_other(mode: str, instrument: str | No
     steps, closes = (75, 45) if instrument is None else (24, 8)
     settings = {"instrument": instrument, "max_episode_steps": steps - 5}
     together, apart = side_by_side(autoreset_mode=mode, **settings), one_after_the_other(mode, **settings)
-    assert isinstance(together, RetractVectorEnv)
+    assert type(together) is vector_class(RetractEnv)
     assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
     first = together.reset(seed=SEED)
     assert_equal(first, apart.reset(seed=SEED))
@@ -107,7 +108,7 @@ def test_single_precision_feels_the_same_force():
 
 def test_lanes_have_rest_shapes_of_their_own_only_where_they_differ():
     """Lesions leave the phantom's rest shape alone: its lanes share it, which is faster."""
-    lobes, phantoms = side_by_side(), PalpateVectorEnv(2, scene="phantom")
+    lobes, phantoms = side_by_side(), vector_class(PalpateEnv)(2, scene="phantom")
     for envs in (lobes, phantoms):
         assert isinstance(envs, LaneVectorEnv)
         envs.reset(seed=SEED)

@@ -10,66 +10,45 @@ import numpy as np
 import pytest
 
 import surgsim_env
-from surgsim_env import rewards
-from surgsim_env.anatomy import load_anatomy
+from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scripting import oracle_script, run_script
-from surgsim_env.tasks.palpate import EPISODE_STEPS, SUCCESS_DISTANCE
-from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE
+from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
+from surgsim_env.tasks.declaration import PERIODS
+from surgsim_env.tasks.palpate import EPISODE_STEPS, SUCCESS_DISTANCE, PalpateTask
+from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, PalpateSitesTask
+from surgsim_env.tasks.retract import RetractTask
 
-# What each table's terms are. Per step: each in [0, 1], so often at most; where `shared`, a share of that number of
-# steps, as `forgone` is. Won: changes of a number in [0, 1], which telescope. Reached: paid once, at a good end.
-# Failures: paid once, at a bad one.
+# The declared terms by what they are paid for, and the number of control steps. Those per step lie in [0, 1]; where
+# `shared`, they and `forgone` are shares of the budget. Changes are of a number in [0, 1] and telescope.
 TABLES = {
-    "SurgSim/Palpate-v0": {
-        "weights": rewards.PALPATE_WEIGHTS,
-        "steps": EPISODE_STEPS,
-        "per_step": ("time", "soft_force"),
-        "won": (),
-        "reached": ("found",),
-        "failures": ("wrong", "hard_force", "fault"),
-    },
-    "SurgSim/Retract-v0": {
-        "weights": rewards.RETRACT_WEIGHTS,
-        "steps": EPISODE_STEPS,
-        "per_step": ("time", "soft_force"),
-        "won": ("visible", "grasped"),
-        "reached": ("success",),
-        "failures": ("torn", "hard_force", "fault"),
-    },
-    "SurgSim/BimanualRetract-v0": {
-        "weights": rewards.BIMANUAL_WEIGHTS,
-        "steps": EPISODE_STEPS,
-        "per_step": ("time", "soft_force"),
-        "won": ("visible", "grasped", "near", "touched"),
-        "reached": ("success",),
-        "failures": ("torn", "hard_force", "collided", "fault"),
-    },
-}
-for _name, _budget in (("phantom", BUDGET), ("phantom_wide", BUDGET_WIDE)):
-    TABLES[f"SurgSim/PalpateSites-v0 {_name}"] = {
-        "weights": rewards.PALPATE_SITES_WEIGHTS,
-        "steps": _budget,
-        "shared": True,
-        "per_step": ("error", "soft_force"),
-        "won": ("found",),
-        "reached": (),
-        "failures": ("hard_force", "fault"),
+    f"{task.__name__} {steps}": {
+        "weights": task.weights,
+        "steps": steps,
+        "shared": task is PalpateSitesTask,
+        **{per: tuple(one.name for one in task.rewards if one.per == per) for per in PERIODS},
     }
+    for task, steps in (
+        (PalpateTask, EPISODE_STEPS),
+        (RetractTask, EPISODE_STEPS),
+        (BimanualRetractTask, EPISODE_STEPS),
+        (PalpateSitesTask, BUDGET),
+        (PalpateSitesTask, BUDGET_WIDE),
+    )
+}
 IDS = sorted(TABLES)
 
 
 def of_a_step(table, *terms):
     """What terms pay in one step at most."""
-    return sum(table["weights"][term] for term in terms) / (table["steps"] if "shared" in table else 1)
+    return sum(table["weights"][term] for term in terms) / (table["steps"] if table["shared"] else 1)
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_every_term_of_the_table_is_one_that_this_file_knows(name):
+def test_costs_are_negative_and_gains_positive(name):
     table = TABLES[name]
-    known = [*table["per_step"], *table["won"], *table["reached"], *table["failures"], "forgone"]
-    assert sorted(known) == sorted(table["weights"])
-    assert all(table["weights"][term] < 0.0 for term in (*table["per_step"], *table["failures"], "forgone"))
-    assert all(table["weights"][term] > 0.0 for term in (*table["won"], *table["reached"]))
+    assert table["failure"] and table["step left"] == ("forgone",)
+    assert all(table["weights"][term] < 0.0 for per in ("step", "failure", "step left") for term in table[per])
+    assert all(table["weights"][term] > 0.0 for per in ("change", "success") for term in table[per])
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -82,19 +61,19 @@ def test_at_no_moment_does_a_bad_end_pay_more_than_going_on(name):
     """
     table = TABLES[name]
     weights = table["weights"]
-    dearest, forgone = of_a_step(table, *table["per_step"]), of_a_step(table, "forgone")
-    won = sum(weights[term] for term in table["won"])
-    for failure in table["failures"]:
+    dearest, forgone = of_a_step(table, *table["step"]), of_a_step(table, "forgone")
+    won = sum(weights[term] for term in table["change"])
+    for failure in table["failure"]:
         for left in range(table["steps"]):
             assert weights[failure] + left * forgone + won < (left + 1) * dearest, (failure, left)
 
 
-@pytest.mark.parametrize("name", [name for name in IDS if TABLES[name]["reached"]])
+@pytest.mark.parametrize("name", [name for name in IDS if TABLES[name]["success"]])
 def test_a_good_end_pays_more_than_standing_still(name):
     """Even the dearest way to success, in the last step, beats doing nothing at all, which pays time alone."""
     weights = TABLES[name]["weights"]
-    reached = sum(weights[term] for term in TABLES[name]["reached"])
-    dearest = TABLES[name]["steps"] * of_a_step(TABLES[name], *TABLES[name]["per_step"])
+    reached = sum(weights[term] for term in TABLES[name]["success"])
+    dearest = TABLES[name]["steps"] * of_a_step(TABLES[name], *TABLES[name]["step"])
     assert reached + dearest > TABLES[name]["steps"] * weights["time"]
 
 
@@ -108,7 +87,7 @@ def test_declaring_at_the_likeliest_place_pays_less_than_a_search_that_finds(sce
     A gentle search that finds in its last step returns found + 600 time. On the small phantom that place is right in
     two of three episodes: there a share of successes says little, and the test next to this does not hold.
     """
-    weights = rewards.PALPATE_WEIGHTS
+    weights = PalpateTask.weights
     right = blind_share(scene)
     missed = weights["wrong"] + EPISODE_STEPS * weights["forgone"]
     blind = right * weights["found"] + (1.0 - right) * missed
@@ -184,7 +163,7 @@ def played(request):
     """An environment, and what its oracle is paid at least: the return of an episode, or that of any success."""
     env = gym.make(request.param)
     if request.param == "SurgSim/BimanualRetract-v0":
-        weights = TABLES[request.param]["weights"]
+        weights = env.unwrapped.task.weights
         return env, weights["success"] + EPISODE_STEPS * (weights["time"] + weights["soft_force"])
     env.reset(seed=SEED)
     trace = run_script(env, oracle_script(env))
@@ -194,7 +173,7 @@ def played(request):
 
 def test_no_cheat_is_paid_like_an_honest_episode(played):
     env, honest = played
-    idle = EPISODE_STEPS * TABLES[env.spec.id]["weights"]["time"]
+    idle = EPISODE_STEPS * env.unwrapped.task.weights["time"]
     for cheat in CHEATS[env.spec.id]:
         env.reset(seed=SEED)
         paid = cheat(env)
@@ -241,7 +220,7 @@ def test_a_search_is_paid_more_than_pressing_one_place_again_and_again():
 
 
 def test_a_press_that_ends_in_harm_is_paid_less_than_the_worst_episode(presses, monkeypatch):
-    weights = rewards.PALPATE_SITES_WEIGHTS
+    weights = PalpateSitesTask.weights
     # What `found` begins with is lost at most.
     worst = weights["error"] + weights["soft_force"] - weights["found"]
     presses.reset(seed=SEED)

@@ -6,8 +6,9 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys
 
 import surgsim_env  # noqa: F401
-from surgsim_env import lane_group
-from surgsim_env.vector_env import PalpateVectorEnv, group_width
+from surgsim_env.coupling import lane_group
+from surgsim_env.envs.ids import PalpateEnv
+from surgsim_env.envs.vector_env import group_width, vector_class
 
 ID = "SurgSim/Palpate-v0"
 COUNT = 3  # five lanes stay empty
@@ -51,7 +52,7 @@ def test_equals_environments_one_after_the_other(mode: str, instrument: str):
     """Observations, rewards, ends and infos of 45 control steps with several episodes each, and all that is saved."""
     together = side_by_side(autoreset_mode=mode, instrument=instrument)
     apart = one_after_the_other(mode, instrument=instrument)
-    assert isinstance(together, PalpateVectorEnv)
+    assert type(together) is vector_class(PalpateEnv)
     assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
     assert_equal(together.reset(seed=11), apart.reset(seed=11))
     ends = 0
@@ -171,7 +172,7 @@ def test_threads_and_the_number_of_environments_change_nothing():
     """Ten environments in two groups, on one thread and on two, against the first three alone."""
     runs = []
     for count, threads in ((10, 1), (10, 2), (COUNT, 1)):
-        envs = PalpateVectorEnv(count, threads=threads)
+        envs = vector_class(PalpateEnv)(count, threads=threads)
         envs.reset(seed=1)
         rows = [
             envs.step(np.concatenate([actions(step), np.tile(DOWN, (count - COUNT, 1))]))[0][:COUNT]

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from surgsim_env.visibility import Disc, hiding_geoms, visible
+from surgsim_env.tasks.visibility import Disc, hiding_geoms, visible
 
 RADIUS = 0.008
 DISC = Disc(np.zeros(3), np.array([0.0, 0.0, 1.0]), RADIUS)

@@ -11,6 +11,9 @@ def walk(env, rng):
             action[1] = 0.4 * action[1] - 0.8  # towards the free edge
             # The jaw nearly closed, so that it does not pass above and below the lobe.
             action[env.unwrapped.task.jaw_place] -= 0.5
+        elif "TracePath" in env.spec.id:
+            action *= (0.2, 0.2, 1.0)  # near the line
+            action[2] -= 0.2
         elif "Sites" not in env.spec.id:
             action[2] -= 0.3  # press
         yield action.astype(np.float32)

@@ -4,17 +4,16 @@ from functools import cache
 
 import numpy as np
 
-from msdm_core.kernels import OrganModel
-from msdm_core.mesh import FloatArray
-from surgsim_env.anatomy import Anatomy, load_anatomy
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import VirtualCoupling
-from surgsim_env.haptics.limits import ForceLimits
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.watchdog import WatchdogTimes
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import make_scene
 
 DT = 1e-3
 # The tip half a millimetre above the middle of the phantom's top.

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from surgsim_env.anatomy import load_anatomy
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.tip_drive import STEER_TIME
-from surgsim_env.scenes import make_scene, with_instrument
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene, with_instrument
 
 DT = 1e-3
 

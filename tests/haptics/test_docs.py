@@ -1,21 +1,19 @@
 """docs/haptics.md: its Python runs as printed, its tables hold what the code has."""
 
 import re
-import threading
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from surgsim_env.haptics.coupling import TipDynamics, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
-from surgsim_env.haptics.limits import ForceLimits
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.packet import FORCE, POSE
-from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings
 from surgsim_env.haptics.udp import UdpDevice
 from surgsim_env.haptics.watchdog import WatchdogTimes
-from surgsim_env.pacing import TIMING, Pacer, PaceSettings
 from tests.haptics.bench_hand import DT, touching_simulation
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "haptics.md").read_text(encoding="utf-8")
@@ -29,24 +27,31 @@ def test_the_example_presses(capsys):
     assert 3.0 < float(depth) < 4.5
 
 
+class Turns:
+    """What the bridge takes for the module `time`: while it sleeps, the loop makes a step."""
+
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, span: float) -> None:
+        assert span == pytest.approx(DT)
+        self.now += span
+        assert not self.step()
+
+
 def test_the_bridge_feels_the_press():
-    """The printed bridge beside a loop at its pace: it is answered, and pushes nothing at its end."""
-    assert len(BRIDGE.splitlines()) <= 31
+    """The printed bridge and a loop, a step each in turn: it is answered, and pushes nothing at its end."""
     names: dict = {}
     exec(compile(BRIDGE, "docs/haptics.md", "exec"), names)
-    device = UdpDevice()
+    names["time"] = turns = Turns()
+    device = UdpDevice(clock=turns.monotonic)
     loop = HapticLoop(touching_simulation(), device, HapticSettings(relative=True, watchdog=WatchdogTimes(resume=0.01)))
     felt: list[tuple] = []
     way = iter(np.linspace(0.0, 0.006, 600))
-    arguments = (lambda: (0.0, 0.0, -next(way, 0.006)), felt.append, device.address[1], 1.5)
-    bridge = threading.Thread(target=names["bridge"], args=arguments)
-    bridge.start()
-    pacer = Pacer(PaceSettings(DT), np.zeros((), dtype=TIMING))
-    while bridge.is_alive():
-        pacer.wait()
-        assert not loop.step().fault
-        pacer.done(DT)
-    bridge.join()
+    turns.step = lambda: loop.step().fault
+    names["bridge"](lambda: (0.0, 0.0, -next(way, 0.006)), felt.append, device.address[1], 1.5)
     device.close()
     assert max(force[2] for force in felt) > 0.1
     assert felt[-1] == (0.0, 0.0, 0.0)
@@ -73,8 +78,8 @@ def test_printed_defaults_are_the_codes():
     assert rows("change of the device's force")[0] == f"{limits.slew_largest:g} N/s"
     fades = f"after {times.timeout * 1e3:g} ms, to zero in {times.fade * 1e3:g} ms"
     assert rows("no fresh pose: the force fades")[0] == fades
-    assert rows("poses again: the force comes back")[0] == f"within {times.resume * 1e3:g} ms"
-    assert rows("the tip follows a device")[0] == f"{settings.speed_largest:g} m/s"
+    assert rows("poses again: the force returns")[0] == f"within {times.resume * 1e3:g} ms"
+    assert rows("speed of the tip following a device")[0] == f"{settings.speed_largest:g} m/s"
     assert f"{settings.approach_speed * 1e3:g} mm/s" in DOCS
 
 

@@ -5,17 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.arms.arm_instrument import parked_place
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import coupling_for, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
-from surgsim_env.haptics.limits import ForceLimits
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.tip_drive import tip_drives
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.instruments.arm.arm_instrument import parked_place
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 from tests.haptics.bench_hand import (
     DT,
     START,

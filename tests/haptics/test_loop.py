@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganError
-from surgsim_env.anatomy import load_anatomy
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.device import DeviceDynamics, DevicePose
 from surgsim_env.haptics.frame import DeviceFrame
-from surgsim_env.haptics.limits import ForceLimits, SlewLimit
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings, SlewLimit
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.watchdog import Watchdog, WatchdogTimes
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 from tests.haptics.bench_hand import DT, START, bare_settings, held_device, run, touching_simulation
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -306,7 +305,7 @@ def test_button_without_a_jaw_is_nothing():
         (
             held_device(),
             HapticSettings(limits=ForceLimits(force_largest=25.0)),
-            "asks for 25 N; the instrument's servo",
+            "is 25 N; the instrument's servo",
         ),
         ([held_device(), held_device()], None, "2 devices and 2 settings for the 1 tips"),
         (held_device(), [HapticSettings()] * 2, "1 devices and 2 settings for the 1 tips"),
@@ -326,7 +325,7 @@ def test_what_cannot_be_coupled_is_refused_at_construction(device, settings, wor
 def test_device_too_weak_for_the_force_is_refused():
     device = Puppet()
     device.dynamics = DeviceDynamics(0.5, 0.05, force_largest=2.0)
-    with pytest.raises(ValueError, match=r"asks for 3 N; the device can push with 2 N: lower it"):
+    with pytest.raises(ValueError, match=r"is 3 N; the device can exert 2 N: lower it"):
         HapticLoop(touching_simulation(), device)
 
 

@@ -95,7 +95,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
     [
         (np.zeros(0), np.zeros((0, 3)), None, "n at least 1"),
         (np.arange(2.0), np.zeros((3, 3)), None, r"these are \(2,\) and \(3, 3\)"),
-        (np.arange(2.0), np.zeros((2, 3)), [0], "give one a row"),
+        (np.arange(2.0), np.zeros((2, 3)), [0], "give one per row"),
         (
             np.arange(2.0),
             np.zeros((2, 3)),

@@ -1,7 +1,5 @@
 """The UDP device: its answers, its one peer, and what a loop makes of a bridge that floods or stops."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -39,7 +37,6 @@ def test_answer_is_never_longer_than_the_request():
 def test_newest_pose_wins_and_one_answer_goes_out(device, sender):
     for sequence in range(1, 6):
         sender.pose(sequence, (0.001 * sequence, 0.0, 0.0))
-    time.sleep(0.05)
     pose = arrived(device)
     assert pose is not None and pose.position[0] == 0.005
     device.write(np.zeros(3))
@@ -94,10 +91,9 @@ def test_garbage_and_old_poses_do_not_keep_a_silent_peer_attached(device, sender
 
 
 def test_reading_never_waits_and_a_flood_is_bounded(device, sender):
-    begin = time.perf_counter()
+    assert device._socket.gettimeout() == 0.0
     for _ in range(200):
         assert device.read() is None
-    assert time.perf_counter() - begin < 0.5
     for _ in range(400):
         sender.raw(b"flood")
     device.read()
@@ -181,7 +177,7 @@ def test_an_answer_that_the_socket_does_not_take_is_counted(device, sender, monk
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "::", "example.org", ""])
 def test_other_hosts_than_loopback_are_refused(host):
-    with pytest.raises(ValueError, match=r"loopback address such as 127\.0\.0\.1 alone"):
+    with pytest.raises(ValueError, match=r"only on a loopback address such as 127\.0\.0\.1"):
         UdpDevice(host=host)
 
 

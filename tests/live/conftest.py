@@ -2,9 +2,8 @@
 
 import pytest
 
-from surgsim_env.live.exchange_records import Phase
+from surgsim_env.live.exchange_records import Change, Phase
 from surgsim_env.live.organ_choice import NONE, OrganChoice
-from surgsim_env.live.requests import Change
 from tests.live.served import Served, wait_until
 
 

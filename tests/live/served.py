@@ -10,15 +10,25 @@ import numpy as np
 import viser
 from websockets.asyncio.client import connect
 
+from surgsim_env.haptics.pacing import PaceSettings
 from surgsim_env.live.page import Page
 from surgsim_env.live.protocol_client import CAMERA
 from surgsim_env.live.session import Session
-from surgsim_env.pacing import PaceSettings
-from surgsim_env.scenes import make_scene
+from surgsim_env.scene.load import make_scene
 
 # A physics at a quarter of real time leaves room on a machine where other tests run beside.
 PACE = PaceSettings(period=0.004)
-SECONDS = 60.0
+# How long anything may take before a test gives up [s]. Nothing that passes depends on it.
+SECONDS = 600.0
+
+
+class Clock:
+    """Time that passes when a test says so [s]."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
 
 
 class Served:
@@ -26,7 +36,8 @@ class Served:
 
     def __init__(self, out: Path) -> None:
         self.out = out
-        self.session = Session(make_scene("phantom_small"), pace=PACE)
+        self.hand_clock = Clock()
+        self.session = Session(make_scene("phantom_small"), pace=PACE, clock=self.hand_clock)
         self.session.wait()
         self.page = Page(self.session, host="127.0.0.1", port=0, remote=False, out=out)
         self._stop = threading.Event()
@@ -35,7 +46,7 @@ class Served:
 
     def close(self) -> None:
         self._stop.set()
-        self._thread.join(timeout=20)
+        self._thread.join()
         self.page.server.stop()
         self.session.close()
 
@@ -56,6 +67,8 @@ class Served:
             subprotocols=[f"viser-v{viser.__version__}"] if path == "/" else None,
             max_size=None,
             compression=None,
+            open_timeout=SECONDS,
+            ping_interval=None,
         )
 
 
@@ -70,10 +83,11 @@ def setting(handle, value):
     return msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}})
 
 
-async def send(served, *messages):
+async def send(served, *messages, until):
+    """Messages of a tab that stays open until a condition holds."""
     async with served.socket() as socket:
         await socket.send(msgspec.msgpack.encode(CAMERA))
         await asyncio.wait_for(socket.recv(), SECONDS)
         for message in messages:
             await socket.send(message)
-        await asyncio.sleep(0.5)
+        await asyncio.to_thread(wait_until, until)

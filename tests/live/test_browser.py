@@ -5,23 +5,23 @@ import io
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from surgsim_env.live.exchange_records import Phase
+from surgsim_env.haptics.pacing import PaceSettings
+from surgsim_env.live.exchange_records import Pause, Phase, Reset
+from surgsim_env.live.messages import HandMotion
 from surgsim_env.live.page import Page
-from surgsim_env.live.requests import Reset
-from surgsim_env.live.session import Session
+from surgsim_env.live.session import HAND_SPEED, Session
 from surgsim_env.live.stage import page_camera
-from surgsim_env.pacing import PaceSettings
-from surgsim_env.scenes import Scene, make_scene, with_instrument
-from tests.live.chromium import CHROMIUM, Browser
+from surgsim_env.scene.load import make_scene, with_instrument
+from surgsim_env.scene.model import Scene
+from tests.live.served import Clock, wait_until
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium (.ci/run does)")
 WIDTH, HEIGHT = 900, 600
 # Pictures are drawn by the processor that the physics runs on: it goes at a tenth of real time here.
 PACE = PaceSettings(period=0.010)
@@ -29,8 +29,8 @@ CANVAS = "document.querySelector('canvas').getBoundingClientRect()"
 
 
 @contextlib.contextmanager
-def serving(scene: Scene, folder: Path) -> Iterator[Page]:
-    session = Session(scene, pace=PACE)
+def serving(scene: Scene, folder: Path, clock: Callable[[], float] = time.monotonic) -> Iterator[Page]:
+    session = Session(scene, pace=PACE, clock=clock)
     page, stop = None, threading.Event()
     thread = None
     try:
@@ -42,7 +42,7 @@ def serving(scene: Scene, folder: Path) -> Iterator[Page]:
     finally:
         stop.set()
         if thread is not None:
-            thread.join(timeout=20)
+            thread.join()
         if page is not None:
             page.server.stop()
         session.close()
@@ -55,24 +55,30 @@ def served(tmp_path) -> Iterator[Page]:
 
 
 @pytest.fixture(scope="module")
-def two_arms(tmp_path_factory) -> Iterator[Page]:
-    with serving(with_instrument(make_scene("lobe"), "psm_pair"), tmp_path_factory.mktemp("two_arms")) as page:
+def hand_clock() -> Clock:
+    """Tells how long sticks were held."""
+    return Clock()
+
+
+@pytest.fixture(scope="module")
+def two_arms(tmp_path_factory, hand_clock) -> Iterator[Page]:
+    scene = with_instrument(make_scene("lobe"), "psm_pair")
+    with serving(scene, tmp_path_factory.mktemp("two_arms"), hand_clock) as page:
         yield page
 
 
 def opened(browser, page) -> None:
     """The page is there, its physics runs, and pictures come."""
     browser.open(page.server.address)
-    browser.wait_for("!!document.body && document.body.innerText.includes('Force and depth')", 120)
-    browser.wait_for("document.body.innerText.includes('steps/s')", 120)
+    browser.wait_for("!!document.body && document.body.innerText.includes('Force and depth')")
+    browser.wait_for("document.body.innerText.includes('steps/s')")
     made = page.pictures
-    wait_until(browser, lambda: page.pictures > made + 10)
+    browser.wait_until(lambda: page.pictures > made + 3)
     browser.run("document.querySelector('.mantine-Notification-closeButton')?.click()")
 
 
-def picture(browser, tmp_path) -> np.ndarray:
-    browser.shot(tmp_path / "shot.png")
-    return np.asarray(Image.open(io.BytesIO((tmp_path / "shot.png").read_bytes())).convert("RGB")).astype(int)
+def picture(browser) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(browser.shot())).convert("RGB")).astype(int)
 
 
 def seen_at(browser, page, place) -> tuple[float, float]:
@@ -83,25 +89,15 @@ def seen_at(browser, page, place) -> tuple[float, float]:
     return box[0] + float(at[0, 0]), box[1] + float(at[0, 1])
 
 
-def wait_until(browser, condition, seconds=120.0):
-    """Until something is so on the server's side, while the browser goes on."""
-    browser.wait_for("new Promise(done => setTimeout(() => done(true), 50))")
-    for _ in range(int(seconds / 0.2)):
-        if condition():
-            return
-        browser.run("new Promise(done => setTimeout(() => done(true), 200))")
-    raise AssertionError("it did not come to pass")
-
-
-def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, tmp_path):
+def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium):
     session = served.session
-    with Browser(tmp_path, WIDTH, HEIGHT) as browser:
+    with chromium.page(WIDTH, HEIGHT) as browser:
         opened(browser, served)
         assert browser.run("location.search") == ""
         # It draws in software, and has said so.
         assert served._plain and served._panel._plain.value
         assert not browser.run(SMOOTH_EDGES)
-        before = picture(browser, tmp_path)
+        before = picture(browser)
         rest = session.frame()["node"].copy()
         plot_before = browser.run(PLOT)
 
@@ -110,36 +106,37 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, tmp_path
         down = start - 0.030 * session.directions[2]
         x, y = seen_at(browser, served, grip)
         to_x, to_y = seen_at(browser, served, down + 0.02 * session.directions[2])
-        browser.drag((x, y), (to_x, to_y))
-        wait_until(browser, lambda: np.linalg.norm(session.targets[0] - start) > 0.015)
-        wait_until(browser, lambda: np.linalg.norm(session.frame()["force"][0]) > 0.05)
+        browser.drag((x, y), (to_x, to_y), lambda: np.linalg.norm(session.targets[0] - start) > 0.015)
+        browser.wait_until(lambda: not served._held and not served._grabs)
+        browser.wait_until(lambda: np.linalg.norm(session.frame()["force"][0]) > 0.05)
         assert np.linalg.norm(session.frame()["node"] - rest, axis=1).max() > 0.001
-        wait_until(browser, lambda: browser.run(PLOT) != plot_before)
-        after = picture(browser, tmp_path)
-
+        browser.wait_until(lambda: browser.run(PLOT) != plot_before)
         box = browser.run(f"(() => {{ const r = {CANVAS}; return [r.x, r.y, r.width, r.height]; }})()")
         middle = (slice(int(0.2 * box[3]), int(0.9 * box[3])), slice(int(0.25 * box[2]), int(0.6 * box[2])))
-        changed = np.abs(before[middle] - after[middle]).max(axis=2) > 24
-        assert changed.mean() > 0.01
+
+        def changed() -> float:
+            """The share of the middle's pixels that have another colour than before the press."""
+            return (np.abs(before[middle] - picture(browser)[middle]).max(axis=2) > 24).mean()
+
+        browser.wait_until(lambda: changed() > 0.01)
+        after = picture(browser)
         # The organ is there: reddish, and shaded, not one flat colour.
         red = after[(after[:, :, 0] > 1.6 * after[:, :, 2]) & (after[:, :, 0] > 60)]
         assert len(red) > 2000 and len(np.unique(red, axis=0)) > 50
 
         browser.click_on("Pause")
-        wait_until(browser, lambda: served._panel._pause.label == "Go on")
-        browser.wait_for("document.body.innerText.includes('Go on')")
+        browser.wait_until(lambda: served._panel._pause.label == "Continue")
+        browser.wait_for("document.body.innerText.includes('Continue')")
         # viser's camera complains of its own way to hear the wheel.
         assert [one for one in browser.complaints() if "passive event listener" not in one] == []
-    assert served._judge.dropped == 0 and served._judge.ignored == 0
+    assert served._message_filter.dropped == 0 and served._message_filter.ignored == 0
 
 
-def test_both_arms_are_dragged_and_both_forces_shown(two_arms, tmp_path):
+def test_both_arms_are_dragged_and_both_forces_shown(two_arms, chromium):
     session = two_arms.session
     out = session.directions[2]
-    session.park()
-    session.ask(Reset())
-    wait_for_rest(session)
-    with Browser(tmp_path, WIDTH, HEIGHT) as browser:
+    rest(session)
+    with chromium.page(WIDTH, HEIGHT) as browser:
         opened(browser, two_arms)
         assert not session.frame()["force"].any()
         assert forces_shown(browser) == [0.0, 0.0]
@@ -147,19 +144,25 @@ def test_both_arms_are_dragged_and_both_forces_shown(two_arms, tmp_path):
         for arm, way in enumerate((0.008, 0.018)):
             tip, start = session.frame()["tip"].copy(), session.targets.copy()
             grip = start[arm] + 0.06 * two_arms._handles[arm].scale * out
-            browser.drag(seen_at(browser, two_arms, grip), seen_at(browser, two_arms, grip - way * out))
-            moved = session.targets - start
-            np.testing.assert_allclose(moved[arm], -way * out, atol=0.15 * way)
-            assert not moved[1 - arm].any()
-            wait_until(browser, lambda arm=arm: np.linalg.norm(session.frame()["force"][arm]) > 0.02)
+            browser.drag(
+                seen_at(browser, two_arms, grip),
+                seen_at(browser, two_arms, grip - way * out),
+                lambda arm=arm, place=start[arm] - way * out, way=way: np.allclose(
+                    session.targets[arm], place, rtol=0.0, atol=0.15 * way
+                ),
+            )
+            browser.wait_until(lambda: not two_arms._held)
+            np.testing.assert_allclose(session.targets[arm] - start[arm], -way * out, atol=0.15 * way)
+            assert np.array_equal(session.targets[1 - arm], start[1 - arm])
+            browser.wait_until(lambda arm=arm: np.linalg.norm(session.frame()["force"][arm]) > 0.02)
             went = session.frame()["tip"][arm] - tip[arm]
             assert -went @ out > 0.5 * way
-        wait_until(browser, lambda: min(forces_shown(browser)) > 0.01)
+        browser.wait_until(lambda: min(forces_shown(browser)) > 0.01)
         assert session.frame()["phase"] == Phase.RUNNING
         # Each is drawn in its colour, too.
-        wait_until(browser, lambda: min(curve_heights(browser, 0)) > 1)
+        browser.wait_until(lambda: min(curve_heights(browser, 0)) > 1)
         assert [one for one in browser.complaints() if "passive event listener" not in one] == []
-    assert two_arms._judge.dropped == 0 and two_arms._judge.ignored == 0
+    assert two_arms._message_filter.dropped == 0 and two_arms._message_filter.ignored == 0
 
 
 # Of the plot with some number, in each arm's colour: the rows of pixels that its curve takes.
@@ -182,55 +185,68 @@ def forces_shown(browser) -> list[float]:
     return [float(one) for one in found.groups()]
 
 
-def wait_for_rest(session) -> None:
-    deadline = time.monotonic() + 60.0
-    while session.frame()["force"].any() or session.frame()["time"] > 1.0:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
-PAD = """window.pad = {connected: true, axes: [0, 0, 0, 0], buttons: Array.from({length: 17}, () => ({value: 0}))};
-navigator.getGamepads = () => [null, window.pad];"""
-
-
-def test_a_gamepad_moves_either_tip_and_its_jaw(two_arms, tmp_path):
-    session = two_arms.session
-    right, away, out = session.directions
+def rest(session) -> None:
+    """Start again with both tips parked, and stand still until that is seen."""
     session.park()
-    session.ask(Reset())
-    wait_for_rest(session)
-    with Browser(tmp_path, WIDTH, HEIGHT) as browser:
+    for request in (Reset(), Pause(True)):
+        session.ask(request)
+    wait_until(lambda: session.frame()["phase"] == Phase.PAUSED)
+    session.ask(Pause(False))
+
+
+# A gamepad that counts how often it was looked at.
+PAD = """window.pad = {connected: true, axes: [0, 0, 0, 0], buttons: Array.from({length: 17}, () => ({value: 0}))};
+window.looks = 0;
+navigator.getGamepads = () => { window.looks += 1; return [null, window.pad]; };"""
+
+
+def test_a_gamepad_moves_either_tip_and_its_jaw(two_arms, hand_clock, chromium, monkeypatch):
+    session, heard = two_arms.session, []
+    rest(session)
+    push = session.push
+    monkeypatch.setattr(session, "push", lambda motion: (heard.append(motion), push(motion)))
+    with chromium.page(WIDTH, HEIGHT) as browser:
         browser.before_pages(PAD)
         opened(browser, two_arms)
 
-        def hold(control: str, value: float, arm: int) -> np.ndarray:
-            """How an arm's tip goes while a stick or a trigger is held; the other one stays."""
+        def put(control: str, value: float) -> None:
+            """Put a stick or a button somewhere, and wait until the page has seen it there."""
+            looks = browser.run(f"(window.pad.{control} = {value}, window.looks)")
+            browser.wait_for(f"window.looks > {looks}")
+
+        def hold(control: str, value: float, arm: int, *axes: float) -> None:
+            """A tenth of a second of a stick moves one hand and its tip, right, away and out of the view."""
             hands, tips = session.targets, session.frame()["tip"].copy()
-            browser.run(f"void (window.pad.{control} = {value})")
-            wait_until(browser, lambda: np.linalg.norm(session.targets[arm] - hands[arm]) > 0.003)
-            browser.run(f"void (window.pad.{control} = 0)")
-            wait_until(browser, lambda: not session._motions)
+            put(control, value)
+            browser.wait_until(lambda: heard)
+            assert heard[0] == HandMotion(axes, arm)
+            hand_clock.now += 0.1
+            browser.wait_until(lambda: not np.array_equal(session.targets, hands))
+            put(control, 0.0)
+            browser.wait_until(lambda: not session._motions)
+            heard.clear()
             moved = session.targets - hands
-            wait_until(browser, lambda: np.linalg.norm(session.frame()["tip"][arm] - tips[arm] - moved[arm]) < 0.001)
+            np.testing.assert_allclose(moved[arm], 0.1 * HAND_SPEED * (np.array(axes) @ session.directions), atol=1e-9)
             assert not moved[1 - arm].any()
-            return moved[arm] / np.linalg.norm(moved[arm])
+            browser.wait_until(lambda: np.linalg.norm(session.frame()["tip"][arm] - tips[arm] - moved[arm]) < 0.001)
 
         # A worn stick that does not come back to its middle moves nothing.
-        hands = session.targets
-        browser.run("new Promise(done => { window.pad.axes[0] = 0.1; setTimeout(done, 500); })")
-        assert np.array_equal(session.targets, hands)
-        np.testing.assert_allclose(hold("axes[0]", 1.0, 0), right, atol=1e-9)
-        np.testing.assert_allclose(hold("axes[1]", 1.0, 0), -away, atol=1e-9)
-        np.testing.assert_allclose(hold("buttons[6].value", 1.0, 0), out, atol=1e-9)
-        np.testing.assert_allclose(hold("axes[3]", -1.0, 0), out, atol=1e-9)
-        browser.run("void (window.pad.buttons[0].value = 1)")
-        wait_until(browser, lambda: session.jaw_closed)
-        browser.run("void (window.pad.buttons[0].value = 0)")
-        browser.run("new Promise(done => { window.pad.buttons[5].value = 1; setTimeout(done, 300); })")
-        browser.run("void (window.pad.buttons[5].value = 0)")
-        np.testing.assert_allclose(hold("axes[0]", -1.0, 1), -right, atol=1e-9)
-        np.testing.assert_allclose(hold("buttons[7].value", 1.0, 1), -out, atol=1e-9)
-    assert session.jaw_closed and two_arms._judge.dropped == 0
+        put("axes[0]", 0.1)
+        put("axes[0]", 0.1)
+        hold("axes[1]", 1.0, 0, 0.0, -1.0, 0.0)
+        hold("axes[0]", 1.0, 0, 1.0, 0.0, 0.0)
+        hold("buttons[6].value", 1.0, 0, 0.0, 0.0, 1.0)
+        hold("axes[3]", -1.0, 0, 0.0, 0.0, 1.0)
+        put("buttons[0].value", 1.0)
+        browser.wait_until(lambda: session.jaw_closed)
+        assert heard == [HandMotion((0.0, 0.0, 0.0), 0, turns_jaw=True)]
+        heard.clear()
+        put("buttons[0].value", 0.0)
+        put("buttons[5].value", 1.0)
+        put("buttons[5].value", 0.0)
+        hold("axes[0]", -1.0, 1, -1.0, 0.0, 0.0)
+        hold("buttons[7].value", 1.0, 1, 0.0, 0.0, -1.0)
+    assert session.jaw_closed and two_arms._message_filter.dropped == 0
     session.close_jaw(False)
 
 
@@ -242,10 +258,10 @@ PLOT = """[...document.querySelectorAll('.uplot canvas')].map(one => {
   return s; }).join(' ')"""
 
 
-def test_without_the_token_a_browser_sees_nothing_of_it(served, tmp_path):
-    with Browser(tmp_path, 400, 300) as browser:
+def test_without_the_token_a_browser_sees_nothing_of_it(served, chromium):
+    with chromium.page(400, 300) as browser:
         browser.open(served.server.address.split("?")[0])
-        browser.wait_for("!!document.body && document.body.innerText.includes('surgsim view')", 120)
+        browser.wait_for("!!document.body && document.body.innerText.includes('surgsim view')")
         assert browser.run("document.querySelectorAll('canvas').length") == 0
         # A page of another origin, in the same browser, that has the address but is not this server's own.
         browser.open("data:text/html,<p>elsewhere</p>")

@@ -4,19 +4,33 @@ from importlib.resources import files
 
 import pytest
 
-from tests.live.chromium import CHROMIUM, Browser
-
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium (.ci/run does)")
-# Frames that are run within a second [1/s].
-FRAMES = """new Promise(done => { let frames = 0, over = false;
-  const tick = () => { if (over) return; frames += 1; requestAnimationFrame(tick); };
-  requestAnimationFrame(tick); setTimeout(() => { over = true; done(frames); }, 1000); })"""
-WORKER = """window.worker = new Worker(URL.createObjectURL(new Blob(['setInterval(() => postMessage(0), 25)'])))"""
+# The page's clock and its frames are moved by the test, a frame in 20 ms; `frames` counts those that a page is given.
+STEPPED = """(() => {
+  let now = 1000, number = 0;
+  const waiting = new Map();
+  performance.now = () => now;
+  window.requestAnimationFrame = callback => { waiting.set(++number, callback); return number; };
+  window.cancelAnimationFrame = key => { waiting.delete(key); };
+  window.step = () => {
+    now += 20;
+    const due = [...waiting];
+    for (const [key, callback] of due) if (waiting.delete(key)) callback(now);
+  };
+  window.frames = 0;
+})()"""
+# Fifty frames, a second of that clock, with something before each; how many of them the page was given.
+SECOND = """(async () => { const before = window.frames;
+  for (let count = 0; count < 50; count += 1) { await (%s); window.step(); }
+  return window.frames - before; })()"""
+NOTHING = "null"
+MESSAGE = "new Promise(done => { window.worker.onmessage = done; window.worker.postMessage(0); })"
+MOVE = "count % 5 || window.dispatchEvent(new PointerEvent('pointerdown'))"
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("drawing"), 200, 100) as made:
+def browser(chromium):
+    with chromium.page(200, 100) as made:
+        made.before_pages(STEPPED)
         made.before_pages(files("surgsim_env.live").joinpath("drawing.js").read_text(encoding="utf-8"))
         made.open("data:text/html,<p>nothing</p>")
         made.wait_for("document.readyState === 'complete' && document.body.innerText.includes('nothing')")
@@ -36,14 +50,15 @@ def test_software_is_known_and_draws_without_smoothed_edges(browser):
 
 
 def test_frames_wait_for_something_new(browser):
-    assert 3 <= browser.run(FRAMES) <= 11
-    browser.run(f"void ({WORKER})")
-    browser.wait_for(FRAMES + ".then(frames => frames > 14)")
-    browser.run("window.worker.terminate()")
-    assert browser.run(FRAMES) <= 12
+    browser.run("void (function tick() { window.frames += 1; requestAnimationFrame(tick); })()")
+    browser.run(
+        "void (window.worker = new Worker(URL.createObjectURL(new Blob(['onmessage = () => postMessage(0)']))))"
+    )
+    assert browser.run(SECOND % NOTHING) == 10
+    assert browser.run(SECOND % MESSAGE) == 50
+    assert browser.run(SECOND % NOTHING) == 10
     # Whoever moves the view sees it move.
-    browser.run("void setInterval(() => window.dispatchEvent(new PointerEvent('pointerdown')), 100)")
-    browser.wait_for(FRAMES + ".then(frames => frames > 14)")
+    assert browser.run(SECOND % MOVE) == 50
 
 
 def test_a_frame_may_be_called_off_and_a_failing_one_stops_no_other(browser):
@@ -53,4 +68,5 @@ def test_a_frame_may_be_called_off_and_a_failing_one_stops_no_other(browser):
         requestAnimationFrame(() => { ran.push('one'); throw Error(); });
         requestAnimationFrame(() => ran.push('other')); cancelAnimationFrame(off); undefined"""
     )
-    assert browser.wait_for("window.ran.length > 1 && window.ran.join()") == "one,other"
+    browser.run(SECOND % NOTHING)
+    assert browser.run("window.ran.join()") == "one,other"

@@ -12,7 +12,7 @@ from surgsim_env.live.errors import LiveError
 from surgsim_env.live.organ_choice import HIDDEN, OrganChoice
 from surgsim_env.live.page import Page
 from surgsim_env.live.session import Session
-from surgsim_env.scenes import make_scene
+from surgsim_env.scene.load import make_scene
 from tests.live.served import PACE, wait_until
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -21,8 +21,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 CHILD = """
 import sys, time
 from surgsim_env.live.session import Session
-from surgsim_env.pacing import PaceSettings
-from surgsim_env.scenes import make_scene
+from surgsim_env.haptics.pacing import PaceSettings
+from surgsim_env.scene.load import make_scene
 if __name__ == "__main__":
     session = Session(make_scene("phantom_small"), pace=PaceSettings(period=0.01))
     session.wait()

@@ -14,8 +14,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from surgsim_env.live.errors import LiveError
 from surgsim_env.live.guarded_server import MESSAGE_SIZE_MOST, SOCKETS_MOST, GuardedServer
+from surgsim_env.live.messages import MessageFilter
 from surgsim_env.live.protocol_client import CAMERA
-from surgsim_env.live.web_messages import Judge
+from tests.live.served import SECONDS
 
 PROTOCOL = f"viser-v{viser.__version__}"
 
@@ -27,13 +28,13 @@ def server():
             while True:
                 await connection.send(await connection.recv())
 
-    made = GuardedServer("127.0.0.1", 0, remote=False, judge=Judge(), serve_hand=serve_hand)
+    made = GuardedServer("127.0.0.1", 0, remote=False, message_filter=MessageFilter(), serve_hand=serve_hand)
     yield made
     made.stop()
 
 
 def get(server, path, **headers):
-    connection = http.client.HTTPConnection("127.0.0.1", server.gate.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.gate.port, timeout=SECONDS)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     return answer.status, answer.read(), answer.headers
@@ -50,6 +51,8 @@ def joined(server, path="/", **options):
         "subprotocols": [PROTOCOL] if path == "/" else None,
         "max_size": None,
         "compression": None,
+        "open_timeout": SECONDS,
+        "ping_interval": None,
     }
     return connect(f"ws://127.0.0.1:{server.gate.port}{path}", **{**given, **options})
 
@@ -57,7 +60,7 @@ def joined(server, path="/", **options):
 async def replayed(socket) -> None:
     """Say where the camera is, and take what a new page is sent."""
     await socket.send(msgspec.msgpack.encode(CAMERA))
-    await asyncio.wait_for(socket.recv(), 20)
+    await asyncio.wait_for(socket.recv(), SECONDS)
 
 
 async def is_dropped(socket, message) -> int:
@@ -65,7 +68,7 @@ async def is_dropped(socket, message) -> int:
     await socket.send(message)
     with pytest.raises(ConnectionClosed) as closed:
         for _ in range(1000):
-            await asyncio.wait_for(socket.recv(), 20)
+            await asyncio.wait_for(socket.recv(), SECONDS)
     return closed.value.rcvd.code
 
 
@@ -83,7 +86,7 @@ def test_the_page_comes_with_the_token_alone(server):
 
 def test_a_request_that_takes_no_packing_is_answered(server):
     """As plain curl asks: without Accept-Encoding."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.gate.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.gate.port, timeout=SECONDS)
     connection.putrequest("GET", f"/?token={server.gate.token}", skip_accept_encoding=True)
     connection.endheaders()
     assert connection.getresponse().status == 200
@@ -145,7 +148,7 @@ def test_a_tab_that_sends_nonsense_is_dropped_and_the_other_lives(server, kind):
             await replayed(bad)
             assert await is_dropped(bad, message) == code
             server.viser.scene.add_frame(f"/{kind.replace(' ', '_')}")
-            assert await asyncio.wait_for(good.recv(), 20)
+            assert await asyncio.wait_for(good.recv(), SECONDS)
 
     asyncio.run(attempt())
 
@@ -157,7 +160,7 @@ def test_a_flood_is_dropped(server):
             with pytest.raises(ConnectionClosed) as closed:
                 for _ in range(20_000):
                     await socket.send(message)
-                await asyncio.wait_for(socket.wait_closed(), 20)
+                await asyncio.wait_for(socket.wait_closed(), SECONDS)
                 await socket.send(message)
             return closed.value.rcvd.code
 
@@ -168,7 +171,7 @@ def test_hands_have_a_path_of_their_own(server):
     async def attempt():
         async with joined(server, "/hand") as socket:
             await socket.send(b"0123456789abcdef")
-            return await asyncio.wait_for(socket.recv(), 20)
+            return await asyncio.wait_for(socket.recv(), SECONDS)
 
     assert asyncio.run(attempt()) == b"0123456789abcdef"
 
@@ -217,10 +220,10 @@ def test_a_viser_that_serves_beside_the_gate_is_refused(monkeypatch):
 
     monkeypatch.setattr(guarded_server.viser, "ViserServer", OtherViser)
     with pytest.raises(LiveError, match="cannot guard"):
-        GuardedServer("127.0.0.1", 0, remote=False, judge=Judge(), serve_hand=None)
+        GuardedServer("127.0.0.1", 0, remote=False, message_filter=MessageFilter(), serve_hand=None)
 
 
-async def wait_until(condition, seconds=20.0):
+async def wait_until(condition, seconds=SECONDS):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline

@@ -1,14 +1,12 @@
 """What the panel and the browser ask of a page, as their own messages: settings, recordings, plain pictures."""
 
 import asyncio
-import time
 
 import pytest
 
-from surgsim_env.live.exchange_records import Phase
-from surgsim_env.live.hand_messages import DrawingReport, HandMotion, write_hand, write_report
+from surgsim_env.live.exchange_records import Pause, Phase, Record, Reset
+from surgsim_env.live.messages import DrawingReport, HandMotion, write_hand, write_report
 from surgsim_env.live.protocol_client import ProtocolClient, press_path
-from surgsim_env.live.requests import Pause, Record, Reset
 from tests.live.served import send, setting, wait_until
 
 pytestmark = pytest.mark.usefixtures("fresh")
@@ -19,14 +17,13 @@ def test_panel_settings_reach_the_physics(served):
     panel, session = served.page._panel, served.session
 
     organ = int(session.frame()["organ"])
-    asyncio.run(send(served, setting(panel._modulus, 9.0)))
-    wait_until(lambda: int(session.frame()["organ"]) > organ)
+    asyncio.run(send(served, setting(panel._modulus, 9.0), until=lambda: int(session.frame()["organ"]) > organ))
     assert session.choice.modulus_factor == pytest.approx(9.0 / (session.scene.material.youngs_modulus / 1e3))
-    ignored = served.page._judge.ignored
-    asyncio.run(send(served, setting(panel._modulus, 1e9), setting(panel._lesions, "all of them")))
-    assert served.page._judge.ignored == ignored + 2 and panel._modulus.value == 9.0
-    asyncio.run(send(served, setting(panel._pause, True)))
-    wait_until(lambda: session.frame()["phase"] == Phase.PAUSED)
+    ignored = served.page._message_filter.ignored
+    beyond = (setting(panel._modulus, 1e9), setting(panel._lesions, "all of them"))
+    asyncio.run(send(served, *beyond, until=lambda: served.page._message_filter.ignored >= ignored + 2))
+    assert served.page._message_filter.ignored == ignored + 2 and panel._modulus.value == 9.0
+    asyncio.run(send(served, setting(panel._pause, True), until=lambda: session.frame()["phase"] == Phase.PAUSED))
     session.ask(Pause(False))
     wait_until(lambda: session.frame()["phase"] == Phase.RUNNING)
 
@@ -37,11 +34,11 @@ def test_a_click_means_what_the_physics_is_doing(served, monkeypatch, tmp_path):
     monkeypatch.setattr(served.page, "_out", tmp_path)
     monkeypatch.setattr(panel, "_name", lambda *_: None)
     for phase in (Phase.PAUSED, Phase.RUNNING):
-        asyncio.run(send(served, setting(panel._pause, True)))
-        wait_until(lambda phase=phase: session.frame()["phase"] == phase)
+        clicked = setting(panel._pause, True)
+        asyncio.run(send(served, clicked, until=lambda phase=phase: session.frame()["phase"] == phase))
     for recording in (True, False):
-        asyncio.run(send(served, setting(panel._record, True)))
-        wait_until(lambda recording=recording: bool(session.frame()["recording"]) == recording)
+        clicked, now = setting(panel._record, True), recording
+        asyncio.run(send(served, clicked, until=lambda now=now: bool(session.frame()["recording"]) == now))
     wait_until((tmp_path / "recording-1.csv").is_file)
 
 
@@ -50,9 +47,9 @@ def test_buttons_are_renamed_with_the_next_picture(served, monkeypatch):
     # They do not wait for the words that are said twice a second.
     monkeypatch.setattr(served.page, "_say", lambda _: None)
     session.ask(Pause(True))
-    wait_until(lambda: panel._pause.label == "Go on", 20.0)
+    wait_until(lambda: panel._pause.label == "Continue")
     session.ask(Pause(False))
-    wait_until(lambda: panel._pause.label == "Pause", 20.0)
+    wait_until(lambda: panel._pause.label == "Pause")
 
 
 def test_a_recording_is_written_to_its_folder_alone(served):
@@ -62,9 +59,10 @@ def test_a_recording_is_written_to_its_folder_alone(served):
     wait_until(lambda: session.exchange.recorded.count > 100)
     session.ask(Record(False))
     wait_until(lambda: (served.out / "recording-1.csv").is_file())
+    stopped = session.frame()["time"]
     assert [path.name for path in served.out.iterdir()] == ["recording-1.csv"]
     session.ask(Reset())
-    wait_until(lambda: session.frame()["time"] < 0.5)
+    wait_until(lambda: session.frame()["time"] < stopped)
 
 
 def test_plain_pictures_have_fewer_triangles_and_keep_the_paint(served):
@@ -91,25 +89,31 @@ def test_plain_pictures_have_fewer_triangles_and_keep_the_paint(served):
     assert not client.errors
 
 
-def report_of(served, software, rate=None):
+def report_of(served, monkeypatch, software, rate=None):
+    """What a tab says of its drawing, until the page has attended to it."""
+    heard, attended = [], []
+    push, attend = served.session.push, served.page._attend
+
     async def attempt():
         async with served.socket("/hand") as socket:
             await socket.send(write_report(DrawingReport(rate, software)))
             await socket.send(write_hand(HandMotion((0.0, 0.0, 0.0), 0)))
+            await asyncio.to_thread(wait_until, lambda: heard)
 
-    asyncio.run(attempt())
+    with monkeypatch.context() as patched:
+        patched.setattr(served.session, "push", lambda motion: (push(motion), heard.append(motion)))
+        asyncio.run(attempt())
+        patched.setattr(served.page, "_attend", lambda frame: (attend(frame), attended.append(frame)))
+        wait_until(lambda: len(attended) > 1)
 
 
-def test_a_browser_without_a_graphics_card_is_drawn_for_plainly_until_its_user_says_otherwise(served):
+def test_a_browser_without_a_graphics_card_is_drawn_for_plainly_until_its_user_says_otherwise(served, monkeypatch):
     page = served.page
     page._plain, page._tabs.software = None, False
-    report_of(served, False, 60.0)
-    time.sleep(0.2)
+    report_of(served, monkeypatch, False, 60.0)
     assert page._plain is None
-    report_of(served, True)
-    wait_until(lambda: page._plain)
-    asyncio.run(send(served, setting(page._panel._plain, False)))
-    wait_until(lambda: page._plain is False)
-    report_of(served, True)
-    time.sleep(0.2)
+    report_of(served, monkeypatch, True)
+    assert page._plain
+    asyncio.run(send(served, setting(page._panel._plain, False), until=lambda: page._plain is False))
+    report_of(served, monkeypatch, True)
     assert page._plain is False and not page._panel._plain.value

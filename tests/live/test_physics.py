@@ -5,8 +5,19 @@ import multiprocessing
 import numpy as np
 import pytest
 
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.live.exchange_records import TRACE_STEPS, Phase, new_exchange
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.haptics.pacing import PaceSettings
+from surgsim_env.live.exchange_records import (
+    TRACE_STEPS,
+    Change,
+    End,
+    Pause,
+    Phase,
+    Record,
+    Replay,
+    Reset,
+    new_exchange,
+)
 from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.organ_choice import (
     HIDDEN,
@@ -20,11 +31,9 @@ from surgsim_env.live.organ_choice import (
 from surgsim_env.live.organ_view import COLOURS, colour_levels
 from surgsim_env.live.physics import REQUESTS_MOST, Physics, Setup
 from surgsim_env.live.recording import read_recording
-from surgsim_env.live.requests import Change, End, Pause, Record, Replay, Reset
-from surgsim_env.pacing import PaceSettings
 from surgsim_env.rendering.instrument_geoms import shown_geoms
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 
 ASIDE, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
@@ -56,14 +65,14 @@ class Bench:
                 self.hold(place)
             if self.physics._phase == Phase.RUNNING:
                 self.physics._last = self.physics._loop.step()
-                self.physics._keep(self.physics._last)
-        self.physics._tell()
+                self.physics._record_step(self.physics._last)
+        self.physics._write_frame()
 
     def ask(self, request) -> bool:
         self.pipe.send(request)
         with self.exchange.hand.writing() as hand:
             hand["requests"] += 1
-        return self.physics._look(lambda: True)
+        return self.physics._handle_requests(lambda: True)
 
     @property
     def frame(self):
@@ -190,7 +199,7 @@ def test_sliders_make_another_organ(bench):
 def test_an_organ_that_cannot_be_is_refused_and_the_last_one_stays(bench):
     bench.ask(Change(OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)))
     frame = bench.frame
-    assert bytes(frame["said"]).startswith(b"not that organ") and frame["organ"] == 1
+    assert bytes(frame["said"]).startswith(b"this organ cannot be made") and frame["organ"] == 1
     bench.step(200, bench.above)
     assert bench.frame["phase"] == Phase.RUNNING
 
@@ -236,18 +245,18 @@ def test_many_requests_wait_for_their_turn(bench):
     with bench.exchange.hand.writing() as hand:
         hand["requests"] += 3 * REQUESTS_MOST
     heeded = []
-    bench.physics._do = heeded.append
+    bench.physics._handle = heeded.append
     for looks in range(1, 5):
-        assert bench.physics._look(lambda: True)
+        assert bench.physics._handle_requests(lambda: True)
         assert len(heeded) == min(looks, 3) * REQUESTS_MOST
 
 
 def test_nobody_left_ends_it(bench):
-    assert not bench.physics._look(lambda: False)
+    assert not bench.physics._handle_requests(lambda: False)
     bench.pipe.close()
     with bench.exchange.hand.writing() as hand:
         hand["requests"] += 1
-    assert not bench.physics._look(lambda: True)
+    assert not bench.physics._handle_requests(lambda: True)
 
 
 @pytest.mark.parametrize(

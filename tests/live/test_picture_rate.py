@@ -4,9 +4,8 @@ import struct
 
 import pytest
 
-from surgsim_env.live.hand_messages import DrawingReport, read_report, write_report
-from surgsim_env.live.picture_rate import RATE_LEAST, RATE_MOST, REPORT_AGE_MOST, PictureRate
-from surgsim_env.live.web_messages import NonsenseError
+from surgsim_env.live.messages import DrawingReport, InvalidMessageError, read_report, write_report
+from surgsim_env.live.tabs import RATE_LEAST, RATE_MOST, REPORT_AGE_MOST, PictureRate
 
 
 def test_the_slowest_browser_sets_the_rate_and_its_closing_frees_it():
@@ -40,13 +39,13 @@ def test_a_tab_that_sleeps_counts_no_more():
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf"), -1.0, 1e9])
 def test_a_rate_that_is_none_is_nonsense(rate):
-    with pytest.raises(NonsenseError, match="frames a second"):
+    with pytest.raises(InvalidMessageError, match="frames a second"):
         read_report(write_report(DrawingReport(rate, False)))
 
 
 @pytest.mark.parametrize("flags", [(2, 0), (0, 2), (1, 0xFFFF)])
 def test_a_flag_that_is_none_is_nonsense(flags):
-    with pytest.raises(NonsenseError, match="counted"):
+    with pytest.raises(InvalidMessageError, match="counted"):
         read_report(struct.pack("<fHH", 30.0, *flags))
 
 

@@ -46,7 +46,7 @@ class Environment:
 
 def run(command: list[str | Path], *, expect: int = 0, **options) -> str:
     """Standard output of a command, which shows all it printed where it ends otherwise than expected."""
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, **options)
     assert done.returncode == expect, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -70,7 +70,7 @@ def clean_environ() -> dict[str, str]:
     return {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "NUMBA_", "PYTEST_"))}
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_environment() -> Callable[[Path], Environment]:
     def make(folder: Path) -> Environment:
         run([sys.executable, "-m", "venv", "--without-pip", folder])

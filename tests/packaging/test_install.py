@@ -8,8 +8,8 @@ import pytest
 
 from tests.packaging.conftest import REPOSITORY, Environment, copy_of_project, run
 
-WHERE = "from surgsim_env.scene_files import scenes_folder; print(scenes_folder())"
-LIST = "import surgsim_env.scenes; print(*surgsim_env.scenes.list_scenes())"
+WHERE = "from surgsim_env.scene.load import scenes_folder; print(scenes_folder())"
+LIST = "import surgsim_env.scene.load; print(*surgsim_env.scene.load.list_scenes())"
 
 
 def scene_files(folder: Path) -> set[str]:
@@ -23,20 +23,31 @@ def scene_files(folder: Path) -> set[str]:
 def test_wheel_holds_the_packages_the_scenes_and_nothing_else(wheel):
     names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
     assert {Path(name).parts[0] for name in names} == {"msdm_core", "surgsim_env"}
-    shipped = {name.removeprefix("surgsim_env/scenes/") for name in names if name.startswith("surgsim_env/scenes/")}
+    assets = "surgsim_env/assets/"
+    shipped = {name.removeprefix(assets) for name in names if name.startswith(assets)}
     assert shipped == scene_files(REPOSITORY / "scenes")
     assert not [name for name in names if name.endswith((".nbi", ".nbc", ".pyc"))]
+
+
+def test_wheel_says_that_its_packages_are_typed(wheel):
+    assert {"msdm_core/py.typed", "surgsim_env/py.typed"} <= set(zipfile.ZipFile(wheel).namelist())
+
+
+def test_wheel_holds_the_templates_of_reports(wheel):
+    folder = "surgsim_env/reports/templates"
+    names = zipfile.ZipFile(wheel).namelist()
+    shipped = {name.removeprefix(f"{folder}/") for name in names if name.startswith(f"{folder}/")}
+    assert shipped == {path.name for path in (REPOSITORY / folder).iterdir()} >= {"base.html.j2", "style.css"}
 
 
 def test_installed_wheel_finds_its_scenes(wheel, make_environment, tmp_path, clean_environ):
     environment: Environment = make_environment(tmp_path / "venv")
     environment.install(wheel)
     found = Path(run([environment.python, "-c", WHERE], cwd=tmp_path, env=clean_environ).strip())
-    assert found == environment.site_packages / "surgsim_env" / "scenes"
+    assert found == environment.site_packages / "surgsim_env" / "assets"
     shipped = sorted(path.name for path in found.glob("organs/*.toml"))
     assert shipped == sorted(path.name for path in (REPOSITORY / "scenes").glob("organs/*.toml")) != []
     assert (environment.folder / "bin" / "surgsim").is_file()
-    # The folder `scenes` lies beside the module `scenes` there: the module must win.
     known = run([environment.python, "-c", LIST], cwd=tmp_path, env=clean_environ).split()
     assert [f"{name}.toml" for name in known] == shipped
 
@@ -53,15 +64,15 @@ def test_editable_install_sees_an_edit_at_once(
 
     assert found == project / "scenes"
     assert (found / "organs" / "planted.toml").is_file()
-    stale = environment.site_packages / "surgsim_env" / "scenes"
+    stale = environment.site_packages / "surgsim_env" / "assets"
     assert not (stale / "organs" / "planted.toml").exists()
 
 
 def test_missing_scenes_name_both_places_and_the_way_out(tmp_path):
-    from surgsim_env.scene_files import scenes_folder
+    from surgsim_env.scene.load import scenes_folder
 
     package = tmp_path / "surgsim_env"
     package.mkdir()
     with pytest.raises(FileNotFoundError, match="reinstall surgsim") as caught:
         scenes_folder(package)
-    assert str(package / "scenes") in str(caught.value) and str(tmp_path / "scenes") in str(caught.value)
+    assert str(package / "assets") in str(caught.value) and str(tmp_path / "scenes") in str(caught.value)

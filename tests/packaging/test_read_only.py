@@ -27,17 +27,7 @@ USE_PROBE = (
     "import probe_kernels; print(probe_kernels.double(2.0), sum(probe_kernels.double.stats.cache_hits.values()))"
 )
 USE_PACKAGE = f"import msdm_core; {USE_PROBE}"
-USE_KERNELS = "import msdm_core.kernels"
-
-
-@pytest.fixture
-def open_folder() -> Iterator[Path]:
-    """A temporary folder that any account may enter and write to, as /tmp is (pytest's own are closed)."""
-    folder = Path(tempfile.mkdtemp(prefix="surgsim-open-"))
-    folder.chmod(0o1777)
-    yield folder
-    subprocess.run(["chmod", "-R", "u+w", folder], check=False)
-    shutil.rmtree(folder, ignore_errors=True)
+USE_KERNELS = "import msdm_core.kernels.substep_kernels"
 
 
 def as_stranger() -> list[str | Path]:
@@ -59,24 +49,39 @@ def as_stranger() -> list[str | Path]:
     return prefix
 
 
-@pytest.fixture
-def read_only(wheel, make_environment, open_folder, clean_environ):
-    """Runs a line of Python in an installation that nobody may write to, by an account without a home."""
+@pytest.fixture(scope="module")
+def open_folder() -> Iterator[Path]:
+    """A temporary folder that any account may enter and write to, as /tmp is (pytest's own are closed)."""
+    folder = Path(tempfile.mkdtemp(prefix="surgsim-open-"))
+    folder.chmod(0o1777)
+    yield folder
+    subprocess.run(["chmod", "-R", "u+w", folder], check=False)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def installation(wheel, make_environment, open_folder) -> Environment:
+    """An installation that nobody may write to."""
     environment: Environment = make_environment(open_folder / "venv")
     environment.install(wheel)
     (environment.site_packages / "probe_kernels.py").write_text(PROBE)
-    temporary = open_folder / "tmp"
-    temporary.mkdir()
+    subprocess.run(["chmod", "-R", "a-w", environment.folder], check=True)
+    return environment
+
+
+@pytest.fixture
+def read_only(installation, open_folder, clean_environ):
+    """Runs a line of Python in that installation, by an account without a home and with an empty temporary folder."""
+    temporary = Path(tempfile.mkdtemp(dir=open_folder))
     temporary.chmod(0o1777)
     environ = {key: value for key, value in clean_environ.items() if key not in ("HOME", "XDG_CACHE_HOME")}
     environ["TMPDIR"] = str(temporary)
     if os.geteuid() != 0:
         environ["HOME"] = environ["XDG_CACHE_HOME"] = "/proc/nowhere"  # our real home can't be taken away
     prefix = as_stranger()
-    subprocess.run(["chmod", "-R", "a-w", environment.folder], check=True)
 
     def python(code: str, *, expect: int = 0) -> str:
-        return run([*prefix, environment.python, "-c", code], expect=expect, cwd="/", env=environ)
+        return run([*prefix, installation.python, "-c", code], expect=expect, cwd="/", env=environ)
 
     return python, temporary
 

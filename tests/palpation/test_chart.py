@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.anatomy import load_anatomy
 from surgsim_env.palpation.chart import make_chart
-from surgsim_env.scenes import make_scene
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 
 
 def test_the_phantoms_chart_is_its_top_less_the_margin():

@@ -2,10 +2,10 @@
 
 import pytest
 
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.levels import DrawnOrgan, find_level
-from surgsim_env.palpation.lesion_reach import LesionReach, lesion_reaches
-from surgsim_env.scenes import make_scene
+from surgsim_env.palpation.scores import LesionReach, lesion_reaches
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.levels import DrawnOrgan, find_level
+from surgsim_env.scene.load import make_scene
 
 
 def test_noise_hides_a_small_difference() -> None:

@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.ospa import CUTOFF, matched_distances, ospa, ospa_cutoff
+from surgsim_env.palpation.scores import CUTOFF, matched_distances, ospa, ospa_cutoff
 
 NONE = np.zeros((0, 2))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from surgsim_env.cli import main
+from surgsim_env.cli.main import main
 
 LIVER = Path(__file__).parents[3] / "shared" / "data" / "anatomy" / "openhelp_liver.stl"
 PLACES = json.loads(Path(__file__).with_name("places.json").read_text(encoding="utf-8"))

@@ -5,8 +5,7 @@ import pydicom
 import pytest
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.label_image import read_label_image
-from surgsim_env.patient.label_names import parse_labels
+from surgsim_env.patient.label_image import parse_labels, read_label_image
 from tests.patient.scans import MIDDLE, check_organ, labels_on
 from tests.patient.segmentation_object import item, write_segmentation
 
@@ -78,7 +77,7 @@ def without_segments(data):
     ("change", "words"),
     [
         (fractional, "its segments are FRACTIONAL; the rule is BINARY or LABELMAP"),
-        (turned_once, "its frames are turned in 2 ways; the rule is one stack"),
+        (turned_once, "its frames have 2 orientations; the rule is one stack"),
         (one_slice_without_thickness, "has one slice and states no thickness"),
         (without_segments, r"is no complete DICOM segmentation \(.*SegmentSequence"),
     ],

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.image_geometry import ImageGeometry
 from surgsim_env.patient.label_cleaning import NAMES_MOST, clean_labels
 from surgsim_env.patient.label_image import LabelImage
+from surgsim_env.patient.label_source import ImageGeometry
 
 
 def image_of(tags, names):

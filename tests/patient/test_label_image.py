@@ -10,8 +10,8 @@ import pytest
 import SimpleITK
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.label_image import RUN_VOXELS, VOXELS_MOST, read_label_image
-from surgsim_env.patient.label_names import parse_labels
+from surgsim_env.patient.label_image import parse_labels, read_label_image
+from surgsim_env.patient.label_source import RUN_VOXELS, VOXELS_MOST
 from tests.patient.scans import affine_of, check_organ, labels_on, write_nifti
 
 BOTH = parse_labels("liver=1,lesion=2")

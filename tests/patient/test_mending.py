@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from msdm_core.mesh_io import read_mesh
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.cli import main
-from surgsim_env.scenes import load_scene
+from msdm_core.mesh_files.mesh_io import read_mesh
+from surgsim_env.cli.main import main
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import load_scene
 from tests.patient.scans import LABELS, affine_of, labels_on, write_nifti
 from tests.patient.surfaces import ball
 

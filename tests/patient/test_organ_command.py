@@ -2,20 +2,21 @@
 
 import re
 import tomllib
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from msdm_core.mesh_io import read_mesh
-from msdm_core.quality import mesh_quality
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.cli import main
+from msdm_core.mesh.quality import mesh_quality
+from msdm_core.mesh_files.mesh_io import read_mesh
+from surgsim_env.cli.main import main
 from surgsim_env.patient.materials import organ_material, region_material
 from surgsim_env.patient.patient_scene import _check_moduli
-from surgsim_env.patient.toml_lines import entry
-from surgsim_env.scenes import load_scene
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import load_scene, make_scene
+from surgsim_env.scene.save import scene_toml
 from tests.patient.scans import LABELS, LESIONS, MIDDLE, ORGAN_VOLUME, scan
 
 
@@ -52,7 +53,7 @@ def test_the_scene_file_states_its_axes_and_sources(written):
     "name", ["scan\U0001f600.nii.gz", 'a"b\\c\td\x7f\x1b.nii.gz', "half\ud83d.nii.gz", "byte\udc80.nii.gz"]
 )
 def test_strings_of_a_scene_are_toml_whatever_a_file_is_called(name):
-    (value,) = tomllib.loads(entry("description", name)).values()
+    value = tomllib.loads(scene_toml(replace(make_scene("phantom"), description=name)))["description"]
     assert value == re.sub("[\ud800-\udfff]", "\ufffd", name)
 
 

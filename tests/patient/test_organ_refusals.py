@@ -5,8 +5,8 @@ import os
 import pytest
 import trimesh
 
-from surgsim_env.cli import main
-from surgsim_env.patient.command import _replace
+from surgsim_env.cli.main import main
+from surgsim_env.patient.make_patient import _replace
 from tests.patient.scans import LABELS, scan
 from tests.patient.surfaces import ball
 
@@ -52,7 +52,7 @@ def test_three_files_are_replaced_or_none(there, failing, tmp_path, monkeypatch)
             raise PermissionError(13, "in use", str(target))
         real(source, target)
 
-    monkeypatch.setattr("surgsim_env.patient.command.os.replace", replace)
+    monkeypatch.setattr("surgsim_env.patient.make_patient.os.replace", replace)
     with pytest.raises(PermissionError):
         _replace([out / name for name in names], part)
     assert {path.name: path.read_text(encoding="utf-8") for path in out.iterdir()} == {

@@ -8,9 +8,9 @@ import shlex
 import numpy as np
 import pytest
 
-from msdm_core.mesh_io import read_mesh
-from msdm_core.quality import mesh_quality
-from surgsim_env.cli import main
+from msdm_core.mesh.quality import mesh_quality
+from msdm_core.mesh_files.mesh_io import read_mesh
+from surgsim_env.cli.main import main
 from tests.patient.scans import LABELS, LESIONS, MIDDLE, scan
 
 
@@ -51,9 +51,9 @@ def test_the_report_shows_the_command_that_was_given(tmp_path, monkeypatch):
         assert word in words, word
     # It is read as what was given.
     again = []
-    monkeypatch.setattr("surgsim_env.palpation.palpate_command.palpate", lambda request, _: again.append(request))
+    monkeypatch.setattr("surgsim_env.cli.palpate.Palpate.run", lambda self, _: again.append(self) or 0)
     assert main(words[1:]) == 0
-    assert again[0].command == command
+    assert again[0].command_line == command
     assert again[0].anchors == ("-0.06,0.025,0.08,0.03",)
     assert again[0].spacing == 0.012
 
@@ -68,7 +68,9 @@ def test_the_report_shows_the_command_that_was_given(tmp_path, monkeypatch):
     ],
 )
 def test_palpation_s_options_are_looked_at_before_an_organ_is_made(option, words, tmp_path, refusal, monkeypatch):
-    monkeypatch.setattr("surgsim_env.patient.command.palpable_patient", lambda *_: pytest.fail("an organ was made"))
+    monkeypatch.setattr(
+        "surgsim_env.patient.make_patient.make_patient", lambda *_, **__: pytest.fail("an organ was made")
+    )
     file = scan(tmp_path / "ct.nii.gz", spacing=(6.0, 6.0, 6.0))
     given = ["palpate", "--segmentation", file, *LABELS, *option, "--out", tmp_path / "out"]
     assert words in refusal(*given)

@@ -3,12 +3,12 @@
 import pytest
 import trimesh
 
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.cli import main
-from surgsim_env.env import PalpateEnv
+from surgsim_env.cli.main import main
+from surgsim_env.envs.ids import PalpateEnv
 from surgsim_env.palpation.job import plan_sites
 from surgsim_env.patient.materials import is_lesion, organ_material, region_material
-from surgsim_env.scenes import load_scene
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import load_scene
 from tests.patient.scans import LABELS, scan
 
 

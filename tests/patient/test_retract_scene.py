@@ -9,19 +9,17 @@ import pytest
 import trimesh
 
 import surgsim_env  # noqa: F401
-from msdm_core.mesh_io import read_mesh
-from msdm_core.meshing import mesh_surface
-from surgsim_env.anatomy import load_anatomy
-from surgsim_env.cli import main
-from surgsim_env.patient.command import _check_targets
-from surgsim_env.patient.organ_voxels import OrganVoxels
+from msdm_core.mesh_files.mesh_io import read_mesh
+from msdm_core.meshing.lattice_meshing import mesh_surface
+from surgsim_env.cli.main import main
+from surgsim_env.patient.make_patient import check_targets
 from surgsim_env.patient.rim import JAW_OPENING, JAW_PLAY, OVERLAP_LEAST, VOXEL, NoRim, Rim, _thickness, find_rim
 from surgsim_env.patient.scene_text import FIRST_LINE
-from surgsim_env.retract_scene import make_retract_scene
-from surgsim_env.retraction import Flap, Retraction
-from surgsim_env.scenes import load_scene
-from surgsim_env.scripting.flap_oracle import edge_section
-from surgsim_env.scripting.oracle import oracle_script
+from surgsim_env.patient.voxels import OrganVoxels
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import load_scene, make_retract_scene
+from surgsim_env.scene.model import Flap, Retraction
+from surgsim_env.scripting.oracle import edge_section, oracle_script
 from surgsim_env.scripting.run import run_script
 from tests.patient.scans import LABELS, WEDGE_EDGE, WEDGE_SLOPE, wedge
 
@@ -218,10 +216,10 @@ def test_files_of_one_s_own_are_not_replaced(tmp_path):
     out = tmp_path / "patient.vtu"
     (tmp_path / "patient_retract.vtu").write_text("mine")
     with pytest.raises(ValueError, match=r"patient_retract\.vtu is there, and not of an earlier run"):
-        _check_targets(out)
+        check_targets(out)
     (tmp_path / "patient_retract.toml").write_text("mine")
     with pytest.raises(ValueError, match=r"patient_retract\.toml is there, and not of an earlier run"):
-        _check_targets(out)
+        check_targets(out)
 
 
 def test_a_flap_has_corners_and_goes_with_an_organ_as_it_is():

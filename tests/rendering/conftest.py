@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from msdm_core.regions import Lesion
-from surgsim_env.anatomy import load_anatomy
+from msdm_core.material.regions import Lesion
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
-from surgsim_env.scenes import make_scene
-from surgsim_env.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 
 
 @pytest.fixture(scope="session")

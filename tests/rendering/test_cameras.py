@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from surgsim_env.anatomy import load_anatomy
 from surgsim_env.rendering.cameras import Camera, scene_cameras
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.rendering.window import orbited
-from surgsim_env.scenes import make_scene, scene_from_table
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene, scene_from_table
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene")
 

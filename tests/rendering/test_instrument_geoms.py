@@ -6,8 +6,8 @@ import pytest
 import trimesh
 
 from surgsim_env import Port, load_arm
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
 from surgsim_env.rendering.instrument_geoms import add_instrument, find_instrument, shown_geoms
-from surgsim_env.tool_bodies import CONTACT_GROUP
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from msdm_core.triangles import nearest_triangle
+from msdm_core.mesh.geodesic import nearest_triangle
 from surgsim_env.rendering import stage
 from surgsim_env.rendering.force_arrow import COLOUR, contact_point
 from surgsim_env.rendering.options import CAMERAS, RenderOptions
@@ -84,7 +84,7 @@ def test_lesions_are_labelled_whatever_the_memory_of_their_geoms_held(phantom, d
     """MuJoCo hands out geoms that nobody has written, and mjv_initGeom writes only a part of them."""
     renderer = draw(phantom, camera="side", show_lesion=True)
     renderer.rgb()
-    drawn = renderer._stage._drawn
+    drawn = renderer._stage.canvas.drawn
     for geom in drawn.geoms[drawn.ngeom - 1 :]:
         geom.objtype, geom.objid, geom.category = left_there, 1000, mujoco.mjtCatBit.mjCAT_STATIC
     assert (renderer.segmentation() == LESION).sum() > 100

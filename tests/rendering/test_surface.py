@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from surgsim_env.anatomy import load_anatomy
 from surgsim_env.rendering.surface import BEND_MOST, drawn_surface, smooth_normals
-from surgsim_env.scenes import make_scene
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
 
 
 @pytest.fixture(params=["phantom", "liver"])

@@ -34,7 +34,7 @@ def test_window_shows_the_picture_of_each_step(env):
     renderer.present(frame)
     shown = np.zeros_like(frame)
     with window._context.as_current():
-        mujoco.mjr_readPixels(shown, None, mujoco.MjrRect(0, 0, 640, 480), renderer._stage.context)
+        mujoco.mjr_readPixels(shown, None, mujoco.MjrRect(0, 0, 640, 480), renderer._stage.canvas.context)
     np.testing.assert_array_equal(shown[::-1], frame)
 
 

@@ -18,7 +18,7 @@ def run_pytest(folder, text):
     (folder / "test_mine.py").write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py"]
     settings = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, env=settings)
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, env=settings)
 
 
 def test_the_guides_test_file_passes(tmp_path):
@@ -48,7 +48,7 @@ def test_the_other_examples_run(tmp_path, monkeypatch, capsys):
 
 def test_the_guide_to_retraction_runs(capsys):
     text = (ROOT / "docs" / "retraction.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.S)
+    code = re.findall(r"```python\n(.*?)```", text, flags=re.S)[-1]  # the first one is run by tests/test_readme.py
     exec(compile(code, "docs/retraction.md", "exec"), {})
     grip, pull, left = map(float, re.findall(r"[\d.]+", capsys.readouterr().out))
     assert 0.3 < grip < 0.6 and pull < 0.3 and left > 0.2

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.exchange import StepsTaken
+from surgsim_env.coupling.exchange import StepsTaken
 
 RADIUS, TOP = 0.008, 0.03
 

@@ -93,7 +93,7 @@ def test_every_environment_whose_tip_is_steered_has_an_oracle():
         assert oracle_script(env)
     env = gym.make(pressing)
     env.reset(seed=0)
-    with pytest.raises(TypeError, match="PalpateSitesTask does not say how its actions are laid out"):
+    with pytest.raises(TypeError, match="PalpateSitesTask cannot be scripted: steps command `velocity`"):
         run_script(env, [Hold(0.1)])
 
 

@@ -1,0 +1,235 @@
+"""A fast surrogate of SurgSim/Palpate-v0 on blocks: forces from a formula instead of an organ.
+
+Training starts here and ends on the full physics; agents are scored on the full physics only. The force of a press at
+x, y and depth d is
+
+    F = c (d / 1 m)^p b (1 + A exp(-r^2 / (2 s^2))) e(x, y)
+
+with b the background's factor, r the distance from the lesion's place, and e the fall towards the block's edges. The
+numbers are fitted to presses of the full physics (`TOUCH_MODELS`); sensor, limits, rewards, memory and episode are the
+environment's own. All environments are stepped together.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.tasks.palpate import (
+    DECLARE_STEPS,
+    DECLARE_VALUE,
+    EPISODE_STEPS,
+    START_GAP,
+    SUCCESS_DISTANCE,
+    PalpateTask,
+    touch_memory,
+)
+from surgsim_env.tasks.task import SPEED_FULL_SCALE
+
+
+@dataclass(frozen=True)
+class TouchModel:
+    """Force model of a scene at level "standard", fitted to the full physics.
+
+    Args:
+        stiffness: c [N], the force of healthy tissue in the middle, extrapolated to a depth of 1 m.
+        exponent: p.
+        edge: e = 1 - edge (x/a)^edge_power - edge (y/a)^edge_power, x and y from the middle, a half the block's side.
+        edge_power: see edge.
+        excess: range of A.
+        width: range of s [m].
+        friction: tangential over normal force of a sliding tip.
+    """
+
+    stiffness: float
+    exponent: float
+    edge: float
+    edge_power: float
+    excess: tuple[float, float]
+    width: tuple[float, float]
+    friction: float
+
+
+TOUCH_MODELS = {
+    "phantom": TouchModel(425.0, 1.37, 0.437, 4.14, (0.25, 0.85), (0.0055, 0.0078), 0.21),
+    "phantom_small": TouchModel(587.0, 1.42, 0.315, 3.06, (0.13, 0.50), (0.0045, 0.0066), 0.2),
+}
+
+# The range of b: the level's moduli times the effect of a capsule.
+BACKGROUND = (0.7, 1.4)
+
+
+class PalpateSurrogate(VectorEnv):
+    """Many palpations of a block's flat top, by formula; an environment that ends is reset in the same step."""
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+
+    def __init__(self, count: int, scene: str = "phantom", *, memory: bool = True) -> None:
+        """Make the environments with spaces, limits, sensor and memory of the original.
+
+        Raises:
+            ValueError: a scene that no touch model was fitted to.
+        """
+        if scene not in TOUCH_MODELS:
+            raise ValueError(f"scene {scene!r} has no touch model; there are: {', '.join(TOUCH_MODELS)}")
+        env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level="standard", memory=memory).unwrapped
+        self.touch, self.scene, self.task = TOUCH_MODELS[scene], env.scene, env.task
+        remembered = touch_memory(env.simulation.anatomy)
+        self.chart, self.indenter, self.least_depth = remembered.chart, remembered.indenter, remembered.least_depth
+        self.memory = memory
+        timing = env.scene.timing
+        self.control_step = timing.haptic_step * timing.haptic_steps_per_control
+        instrument = env.simulation.instrument
+        self.low, self.high = instrument.lower, instrument.upper
+        self.block = np.array(env.scene.mesh.block.size)
+        self.surface = self.block[2] + env.scene.instrument.tip_radius
+        self.num_envs = count
+        self.single_observation_space, self.single_action_space = env.observation_space, env.action_space
+        self.observation_space = batch_space(self.single_observation_space, count)
+        self.action_space = batch_space(self.single_action_space, count)
+        # Scene and task are those of the original environment.
+        self.envs = [env] * count
+        self.rng = np.random.default_rng(0)
+        sites = self.chart.side_count**2
+        self.tip, self.velocity, self.bias = np.zeros((3, count, 3))
+        self.lesion = np.zeros((count, 2))
+        self.excess, self.width, self.background = np.zeros((3, count))
+        self.steps, self.declared = np.zeros((2, count), dtype=np.int64)
+        self.product, self.square = np.zeros((2, count, sites))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[NDArray[np.float32], dict]:
+        """Start an episode in every environment."""
+        if isinstance(seed, list):
+            seed = seed[0]
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        everywhere = np.ones(self.num_envs, dtype=np.bool_)
+        self._draw(everywhere)
+        return self._observe(everywhere), {}
+
+    def step(self, actions: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray, NDArray, NDArray, dict]:
+        """One control step of all; a finished environment begins its next episode in the same step."""
+        actions, before = np.asarray(actions, dtype=np.float64), self.tip
+        self.tip = np.clip(before + actions[:, :3] * SPEED_FULL_SCALE * self.control_step, self.low, self.high)
+        self.velocity = (self.tip - before) / self.control_step
+        self.steps += 1
+        force = self.normal_force()
+        pressing = (actions[:, 3] > DECLARE_VALUE) & (force > 0.0)
+        self.declared = np.where(pressing, self.declared + 1, 0)
+        observation = self._observe(np.ones(self.num_envs, dtype=np.bool_))
+        rewards, terminated, truncated, endings = self._judge(force)
+        infos: dict[str, Any] = {}
+        over = terminated | truncated
+        if over.any():
+            for index in np.flatnonzero(over):
+                ended = {"final_obs": observation[index].copy(), "final_info": endings(index)}
+                infos = self._add_info(infos, ended, int(index))
+            self._draw(over)
+            observation[over] = self._observe(over)[over]
+        return observation, rewards, terminated, truncated, infos
+
+    # ---- the palpation -------------------------------------------------------------------------------------------
+
+    def normal_force(self) -> NDArray[np.float64]:
+        """Force along the normal [N] (n_env,): the formula above."""
+        touch, depth = self.touch, np.maximum(self.surface - self.tip[:, 2], 0.0)
+        off = np.abs(self.tip[:, :2] / (0.5 * self.block[:2]) - 1.0)
+        edge = np.maximum(1.0 - touch.edge * (off**touch.edge_power).sum(axis=1), 0.3)
+        gap = ((self.tip[:, :2] - self.lesion) ** 2).sum(axis=1)
+        bump = 1.0 + self.excess * np.exp(-0.5 * gap / self.width**2)
+        return touch.stiffness * depth**touch.exponent * self.background * bump * edge
+
+    def _draw(self, which: NDArray[np.bool_]) -> None:
+        """Draw new episodes: lesion, background, sensor bias, start."""
+        count, rng, scene = int(which.sum()), self.rng, self.scene
+        rim, margin = scene.lesion.rim_distance, scene.palpation.face_margin
+        self.lesion[which] = rng.uniform(rim, self.block[:2] - rim, (count, 2))
+        self.excess[which] = rng.uniform(*self.touch.excess, count)
+        self.width[which] = rng.uniform(*self.touch.width, count)
+        self.background[which] = rng.uniform(*BACKGROUND, count)
+        self.bias[which] = rng.uniform(-scene.sensor.bias, scene.sensor.bias, (count, 3))
+        place = rng.uniform(margin, self.block[:2] - margin, (count, 2))
+        height = self.surface + rng.uniform(*START_GAP, count)
+        self.tip[which] = np.column_stack([place, height])
+        self.velocity[which] = 0.0
+        self.steps[which] = self.declared[which] = 0
+        self.product[which] = self.square[which] = 0.0
+
+    def _observe(self, which: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Observations (n_env, n); the reading is added to the memory of `which`."""
+        normal = self.normal_force()
+        speed = np.linalg.norm(self.velocity[:, :2], axis=1, keepdims=True)
+        way = self.velocity[:, :2] / np.maximum(speed, 1e-9)
+        force = np.column_stack([-self.touch.friction * normal[:, None] * way, normal]) + self.bias
+        reach = self.scene.sensor.range
+        reading = np.clip(force + self.rng.normal(0.0, self.scene.sensor.noise, force.shape), -reach, reach)
+        left = 1.0 - self.steps / EPISODE_STEPS
+        seen = {"tip_position": self.tip, "tip_velocity": self.velocity, "contact_force": reading}
+        seen["time_left"] = left[:, None]
+        if self.memory:
+            self._remember(which, reading[:, 2])
+            seen |= zip(("contrast", "visited", "stiffest"), self._recalled(), strict=True)
+        channels = self.task.observation_slices
+        return np.concatenate([seen[name] for name in channels], axis=1).astype(np.float32)
+
+    def _remember(self, which: NDArray[np.bool_], force: NDArray[np.float64]) -> None:
+        """`TouchMemory.feel` of all at once."""
+        side, depth = self.chart.side_count, self.surface - self.tip[:, 2]
+        cell = np.floor(0.5 * (self.chart.place(self.tip) + 1.0) * (side - 1) + 0.5).astype(np.int64)
+        felt = which & (depth >= self.least_depth) & ((cell >= 0) & (cell < side)).all(axis=1)
+        rows, sites = np.flatnonzero(felt), cell[felt, 1] * side + cell[felt, 0]
+        healthy = self.indenter.force(1.0) * depth[felt] ** 1.5
+        self.product[rows, sites] += force[felt] * healthy
+        self.square[rows, sites] += healthy**2
+
+    def _recalled(self) -> tuple[NDArray[np.float64], ...]:
+        """Contrasts, visited marks and the stiffest place, as `TouchMemory` gives them."""
+        side = self.chart.side_count
+        visited = self.square > 0.0
+        contrast = np.divide(self.product, self.square, out=np.zeros_like(self.product), where=visited)
+        sums = []
+        for values in (self.product, self.square):
+            padded = np.pad(values.reshape(-1, side, side), ((0, 0), (1, 1), (1, 1)))
+            rows = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+            sums.append((rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]).reshape(len(values), -1))
+        around = np.divide(sums[0], sums[1], out=np.zeros_like(sums[0]), where=sums[1] > 0.0)
+        best = np.argmax(np.where(visited, around, -np.inf), axis=1)
+        stiffest = np.column_stack([self.chart.sites[best], around[np.arange(len(best)), best]])
+        stiffest[~visited.any(axis=1)] = 0.0
+        return contrast, visited.astype(np.float64), stiffest
+
+    def _judge(
+        self, force: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Callable[[int], dict[str, Any]]]:
+        """Rewards, ends and infos, as `PalpateTask.judge` has them."""
+        limits, weights = self.scene.limits, PalpateTask.weights
+        hard = force > limits.hard_force
+        declared = ~hard & (self.declared >= DECLARE_STEPS)
+        error = np.linalg.norm(self.tip[:, :2] - self.lesion, axis=1)
+        found = declared & (error <= SUCCESS_DISTANCE)
+        terminated, left = hard | declared, EPISODE_STEPS - self.steps
+        share = np.clip((force - limits.soft_force) / (limits.hard_force - limits.soft_force), 0.0, 1.0)
+        rewards = (
+            weights["time"]
+            + weights["soft_force"] * share
+            + weights["found"] * found
+            + weights["wrong"] * (declared & ~found)
+            + weights["hard_force"] * hard
+            + weights["forgone"] * (terminated & ~found) * left
+        )
+
+        def ending(index: int) -> dict[str, Any]:
+            return {
+                "success": bool(found[index]),
+                "declared": bool(declared[index]),
+                "hard_limit": bool(hard[index]),
+                "error_mm": float(error[index]) * 1000.0 if declared[index] else -1.0,
+            }
+
+        return rewards, terminated, ~terminated & (left <= 0), ending

@@ -1,0 +1,1 @@
+"""Compiled functions of the organ's substep, alone and in lanes."""

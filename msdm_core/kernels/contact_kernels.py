@@ -1,0 +1,422 @@
+"""Contact of the surface of an organ with the shapes that tools carry: broad phase, pressure and friction."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+# Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
+CANDIDATE_MARGIN = 1e-3
+
+# A point nearer than this share of its size to the border of a core counts as on the border (rounding).
+BORDER = 1e-12
+
+# Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
+QUADRATURE_COUNT = 4
+QUADRATURE_WEIGHT = 0.25
+QUADRATURE_BARYCENTRIC = np.array(
+    [
+        [1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0],
+        [2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0],
+        [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0],
+        [1.0 / 6.0, 1.0 / 6.0, 2.0 / 3.0],
+    ]
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_candidates(model, state, shapes, duration):
+    """Broad phase of one call: the triangles that a shape may touch within a duration, by bounding boxes and spheres.
+
+    Contact with a triangle that moves faster than the margin begins one haptic step later; an engaged triangle always
+    stays a candidate.
+
+    Model: model: surface_triangles (n_surface, 3)
+    In:    state: node_position [m] (n_node, 3), contact_engaged (n_shape, n_surface * 4), shapes, duration [s]
+    Out:   state: contact_candidates, a row for each shape that ends with -1 (n_shape, n_surface)
+    Returns the number of candidates of the shape that has the most.
+    """
+    # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
+    position, ends, spans, surface = state.node_position, shapes.shape_ends, shapes.shape_span, model.surface_triangles
+    engaged, candidates, twist = state.contact_engaged, state.contact_candidates, shapes.tool_twist
+    most = 0
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        radius = shapes.shape_radius[shape]
+        speed = 0.0
+        for part in range(6):
+            # An angular part moves a point by at most its lever, taken as one metre: generous for a hand-held tool.
+            speed += abs(twist[tool, part])
+        margin = CANDIDATE_MARGIN + 2.0 * speed * duration
+        low_x, high_x = _extent(ends, spans, shape, 0, radius + margin)
+        low_y, high_y = _extent(ends, spans, shape, 1, radius + margin)
+        low_z, high_z = _extent(ends, spans, shape, 2, radius + margin)
+        count = 0
+        for triangle in range(surface.shape[0]):
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
+            # Cheap first: box against box; then the sphere around the triangle against the axis.
+            near = (
+                _overlap(position, 0, a, b, c, low_x, high_x)
+                and _overlap(position, 1, a, b, c, low_y, high_y)
+                and _overlap(position, 2, a, b, c, low_z, high_z)
+            )
+            if near:
+                x, y, z, size_squared = _middle(position, a, b, c)
+                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
+                limit = math.sqrt(size_squared) + radius + margin
+                near = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 <= limit * limit
+            if near or _is_held(engaged, shape, triangle):
+                candidates[shape, count] = triangle
+                count += 1
+        if count < candidates.shape[1]:
+            candidates[shape, count] = -1
+        most = max(most, count)
+    return most
+
+
+@njit(forceinline=True, error_model="numpy")
+def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
+    """Stretch of a spring across a normal that sticks to a surface and slips above a limit (Coulomb, stick-slip).
+
+    u <- u + dt v, without its part along n; then shortened to `longest` = mu p / k_t where it is longer.
+
+    In: u: stretch before [m], v: relative velocity [m/s], dt [s], n: unit normal, longest [m]
+    Returns u [m], three numbers.
+    """
+    ux += dt * vx
+    uy += dt * vy
+    uz += dt * vz
+    along = ux * nx + uy * ny + uz * nz
+    ux -= along * nx
+    uy -= along * ny
+    uz -= along * nz
+    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+    if length > longest:
+        ux *= longest / length
+        uy *= longest / length
+        uz *= longest / length
+    return ux, uy, uz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
+    """Contact forces of every shape on its candidate triangles, and the reaction on the tools.
+
+    Each quadrature point is held off by a penetration that keeps rising with depth. With d from the shape's core to the
+    point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2) the half chord, the line through the
+    point along n leaves the ball t + s below the point. The energy per area is (k_p / 2) g^2 with g = s (s + t) / r: to
+    first order the radial penetration r - |d|, yet growing without bound as the ball sinks below the surface, where a
+    radial one falls again and lets the ball tunnel. Forces are its exact gradient, the turning of n with the corners
+    included, so that action and reaction balance, torque too.
+    A point engages where the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays
+    engaged until it parts, so that the far side of a thin organ is never taken for the near one.
+
+    Model: model: surface_triangles (n_surface, 3), surface_rest_area [m^2] (n_surface,); law
+    In:    state: node_position [m], node_velocity [m/s] (n_node, 3), contact_candidates; shapes, dt [s],
+           candidate_count, reference: point of each tool's torque [m] (n_tool, 3)
+    Out:   state: node_force, added to [N] (n_node, 3), contact_engaged (n_shape, n_surface * 4), contact_stretch [m]
+           (n_shape, n_surface * 4, 3); wrench, added to [N, N m] (n_tool, 6)
+    """
+    # All branches are in this one body: a function with branches that takes arrays counts references at each call,
+    # which took three times as long as the rest.
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
+    surface, rest_area = model.surface_triangles, model.surface_rest_area
+    ends, spans, centre, twist = shapes.shape_ends, shapes.shape_span, shapes.tool_centre, shapes.tool_twist
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        radius = shapes.shape_radius[shape]
+        friction = law.friction * shapes.shape_friction[shape]
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
+            if not _is_held(engaged, shape, triangle):
+                # Only points inside the shape can be met, and they lie within half of that radius around the middle.
+                x, y, z, size_squared = _middle(position, a, b, c)
+                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
+                limit = 0.5 * math.sqrt(size_squared) + radius
+                if (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 > limit * limit:
+                    continue
+            bx, by, bz = _span(position, a, b)
+            cx, cy, cz = _span(position, a, c)
+            nx = by * cz - bz * cy
+            ny = bz * cx - bx * cz
+            nz = bx * cy - by * cx
+            twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
+            nx /= twice_area
+            ny /= twice_area
+            nz /= twice_area
+            weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
+            for point in range(QUADRATURE_COUNT):
+                item = triangle * QUADRATURE_COUNT + point
+                wa = QUADRATURE_BARYCENTRIC[point, 0]
+                wb = QUADRATURE_BARYCENTRIC[point, 1]
+                wc = QUADRATURE_BARYCENTRIC[point, 2]
+                x, y, z = _mean(position, a, b, c, wa, wb, wc)
+                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
+                t = (x - px) * nx + (y - py) * ny + (z - pz) * nz
+                rx = x - px - t * nx
+                ry = y - py - t * ny
+                rz = z - pz - t * nz
+                chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
+                if chord_squared <= 0.0:
+                    _release(engaged, stretch_memory, shape, item)
+                    continue
+                s = math.sqrt(chord_squared)
+                depth = s + t
+                if depth <= 0.0 or (not engaged[shape, item] and t > 0.0):
+                    _release(engaged, stretch_memory, shape, item)
+                    continue
+                engaged[shape, item] = 1
+                vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
+                ux, uy, uz = _tool_velocity(twist, centre, tool, x, y, z)
+                vx -= ux
+                vy -= uy
+                vz -= uz
+                # e: unit vector against the ball's own normal where the line along n leaves the ball.
+                ex = (s * nx - rx) / radius
+                ey = (s * ny - ry) / radius
+                ez = (s * nz - rz) / radius
+                load = law.stiffness * depth + law.damping * (ex * vx + ey * vy + ez * vz)
+                if load < 0.0:
+                    load = 0.0
+                scale = -weighted_area * load / (radius * radius)
+
+                # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the directions in which
+                # the nearest point of the core follows.
+                gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
+                gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
+                gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
+                gx, gy, gz = _without_core(ends, spans, shape, px, py, pz, gx, gy, gz)
+
+                # Friction: a tangential spring that turns with the tool and sticks until mu times the pressure, then
+                # slips.
+                ux = stretch_memory[shape, item, 0]
+                uy = stretch_memory[shape, item, 1]
+                uz = stretch_memory[shape, item, 2]
+                vx += twist[tool, 4] * uz - twist[tool, 5] * uy
+                vy += twist[tool, 5] * ux - twist[tool, 3] * uz
+                vz += twist[tool, 3] * uy - twist[tool, 4] * ux
+                longest = friction * load * s / radius / law.tangential_stiffness
+                ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, ex, ey, ez, longest)
+                stretch_memory[shape, item, 0] = ux
+                stretch_memory[shape, item, 1] = uy
+                stretch_memory[shape, item, 2] = uz
+                drag = law.tangential_stiffness * weighted_area
+                gx -= drag * ux
+                gy -= drag * uy
+                gz -= drag * uz
+
+                # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the gradient
+                # is along n. rho . grad(lambda_b) = rho . (c x n) / (2 A), for the corner c rho . (n x b) / (2 A).
+                turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
+                turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
+                turn = -scale * depth * depth
+                tb = turn * turn_b
+                tc = turn * turn_c
+                _push_corner(position, force, reference, wrench, tool, a, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
+                _push_corner(position, force, reference, wrench, tool, b, wb, tb, gx, gy, gz, nx, ny, nz)
+                _push_corner(position, force, reference, wrench, tool, c, wc, tc, gx, gy, gz, nx, ny, nz)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _extent(ends, spans, shape, axis, around):
+    """Lowest and highest coordinate of the core of a shape, widened by `around` [m]."""
+    first, second = ends[shape, 0, axis], ends[shape, 1, axis]
+    around += abs(spans[shape, axis])
+    return min(first, second) - around, max(first, second) + around
+
+
+@njit(forceinline=True, error_model="numpy")
+def _overlap(position, axis, a, b, c, low, high):
+    """Whether a triangle reaches into an interval of one coordinate."""
+    first, second, third = position[a, axis], position[b, axis], position[c, axis]
+    return max(first, second, third) >= low and min(first, second, third) <= high
+
+
+@njit(forceinline=True, error_model="numpy")
+def _span(position, a, b):
+    """From one node to another [m]."""
+    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
+
+
+@njit(forceinline=True, error_model="numpy")
+def _mean(values, a, b, c, wa, wb, wc):
+    """Three nodes' values by their weights."""
+    x = wa * values[a, 0] + wb * values[b, 0] + wc * values[c, 0]
+    y = wa * values[a, 1] + wb * values[b, 1] + wc * values[c, 1]
+    z = wa * values[a, 2] + wb * values[b, 2] + wc * values[c, 2]
+    return x, y, z
+
+
+@njit(forceinline=True, error_model="numpy")
+def _tool_velocity(twist, centre, tool, x, y, z):
+    """Velocity of a tool at a point [m/s]."""
+    ox = x - centre[tool, 0]
+    oy = y - centre[tool, 1]
+    oz = z - centre[tool, 2]
+    vx = twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy
+    vy = twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz
+    vz = twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox
+    return vx, vy, vz
+
+
+@njit(forceinline=True, error_model="numpy")
+def _middle(position, a, b, c):
+    """Centroid of a triangle [m], and the square of the radius around it that holds its corners [m^2]."""
+    x = (position[a, 0] + position[b, 0] + position[c, 0]) / 3.0
+    y = (position[a, 1] + position[b, 1] + position[c, 1]) / 3.0
+    z = (position[a, 2] + position[b, 2] + position[c, 2]) / 3.0
+    to_a = (position[a, 0] - x) ** 2 + (position[a, 1] - y) ** 2 + (position[a, 2] - z) ** 2
+    to_b = (position[b, 0] - x) ** 2 + (position[b, 1] - y) ** 2 + (position[b, 2] - z) ** 2
+    to_c = (position[c, 0] - x) ** 2 + (position[c, 1] - y) ** 2 + (position[c, 2] - z) ** 2
+    return x, y, z, max(to_a, to_b, to_c)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _is_held(engaged, shape, triangle):
+    """Whether a shape holds any point of a triangle."""
+    first = triangle * QUADRATURE_COUNT
+    for point in range(first, first + QUADRATURE_COUNT):
+        if engaged[shape, point]:
+            return True
+    return False
+
+
+@njit(forceinline=True, error_model="numpy")
+def closest_on_axis(ends, shape, x, y, z):
+    """The point of the axis of a shape that is nearest to a point.
+
+    In: ends of axes [m] (n_shape, 2, 3), shape: its number, x, y, z: the point [m]
+    Returns three coordinates [m].
+    """
+    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
+    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
+    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    along = 0.0
+    if length_squared > 0.0:
+        along = (
+            (x - ends[shape, 0, 0]) * ux + (y - ends[shape, 0, 1]) * uy + (z - ends[shape, 0, 2]) * uz
+        ) / length_squared
+        along = min(1.0, max(0.0, along))
+    return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
+
+
+@njit(forceinline=True, error_model="numpy")
+def closest_on_core(ends, spans, shape, x, y, z):
+    """The point of the core of a shape that is nearest to a point: on its axis, and across it in a rounded box.
+
+    In: ends of axes [m] (n_shape, 2, 3), spans across them [m] (n_shape, 3), shape: its number, x, y, z: the point [m]
+    Returns three coordinates [m].
+    """
+    px, py, pz = closest_on_axis(ends, shape, x, y, z)
+    sx = spans[shape, 0]
+    sy = spans[shape, 1]
+    sz = spans[shape, 2]
+    squared = sx * sx + sy * sy + sz * sz
+    if squared > 0.0:
+        across = min(1.0, max(-1.0, ((x - px) * sx + (y - py) * sy + (z - pz) * sz) / squared))
+        px += across * sx
+        py += across * sy
+        pz += across * sz
+    return px, py, pz
+
+
+@njit(forceinline=True, error_model="numpy")
+def _release(engaged, stretch_memory, shape, item):
+    """Forget the contact of one quadrature point with one shape."""
+    engaged[shape, item] = 0
+    stretch_memory[shape, item, 0] = 0.0
+    stretch_memory[shape, item, 1] = 0.0
+    stretch_memory[shape, item, 2] = 0.0
+
+
+@njit(forceinline=True, error_model="numpy")
+def _push_corner(position, force, reference, wrench, tool, node, weight, along_n, gx, gy, gz, nx, ny, nz):
+    """One corner's share of a point's force, weight g + along_n n, and the reaction to it."""
+    fx = weight * gx + along_n * nx
+    fy = weight * gy + along_n * ny
+    fz = weight * gz + along_n * nz
+    force[node, 0] += fx
+    force[node, 1] += fy
+    force[node, 2] += fz
+    ax = position[node, 0] - reference[tool, 0]
+    ay = position[node, 1] - reference[tool, 1]
+    az = position[node, 2] - reference[tool, 2]
+    wrench[tool, 0] -= fx
+    wrench[tool, 1] -= fy
+    wrench[tool, 2] -= fz
+    wrench[tool, 3] -= ay * fz - az * fy
+    wrench[tool, 4] -= az * fx - ax * fz
+    wrench[tool, 5] -= ax * fy - ay * fx
+
+
+@njit(forceinline=True, error_model="numpy")
+def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
+    """Drop the part along a shape's core in which the nearest point (px, py, pz) lies strictly between its borders."""
+    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
+    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
+    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
+    px -= ends[shape, 0, 0]
+    py -= ends[shape, 0, 1]
+    pz -= ends[shape, 0, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    if length_squared > 0.0:
+        along = px * ux + py * uy + pz * uz
+        if BORDER * length_squared < along < (1.0 - BORDER) * length_squared:
+            share = (gx * ux + gy * uy + gz * uz) / length_squared
+            gx -= share * ux
+            gy -= share * uy
+            gz -= share * uz
+    ux = spans[shape, 0]
+    uy = spans[shape, 1]
+    uz = spans[shape, 2]
+    length_squared = ux * ux + uy * uy + uz * uz
+    if length_squared > 0.0 and abs(px * ux + py * uy + pz * uz) < (1.0 - BORDER) * length_squared:
+        share = (gx * ux + gy * uy + gz * uz) / length_squared
+        gx -= share * ux
+        gy -= share * uy
+        gz -= share * uz
+    return gx, gy, gz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def stretch_by_lag(model, state, shapes, response, candidate_count):
+    """Shift the stretch of sticking friction by each tool's lag, to where MuJoCo puts the tool at the end of the step.
+
+    Model: model: surface_triangles (n_surface, 3)
+    In:    state: node_position [m] (n_node, 3), contact_engaged, contact_candidates; shapes: tool_centre [m]
+           (n_tool, 3); response: tool_lag [m, rad] (n_tool, 6); candidate_count
+    Out:   state: contact_stretch [m] (n_shape, n_surface * 4, 3)
+    """
+    position, surface = state.node_position, model.surface_triangles
+    engaged, stretch, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
+    centre, lag = shapes.tool_centre, response.tool_lag
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            for point in range(QUADRATURE_COUNT):
+                item = triangle * QUADRATURE_COUNT + point
+                if not engaged[shape, item]:
+                    continue
+                ox = -centre[tool, 0]
+                oy = -centre[tool, 1]
+                oz = -centre[tool, 2]
+                for corner in range(3):
+                    weight = QUADRATURE_BARYCENTRIC[point, corner]
+                    ox += weight * position[surface[triangle, corner], 0]
+                    oy += weight * position[surface[triangle, corner], 1]
+                    oz += weight * position[surface[triangle, corner], 2]
+                stretch[shape, item, 0] -= lag[tool, 0] + lag[tool, 4] * oz - lag[tool, 5] * oy
+                stretch[shape, item, 1] -= lag[tool, 1] + lag[tool, 5] * ox - lag[tool, 3] * oz
+                stretch[shape, item, 2] -= lag[tool, 2] + lag[tool, 3] * oy - lag[tool, 4] * ox

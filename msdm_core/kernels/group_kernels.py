@@ -1,0 +1,209 @@
+"""Springs and tets of one organ, eight at a time; node arrays are rows of four (x, y, z and nothing).
+
+The rows of eight items are loaded, turned into vectors of eight x, y and z, worked on by the equations of
+`element_kernels`, turned back and added up item by item: the same sums in the same order as the plain loops of
+`tissue_kernels`, which call these for an organ alone and do the items that are left over.
+"""
+
+from numba import njit
+
+from msdm_core.kernels.element_kernels import (
+    SQUEEZED_RATIO,
+    six_volumes,
+    spring_scale,
+    tet_gradients,
+    tet_scale,
+    volume_ratio,
+)
+from msdm_core.kernels.layout_kernels import add_to_corners, corner_mean
+from msdm_core.kernels.vector_kernels import (
+    any_below,
+    define_extract,
+    define_shuffle,
+    keep_lower,
+    load_full,
+    load_row,
+    pack,
+    spread_like,
+    store_row,
+)
+
+GROUP = 8
+
+_join = define_shuffle([0, 1, 2, 3, 4, 5, 6, 7])
+_pick_xy = define_shuffle([0, 4, 8, 12, 1, 5, 9, 13])
+_pick_z = define_shuffle([2, 6, 10, 14, 3, 7, 11, 15])
+_low_halves = define_shuffle([0, 1, 2, 3, 8, 9, 10, 11])
+_high_halves = define_shuffle([4, 5, 6, 7, 12, 13, 14, 15])
+_mesh_low = define_shuffle([0, 8, 1, 9, 2, 10, 3, 11])
+_mesh_high = define_shuffle([4, 12, 5, 13, 6, 14, 7, 15])
+_row_0 = define_shuffle([0, 1, 8, 9])
+_row_1 = define_shuffle([2, 3, 10, 11])
+_row_2 = define_shuffle([4, 5, 12, 13])
+_row_3 = define_shuffle([6, 7, 14, 15])
+_at_0, _at_1, _at_2, _at_3, _at_4, _at_5, _at_6, _at_7 = (define_extract(place) for place in range(GROUP))
+
+
+@njit(forceinline=True, error_model="numpy")
+def _columns(r0, r1, r2, r3, r4, r5, r6, r7):
+    """Eight rows (x, y, z, -) as three vectors of eight."""
+    r01, r23, r45, r67 = _join(r0, r1), _join(r2, r3), _join(r4, r5), _join(r6, r7)
+    low, high = _pick_xy(r01, r23), _pick_xy(r45, r67)
+    return _low_halves(low, high), _high_halves(low, high), _low_halves(_pick_z(r01, r23), _pick_z(r45, r67))
+
+
+@njit(forceinline=True, error_model="numpy")
+def _rows(x, y, z):
+    """Three vectors of eight as eight rows (x, y, z, 0)."""
+    nothing = z * 0.0
+    low, high, low_z, high_z = _mesh_low(x, y), _mesh_high(x, y), _mesh_low(z, nothing), _mesh_high(z, nothing)
+    return (
+        _row_0(low, low_z), _row_1(low, low_z), _row_2(low, low_z), _row_3(low, low_z),
+        _row_0(high, high_z), _row_1(high, high_z), _row_2(high, high_z), _row_3(high, high_z),
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def _edge(values, items, item, corner):
+    """Row from corner 0 of an item to another of its corners."""
+    return load_row(values, items[item, corner]) - load_row(values, items[item, 0])
+
+
+@njit(forceinline=True, error_model="numpy")
+def _edges(values, items, first, corner):
+    """The same of eight items, as three vectors."""
+    return _columns(
+        _edge(values, items, first, corner), _edge(values, items, first + 1, corner),
+        _edge(values, items, first + 2, corner), _edge(values, items, first + 3, corner),
+        _edge(values, items, first + 4, corner), _edge(values, items, first + 5, corner),
+        _edge(values, items, first + 6, corner), _edge(values, items, first + 7, corner),
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def _pull(force, items, item, pull):
+    """Add a row to the first end of a spring and take it from the other."""
+    i, j = items[item, 0], items[item, 1]
+    store_row(force, i, load_row(force, i) + pull)
+    store_row(force, j, load_row(force, j) - pull)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _push(force, items, item, a, b, c, d):
+    """Take a row from corner a of a tet and add one to each of the others."""
+    at_a, at_b, at_c, at_d = items[item, 0], items[item, 1], items[item, 2], items[item, 3]
+    store_row(force, at_a, load_row(force, at_a) - a)
+    store_row(force, at_b, load_row(force, at_b) + b)
+    store_row(force, at_c, load_row(force, at_c) + c)
+    store_row(force, at_d, load_row(force, at_d) + d)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_spring_groups(position, force, nodes, stiffness, rest_length, begin):
+    """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
+
+    Returns the first spring that is in no whole group.
+    """
+    whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
+    for first in range(begin, whole, GROUP):
+        r0, r1 = _edge(position, nodes, first, 1), _edge(position, nodes, first + 1, 1)
+        r2, r3 = _edge(position, nodes, first + 2, 1), _edge(position, nodes, first + 3, 1)
+        r4, r5 = _edge(position, nodes, first + 4, 1), _edge(position, nodes, first + 5, 1)
+        r6, r7 = _edge(position, nodes, first + 6, 1), _edge(position, nodes, first + 7, 1)
+        x, y, z = _columns(r0, r1, r2, r3, r4, r5, r6, r7)
+        scale = spring_scale(x, y, z, load_full(stiffness, first), load_full(rest_length, first))
+        _pull(force, nodes, first, r0 * _at_0(scale))
+        _pull(force, nodes, first + 1, r1 * _at_1(scale))
+        _pull(force, nodes, first + 2, r2 * _at_2(scale))
+        _pull(force, nodes, first + 3, r3 * _at_3(scale))
+        _pull(force, nodes, first + 4, r4 * _at_4(scale))
+        _pull(force, nodes, first + 5, r5 * _at_5(scale))
+        _pull(force, nodes, first + 6, r6 * _at_6(scale))
+        _pull(force, nodes, first + 7, r7 * _at_7(scale))
+    return whole
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sum_volume_groups(position, total, tets):
+    """Six times the volume of each tet of whole groups, added up at its corners [m^3].
+
+    In:  position [m] (n_node, 4), tets (n_tet, 4)
+    Out: total, added to [m^3] (n_node,)
+    Returns the first tet that is in no whole group.
+    """
+    whole = tets.shape[0] // GROUP * GROUP
+    for first in range(0, whole, GROUP):
+        bx, by, bz = _edges(position, tets, first, 1)
+        cx, cy, cz = _edges(position, tets, first, 2)
+        dx, dy, dz = _edges(position, tets, first, 3)
+        g = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
+        six = six_volumes(bx, by, bz, g[0], g[1], g[2])
+        add_to_corners((), total, tets, first, _at_0(six))
+        add_to_corners((), total, tets, first + 1, _at_1(six))
+        add_to_corners((), total, tets, first + 2, _at_2(six))
+        add_to_corners((), total, tets, first + 3, _at_3(six))
+        add_to_corners((), total, tets, first + 4, _at_4(six))
+        add_to_corners((), total, tets, first + 5, _at_5(six))
+        add_to_corners((), total, tets, first + 6, _at_6(six))
+        add_to_corners((), total, tets, first + 7, _at_7(six))
+    return whole
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_tet_groups(
+    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed
+):  # fmt: skip
+    """Forces of whole groups of tets; arguments as in `tissue_kernels.add_tet_forces`.
+
+    Returns the first tet that is in no whole group, and how many groups have a squeezed tet.
+    """
+    whole = tets.shape[0] // GROUP * GROUP
+    count = 0
+    lowest = spread_like(inverse_volume, low[0])
+    for first in range(0, whole, GROUP):
+        bx, by, bz = _edges(position, tets, first, 1)
+        cx, cy, cz = _edges(position, tets, first, 2)
+        dx, dy, dz = _edges(position, tets, first, 3)
+        gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
+        ratio = volume_ratio(six_volumes(bx, by, bz, gbx, gby, gbz), load_full(inverse_volume, first))
+        lowest = keep_lower(ratio, lowest, ratio, lowest)
+        if any_below(ratio, SQUEEZED_RATIO):
+            squeezed[count] = first
+            count += 1
+        averaged = pack(
+            corner_mean((), tension, tets, first), corner_mean((), tension, tets, first + 1),
+            corner_mean((), tension, tets, first + 2), corner_mean((), tension, tets, first + 3),
+            corner_mean((), tension, tets, first + 4), corner_mean((), tension, tets, first + 5),
+            corner_mean((), tension, tets, first + 6), corner_mean((), tension, tets, first + 7),
+        )  # fmt: skip
+        scale = tet_scale(ratio, load_full(bulk, first), load_full(averaged_bulk, first), averaged)
+        pull = spring_scale(bx, by, bz, load_full(stiffness, first), load_full(rest_length, first))
+        gbx, gby, gbz = scale * gbx - pull * bx, scale * gby - pull * by, scale * gbz - pull * bz
+        gcx, gcy, gcz = scale * gcx, scale * gcy, scale * gcz
+        gdx, gdy, gdz = scale * gdx, scale * gdy, scale * gdz
+        a = _rows(gbx + gcx + gdx, gby + gcy + gdy, gbz + gcz + gdz)
+        b, c, d = _rows(gbx, gby, gbz), _rows(gcx, gcy, gcz), _rows(gdx, gdy, gdz)
+        _push(force, tets, first, a[0], b[0], c[0], d[0])
+        _push(force, tets, first + 1, a[1], b[1], c[1], d[1])
+        _push(force, tets, first + 2, a[2], b[2], c[2], d[2])
+        _push(force, tets, first + 3, a[3], b[3], c[3], d[3])
+        _push(force, tets, first + 4, a[4], b[4], c[4], d[4])
+        _push(force, tets, first + 5, a[5], b[5], c[5], d[5])
+        _push(force, tets, first + 6, a[6], b[6], c[6], d[6])
+        _push(force, tets, first + 7, a[7], b[7], c[7], d[7])
+    _keep(low, _at_0(lowest))
+    _keep(low, _at_1(lowest))
+    _keep(low, _at_2(lowest))
+    _keep(low, _at_3(lowest))
+    _keep(low, _at_4(lowest))
+    _keep(low, _at_5(lowest))
+    _keep(low, _at_6(lowest))
+    _keep(low, _at_7(lowest))
+    return whole, count
+
+
+@njit(forceinline=True, error_model="numpy")
+def _keep(low, ratio):
+    """Remember a volume ratio where it is the smallest yet."""
+    if not ratio >= low[0]:
+        low[0] = ratio

@@ -1,0 +1,272 @@
+"""The guard that keeps the surface of an organ off the axes of the shapes, and detects where one passed through."""
+
+import math
+from typing import NamedTuple
+
+from numba import njit
+
+from msdm_core.kernels.contact_kernels import closest_on_axis
+
+# The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
+GUARD_SHARE = 0.6
+# Half a thousandth of a triangle is taken for its edge, so that nothing slips through between two.
+EDGE_WIDTH = 5e-4
+
+
+class _NearPoint(NamedTuple):
+    """The point of a triangle that is nearest to the axis of a shape, SI units.
+
+    Fields:
+        corners: the triangle's nodes                                            3
+        weights: what each of them counts at the point                           3
+        place: where the point is [m]                                            3
+        direction: unit vector from the axis to it                               3
+        distance: between them [m]
+        reach: distance below which the guard pushes [m]
+        stiffness: of the guard [N/m]
+    """
+
+    corners: tuple[int, int, int]
+    weights: tuple[float, float, float]
+    place: tuple[float, float, float]
+    direction: tuple[float, float, float]
+    distance: float
+    reach: float
+    stiffness: float
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def guard_axes(model, state, shapes, law, response, dt, candidate_count, reference, wrench):
+    """Keep the surface off the axes of the shapes, which the quadrature points alone may let pass.
+
+    Where a ball is small against a triangle, the surface opens between its quadrature points. So the point of each
+    triangle nearest to the axis, at the distance d, is pushed away from it by k h (h / d - 1) below h = 0.6 r, with
+    k = pi r^2 k_p: nothing at h, without bound at the axis. It is taken implicitly, with the nodes' masses and the
+    tool's mobility, so that it asks for no shorter step; it must therefore come after all other forces.
+
+    Model: model: surface_triangles (n_surface, 3), node_inverse_mass [1/kg] (n_node,); law, response
+    In:    state: node_position [m], node_velocity [m/s] (n_node, 3), contact_candidates; shapes, dt [s],
+           candidate_count, reference: point of each tool's torque [m] (n_tool, 3)
+    Out:   state: node_force, added to [N] (n_node, 3), contact_passed (2,); wrench, added to [N, N m] (n_tool, 6)
+    Returns whether the surface is on its side of every axis.
+    """
+    position, velocity = state.node_position, state.node_velocity
+    candidates, surface = state.contact_candidates, model.surface_triangles
+    ends, twist = shapes.shape_ends, shapes.tool_twist
+    kept = True
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        radius = shapes.shape_radius[shape]
+        reach = GUARD_SHARE * radius
+        # What an axis may pass in one substep, with the broad phase's bound on its speed.
+        watched = reach
+        for part in range(6):
+            watched += dt * abs(twist[tool, part])
+        for entry in range(candidate_count):
+            triangle = candidates[shape, entry]
+            if triangle < 0:
+                break
+            a = surface[triangle, 0]
+            b = surface[triangle, 1]
+            c = surface[triangle, 2]
+            bx = position[b, 0] - position[a, 0]
+            by = position[b, 1] - position[a, 1]
+            bz = position[b, 2] - position[a, 2]
+            cx = position[c, 0] - position[a, 0]
+            cy = position[c, 1] - position[a, 1]
+            cz = position[c, 2] - position[a, 2]
+            nx = by * cz - bz * cy
+            ny = bz * cx - bx * cz
+            nz = bx * cy - by * cx
+            twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
+            first = 0.0
+            second = 0.0
+            for axis, part in ((0, nx), (1, ny), (2, nz)):
+                first += (ends[shape, 0, axis] - position[a, axis]) * part
+                second += (ends[shape, 1, axis] - position[a, axis]) * part
+            low = 0 if first < second else 1
+            if min(first, second) > watched * twice_area or max(first, second) < -watched * twice_area:
+                continue
+            if min(first, second) <= 0.0 and _passed(shapes, shape, position, velocity, dt, a, b, c):
+                state.contact_passed[0] = shape
+                state.contact_passed[1] = triangle
+                kept = False
+                continue
+            # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, near for a shaft.
+            wb, wc = closest_in_triangle(
+                bx, by, bz, cx, cy, cz,
+                ends[shape, low, 0] - position[a, 0], ends[shape, low, 1] - position[a, 1],
+                ends[shape, low, 2] - position[a, 2],
+            )  # fmt: skip
+            x = position[a, 0] + wb * bx + wc * cx
+            y = position[a, 1] + wb * by + wc * cy
+            z = position[a, 2] + wb * bz + wc * cz
+            px, py, pz = closest_on_axis(ends, shape, x, y, z)
+            ex = x - px
+            ey = y - py
+            ez = z - pz
+            distance = math.sqrt(ex * ex + ey * ey + ez * ez)
+            # Behind the triangle, beyond one of its edges: another one stands between.
+            if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
+                continue
+            direction = (ex / distance, ey / distance, ez / distance)
+            stiffness = math.pi * radius * radius * law.stiffness
+            near = _NearPoint((a, b, c), (1.0 - wb - wc, wb, wc), (x, y, z), direction, distance, reach, stiffness)
+            _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
+    return kept
+
+
+@njit(forceinline=True, error_model="numpy")
+def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near):
+    """The guard's push on a point of a triangle, with the speed and mobility that it has in this substep.
+
+    Model: model, response
+    In:    shapes: twist and centre of the tool [m, rad, s], dt [s], reference [m] (n_tool, 3), tool, near
+    Out:   state: node_force [N] (n_node, 3), wrench, added to [N, N m] (n_tool, 6)
+    """
+    velocity, force, inverse_mass = state.node_velocity, state.node_force, model.node_inverse_mass
+    twist, centre, mobility = shapes.tool_twist, shapes.tool_centre, response.tool_mobility
+    ex, ey, ez = near.direction
+    x, y, z = near.place
+    ox = x - centre[tool, 0]
+    oy = y - centre[tool, 1]
+    oz = z - centre[tool, 2]
+    speed = -(
+        ex * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
+        + ey * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
+        + ez * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
+    )
+    lever = (ex, ey, ez, oy * ez - oz * ey, oz * ex - ox * ez, ox * ey - oy * ex)
+    give = 0.0
+    for row in range(6):
+        for column in range(6):
+            give += dt * lever[row] * mobility[tool, tool, row, column] * lever[column]
+    for corner in range(3):
+        node, weight = near.corners[corner], near.weights[corner]
+        rate = dt * inverse_mass[node]
+        speed += weight * (
+            ex * (velocity[node, 0] + rate * force[node, 0])
+            + ey * (velocity[node, 1] + rate * force[node, 1])
+            + ez * (velocity[node, 2] + rate * force[node, 2])
+        )
+        give += weight * weight * rate
+    closeness = near.reach / near.distance
+    slope = near.stiffness * closeness**2
+    push = near.stiffness * near.reach * (closeness - 1.0) - slope * dt * speed
+    push = max(0.0, push / (1.0 + slope * dt * give))
+    fx = push * ex
+    fy = push * ey
+    fz = push * ez
+    for corner in range(3):
+        node, weight = near.corners[corner], near.weights[corner]
+        force[node, 0] += weight * fx
+        force[node, 1] += weight * fy
+        force[node, 2] += weight * fz
+    x -= reference[tool, 0]
+    y -= reference[tool, 1]
+    z -= reference[tool, 2]
+    wrench[tool, 0] -= fx
+    wrench[tool, 1] -= fy
+    wrench[tool, 2] -= fz
+    wrench[tool, 3] -= y * fz - z * fy
+    wrench[tool, 4] -= z * fx - x * fz
+    wrench[tool, 5] -= x * fy - y * fx
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _passed(shapes, shape, position, velocity, dt, a, b, c):
+    """Whether an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
+    ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]
+    ux, uy, uz, wx, wy, wz = twist[tool]
+    highest, highest_b, highest_c = 0.0, 0.0, 0.0
+    lowest, lowest_b, lowest_c = 0.0, 0.0, 0.0
+    for end in range(2):
+        x = ends[shape, end, 0]
+        y = ends[shape, end, 1]
+        z = ends[shape, end, 2]
+        now, now_b, now_c = _foot(x, y, z, position, velocity, 0.0, a, b, c)
+        ox = x - centre[tool, 0]
+        oy = y - centre[tool, 1]
+        oz = z - centre[tool, 2]
+        x -= dt * (ux + wy * oz - wz * oy)
+        y -= dt * (uy + wz * ox - wx * oz)
+        z -= dt * (uz + wx * oy - wy * ox)
+        then, then_b, then_c = _foot(x, y, z, position, velocity, dt, a, b, c)
+        if then > 0.0 >= now and _is_inside(then, then_b, then_c, now, now_b, now_c):
+            return True
+        if now > highest:
+            highest, highest_b, highest_c = now, now_b, now_c
+        if now < lowest:
+            lowest, lowest_b, lowest_c = now, now_b, now_c
+    return highest > 0.0 > lowest and _is_inside(highest, highest_b, highest_c, lowest, lowest_b, lowest_c)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _foot(x, y, z, position, velocity, dt, a, b, c):
+    """Of a point over a triangle as it was dt ago: height [m], and its foot's weights of the corners b and c."""
+    ax = position[a, 0] - dt * velocity[a, 0]
+    ay = position[a, 1] - dt * velocity[a, 1]
+    az = position[a, 2] - dt * velocity[a, 2]
+    bx = position[b, 0] - dt * velocity[b, 0] - ax
+    by = position[b, 1] - dt * velocity[b, 1] - ay
+    bz = position[b, 2] - dt * velocity[b, 2] - az
+    cx = position[c, 0] - dt * velocity[c, 0] - ax
+    cy = position[c, 1] - dt * velocity[c, 1] - ay
+    cz = position[c, 2] - dt * velocity[c, 2] - az
+    px = x - ax
+    py = y - ay
+    pz = z - az
+    nx = by * cz - bz * cy
+    ny = bz * cx - bx * cz
+    nz = bx * cy - by * cx
+    squared = nx * nx + ny * ny + nz * nz
+    wb = ((py * cz - pz * cy) * nx + (pz * cx - px * cz) * ny + (px * cy - py * cx) * nz) / squared
+    wc = ((by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz) / squared
+    return (px * nx + py * ny + pz * nz) / math.sqrt(squared), wb, wc
+
+
+@njit(forceinline=True, error_model="numpy")
+def _is_inside(high, high_b, high_c, low, low_b, low_c):
+    """Whether the way from a height above a triangle to one below it leads through it, its edges included."""
+    share = high / (high - low)
+    wb = high_b + share * (low_b - high_b)
+    wc = high_c + share * (low_c - high_c)
+    return wb >= -EDGE_WIDTH and wc >= -EDGE_WIDTH and wb + wc <= 1.0 + EDGE_WIDTH
+
+
+@njit(forceinline=True, error_model="numpy")
+def closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
+    """The point of a triangle that is nearest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
+
+    In: b, c: edges from the corner a [m], p: from the corner a to the point [m]
+    Returns the weights of the corners b and c.
+    """
+    bb = bx * bx + by * by + bz * bz
+    cc = cx * cx + cy * cy + cz * cz
+    bc = bx * cx + by * cy + bz * cz
+    pb = px * bx + py * by + pz * bz
+    pc = px * cx + py * cy + pz * cz
+    determinant = bb * cc - bc * bc
+    wb = cc * pb - bc * pc
+    wc = bb * pc - bc * pb
+    if wb > 0.0 and wc > 0.0 and wb + wc < determinant:
+        return wb / determinant, wc / determinant
+    # The nearest of the three edges' nearest points.
+    on_b = min(1.0, max(0.0, pb / bb))
+    best = on_b * (on_b * bb - 2.0 * pb)
+    wb = on_b
+    wc = 0.0
+    on_c = min(1.0, max(0.0, pc / cc))
+    distance = on_c * (on_c * cc - 2.0 * pc)
+    if distance < best:
+        best = distance
+        wb = 0.0
+        wc = on_c
+    # Along b to c.
+    along = min(1.0, max(0.0, (bb - bc - pb + pc) / (bb + cc - 2.0 * bc)))
+    ub = 1.0 - along
+    distance = ub * ub * bb + along * along * cc + 2.0 * ub * along * bc - 2.0 * (ub * pb + along * pc)
+    if distance < best:
+        wb = ub
+        wc = along
+    return wb, wc

@@ -1,0 +1,160 @@
+"""How numbers of nodes, springs and tets lie in memory: of an organ alone, and of organs side by side.
+
+`lanes` is a tuple as long as there are organs side by side; their number is thereby part of the compiled type. One
+register then holds the same number of every organ (8 of float64, 16 or 8 of float32): arrays are (n_item, n_lane) and
+(n_node, 3, n_lane), and nothing is gathered or scattered. For an organ alone `lanes` is empty: arrays are (n_item,) of
+numbers and (n_node, 4) of float64, whose rows of x, y, z and nothing load as one register. Which of the two holds is
+known when a function is compiled, which drops the other branch of each `if len(lanes) == 0`.
+"""
+
+import numpy as np
+from numba import njit
+
+from msdm_core.kernels.vector_kernels import (
+    define_extract,
+    keep_lower,
+    load_lanes,
+    load_or_spread,
+    load_row,
+    store_lanes,
+    store_row,
+)
+
+_at_0, _at_1, _at_2 = define_extract(0), define_extract(1), define_extract(2)
+
+
+@njit(forceinline=True, error_model="numpy")
+def load_item(lanes, values, item):
+    """An item's number, or the vector of all organs' numbers of it."""
+    if len(lanes) == 0:
+        return values[item]
+    return load_lanes(lanes, values, item)
+
+
+@njit(forceinline=True, error_model="numpy")
+def store_item(lanes, values, item, value):
+    """Write what `load_item` reads."""
+    if len(lanes) == 0:
+        values[item] = value
+    else:
+        store_lanes(values, item, value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def load_shared(lanes, like, values, item):
+    """`load_item` of an array that organs may share: then (n_item,) for all of them; of the type of `like`."""
+    if len(lanes) == 0:
+        return values[item]
+    return load_or_spread(lanes, like, values, item)
+
+
+@njit(forceinline=True, error_model="numpy")
+def parts_of(lanes):
+    """How many registers hold a node's x, y and z."""
+    if len(lanes) == 0:
+        return 1
+    return 3
+
+
+@njit(forceinline=True, error_model="numpy")
+def load_part(lanes, values, part):
+    """A register of an array of nodes; those of node i are i * parts_of(lanes) and on."""
+    if len(lanes) == 0:
+        return load_row(values, part)
+    return load_lanes(lanes, values, part)
+
+
+@njit(forceinline=True, error_model="numpy")
+def store_part(lanes, values, part, value):
+    """Write what `load_part` reads."""
+    if len(lanes) == 0:
+        store_row(values, part, value)
+    else:
+        store_lanes(values, part, value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def store_sum(lanes, total, value):
+    """Write a sum over `load_part` into an array (1,) or (1, n_lane); of a row its three numbers added up."""
+    if len(lanes) == 0:
+        total[0] = (_at_0(value) + _at_1(value)) + _at_2(value)
+    else:
+        store_lanes(total, 0, value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def where_moving(lanes, moving, after, before):
+    """For each organ the value `after` where it moves (1 in `moving`), else `before`."""
+    if len(lanes) == 0:
+        return after
+    moves = load_lanes(lanes, moving, 0)
+    return keep_lower(moves, moves * 0.0 + 1.0, before, after)
+
+
+@njit(forceinline=True, error_model="numpy")
+def difference(lanes, values, items, item, corner):
+    """From corner 0 of an item to another of its corners, of an array of nodes: x, y and z."""
+    if len(lanes) == 0:
+        a, b = items[item, 0], items[item, corner]
+        return values[b, 0] - values[a, 0], values[b, 1] - values[a, 1], values[b, 2] - values[a, 2]
+    i, j = 3 * np.intp(items[item, 0]), 3 * np.intp(items[item, corner])
+    return (
+        load_lanes(lanes, values, j) - load_lanes(lanes, values, i),
+        load_lanes(lanes, values, j + 1) - load_lanes(lanes, values, i + 1),
+        load_lanes(lanes, values, j + 2) - load_lanes(lanes, values, i + 2),
+    )
+
+
+@njit(forceinline=True, error_model="numpy")
+def three_edges(lanes, values, tets, tet):
+    """From corner 0 of a tet to its other three."""
+    return (
+        difference(lanes, values, tets, tet, 1),
+        difference(lanes, values, tets, tet, 2),
+        difference(lanes, values, tets, tet, 3),
+    )
+
+
+@njit(forceinline=True, error_model="numpy")
+def add_to_node(lanes, force, node, x, y, z):
+    """Add x, y and z to a node's force."""
+    if len(lanes) == 0:
+        force[node, 0] += x
+        force[node, 1] += y
+        force[node, 2] += z
+    else:
+        part = 3 * np.intp(node)
+        store_lanes(force, part, load_lanes(lanes, force, part) + x)
+        store_lanes(force, part + 1, load_lanes(lanes, force, part + 1) + y)
+        store_lanes(force, part + 2, load_lanes(lanes, force, part + 2) + z)
+
+
+@njit(forceinline=True, error_model="numpy")
+def take_from_node(lanes, force, node, x, y, z):
+    """Take x, y and z from a node's force."""
+    if len(lanes) == 0:
+        force[node, 0] -= x
+        force[node, 1] -= y
+        force[node, 2] -= z
+    else:
+        part = 3 * np.intp(node)
+        store_lanes(force, part, load_lanes(lanes, force, part) - x)
+        store_lanes(force, part + 1, load_lanes(lanes, force, part + 1) - y)
+        store_lanes(force, part + 2, load_lanes(lanes, force, part + 2) - z)
+
+
+@njit(forceinline=True, error_model="numpy")
+def add_to_corners(lanes, total, tets, tet, value):
+    """Add a number to each corner of a tet."""
+    for corner in range(4):
+        node = tets[tet, corner]
+        store_item(lanes, total, node, load_item(lanes, total, node) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def corner_mean(lanes, values, tets, tet):
+    """Mean of the numbers at the corners of a tet."""
+    return 0.25 * (
+        load_item(lanes, values, tets[tet, 0]) + load_item(lanes, values, tets[tet, 1])
+        + load_item(lanes, values, tets[tet, 2]) + load_item(lanes, values, tets[tet, 3])
+    )  # fmt: skip

@@ -1,0 +1,497 @@
+"""Model, state, contact shapes, tools and contact law of organs: what the compiled code reads and writes.
+
+An organ alone has `OrganModel` and `OrganState`; organs of the same tets that advance together, one a lane, have
+`LaneModel` and `LaneState`. The functions at the end give what contact and tools need of one lane; for an organ alone
+that is the whole. Arrays of models are read-only, which numba enforces at compile time.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numba.extending import overload
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+# float64 or float32, eight or sixteen lanes.
+LaneArray = NDArray[Any]
+
+FAULT_NONE = 0
+FAULT_INVERTED_TET = 1
+FAULT_NOT_FINITE = 2
+FAULT_CONTACT_LOST = 3
+# Instead of a fault: the lane has no organ, or its organ must not move.
+LANE_EMPTY = -1
+
+
+class OrganModel(NamedTuple):
+    """The constants of an organ: read-only arrays, SI units.
+
+    Fields:
+        node_rest_position: undeformed position [m]                              (n_node, 3)
+        node_mass: lumped mass [kg]                                              (n_node,)
+        node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node,)
+        spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
+        spring_stiffness: [N/m]                                                  (n_spring,)
+        spring_rest_length: [m]                                                  (n_spring,)
+        tet_nodes: corners of each tet                                           (n_tet, 4)
+        tet_rest_volume: [m^3]                                                   (n_tet,)
+        tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,)
+        tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet,)
+        tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet,)
+        node_rest_volume: volume averaged at a node, a quarter of its tets [m^3] (n_node,)
+        node_inverse_volume: 1 / that [1/m^3]                                    (n_node,)
+        node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node,)
+        averages_volume: whether any node_bulk is above 0                        scalar
+        surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
+        surface_rest_area: [m^2]                                                 (n_surface,)
+        support_kind: the solids it rests on, PLANE, SPHERE, ...                 (n_support,)
+        support_position: its middle or a plane's point [m]                      (n_support, 3)
+        support_rotation: its axes in the world, one a column                    (n_support, 3, 3)
+        support_size: radius, half length, half sizes [m]                        (n_support, 3)
+        support_friction: Coulomb coefficient                                    (n_support,)
+        support_nodes: nodes that supports may hold: free ones of the surface    (n_support_node,)
+        support_area: surface area that belongs to each of them [m^2]            (n_support_node,)
+        support_stiffness: pressure per penetration [N/m^3]                      scalar
+        support_damping: pressure per closing speed [N s/m^3]                    scalar
+        support_tangential_stiffness: traction per stretch while sticking [N/m^3] scalar
+        gravity: [m/s^2]                                                         (3,)
+        alpha: mass-proportional damping rate [1/s]                              scalar
+        beta: stiffness-proportional damping time [s]                            scalar
+        stable_step: largest stable step without contact of instruments [s]      scalar
+        added_mass: how much of node_mass `stability.scale_mass` added [kg]      scalar
+    """
+
+    node_rest_position: FloatArray
+    node_mass: FloatArray
+    node_inverse_mass: FloatArray
+    spring_nodes: NDArray[np.int32]
+    spring_stiffness: FloatArray
+    spring_rest_length: FloatArray
+    tet_nodes: NDArray[np.int32]
+    tet_rest_volume: FloatArray
+    tet_inverse_volume: FloatArray
+    tet_bulk: FloatArray
+    tet_averaged_bulk: FloatArray
+    node_rest_volume: FloatArray
+    node_inverse_volume: FloatArray
+    node_bulk: FloatArray
+    averages_volume: bool
+    surface_triangles: NDArray[np.int32]
+    surface_rest_area: FloatArray
+    support_kind: NDArray[np.int32]
+    support_position: FloatArray
+    support_rotation: FloatArray
+    support_size: FloatArray
+    support_friction: FloatArray
+    support_nodes: NDArray[np.int32]
+    support_area: FloatArray
+    support_stiffness: float
+    support_damping: float
+    support_tangential_stiffness: float
+    gravity: FloatArray
+    alpha: float
+    beta: float
+    stable_step: float
+    added_mass: float
+
+    def __deepcopy__(self, memo: dict) -> "OrganModel":
+        """The same: nothing writes to it, and numba would compile everything again for copies that can be written."""
+        return self
+
+
+class OrganState(NamedTuple):
+    """What changes while an organ moves, SI units; all but SCRATCH_FIELDS is saved and restored.
+
+    Fields:
+        node_position: [m]                                                       (n_node, 3)
+        node_velocity: [m/s]                                                     (n_node, 3)
+        node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3)
+        node_tension: scratch: tension of the averaged volume term [Pa]          (n_node,)
+        row_position: scratch: position in rows of four, which load as one       (n_node, 4)
+        row_velocity: scratch: likewise                                          (n_node, 4)
+        row_force: scratch: likewise                                             (n_node, 4)
+        squeezed_tets: scratch: where tets are squeezed below SQUEEZED_RATIO     (n_tet,)
+        contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
+        contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
+        contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
+        contact_passed: the shape and the triangle it passed through, after such a fault  (2,)
+        support_stretch: tangential stretch of nodes that stick to supports [m]  (n_support_node, n_support, 3)
+        volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
+        lane_fault: scratch: FAULT_ code of the last call                        (1,)
+        moving: scratch: 1 until a fault stops the organ, then 0                 (1,)
+        finite_sum: scratch: finite where positions and velocities are           (1,)
+        candidate_count: scratch: candidates of the busiest shape                (1,)
+        contact_kept: scratch: 0 where the surface passed through an axis        (1,)
+    """
+
+    node_position: FloatArray
+    node_velocity: FloatArray
+    node_force: FloatArray
+    node_tension: FloatArray
+    row_position: FloatArray
+    row_velocity: FloatArray
+    row_force: FloatArray
+    squeezed_tets: NDArray[np.int32]
+    contact_engaged: NDArray[np.uint8]
+    contact_stretch: FloatArray
+    contact_candidates: NDArray[np.int32]
+    contact_passed: NDArray[np.int32]
+    support_stretch: FloatArray
+    volume_ratio_smallest: FloatArray
+    lane_fault: NDArray[np.int32]
+    moving: FloatArray
+    finite_sum: FloatArray
+    candidate_count: NDArray[np.int32]
+    contact_kept: NDArray[np.uint8]
+
+
+# Written anew in every call: need not be saved.
+SCRATCH_FIELDS = (
+    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets", "contact_candidates"),
+    *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept"),
+)
+
+
+class LaneModel(NamedTuple):
+    """The constants of organs side by side: read-only arrays, SI units; tets are shared, the lane is the last index.
+
+    Rest shapes and anchors are shared too, or each lane's own. Their arrays are then (n, n_lane) in place of (n,), and
+    those of surface and supports have the lane as their first index, of which a lane uses as many rows as it has.
+
+    Fields:
+        lanes: as many zeros as there are lanes; their number is part of the compiled type
+        node_mass: lumped mass [kg]                                              (n_node, n_lane)
+        node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node, n_lane)
+        spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
+        spring_stiffness: [N/m]                                                  (n_spring, n_lane)
+        spring_rest_length: [m]                                                  (n_spring,) or own
+        tet_nodes: corners of each tet                                           (n_tet, 4)
+        tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,) or own
+        tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet, n_lane)
+        tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet, n_lane)
+        node_inverse_volume: 1 / volume averaged at a node [1/m^3]               (n_node,) or own
+        node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node, n_lane)
+        averages_volume: whether any node_bulk of the lane is above 0            (n_lane,)
+        node_rest_position: undeformed position, of lane 0 if they differ [m]    (n_node, 3)
+        surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3) or own
+        surface_rest_area: [m^2]                                                 (n_surface,) or own
+        surface_count: how many of them each lane has                            (n_lane,)
+        support_nodes, support_area: as in OrganModel                            (n_support_node,) or own
+        support_count: how many of them each lane has                            (n_lane,)
+        support_kind and the other support_ fields: as in OrganModel
+        gravity: [m/s^2]                                                         (3,)
+        alpha: mass-proportional damping rate [1/s]                              scalar
+        beta: stiffness-proportional damping time [s]                            scalar
+        stable_step: largest stable step without contact of instruments [s]      (n_lane,)
+    """
+
+    lanes: tuple[int, ...]
+    node_mass: LaneArray
+    node_inverse_mass: LaneArray
+    spring_nodes: NDArray[np.int32]
+    spring_stiffness: LaneArray
+    spring_rest_length: FloatArray
+    tet_nodes: NDArray[np.int32]
+    tet_inverse_volume: FloatArray
+    tet_bulk: LaneArray
+    tet_averaged_bulk: LaneArray
+    node_inverse_volume: FloatArray
+    node_bulk: LaneArray
+    averages_volume: NDArray[np.bool_]
+    node_rest_position: FloatArray
+    surface_triangles: NDArray[np.int32]
+    surface_rest_area: FloatArray
+    surface_count: NDArray[np.int32]
+    support_kind: NDArray[np.int32]
+    support_position: FloatArray
+    support_rotation: FloatArray
+    support_size: FloatArray
+    support_friction: FloatArray
+    support_nodes: NDArray[np.int32]
+    support_area: FloatArray
+    support_count: NDArray[np.int32]
+    support_stiffness: float
+    support_damping: float
+    support_tangential_stiffness: float
+    gravity: FloatArray
+    alpha: float
+    beta: float
+    stable_step: FloatArray
+
+
+class LaneState(NamedTuple):
+    """What changes while organs side by side move, SI units.
+
+    Fields:
+        node_position: [m]                                                       (n_node, 3, n_lane)
+        node_velocity: [m/s]                                                     (n_node, 3, n_lane)
+        node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3, n_lane)
+        volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1, n_lane)
+        lane_fault: a FAULT_ code, or LANE_EMPTY; moves only if FAULT_NONE       (n_lane,)
+        contact_engaged: 1 where a quadrature point is held off by a shape       (n_lane, n_shape, n_surface * 4)
+        contact_stretch: tangential stretch of sticking friction [m]             (n_lane, n_shape, n_surface * 4, 3)
+        contact_candidates: scratch: triangles in reach, shape by shape          (n_lane, n_shape, n_surface)
+        contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
+        support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
+        node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
+        squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
+        kept_force: scratch: node_force of the lanes that do not move [N]        (n_node, 3, n_lane)
+        moving: scratch: 1 where a lane moves, else 0                            (1, n_lane)
+        finite_sum: scratch: finite where a lane's positions and velocities are  (1, n_lane)
+        candidate_count: scratch: candidates of the busiest shape                (n_lane,)
+        contact_kept: scratch: 0 where the surface passed through an axis        (n_lane,)
+        surface_count, support_count: how much of the memory belongs to a lane   (n_lane,)
+    """
+
+    node_position: LaneArray
+    node_velocity: LaneArray
+    node_force: LaneArray
+    volume_ratio_smallest: LaneArray
+    lane_fault: NDArray[np.int32]
+    contact_engaged: NDArray[np.uint8]
+    contact_stretch: FloatArray
+    contact_candidates: NDArray[np.int32]
+    contact_passed: NDArray[np.int32]
+    support_stretch: FloatArray
+    node_tension: LaneArray
+    squeezed_tets: NDArray[np.int32]
+    kept_force: LaneArray
+    moving: LaneArray
+    finite_sum: LaneArray
+    candidate_count: NDArray[np.int32]
+    contact_kept: NDArray[np.uint8]
+    surface_count: NDArray[np.int32]
+    support_count: NDArray[np.int32]
+
+
+class ContactShapes(NamedTuple):
+    """Rounded bodies rigidly carried by tools, SI units, world frame: all within a radius of a core.
+
+    The core is a point (a ball), an axis (a capsule) or a rectangle (a rounded box), given by its long centre line and
+    the half way across; `stepping.round_shapes` makes balls and capsules.
+
+    Fields:
+        shape_ends: the two end points of the axis [m]                           (n_shape, 2, 3)
+        shape_radius: [m]                                                        (n_shape,)
+        shape_tool: the tool that carries the shape                              (n_shape,)
+        tool_centre: centre of mass, moved along the twist by each substep [m]   (n_tool, 3)
+        tool_twist: linear [m/s] at the centre of mass, angular [rad/s]          (n_tool, 6)
+        shape_span: from the axis to the rectangle's border, square to it [m]    (n_shape, 3)
+        shape_friction: Coulomb coefficient over the contact law's               (n_shape,)
+    """
+
+    shape_ends: FloatArray
+    shape_radius: FloatArray
+    shape_tool: NDArray[np.int32]
+    tool_centre: FloatArray
+    tool_twist: FloatArray
+    shape_span: FloatArray
+    shape_friction: FloatArray
+
+
+class ToolResponse(NamedTuple):
+    """Motion of the tools under the force of the tissue within one haptic step, SI units; all 0: the twist stays.
+
+    Fields:
+        tool_acceleration: rate of the twist without the tissue [m/s^2, rad/s^2]  (n_tool, 6)
+        tool_mobility: rate of a tool's twist per wrench on each tool [1/kg, ...]  (n_tool, n_tool, 6, 6)
+        tool_wrench: scratch: sum of the wrenches before the substep [N, N m]    (n_tool, 6)
+        tool_lag: scratch: how far the tool ends behind twist times step [m, rad] (n_tool, 6)
+    """
+
+    tool_acceleration: FloatArray
+    tool_mobility: FloatArray
+    tool_wrench: FloatArray
+    tool_lag: FloatArray
+
+
+class ContactLaw(NamedTuple):
+    """How tissue and instrument push on each other, per unit of surface area.
+
+    Fields:
+        stiffness: pressure per penetration, k_p [N/m^3]
+        damping: pressure per closing speed [N s/m^3]
+        friction: Coulomb coefficient mu
+        tangential_stiffness: traction per stretch while sticking [N/m^3]
+    """
+
+    stiffness: float
+    damping: float
+    friction: float
+    tangential_stiffness: float
+
+
+class _Surface(NamedTuple):
+    """What contact reads of one lane's model."""
+
+    surface_triangles: NDArray[np.int32]
+    surface_rest_area: FloatArray
+    node_inverse_mass: LaneArray
+
+
+class _Supports(NamedTuple):
+    """What supports read of one lane's model."""
+
+    support_kind: NDArray[np.int32]
+    support_position: FloatArray
+    support_rotation: FloatArray
+    support_size: FloatArray
+    support_friction: FloatArray
+    support_nodes: NDArray[np.int32]
+    support_area: FloatArray
+    support_stiffness: float
+    support_damping: float
+    support_tangential_stiffness: float
+
+
+class _Touched(NamedTuple):
+    """What contact reads and writes of one lane's state."""
+
+    node_position: LaneArray
+    node_velocity: LaneArray
+    node_force: LaneArray
+    contact_engaged: NDArray[np.uint8]
+    contact_stretch: FloatArray
+    contact_candidates: NDArray[np.int32]
+    contact_passed: NDArray[np.int32]
+
+
+def lanes_of(model: OrganModel | LaneModel) -> tuple[int, ...]:
+    """As many zeros as there are organs side by side; none for an organ alone."""
+    return model.lanes if isinstance(model, LaneModel) else ()
+
+
+@overload(lanes_of)
+def _(model):
+    return (lambda model: model.lanes) if model.instance_class is LaneModel else (lambda model: ())
+
+
+# Whether `lanes` is empty, and how many indices an array has, is known when these are compiled: one way is left.
+
+
+@njit(forceinline=True, error_model="numpy")
+def entry_of(values, lane):
+    """One lane's number of an array (1, n_lane), or that of an organ alone in an array (1,)."""
+    if values.ndim == 2:
+        return values[0, lane]
+    return values[lane]
+
+
+@njit(forceinline=True, error_model="numpy")
+def set_entry(values, lane, value):
+    """Write what `entry_of` reads."""
+    if values.ndim == 2:
+        values[0, lane] = value
+    else:
+        values[lane] = value
+
+
+@njit(forceinline=True, error_model="numpy")
+def column_of(values, lane):
+    """One lane's numbers of an array (n, n_lane), or of all lanes' array (n,)."""
+    if values.ndim == 2:
+        return values[:, lane]
+    return values
+
+
+@njit(forceinline=True, error_model="numpy")
+def part_of(lanes, values, lane):
+    """One lane's part of an array whose first index is the lane; an organ alone has the whole array."""
+    if len(lanes) == 0:
+        return values
+    return values[lane]
+
+
+@njit(forceinline=True, error_model="numpy")
+def _triangles_of(values, lane, count):
+    if values.ndim == 3:
+        return values[lane, :count]
+    return values
+
+
+@njit(forceinline=True, error_model="numpy")
+def _numbers_of(values, lane, count):
+    if values.ndim == 2:
+        return values[lane, :count]
+    return values
+
+
+@njit(forceinline=True, error_model="numpy")
+def surface_of(lanes, model, lane):
+    """One lane's surface, as contact reads it."""
+    if len(lanes) == 0:
+        return _Surface(model.surface_triangles, model.surface_rest_area, model.node_inverse_mass)
+    count = model.surface_count[lane]
+    return _Surface(
+        _triangles_of(model.surface_triangles, lane, count), _numbers_of(model.surface_rest_area, lane, count),
+        model.node_inverse_mass[:, lane],
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def supports_of(lanes, model, lane):
+    """One lane's supports; kernels that read them take an OrganModel as well."""
+    if len(lanes) == 0:
+        return _Supports(
+            model.support_kind, model.support_position, model.support_rotation, model.support_size,
+            model.support_friction, model.support_nodes, model.support_area,
+            model.support_stiffness, model.support_damping, model.support_tangential_stiffness,
+        )  # fmt: skip
+    count = model.support_count[lane]
+    return _Supports(
+        model.support_kind, model.support_position, model.support_rotation, model.support_size, model.support_friction,
+        _numbers_of(model.support_nodes, lane, count), _numbers_of(model.support_area, lane, count),
+        model.support_stiffness, model.support_damping, model.support_tangential_stiffness,
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def touched_of(lanes, state, lane):
+    """One lane's state, as contact reads and writes it."""
+    if len(lanes) == 0:
+        return _Touched(
+            state.node_position, state.node_velocity, state.node_force,
+            state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
+        )  # fmt: skip
+    return _Touched(
+        state.node_position[:, :, lane], state.node_velocity[:, :, lane], state.node_force[:, :, lane],
+        state.contact_engaged[lane], state.contact_stretch[lane], state.contact_candidates[lane],
+        state.contact_passed[lane],
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def shapes_of(lanes, shapes, lane):
+    """One lane's contact shapes."""
+    if len(lanes) == 0:
+        return shapes
+    return ContactShapes(
+        shapes.shape_ends[lane], shapes.shape_radius[lane], shapes.shape_tool[lane], shapes.tool_centre[lane],
+        shapes.tool_twist[lane], shapes.shape_span[lane], shapes.shape_friction[lane],
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def response_of(lanes, response, lane):
+    """The response of one lane's tools."""
+    if len(lanes) == 0:
+        return response
+    return ToolResponse(
+        response.tool_acceleration[lane], response.tool_mobility[lane], response.tool_wrench[lane],
+        response.tool_lag[lane],
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def in_rows(lanes, state):
+    """The state whose node arrays the tissue's kernels work on: of an organ alone with rows of four in their place."""
+    if len(lanes) > 0:
+        return state
+    return OrganState(
+        state.row_position, state.row_velocity, state.row_force, state.node_tension,
+        state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
+        state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
+        state.support_stretch, state.volume_ratio_smallest,
+        state.lane_fault, state.moving, state.finite_sum, state.candidate_count, state.contact_kept,
+    )  # fmt: skip

@@ -1,0 +1,348 @@
+"""The substep: the one sequence of forces, integration and tools, for an organ alone and for organs side by side.
+
+The type of the model decides for which of the two it is compiled: `lanes` is empty for an `OrganModel`. Springs, volume
+term and integration work on all lanes at once (`tissue_kernels`); supports, contact, guard and tools on one lane after
+the other. An organ that stops, by a fault or because its lane is empty, does not affect the lanes beside it.
+Kernels work in place, allocate nothing and use no fastmath: a run repeats to the bit.
+"""
+
+import math
+
+from numba import njit
+
+from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, stretch_by_lag
+from msdm_core.kernels.guard_kernels import guard_axes
+from msdm_core.kernels.squeeze_kernels import hold_squeezed
+from msdm_core.kernels.structure_kernels import (
+    FAULT_CONTACT_LOST,
+    FAULT_INVERTED_TET,
+    FAULT_NONE,
+    FAULT_NOT_FINITE,
+    column_of,
+    entry_of,
+    in_rows,
+    lanes_of,
+    part_of,
+    response_of,
+    set_entry,
+    shapes_of,
+    supports_of,
+    surface_of,
+    touched_of,
+)
+from msdm_core.kernels.support_kernels import add_support_forces
+from msdm_core.kernels.tissue_kernels import (
+    add_spring_damping,
+    add_spring_forces,
+    add_tet_forces,
+    add_volume_damping,
+    average_volumes,
+    group_width,
+    integrate,
+    put_back,
+    set_gravity,
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def move_shapes(shapes, dt):
+    """Carry the shapes along the twist of their tool for one substep: x <- x + dt (v + w x (x - c)).
+
+    In:  dt [s], shapes: tool_twist [m/s, rad/s] (n_tool, 6), shape_tool (n_shape,)
+    Out: shapes: shape_ends [m] (n_shape, 2, 3), shape_span [m] (n_shape, 3), tool_centre [m] (n_tool, 3)
+    """
+    twist = shapes.tool_twist
+    for shape in range(shapes.shape_radius.shape[0]):
+        tool = shapes.shape_tool[shape]
+        for end in range(2):
+            ox = shapes.shape_ends[shape, end, 0] - shapes.tool_centre[tool, 0]
+            oy = shapes.shape_ends[shape, end, 1] - shapes.tool_centre[tool, 1]
+            oz = shapes.shape_ends[shape, end, 2] - shapes.tool_centre[tool, 2]
+            shapes.shape_ends[shape, end, 0] += dt * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
+            shapes.shape_ends[shape, end, 1] += dt * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
+            shapes.shape_ends[shape, end, 2] += dt * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
+        sx = shapes.shape_span[shape, 0]
+        sy = shapes.shape_span[shape, 1]
+        sz = shapes.shape_span[shape, 2]
+        shapes.shape_span[shape, 0] += dt * (twist[tool, 4] * sz - twist[tool, 5] * sy)
+        shapes.shape_span[shape, 1] += dt * (twist[tool, 5] * sx - twist[tool, 3] * sz)
+        shapes.shape_span[shape, 2] += dt * (twist[tool, 3] * sy - twist[tool, 4] * sx)
+    for tool in range(shapes.tool_centre.shape[0]):
+        for axis in range(3):
+            shapes.tool_centre[tool, axis] += dt * twist[tool, axis]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def push_tools(shapes, response, dt, substep, wrench):
+    """Change the tools' twists by the wrench of a substep, before the shapes move along them: twist += dt (a + B w).
+
+    In:  dt [s], substep: its number, wrench: sum of the substeps' wrenches so far [N, N m] (n_tool, 6)
+    Out: shapes: tool_twist [m/s, rad/s] (n_tool, 6), response: tool_wrench [N, N m], tool_lag [m, rad] (n_tool, 6)
+    """
+    twist, before, lag = shapes.tool_twist, response.tool_wrench, response.tool_lag
+    acceleration, mobility = response.tool_acceleration, response.tool_mobility
+    for tool in range(twist.shape[0]):
+        for row in range(6):
+            rate = acceleration[tool, row]
+            for other in range(twist.shape[0]):
+                for column in range(6):
+                    rate += mobility[tool, other, row, column] * (wrench[other, column] - before[other, column])
+            twist[tool, row] += dt * rate
+            lag[tool, row] += dt * dt * substep * rate
+    for tool in range(twist.shape[0]):
+        for row in range(6):
+            before[tool, row] = wrench[tool, row]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _copy_rows(source, target):
+    """The first three columns of an array."""
+    for node in range(source.shape[0]):
+        for axis in range(3):
+            target[node, axis] = source[node, axis]
+
+
+@njit(forceinline=True, error_model="numpy")
+def _load_rows(lanes, state):
+    """Positions and velocities of an organ alone into its rows of four."""
+    if len(lanes) == 0:
+        _copy_rows(state.node_position, state.row_position)
+        _copy_rows(state.node_velocity, state.row_velocity)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _averages(lanes, averages_volume):
+    """Whether any lane has a volume term that is averaged at nodes."""
+    if len(lanes) == 0:
+        return averages_volume
+    return averages_volume.any()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _evaluate(model, state):
+    """Gravity, springs and volume term into the force of all lanes; returns how many entries `squeezed_tets` has."""
+    lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
+    position, velocity, force, tension = state.node_position, state.node_velocity, state.node_force, state.node_tension
+    set_gravity(lanes, force, model.node_mass, model.gravity)
+    add_spring_forces(
+        lanes, position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0]
+    )
+    if beta > 0.0:
+        add_spring_damping(lanes, position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
+    tension[:] = 0.0
+    if _averages(lanes, model.averages_volume):
+        average_volumes(lanes, position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
+    squeezed_count = add_tet_forces(
+        lanes, position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
+        model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
+        state.squeezed_tets,
+    )  # fmt: skip
+    if beta > 0.0:
+        add_volume_damping(lanes, position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
+    return squeezed_count
+
+
+@njit(forceinline=True, error_model="numpy")
+def _lane_count(lanes):
+    """How many organs there are."""
+    if len(lanes) == 0:
+        return 1
+    return len(lanes)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _wake(lanes, state):
+    """Clear the fault of an organ alone at the start of a call; a lane keeps its fault until `put_lane`."""
+    if len(lanes) == 0:
+        state.lane_fault[0] = FAULT_NONE
+
+
+@njit(forceinline=True, error_model="numpy")
+def _keep_forces(lanes, state):
+    """Keep the forces of lanes that do not move: the tissue's kernels overwrite them."""
+    if len(lanes) > 0:
+        state.kept_force[:, :, :] = state.node_force
+
+
+@njit(forceinline=True, error_model="numpy")
+def _put_back_forces(lanes, state):
+    """Restore the forces of lanes that do not move."""
+    if len(lanes) > 0:
+        put_back(lanes, state.node_force, state.kept_force, state.moving)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _store_motion(lanes, state):
+    """Positions and velocities of an organ alone out of its rows of four."""
+    if len(lanes) == 0:
+        _copy_rows(state.row_position, state.node_position)
+        _copy_rows(state.row_velocity, state.node_velocity)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _store_force(lanes, state):
+    """Forces of an organ alone out of its rows of four."""
+    if len(lanes) == 0:
+        _copy_rows(state.row_force, state.node_force)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keep_force(state, lane):
+    """Keep one lane's forces as they are."""
+    force, kept = state.node_force, state.kept_force
+    for node in range(force.shape[0]):
+        for axis in range(3):
+            kept[node, axis, lane] = force[node, axis, lane]
+
+
+@njit(forceinline=True, error_model="numpy")
+def _stop(lanes, state, lane, fault):
+    """Stop one lane in its present state."""
+    state.lane_fault[lane] = fault
+    set_entry(state.moving, lane, 0.0)
+    if len(lanes) > 0:
+        _keep_force(state, lane)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _begin(lanes, model, state, shapes, response, duration):
+    """Note which lanes move and look for the triangles in reach of their shapes."""
+    stands = False
+    for lane in range(_lane_count(lanes)):
+        if state.lane_fault[lane] != FAULT_NONE:
+            set_entry(state.moving, lane, 0.0)
+            stands = True
+            continue
+        set_entry(state.moving, lane, 1.0)
+        answer = response_of(lanes, response, lane)
+        answer.tool_wrench[:, :] = 0.0
+        answer.tool_lag[:, :] = 0.0
+        state.candidate_count[lane] = find_candidates(
+            surface_of(lanes, model, lane), touched_of(lanes, state, lane), shapes_of(lanes, shapes, lane), duration
+        )
+    if stands:
+        _keep_forces(lanes, state)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, reference, wrench):
+    """Supports, contact, guard and squeezed tets, lane by lane; returns how many lanes move.
+
+    An inverted tet stops its lane before anything moves: the state shows which tet it was.
+    """
+    moving = 0
+    for lane in range(_lane_count(lanes)):
+        if state.lane_fault[lane] != FAULT_NONE:
+            continue
+        if not entry_of(state.volume_ratio_smallest, lane) > 0.0:
+            _stop(lanes, state, lane, FAULT_INVERTED_TET)
+            continue
+        moving += 1
+        state.contact_kept[lane] = 1
+        touched = touched_of(lanes, state, lane)
+        position, velocity, force = touched.node_position, touched.node_velocity, touched.node_force
+        if model.support_kind.shape[0] > 0:
+            stretch = part_of(lanes, state.support_stretch, lane)
+            add_support_forces(supports_of(lanes, model, lane), position, velocity, force, stretch, dt)
+        count = state.candidate_count[lane]
+        if count == 0 and squeezed_count == 0:
+            continue
+        surface, moved = surface_of(lanes, model, lane), shapes_of(lanes, shapes, lane)
+        about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
+        add_contact_forces(surface, touched, moved, law, dt, count, about, push)
+        answer = response_of(lanes, response, lane)
+        if not guard_axes(surface, touched, moved, law, answer, dt, count, about, push):
+            state.contact_kept[lane] = 0
+        hold_squeezed(
+            position, velocity, force, surface.node_inverse_mass, model.tet_nodes,
+            column_of(model.tet_inverse_volume, lane), column_of(model.tet_averaged_bulk, lane),
+            state.squeezed_tets, squeezed_count, group_width(lanes), dt,
+        )  # fmt: skip
+    return moving
+
+
+@njit(forceinline=True, error_model="numpy")
+def _move_tools(lanes, state, shapes, response, dt, substep, wrench):
+    """Advance the tools, lane by lane; stop lanes with a fault; returns how many lanes still move."""
+    moving = 0
+    for lane in range(_lane_count(lanes)):
+        if state.lane_fault[lane] != FAULT_NONE:
+            continue
+        moved = shapes_of(lanes, shapes, lane)
+        push_tools(moved, response_of(lanes, response, lane), dt, substep, part_of(lanes, wrench, lane))
+        move_shapes(moved, dt)
+        if not math.isfinite(entry_of(state.finite_sum, lane)):
+            _stop(lanes, state, lane, FAULT_NOT_FINITE)
+        elif state.contact_kept[lane] == 0:
+            _stop(lanes, state, lane, FAULT_CONTACT_LOST)
+        else:
+            moving += 1
+    return moving
+
+
+@njit(forceinline=True, error_model="numpy")
+def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
+    """Mean wrenches and the lag of friction for lanes that move; restore the forces of those that do not."""
+    stands = False
+    for lane in range(_lane_count(lanes)):
+        if state.lane_fault[lane] != FAULT_NONE:
+            stands = True
+            continue
+        if law.friction > 0.0:
+            stretch_by_lag(
+                surface_of(lanes, model, lane), touched_of(lanes, state, lane), shapes_of(lanes, shapes, lane),
+                response_of(lanes, response, lane), state.candidate_count[lane],
+            )  # fmt: skip
+        push = part_of(lanes, wrench, lane)
+        for tool in range(push.shape[0]):
+            for part in range(6):
+                push[tool, part] /= substep_count
+    if stands:
+        _put_back_forces(lanes, state)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
+    """Advance organs by some substeps against moving shapes; the kernel behind `organ.advance` and `advance_lanes`.
+
+    Organs side by side (LaneModel, LaneState) have the lane as first index of shapes, response, reference and wrench.
+    A fault stops an organ at the substep that showed it: an organ alone until the next call, a lane for good.
+
+    Model: model, law, response
+    In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point of each tool's torque [m] (n_tool, 3)
+    Out:   state, shapes (moved), wrench: MEAN force [N] and torque [N m] on each tool (n_tool, 6)
+    Returns the FAULT_ code of an organ alone, or of the first lane; `state.lane_fault` has all of them.
+    """
+    lanes = lanes_of(model)
+    wrench[:] = 0.0
+    _wake(lanes, state)
+    _load_rows(lanes, state)
+    rows = in_rows(lanes, state)
+    _begin(lanes, model, rows, shapes, response, dt * substep_count)
+    for substep in range(substep_count):
+        squeezed_count = _evaluate(model, rows)
+        if _touch(lanes, model, rows, shapes, law, response, dt, squeezed_count, reference, wrench) == 0:
+            break
+        integrate(
+            lanes, rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay,
+            rows.moving, rows.finite_sum,
+        )  # fmt: skip
+        if _move_tools(lanes, rows, shapes, response, dt, substep, wrench) == 0:
+            break
+    _end(lanes, model, rows, shapes, law, response, substep_count, wrench)
+    _store_motion(lanes, state)
+    _store_force(lanes, state)
+    return state.lane_fault[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def evaluate_forces(model, state):
+    """Internal forces and gravity of a state, without contact and supports.
+
+    In:  model, state: positions [m] and velocities [m/s] (n_node, 3)
+    Out: state: node_force [N] (n_node, 3), volume_ratio_smallest (1,)
+    """
+    lanes = lanes_of(model)
+    _load_rows(lanes, state)
+    _evaluate(model, in_rows(lanes, state))
+    _store_force(lanes, state)

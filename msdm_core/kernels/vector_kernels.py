@@ -1,0 +1,318 @@
+"""Vector registers for numba: a type whose values are LLVM vectors, their arithmetic, loads, stores and shuffles.
+
+numba does not vectorise the organ's loops by itself: they gather and scatter, and short loops over lanes are unrolled
+before LLVM's vectoriser sees them. Here eight springs, or one spring of eight organs, are worked on as one value.
+LLVM splits a vector wider than the machine's registers, so the same code runs, to the same bits, on any machine.
+
+A kernel written with `+ - * /`, `root`, `keep_lower`, `below_zero` and `any_below` takes numbers and vectors alike: the
+equations of springs and tets stand once, in `element_kernels.py`.
+"""
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import extending, types
+from numba.core import cgutils
+from numba.core.datamodel.models import PrimitiveModel
+from numba.extending import overload, register_model
+from numpy.typing import NDArray
+
+# Untyped: a compiled function is called without the typing context that an intrinsic is defined with.
+intrinsic: Any = extending.intrinsic
+
+# Bytes of the widest register there is: 8 float64 or 16 float32 a vector.
+REGISTER_SIZE = 64
+# No fusing of products and sums: the same bits on every machine, for numbers and for vectors of any width.
+FLAGS = ()
+
+
+class VectorType(types.Type):
+    """Several floats in one register."""
+
+    def __init__(self, element: Any, width: int) -> None:
+        self.element = element
+        self.width = width
+        super().__init__(f"vector({element} x {width})")
+
+
+@register_model(VectorType)
+class VectorModel(PrimitiveModel):
+    """LLVM's own vector."""
+
+    def __init__(self, manager: Any, kind: VectorType) -> None:
+        element = ir.DoubleType() if kind.element == types.float64 else ir.FloatType()
+        super().__init__(manager, kind, ir.VectorType(element, kind.width))
+
+
+def lane_counts(dtype: Any) -> tuple[int, ...]:
+    """Possible numbers of lanes of a numpy type: a full register first, then half a register."""
+    return (8,) if np.dtype(dtype) == np.float64 else (16, 8)
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
+    """Zeros that begin at a register's boundary; a load across two cache lines costs up to a third."""
+    count = math.prod(shape) * np.dtype(dtype).itemsize
+    raw = np.zeros(count + REGISTER_SIZE, dtype=np.uint8)
+    start = -raw.ctypes.data % REGISTER_SIZE
+    return raw[start : start + count].view(dtype).reshape(shape)
+
+
+# ---- arithmetic ---------------------------------------------------------------------------------------------------
+
+
+def _spread(builder: ir.IRBuilder, value: Any, kind: ir.VectorType) -> Any:
+    """A number in every place of a vector."""
+    empty = ir.Constant(kind, ir.Undefined)
+    first = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(
+        first, empty, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
+    )
+
+
+def _operand(context: Any, builder: ir.IRBuilder, value: Any, kind: Any, vector: VectorType) -> Any:
+    if isinstance(kind, VectorType):
+        return value
+    number = context.cast(builder, value, kind, vector.element)
+    return _spread(builder, number, context.get_value_type(vector))
+
+
+def _common(a: Any, b: Any) -> VectorType | None:
+    """The vector type that two operands have in common, if one of them is a vector and the other goes with it."""
+    if isinstance(a, VectorType):
+        return a if a == b or isinstance(b, types.Number) else None
+    return b if isinstance(b, VectorType) and isinstance(a, types.Number) else None
+
+
+def _define_operator(function: Callable[..., Any], instruction: str) -> None:
+    @intrinsic
+    def apply(_typing: Any, a: Any, b: Any) -> Any:
+        vector = _common(a, b)
+        if vector is None:
+            return None
+
+        def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+            pair = [_operand(context, builder, value, kind, vector) for value, kind in zip(values, (a, b), strict=True)]
+            return getattr(builder, instruction)(*pair, flags=FLAGS)
+
+        return vector(a, b), generate
+
+    @overload(function, inline="never")
+    def _(a, b):  # numba compares the names of both, annotations included
+        return (lambda a, b: apply(a, b)) if _common(a, b) is not None else None
+
+
+for _function, _instruction in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _define_operator(_function, _instruction)
+
+
+@intrinsic
+def root(_typing: Any, value: Any) -> Any:
+    """Square root of a number or of every number of a vector, correctly rounded."""
+    vector = isinstance(value, VectorType)
+    if not vector and not isinstance(value, types.Float):
+        return None
+
+    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        kind = values[0].type
+        element = kind.element if vector else kind
+        name = f"llvm.sqrt.{f'v{kind.count}' if vector else ''}{'f64' if element == ir.DoubleType() else 'f32'}"
+        return builder.call(cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind]), name), values)
+
+    return value(value), generate
+
+
+@intrinsic
+def keep_lower(_typing: Any, new: Any, old: Any, of_new: Any, of_old: Any) -> Any:
+    """Entry by entry `of_old` where old <= new, else `of_new`: a new value that is not a number is taken."""
+    vector = isinstance(new, VectorType)
+    if new != old or of_new != of_old or not (vector or isinstance(new, types.Float)):
+        return None
+
+    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">=", values[0], values[1]), values[3], values[2])
+
+    return of_new(new, old, of_new, of_old), generate
+
+
+@intrinsic
+def below_zero(_typing: Any, value: Any) -> Any:
+    """Entry by entry min(value, 0)."""
+    vector = isinstance(value, VectorType)
+    if not vector and not isinstance(value, types.Float):
+        return None
+
+    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        zero = ir.Constant(values[0].type, [0.0] * value.width if isinstance(value, VectorType) else 0.0)
+        return builder.select(builder.fcmp_ordered("<", values[0], zero), values[0], zero)
+
+    return value(value), generate
+
+
+@intrinsic
+def any_below(_typing: Any, value: Any, limit: Any) -> Any:
+    """Whether a number, or any number of a vector, is below a limit."""
+    if not isinstance(value, VectorType | types.Float) or not isinstance(limit, types.Number):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        if not isinstance(value, VectorType):
+            return builder.fcmp_ordered("<", values[0], context.cast(builder, values[1], limit, value))
+        is_below = builder.fcmp_ordered("<", values[0], _operand(context, builder, values[1], limit, value))
+        bits = ir.IntType(value.width)
+        return builder.icmp_unsigned("!=", builder.bitcast(is_below, bits), bits(0))
+
+    return types.boolean(value, limit), generate
+
+
+# ---- memory -------------------------------------------------------------------------------------------------------
+
+
+def _pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, index: Any, vector: VectorType) -> Any:
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), context.get_value_type(vector).as_pointer())
+
+
+def _define_load(width_of: Callable[[Any], int], scale: Callable[[int], int]) -> Any:
+    """A load of `width_of` numbers from place index * scale of an array seen as flat."""
+
+    @intrinsic
+    def load(_typing: Any, array: Any, index: Any) -> Any:
+        vector = VectorType(array.dtype, width_of(array.dtype))
+
+        def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
+            place = builder.mul(values[1], ir.Constant(values[1].type, scale(vector.width)))
+            loaded = builder.load(_pointer(context, builder, signature.args[0], values[0], place, vector))
+            # What the numbers need, not what the register would like: saved states come back wherever numpy puts them.
+            loaded.align = array.dtype.bitwidth // 8
+            return loaded
+
+        return vector(array, types.intp), generate
+
+    return load
+
+
+def _define_store(scale: Callable[[int], int]) -> Any:
+    @intrinsic
+    def store(_typing: Any, array: Any, index: Any, value: Any) -> Any:
+        if not isinstance(value, VectorType) or value.element != array.dtype:
+            return None
+
+        def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
+            place = builder.mul(values[1], ir.Constant(values[1].type, scale(value.width)))
+            pointer = _pointer(context, builder, signature.args[0], values[0], place, value)
+            builder.store(values[2], pointer, align=array.dtype.bitwidth // 8)
+            return context.get_dummy_value()
+
+        return types.none(array, types.intp, value), generate
+
+    return store
+
+
+def _full_width(dtype: Any) -> int:
+    return REGISTER_SIZE * 8 // dtype.bitwidth
+
+
+# A full register from place `index` of an array; the four numbers of row `index` of an array (n, 4).
+load_full = _define_load(_full_width, lambda _: 1)
+load_row = _define_load(lambda _: 4, lambda _: 4)
+# The `index`-th vector of an array that is made of them.
+store_lanes = _define_store(lambda width: width)
+store_row = _define_store(lambda _: 4)
+
+
+@intrinsic
+def load_lanes(_typing: Any, lanes: Any, array: Any, index: Any) -> Any:
+    """The `index`-th vector of an array that is made of them, as wide as the tuple `lanes` is long."""
+    vector = VectorType(array.dtype, len(lanes))
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
+        place = builder.mul(values[2], ir.Constant(values[2].type, vector.width))
+        loaded = builder.load(_pointer(context, builder, signature.args[1], values[1], place, vector))
+        loaded.align = array.dtype.bitwidth // 8
+        return loaded
+
+    return vector(lanes, array, types.intp), generate
+
+
+@intrinsic
+def spread_like(_typing: Any, array: Any, value: Any) -> Any:
+    """A number in every place of a full register of an array's type."""
+    vector = VectorType(array.dtype, _full_width(array.dtype))
+
+    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        return _operand(context, builder, values[1], value, vector)
+
+    return vector(array, value), generate
+
+
+@intrinsic
+def load_or_spread(_typing: Any, lanes: Any, like: Any, array: Any, index: Any) -> Any:
+    """What each lane has of its own in an array (n, n_lane), or what an array (n,) has for all, of type `like`."""
+    own = array.ndim == 2
+    vector = VectorType(array.dtype if own else like.dtype, len(lanes))
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
+        kind = signature.args[2]
+        if own:
+            place = builder.mul(values[3], ir.Constant(values[3].type, vector.width))
+            loaded = builder.load(_pointer(context, builder, kind, values[2], place, vector))
+            loaded.align = array.dtype.bitwidth // 8
+            return loaded
+        data = context.make_array(kind)(context, builder, values[2]).data
+        return _operand(context, builder, builder.load(builder.gep(data, [values[3]])), array.dtype, vector)
+
+    return vector(lanes, like, array, types.intp), generate
+
+
+# ---- shuffles -----------------------------------------------------------------------------------------------------
+
+
+def define_shuffle(places: list[int]) -> Any:
+    """A function of two vectors that picks entries of both, one after the other, by place."""
+
+    @intrinsic
+    def shuffle(_typing: Any, a: Any, b: Any) -> Any:
+        def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+            mask = ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places)
+            return builder.shuffle_vector(values[0], values[1], mask)
+
+        return VectorType(a.element, len(places))(a, b), generate
+
+    return shuffle
+
+
+def define_extract(place: int) -> Any:
+    """A function that takes one number out of a vector."""
+
+    @intrinsic
+    def extract(_typing: Any, a: Any) -> Any:
+        def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+            return builder.extract_element(values[0], ir.Constant(ir.IntType(32), place))
+
+        return a.element(a), generate
+
+    return extract
+
+
+@intrinsic
+def pack(_typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+    """A vector of eight numbers."""
+    numbers = (a, b, c, d, e, f, g, h)
+    vector = VectorType(a, len(numbers))
+
+    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        packed = ir.Constant(context.get_value_type(vector), ir.Undefined)
+        for place, value in enumerate(values):
+            packed = builder.insert_element(packed, value, ir.Constant(ir.IntType(32), place))
+        return packed
+
+    return vector(*numbers), generate

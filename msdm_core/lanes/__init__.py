@@ -1,0 +1,1 @@
+"""Many organs advanced side by side in vector registers."""

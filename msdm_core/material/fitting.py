@@ -1,0 +1,432 @@
+"""Springs fitted to the mesh: factors on formula (6) that bring the network's node forces near those of the solid.
+
+Formula (6) gives every tet's edges a share that knows only the tet's volume; on the surface, where a node has half its
+tets, the network is then too stiff (clamped torsion of the paper's prism: +58 %). Here each spring gets a factor s_e:
+
+    minimise  sum over strains m and nodes i of |w_i (f_mi(s) - F_mi)|^2  +  sum over springs of p_e (s_e - 1)^2
+    with      s_e >= 0.05,
+
+f_mi the force that the springs s_e k_e, k_e of formula (6), put on node i in the affine strain m, F_mi the force of
+linear tets (finite elements of first order, nu = 1/4, lambda = mu = 2 E / 5) in the same field, both with the mesh's
+moduli; w_i = V_i^(-2/3) / E_i, of the mean volume and modulus of the tets around a node, makes coarse and fine, soft
+and hard parts count alike. The six strains are an orthonormal basis (|eps| = 1), so the sum does not change when the
+mesh is turned.
+
+On the surface, averages over neighbouring nodes are compared instead of single nodes, whose differences count
+0.003: linear tets give a node with eight triangles twice the traction of one with four, and springs made to follow that
+vary as much (single surface nodes of a block then differ by 43 % in stiffness; 8 % with averages and with formula (6)).
+
+In the affine strain every straight line of springs through a lattice has one tension, so a change at the surface
+continues along the line through the body. Inside, formula (6) is right already: the pull p_e towards it is weak near
+the surface and triples with every layer of nodes from the third on, which brings the factors back to 1 over some five
+cells and changes the residual little.
+
+No published source is known for this fit; `FitReport` says how well it represents a mesh.
+
+The factors are those of the homogeneous organ: lesions change the formula's k_e, not s_e, so lesions may differ from
+reset to reset. With an 8x lesion the stiffness of a whole block is within 0.6 % of that of a fit with the lesion in it;
+a disc of 1.5 cells pressed onto the lesion within 1.5 %, single nodes above it within 14 %. The factors stay with the
+mesh object for as long as it lives; `write_fit` keeps them in a file.
+"""
+
+import hashlib
+import math
+import time
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron, vstack
+from scipy.sparse.csgraph import dijkstra
+
+from msdm_core.errors import OrganError
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
+
+# No spring is fitted softer than this share of formula (6): a spring near 0 would leave its nodes loose.
+SMALLEST_FACTOR = 0.05
+# p_e at the surface, over the mean diagonal of the normal equations, and how it grows with the layer of nodes, counted
+# in springs from the surface.
+PULL_TO_LLOYD = 2e-3
+PULL_GROWTH = 3.0
+WEAK_LAYERS = 2
+LARGEST_PULL = 1.0
+# Weight of the differences of single surface nodes' forces, relative to that of their averages.
+SINGLE_NODE_SHARE = 3e-3
+# Above this residual the network cannot represent the solid. Blocks of cubes cut as BCC or into five tets leave 0.02 to
+# 0.11 (37000 nodes), BCC cells stretched by 1.5 to 1 0.177: tension within 5 % and torsion within 12 %. Surfaces filled
+# by isosurface stuffing leave 0.07 to 0.23: fine ones (a 6 mm sphere) come nearer than formula (6), coarse curved ones
+# do not (a 10 mm sphere, residual 0.11, comes out softer, 0.70 of the solid in shear, not 0.79): use "lloyd" there.
+# Jittered Delaunay and 6-tet cubes leave 0.24 to 0.5, and torsion falls to 0.66 and less.
+LARGEST_RESIDUAL = 0.18
+# Largest imbalance |sum of k l n n n| over sum of k l of formula (6)'s springs n around a node whose neighbours all lie
+# inside. Lattices of one cell size have none. Where there is some, formula (6) is wrong inside too, and a fit leaves
+# nodes loose: at the seams of graded lattices (0.19), E across them fell by 7 to 34 %.
+LARGEST_IMBALANCE = 0.05
+
+_H = 0.5**0.5
+# Orthonormal basis of the symmetric tensors: three stretches, three shears, shape (6, 3, 3).
+UNIT_STRAINS = np.array(
+    [
+        [[1, 0, 0], [0, 0, 0], [0, 0, 0]],
+        [[0, 0, 0], [0, 1, 0], [0, 0, 0]],
+        [[0, 0, 0], [0, 0, 0], [0, 0, 1]],
+        [[0, 0, 0], [0, 0, _H], [0, _H, 0]],
+        [[0, 0, _H], [0, 0, 0], [_H, 0, 0]],
+        [[0, _H, 0], [_H, 0, 0], [0, 0, 0]],
+    ],
+    dtype=np.float64,
+)
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """How well springs could be fitted to a mesh.
+
+    Fields:
+        residual_before: |f - F| / |F| of formula (6), of the node forces as they are compared, six unit strains.
+        residual_after: the same of the fitted springs (of the attempt, where the fallback was used).
+        fallback: whether the springs are formula (6) times one scalar per region, because the residual stayed large or
+            the mesh is uneven inside.
+        factor_smallest: smallest factor on formula (6).
+        factor_largest: largest factor on formula (6).
+        duration: what the fit took [s].
+    """
+
+    residual_before: float
+    residual_after: float
+    fallback: bool
+    factor_smallest: float
+    factor_largest: float
+    duration: float
+
+
+@dataclass(frozen=True, eq=False)
+class SpringFit:
+    """Factors on formula (6), k_e = edge_factor_e sum over tets of tet_factor_t k_et, and the quality of the fit.
+
+    Fields:
+        edge_factor: of each spring, all 1 in the fallback                       (n_spring,)
+        tet_factor: of each tet's share: its region's scalar in the fallback,
+            else all 1                                                           (n_tet,)
+        report: its quality.
+    """
+
+    edge_factor: FloatArray
+    tet_factor: FloatArray
+    report: FitReport
+
+
+_FITS: WeakKeyDictionary[TetMesh, SpringFit] = WeakKeyDictionary()
+
+
+def spring_fit(mesh: TetMesh) -> SpringFit:
+    """The fit of a mesh's homogeneous organ, made on first use and kept for as long as the mesh lives.
+
+    Warns:
+        UserWarning: the network cannot represent the solid on this mesh; names the residual and the scalars used.
+    """
+    fit = _FITS.get(mesh)
+    if fit is None:
+        fit = keep_fit(mesh, fit_springs(mesh))
+    return fit
+
+
+def keep_fit(mesh: TetMesh, fit: SpringFit) -> SpringFit:
+    """Make `fit` the fit of a mesh, such as one read from a file; returns it."""
+    _FITS[mesh] = fit
+    return fit
+
+
+def fit_springs(mesh: TetMesh, youngs_modulus: ArrayLike = 1.0) -> SpringFit:
+    """Fit factors to formula (6), or fall back to one scalar per region; the result is not remembered.
+
+    Args:
+        mesh: the organ's tets.
+        youngs_modulus: E, only its distribution matters: a scalar or one value a tet, shape (n_tet,).
+
+    Warns:
+        UserWarning: the fallback is used; names the residual and the scalars.
+
+    Raises:
+        OrganError: the fit does not converge.
+    """
+    started = time.perf_counter()
+    modulus = np.broadcast_to(np.asarray(youngs_modulus, dtype=np.float64), (mesh.tet_count,))
+    modulus = modulus / modulus.mean()
+    share = lloyd_share(mesh, modulus)
+    matrix, target = _force_equations(mesh, share, modulus)
+    spread = _surface_averages(mesh)
+    matrix, target = csr_array(spread @ matrix), spread @ target
+    factor = _fit_factors(matrix, target, _pull_to_lloyd(mesh))
+    before = _relative(matrix @ np.ones_like(factor) - target, target)
+    after = _relative(matrix @ factor - target, target)
+    tet_factor = np.ones(mesh.tet_count)
+    fallback = after > LARGEST_RESIDUAL or _inner_imbalance(mesh) > LARGEST_IMBALANCE
+    if fallback:
+        factor, tet_factor = np.ones_like(factor), _region_scalars(mesh, share, modulus)
+        _warn_of_fallback(after, tet_factor)
+    factors = tet_factor if fallback else factor
+    duration = time.perf_counter() - started
+    report = FitReport(before, after, fallback, float(factors.min()), float(factors.max()), duration)
+    factor.setflags(write=False)
+    tet_factor.setflags(write=False)
+    return SpringFit(factor, tet_factor, report)
+
+
+def _fit_factors(matrix: csr_array, target: FloatArray, pull: FloatArray) -> FloatArray:
+    """The factors of the springs: the normal equations of |A s - b|^2 + sum p_e (s_e - 1)^2, with s_e bounded below."""
+    normal = csr_array(matrix.T @ matrix)
+    weight = pull * float(normal.diagonal().mean())
+    normal = csr_array(normal + diags_array(weight))
+    return minimise_bounded(normal, matrix.T @ target + weight, np.ones(len(pull)), SMALLEST_FACTOR)
+
+
+def _relative(part: FloatArray, whole: FloatArray) -> float:
+    return (dot(part, part) / dot(whole, whole)) ** 0.5
+
+
+def _pull_to_lloyd(mesh: TetMesh) -> FloatArray:
+    """p_e over the mean diagonal of the normal equations, by the layer of a spring's outer node, shape (n_spring,)."""
+    edges = mesh.edges
+    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(mesh.node_count,) * 2).tocsr()
+    layer = dijkstra(graph, directed=False, indices=mesh.boundary_nodes, unweighted=True, min_only=True)
+    beyond = np.maximum(layer[edges].min(axis=1) + 1 - WEAK_LAYERS, 0.0)
+    doublings = np.minimum(beyond, np.log2(LARGEST_PULL / PULL_TO_LLOYD) / np.log2(PULL_GROWTH))
+    return PULL_TO_LLOYD * PULL_GROWTH**doublings
+
+
+def _inner_imbalance(mesh: TetMesh) -> float:
+    """Largest |sum of k l n n n| / sum of k l of formula (6)'s springs around nodes whose neighbours all lie inside."""
+    inside = np.ones(mesh.node_count, dtype=bool)
+    inside[mesh.tets[np.isin(mesh.tets, mesh.boundary_nodes).any(axis=1)]] = False
+    ends = mesh.edges.astype(np.int64)
+    span = mesh.points[ends[:, 1]] - mesh.points[ends[:, 0]]
+    length = np.linalg.norm(span, axis=1)
+    along = span / length[:, None]
+    share = lloyd_share(mesh, np.ones(mesh.tet_count))
+    tension = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(ends)) * length
+    moment = (np.einsum("ei,ej,ek->eijk", along, along, along) * tension[:, None, None, None]).reshape(-1, 27)
+    # Seen from its two ends a spring points in opposite directions.
+    signs = csr_array((np.tile([1.0, -1.0], len(ends)), (ends.ravel(), np.repeat(np.arange(len(ends)), 2))))
+    imbalance = np.linalg.norm(signs @ moment, axis=1) / (abs(signs) @ tension)
+    return float(imbalance[inside].max(initial=0.0))
+
+
+def _warn_of_fallback(residual: float, tet_factor: FloatArray) -> None:
+    scalars = ", ".join(f"{scalar:.3f}" for scalar in np.unique(tet_factor))
+    why = (
+        f"springs fitted to this mesh leave a residual of {residual:.2f} of the solid's node forces, more than "
+        f"{LARGEST_RESIDUAL:g}"
+        if residual > LARGEST_RESIDUAL
+        else "this mesh has cells of several sizes inside, and springs fitted to it leave nodes loose where they meet"
+    )
+    warnings.warn(
+        f"{why}: the network cannot represent the solid there. Formula (6) times one scalar per region "
+        f"({scalars}) is used instead; blocks of cubic cells (box_mesh) can be fitted",
+        UserWarning,
+        stacklevel=4,
+    )
+
+
+def _region_scalars(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> FloatArray:
+    """The scalar of each tet's region that makes its affine stiffness right in the mean, shape (n_tet,).
+
+    C_iijj = (1 / V) sum k l^2 = 6 E for lambda = mu = 2 E / 5, so the scalar is 6 sum E_t V_t / sum k_et l_e^2.
+    """
+    spans = mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]]
+    squares = np.einsum("ei,ei->e", spans, spans)[mesh.tet_edges].sum(axis=1)
+    tags, region = np.unique(mesh.region, return_inverse=True)
+    wanted = 6.0 * np.bincount(region, modulus * mesh.volumes, len(tags))
+    return (wanted / np.bincount(region, share * squares, len(tags)))[region]
+
+
+# ---- node forces of the six unit strains ------------------------------------------------------------------------
+
+
+def _force_equations(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> tuple[csr_array, FloatArray]:
+    """Weighted node forces of the springs per factor, (18 n_node, n_spring), and of the solid, (18 n_node,).
+
+    Row 18 i + 3 m + a is component a of node i's force in strain m. A spring with span d puts k (d . eps d) / |d|^2 d
+    on its second node's pull, and minus that on the first.
+    """
+    edges, node_count = mesh.edges.astype(np.int64), mesh.node_count
+    stiffness = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(edges))
+    weight = _node_weights(mesh, modulus)
+    spans = mesh.points[edges[:, 1]] - mesh.points[edges[:, 0]]
+    stretch = np.einsum("ei,mij,ej->em", spans, UNIT_STRAINS, spans) / np.einsum("ei,ei->e", spans, spans)[:, None]
+    tension = ((stiffness[:, None] * stretch)[:, :, None] * spans[:, None, :]).reshape(-1, 18)
+    values = np.concatenate([-weight[edges[:, 0], None] * tension, weight[edges[:, 1], None] * tension])
+    rows = 18 * np.concatenate([edges[:, 0], edges[:, 1]])[:, None] + np.arange(18)
+    columns = np.repeat(np.tile(np.arange(len(edges)), 2), 18)
+    present = values.ravel() != 0.0
+    entries = (values.ravel()[present], (rows.ravel()[present], columns[present]))
+    matrix = csr_array(entries, shape=(18 * node_count, len(edges)))
+    return matrix, (weight[:, None] * _solid_forces(mesh, modulus)).ravel()
+
+
+def _surface_averages(mesh: TetMesh) -> csr_array:
+    """From node forces to those that are compared: averages on the surface, then single nodes, (36 n, 18 n).
+
+    A surface node's force is shared among its triangles by area, and each triangle gives a third to each corner.
+    Eight triangles around one node and four around the next, as outer faces are cut, then make no difference.
+    """
+    triangles, node_count = mesh.boundary_triangles, mesh.node_count
+    corners = mesh.points[triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    around = np.bincount(triangles.ravel(), np.repeat(area, 3), node_count)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    places, shape = (owner, triangles.ravel()), (len(triangles), node_count)
+    shared = csr_array((np.repeat(area, 3) / around[triangles.ravel()], places), shape=shape)
+    handed = csr_array((np.full(owner.size, 1.0 / 3.0), places), shape=shape)
+    single = np.ones(node_count)
+    single[mesh.boundary_nodes] = SINGLE_NODE_SHARE**0.5
+    return csr_array(kron(vstack([handed.T @ shared, diags_array(single)]), eye_array(18), format="csr"))
+
+
+def _node_weights(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
+    """w_i = V_i^(-2/3) / E_i, V_i and E_i the mean volume and modulus of the tets around a node, shape (n_node,)."""
+    corners = mesh.tets.ravel()
+    count, volume, stiffness = (
+        np.bincount(corners, np.repeat(values, 4), mesh.node_count)
+        for values in (np.ones(mesh.tet_count), mesh.volumes, modulus)
+    )
+    return count / (stiffness * np.cbrt(volume / count) ** 2)
+
+
+def _solid_forces(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
+    """Internal node forces of linear tets in the six strains, F = sum over tets of sigma V grad N, (n_node, 18).
+
+    sigma = lambda tr(eps) 1 + 2 mu eps with lambda = mu = 2 E / 5; V grad N_a = -(area vector of the face opposite
+    corner a) / 3, area vectors outward.
+    """
+    trace = np.trace(UNIT_STRAINS, axis1=1, axis2=2)
+    stress = 0.4 * (trace[:, None, None] * np.eye(3) + 2.0 * UNIT_STRAINS)
+    faces = mesh.points[mesh.tets[:, TET_FACES]]
+    area = 0.5 * np.cross(faces[:, :, 1] - faces[:, :, 0], faces[:, :, 2] - faces[:, :, 0])
+    force = np.einsum("mij,taj->tami", stress, area * (modulus / -3.0)[:, None, None]).reshape(-1, 18)
+    corners = mesh.tets.ravel()
+    columns = [np.bincount(corners, column, mesh.node_count) for column in force.T]
+    return np.column_stack(columns).astype(np.float64)
+
+
+def lloyd_share(mesh: TetMesh, youngs_modulus: FloatArray) -> FloatArray:
+    """Stiffness that a tet gives to each of its edges, (2 sqrt 2 / 25) l_t E_t [N/m], shape (n_tet,).
+
+    l_t = (12 V_t / sqrt 2)^(1/3) is the edge of the regular tet of the same volume; E_t [Pa], shape (n_tet,).
+    """
+    length = np.cbrt(mesh.volumes * (12.0 / math.sqrt(2.0)))
+    return (2.0 * math.sqrt(2.0) / 25.0) * length * youngs_modulus
+
+
+ROUNDS = 60
+TOLERANCE = 1e-6
+
+
+def minimise_bounded(matrix: csr_array, right: FloatArray, start: FloatArray, lower: float) -> FloatArray:
+    """The x >= lower that minimises x . H x / 2 - c . x, for a symmetric positive definite H, shape (n,).
+
+    Unknowns at the bound that the gradient holds there are set aside; the rest take the Newton step, found by
+    conjugate gradients, bent at the bound and halved until the sum falls enough (Bertsekas 1982). It ends where no
+    free unknown would move by more than TOLERANCE on its own, |g_i| / H_ii.
+
+    Args:
+        matrix: H, (n, n).
+        right: c, (n,).
+        start: where to begin, at least `lower`, (n,).
+        lower: the bound.
+
+    Raises:
+        OrganError: it does not converge; names what is left.
+    """
+    diagonal, found = np.asarray(matrix.diagonal(), dtype=np.float64), start
+    left = np.inf
+    for turn in range(ROUNDS):
+        gradient = matrix @ found - right
+        free = np.flatnonzero((found > lower) | (gradient < 0.0))
+        left = float(np.abs(gradient[free] / diagonal[free]).max(initial=0.0))
+        if left <= TOLERANCE:
+            return found
+        accuracy = 1e-3 if turn < 3 else 1e-6
+        step = np.zeros_like(found)
+        step[free] = _conjugate_gradients(matrix[free][:, free], -gradient[free], diagonal[free], accuracy)
+        found = _descend(matrix, found, gradient, step, lower)
+    raise OrganError(
+        f"fitting springs to this mesh did not converge in {ROUNDS} rounds (largest step left {left:.2g}, the rule is "
+        f'at most {TOLERANCE:g}): use stiffness_rule="lloyd", or remesh'
+    )
+
+
+def _descend(matrix: csr_array, found: FloatArray, gradient: FloatArray, step: FloatArray, lower: float) -> FloatArray:
+    """Go along a step bent at the bound; the sum changes by g . d + d . H d / 2 for a change d."""
+    length = 1.0
+    for _ in range(40):
+        moved = np.maximum(found + length * step, lower)
+        change = moved - found
+        slope = dot(gradient, change)
+        if slope + 0.5 * dot(change, matrix @ change) <= 1e-4 * slope:
+            return moved
+        length *= 0.5
+    return found
+
+
+def _conjugate_gradients(matrix: csr_array, right: FloatArray, diagonal: FloatArray, accuracy: float) -> FloatArray:
+    """Solve M x = b for a symmetric positive M with Jacobi's preconditioner, to a relative accuracy."""
+    solution, residual = np.zeros_like(right), right.copy()
+    scaled = residual / diagonal
+    direction = scaled.copy()
+    power = start = dot(residual, scaled)
+    for _ in range(1000):
+        if power <= accuracy * accuracy * start:
+            break
+        product = matrix @ direction
+        length = power / dot(direction, product)
+        solution += length * direction
+        residual -= length * product
+        scaled = residual / diagonal
+        power, before = dot(residual, scaled), power
+        direction = scaled + (power / before) * direction
+    return solution
+
+
+def dot(left: FloatArray, right: FloatArray) -> float:
+    """A sum whose order does not depend on the number of threads, as BLAS's may."""
+    return float((left * right).sum())
+
+
+def write_fit(path: Path, mesh: TetMesh) -> SpringFit:
+    """Write a mesh's fit, made where it has none yet, with a fingerprint of the mesh; returns it."""
+    fit = spring_fit(mesh)
+    arrays = {"edge_factor": fit.edge_factor, "tet_factor": fit.tet_factor}
+    with path.open("wb") as file:
+        np.savez_compressed(file, fingerprint=_fingerprint(mesh), **arrays, **asdict(fit.report))
+    return fit
+
+
+def read_fit(path: Path, mesh: TetMesh) -> SpringFit:
+    """Read a fit written by `write_fit` and make it the mesh's, so that `stiffness_rule="fitted"` need not fit.
+
+    Raises:
+        OrganError: the file is no such file, or belongs to another mesh.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            table = {name: file[name] for name in file.files}
+        owner = str(table["fingerprint"])
+        report = FitReport(**{name: table[name].item() for name in FitReport.__dataclass_fields__})
+        fit = SpringFit(table["edge_factor"], table["tet_factor"], report)
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise OrganError(f"{path} cannot be read as fitted springs ({error}): make it with write_fit") from None
+    if owner != _fingerprint(mesh):
+        raise OrganError(f"{path} holds springs fitted to another mesh than {mesh!r}: use write_fit on this one")
+    fit.edge_factor.setflags(write=False)
+    fit.tet_factor.setflags(write=False)
+    return keep_fit(mesh, fit)
+
+
+def _fingerprint(mesh: TetMesh) -> str:
+    """SHA-256 of points, tets and regions."""
+    parts = (mesh.points, mesh.tets, mesh.region)
+    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()

@@ -1,0 +1,81 @@
+"""Spring stiffness from Young's moduli: formula (6) of Sala et al. 2011, fitted, Van Gelder's, and a membrane."""
+
+from difflib import get_close_matches
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.errors import OrganError
+from msdm_core.material.fitting import lloyd_share, spring_fit
+from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, IntArray, TetMesh
+
+STIFFNESS_RULES = ("lloyd", "fitted", "van_gelder")
+
+
+def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "lloyd") -> tuple[IntArray, FloatArray]:
+    """One spring per mesh edge; each tet adds to its six edges a share proportional to its modulus.
+
+    * "lloyd": k_ij = sum over tets of (2 sqrt 2 / 25) l_t E_t, l_t = (12 V_t / sqrt 2)^(1/3), the edge of the regular
+      tet of the same volume (Sala et al. 2011, eq. 6; Lloyd et al. 2007).
+    * "fitted": formula (6) times factors fitted to the mesh, see `msdm_core.material.fitting`; best on blocks of cubic
+      cells.
+    * "van_gelder": k_ij = sum over tets of E_t V_t / l_ij^2 (Van Gelder 1998, extended to tets).
+
+    Args:
+        mesh: the organ's tets.
+        youngs_modulus: E [Pa], a scalar or one value a tet, shape (n_tet,).
+        rule: one of STIFFNESS_RULES.
+
+    Warns:
+        UserWarning: "fitted" on a mesh where the network cannot represent the solid; names the residual.
+
+    Returns:
+        edges (n_spring, 2) and stiffness [N/m] (n_spring,), in the order of `mesh.edges`.
+
+    Raises:
+        OrganError: an unknown rule (lists the known) or a modulus that is not above 0 (names the tet).
+    """
+    check_stiffness_rule(rule)
+    modulus = np.broadcast_to(np.asarray(youngs_modulus, dtype=np.float64), (mesh.tet_count,))
+    bad = np.flatnonzero(~(np.isfinite(modulus) & (modulus > 0.0)))
+    if bad.size:
+        raise OrganError(f"youngs_modulus of tet {bad[0]} is {modulus[bad[0]]} Pa; it must be finite and above 0")
+    if rule == "lloyd":
+        share = np.repeat(lloyd_share(mesh, modulus), 6)
+    elif rule == "fitted":
+        share = np.repeat(lloyd_share(mesh, modulus) * spring_fit(mesh).tet_factor, 6)
+    else:
+        share = _van_gelder_shares(mesh, modulus)
+    stiffness = np.bincount(mesh.tet_edges.ravel(), share, len(mesh.edges)).astype(np.float64)
+    return mesh.edges, stiffness * spring_fit(mesh).edge_factor if rule == "fitted" else stiffness
+
+
+def _van_gelder_shares(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
+    corners = mesh.points[mesh.tets]
+    spans = corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]]
+    return ((modulus * mesh.volumes)[:, None] / np.einsum("tij,tij->ti", spans, spans)).ravel()
+
+
+def check_stiffness_rule(rule: str) -> None:
+    """OrganError where a rule is none of STIFFNESS_RULES: lists them and suggests the nearest."""
+    if rule not in STIFFNESS_RULES:
+        nearest = get_close_matches(str(rule), STIFFNESS_RULES, n=1)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise OrganError(f"stiffness rule {rule!r} is unknown; the rules are {', '.join(STIFFNESS_RULES)}{hint}")
+
+
+def membrane_stiffness(mesh: TetMesh, youngs_modulus: float, thickness: float) -> FloatArray:
+    """Stiffness that a thin capsule adds to the springs of the surface's edges [N/m], shape (n_spring,).
+
+    Each surface triangle of area A and edges l1, l2, l3 gives 3 E_c h_c A / (l1^2 + l2^2 + l3^2) to each of its edges:
+    a membrane of stiffness E_c h_c with 2-D Poisson ratio 1/3, equal to (sqrt 3 / 4) E_c h_c on equilateral triangles.
+    """
+    triangles = mesh.boundary_triangles
+    corners = mesh.points[triangles]
+    edges = corners[:, [1, 2, 0]] - corners
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    share = 3.0 * youngs_modulus * thickness * area / np.einsum("tij,tij->t", edges, edges)
+    pairs = np.sort(np.stack([triangles, triangles[:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1).astype(np.int64)
+    known = mesh.edges.astype(np.int64)
+    index = np.searchsorted(known[:, 0] * mesh.node_count + known[:, 1], pairs[:, 0] * mesh.node_count + pairs[:, 1])
+    return np.bincount(index, np.repeat(share, 3), len(mesh.edges)).astype(np.float64)

@@ -1,0 +1,1 @@
+"""Tetrahedral meshes and triangle surfaces: structure, quality, order, distances along the surface."""

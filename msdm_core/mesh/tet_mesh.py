@@ -1,0 +1,279 @@
+"""The tetrahedral mesh of an organ: points, tets, regions and their incidences."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from msdm_core.errors import MeshError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+# Vertices of the face opposite each corner of a tet, ordered so that its normal points out of a positive tet.
+TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int32)
+TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int32)
+
+# A tet whose volume is below this share of its longest edge cubed is flat (a regular tet has 0.118).
+DEGENERATE_VOLUME_RATIO = 1e-6
+
+
+@dataclass(frozen=True)
+class Incidence:
+    """Which tets touch each item (edge or node), in compressed rows: item i owns tets[start[i]:start[i + 1]]."""
+
+    start: IntArray  # (n_item + 1,)
+    tets: IntArray  # (sum of counts,)
+
+    def of(self, item: int) -> IntArray:
+        """The tets that touch one item."""
+        return self.tets[self.start[item] : self.start[item + 1]]
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """A connected body of tetrahedra, in metres, every tet with positive volume.
+
+    Tets given inside out are reoriented and counted in `reoriented_count`. Arrays are copied to contiguous
+    native float64 / int32 and made read-only.
+
+    Args:
+        points: node positions [m], shape (n_node, 3).
+        tets: node indices of each tet, shape (n_tet, 4).
+        region: integer tag of each tet, shape (n_tet,); all 0 when left out.
+        region_names: (tag, name) pairs.
+
+    Raises:
+        MeshError: names the first offending node or tet, its value, the rule and the way out.
+    """
+
+    points: FloatArray
+    tets: IntArray
+    region: IntArray
+    region_names: tuple[tuple[int, str], ...]
+    reoriented_count: int = field(init=False, default=0)
+
+    def __init__(
+        self,
+        points: ArrayLike,
+        tets: ArrayLike,
+        region: ArrayLike | None = None,
+        region_names: tuple[tuple[int, str], ...] | dict[int, str] = (),
+    ) -> None:
+        point_array = _checked_points(points)
+        tet_array = _checked_tets(tets, len(point_array))
+        tet_array, reoriented_count = _oriented(point_array, tet_array)
+        _check_faces(tet_array)
+        pairs = region_names.items() if isinstance(region_names, dict) else region_names
+        object.__setattr__(self, "points", _frozen(point_array))
+        object.__setattr__(self, "tets", _frozen(tet_array))
+        object.__setattr__(self, "region", _frozen(_checked_region(region, len(tet_array))))
+        object.__setattr__(self, "region_names", tuple((int(tag), str(name)) for tag, name in pairs))
+        object.__setattr__(self, "reoriented_count", reoriented_count)
+
+    @property
+    def node_count(self) -> int:
+        """Number of nodes."""
+        return len(self.points)
+
+    @property
+    def tet_count(self) -> int:
+        """Number of tets."""
+        return len(self.tets)
+
+    def region_tag(self, name: str) -> int:
+        """The tag of a named region; MeshError lists the names there are."""
+        for tag, known in self.region_names:
+            if known == name:
+                return tag
+        names = ", ".join(known for _, known in self.region_names) or "none"
+        raise MeshError(f"region {name!r} is not in the mesh; its named regions: {names}")
+
+    @cached_property
+    def volumes(self) -> FloatArray:
+        """Volume of each tet [m^3], shape (n_tet,)."""
+        return _frozen(tet_volumes(self.points, self.tets))
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """Unique edges, smaller node first, in lexicographic order, shape (n_edge, 2)."""
+        return self._edge_table[0]
+
+    @cached_property
+    def tet_edges(self) -> IntArray:
+        """Edge index of each of the six edges of each tet, in the order of TET_EDGES, shape (n_tet, 6)."""
+        return self._edge_table[1]
+
+    @cached_property
+    def _edge_table(self) -> tuple[IntArray, IntArray]:
+        pairs = np.sort(self.tets[:, TET_EDGES].reshape(-1, 2), axis=1).astype(np.int64)
+        keys = pairs[:, 0] * self.node_count + pairs[:, 1]
+        unique, inverse = np.unique(keys, return_inverse=True)
+        edges = np.column_stack([unique // self.node_count, unique % self.node_count])
+        return _frozen(edges.astype(np.int32)), _frozen(inverse.reshape(-1, 6).astype(np.int32))
+
+    @cached_property
+    def edge_tets(self) -> Incidence:
+        """The tets that share each edge."""
+        return _incidence(self.tet_edges, len(self.edges))
+
+    @cached_property
+    def node_tets(self) -> Incidence:
+        """The tets that share each node."""
+        return _incidence(self.tets, self.node_count)
+
+    @cached_property
+    def boundary_triangles(self) -> IntArray:
+        """Triangles of the outer surface, normals outward, shape (n_triangle, 3)."""
+        return self._boundary[0]
+
+    @cached_property
+    def boundary_tets(self) -> IntArray:
+        """The tet behind each boundary triangle, shape (n_triangle,)."""
+        return self._boundary[1]
+
+    @cached_property
+    def _boundary(self) -> tuple[IntArray, IntArray]:
+        faces = self.tets[:, TET_FACES].reshape(-1, 3)
+        ordered = np.sort(faces, axis=1)
+        _, first, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
+        outer = np.sort(first[counts == 1])
+        return _frozen(faces[outer].astype(np.int32)), _frozen((outer // 4).astype(np.int32))
+
+    @cached_property
+    def boundary_nodes(self) -> IntArray:
+        """Sorted indices of the nodes on the outer surface, shape (n_boundary_node,)."""
+        return _frozen(np.unique(self.boundary_triangles).astype(np.int32))
+
+    def __repr__(self) -> str:
+        size = np.ptp(self.points, axis=0) * 1000
+        return (
+            f"TetMesh({self.node_count} nodes, {self.tet_count} tets, "
+            f"{size[0]:.1f} x {size[1]:.1f} x {size[2]:.1f} mm, {self.volumes.sum() * 1e6:.4g} ml)"
+        )
+
+
+def tet_volumes(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
+    """Signed volume of each tet, V = (b - a) . ((c - a) x (d - a)) / 6 [m^3], shape (n_tet,)."""
+    a, b, c, d = (points[tets[:, corner]] for corner in range(4))
+    return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6.0
+
+
+def _frozen(array: NDArray) -> NDArray:
+    array.setflags(write=False)
+    return array
+
+
+def _checked_points(points: ArrayLike) -> FloatArray:
+    array = np.array(points, dtype=np.float64, order="C")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise MeshError(f"points have shape {array.shape}; the rule is (n_node, 3), in metres")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise MeshError(
+            f"node {bad[0]} is at {array[bad[0]].tolist()}; every coordinate must be finite: repair the file"
+        )
+    order = np.lexsort(array.T)
+    twins = np.flatnonzero((np.diff(array[order], axis=0) == 0).all(axis=1))
+    if twins.size:
+        first, second = sorted((int(order[twins[0]]), int(order[twins[0] + 1])))
+        raise MeshError(
+            f"nodes {first} and {second} are duplicates at {array[first].tolist()}; "
+            "every node needs a place of its own: merge duplicate nodes"
+        )
+    return array
+
+
+def _checked_tets(tets: ArrayLike, node_count: int) -> IntArray:
+    given = np.asarray(tets)
+    if given.size == 0:
+        raise MeshError("the mesh has no tets; an organ needs at least one: mesh the volume first (mesh_surface)")
+    if given.ndim != 2 or given.shape[1] != 4 or given.dtype.kind not in "iu":
+        raise MeshError(f"tets have shape {given.shape}, dtype {given.dtype}; the rule is integer (n_tet, 4)")
+    outside = np.flatnonzero(((given < 0) | (given >= node_count)).any(axis=1))
+    if outside.size:
+        raise MeshError(
+            f"tet {outside[0]} uses nodes {given[outside[0]].tolist()}; indices must lie in 0..{node_count - 1}"
+        )
+    array = np.array(given, dtype=np.int32, order="C")
+    repeated = np.flatnonzero((np.diff(np.sort(array, axis=1), axis=1) == 0).any(axis=1))
+    if repeated.size:
+        raise MeshError(f"tet {repeated[0]} uses a node twice, {array[repeated[0]].tolist()}: remove the tet")
+    unused = np.flatnonzero(np.bincount(array.ravel(), minlength=node_count) == 0)
+    if unused.size:
+        raise MeshError(
+            f"node {unused[0]} (of {unused.size}) belongs to no tet; every node must: drop unused nodes before meshing"
+        )
+    return array
+
+
+def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
+    volumes = tet_volumes(points, tets)
+    edge_lengths = np.linalg.norm(points[tets[:, TET_EDGES[:, 0]]] - points[tets[:, TET_EDGES[:, 1]]], axis=2)
+    ratios = np.abs(volumes) / edge_lengths.max(axis=1) ** 3
+    flat = np.flatnonzero(ratios <= DEGENERATE_VOLUME_RATIO)
+    if flat.size:
+        tet = int(flat[0])
+        raise MeshError(
+            f"tet {tet} (of {flat.size}) is degenerate: volume / longest edge^3 = {ratios[tet]:.2g}, "
+            f"the rule is above {DEGENERATE_VOLUME_RATIO:g}: remesh, for instance with mesh_surface"
+        )
+    negative = volumes < 0
+    tets[negative] = tets[negative][:, [0, 1, 3, 2]]
+    return tets, int(negative.sum())
+
+
+def _check_faces(tets: IntArray) -> None:
+    """Refuse doubled tets, crowded faces, and parts that meet only in nodes or edges.
+
+    Springs at a single node or edge resist no bending: such parts are joined by hinges.
+    """
+    alike, first = np.unique(np.sort(tets, axis=1), axis=0, return_index=True)
+    if len(alike) < len(tets):
+        tet = int(np.setdiff1d(np.arange(len(tets)), first)[0])
+        raise MeshError(f"tet {tet} is a duplicate, nodes {tets[tet].tolist()}: remove one of the two")
+    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    same = (np.diff(faces[order], axis=0) == 0).all(axis=1)
+    crowded = np.flatnonzero(same[1:] & same[:-1])
+    if crowded.size:
+        tet = int(order[crowded[0]] // 4)
+        raise MeshError(
+            f"face {faces[order[crowded[0]]].tolist()} of tet {tet} is shared by more than 2 tets: "
+            "remove the overlapping ones"
+        )
+    twins = np.flatnonzero(same)
+    pairs = order[twins] // 4, order[twins + 1] // 4
+    graph = coo_array((np.ones(len(twins), dtype=np.int8), pairs), shape=(len(tets), len(tets)))
+    count, part = connected_components(graph, directed=False)
+    if count > 1:
+        sizes = ", ".join(map(str, np.sort(np.bincount(part))[::-1][:6])) + (", ..." if count > 6 else "")
+        raise MeshError(
+            f"the mesh falls into {count} disconnected parts, which share no face, of {sizes} tets; "
+            "an organ is one body, and parts that meet in a node or an edge hang on a hinge: remesh, or keep one part"
+        )
+
+
+def _checked_region(region: ArrayLike | None, tet_count: int) -> IntArray:
+    if region is None:
+        return np.zeros(tet_count, dtype=np.int32)
+    array = np.asarray(region)
+    if array.shape != (tet_count,):
+        raise MeshError(f"region has shape {array.shape}; the rule is one integer tag per tet, ({tet_count},)")
+    tags = array.astype(np.int32)
+    wrong = np.flatnonzero(tags != array)
+    if wrong.size:
+        raise MeshError(f"region tag of tet {wrong[0]} is {array[wrong[0]]}; tags must be whole numbers")
+    return tags
+
+
+def _incidence(members: IntArray, item_count: int) -> Incidence:
+    """Compressed rows of tets per item, from the items of each tet, shape (n_tet, k)."""
+    flat = members.ravel()
+    order = np.argsort(flat, kind="stable")
+    counts = np.bincount(flat, minlength=item_count)
+    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    return Incidence(_frozen(start), _frozen((order // members.shape[1]).astype(np.int32)))

@@ -1,0 +1,82 @@
+"""Reading the surface of an organ from STL, OBJ and PLY files."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh.surface import merge_vertices
+from msdm_core.mesh_files.mesh_file import LengthUnit, check_extent, checked_file, metres_per_unit, parsed
+
+SURFACE_SUFFIXES = (".obj", ".ply", ".stl")
+
+
+def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Vertices [m], shape (n_vertex, 3), and triangles, shape (n_triangle, 3), of an STL, OBJ or PLY file.
+
+    `length_unit` is "m", "cm", "mm" or metres per unit: none of the formats states one. Vertices at exactly the same
+    place become one (STL repeats them per triangle, OBJ along texture seams); triangles that then use a vertex twice
+    have no area and are left out, and so are vertices that no triangle uses.
+
+    Raises:
+        ValueError: names an unknown length unit.
+        MeshError: names the file and the fault: missing, not parsable, no triangles, not finite, an unlikely extent.
+    """
+    metres = metres_per_unit(length_unit)
+    file = checked_file(path, SURFACE_SUFFIXES, "export the surface as STL, OBJ or PLY")
+    _check_whole(file)
+    points, faces = parsed(file, _loaded, "export it again as STL, OBJ or PLY")
+    if len(faces) == 0:
+        raise MeshError(f"{file}: has no triangles ({len(points)} vertices); export a triangulated surface")
+    outside = np.flatnonzero(((faces < 0) | (faces >= len(points))).any(axis=1))
+    if outside.size:
+        raise MeshError(
+            f"{file}: triangle {outside[0]} uses vertices {faces[outside[0]].tolist()}; "
+            f"indices must lie in 0..{len(points) - 1}: export it again"
+        )
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise MeshError(
+            f"{file}: vertex {bad[0]} is at {points[bad[0]].tolist()}; every coordinate must be finite: repair the file"
+        )
+    vertices, triangles = _merged(points, faces)
+    if len(triangles) == 0:
+        raise MeshError(f"{file}: every triangle uses a vertex twice, so none has an area; export the surface again")
+    vertices = vertices * metres
+    check_extent(vertices, metres, file)
+    return vertices, triangles
+
+
+def _check_whole(file: Path) -> None:
+    """Refuse a binary STL that is shorter than its own count of triangles says; the parser would take it for text."""
+    with file.open("rb") as stream:
+        head = stream.read(84)
+    if file.suffix.lower() != ".stl" or head.lstrip().lower().startswith(b"solid") or len(head) < 84:
+        return
+    promised = int.from_bytes(head[80:84], "little")
+    there = (file.stat().st_size - 84) // 50
+    if there < promised:
+        raise MeshError(f"{file}: is cut short, {promised} triangles are promised and {there} are there: copy it again")
+
+
+def _loaded(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and triangles of a file, every object in it taken together."""
+    import trimesh
+
+    # Merging is ours (exact, trimesh rounds); materials would open further files.
+    options: dict[str, Any] = {"process": False} | ({"skip_materials": True} if path.lower().endswith(".obj") else {})
+    surface: Any = trimesh.load(path, force="mesh", **options)
+    if not isinstance(surface, trimesh.Trimesh):
+        return np.asarray(getattr(surface, "vertices", np.empty((0, 3)))), np.empty((0, 3), dtype=np.int64)
+    return np.asarray(surface.vertices, dtype=np.float64), np.asarray(surface.faces, dtype=np.int64)
+
+
+def _merged(points: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Points with exact twins and unused ones gone, otherwise in their order, and the triangles renumbered."""
+    vertices, triangles = merge_vertices(points, faces)
+    flat = (np.diff(np.sort(triangles, axis=1), axis=1) == 0).any(axis=1)
+    if flat.any():
+        vertices, triangles = merge_vertices(vertices, triangles[~flat])
+    return vertices, triangles.astype(np.int32)

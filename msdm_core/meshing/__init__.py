@@ -1,0 +1,1 @@
+"""Making tetrahedral meshes from blocks, surfaces and label images."""

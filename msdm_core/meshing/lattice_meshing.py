@@ -1,0 +1,267 @@
+"""Meshes of body-centred cubic (BCC) lattices, on which formula (6) is isotropic: blocks and filled surfaces.
+
+Both can be graded: fine where the tissue is felt, with cells 2 or 4 times as long elsewhere
+(`msdm_core.meshing.octree`). At the seams between cell sizes formula (6) is not isotropic.
+"""
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh.ordering import swept
+from msdm_core.mesh.surface import check_surface, surface_volume
+from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh, tet_volumes
+from msdm_core.meshing.grading import (
+    CELLS_ACROSS_MIN,
+    COARSENINGS,
+    check_coarse_cell_size,
+    checked_coarsest,
+    checked_fine_triangles,
+    stuff_graded,
+)
+from msdm_core.meshing.lattice import lattice_around
+from msdm_core.meshing.octree import balanced_levels, octree_tets
+from msdm_core.meshing.stuffing import stuff
+
+FloatArray = NDArray[np.float64]
+Int64Array = NDArray[np.int64]
+
+STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
+TETS_PER_CELL = 12
+TET_LIMIT = 2_000_000
+GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB while meshing
+
+
+def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float | None = None) -> TetMesh:
+    """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
+
+    Nodes are the corners and then the centres of the cells. Each inner cell face gives four tets (two centres and
+    an edge of the face); each outer face is cut along a diagonal that alternates like a checkerboard, so that the
+    block prefers no direction.
+
+    Args:
+        size: edge lengths [m], shape (3,).
+        cells: whole numbers of cells along each axis, shape (3,).
+        coarsening: largest cell edge in fine ones, 1 (all cells alike), 2 or 4; divides each number of cells.
+        fine_depth: where cells may coarsen, the depth below the top face z = sz that is filled with fine cells [m].
+
+    Warns:
+        UserWarning: names the stretch where cells are more than 1 % from cubes: formula (6) is then not isotropic.
+
+    Raises:
+        ValueError: names the size or count that is not positive, the coarsening that does not fit the cells or the
+            fine depth that does not fit the block.
+    """
+    lengths, counts = _checked_box(size, cells)
+    fine_layers = _checked_fine_layers(lengths, counts, coarsening, fine_depth)
+    edges = lengths / counts
+    stretch = edges.max() / edges.min()
+    if stretch > STRETCH_LIMIT:
+        warnings.warn(
+            f"the cells are {' x '.join(f'{edge * 1000:.4g}' for edge in edges)} mm, stretched {stretch:.3g} to 1; "
+            f"above {STRETCH_LIMIT} the springs of formula (6) are not isotropic: choose cells in proportion to size",
+            UserWarning,
+            stacklevel=2,
+        )
+    if coarsening > 1:
+        return _graded_box(lengths, counts, coarsening, fine_layers)
+    corners = np.arange(np.prod(counts + 1)).reshape(counts + 1)
+    centres = corners.size + np.arange(np.prod(counts)).reshape(counts)
+    corner_places = np.stack(np.unravel_index(corners.ravel(), corners.shape), axis=1) / counts
+    centre_places = (np.stack(np.unravel_index(np.arange(centres.size), centres.shape), axis=1) + 0.5) / counts
+    points = np.concatenate([corner_places, centre_places]) * lengths
+    tets = np.concatenate([_face_tets(corners, centres, axis) for axis in range(3)])
+    return _swept_mesh(points, tets)
+
+
+def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Array]:
+    lengths, counts = np.asarray(size, dtype=np.float64), np.asarray(cells)
+    if lengths.shape != (3,) or not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise ValueError(f"size is {lengths.tolist()}; the rule is three positive lengths in metres")
+    if counts.shape != (3,) or not (np.isfinite(counts) & (counts >= 1) & (counts == np.floor(counts))).all():
+        raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1")
+    if TETS_PER_CELL * float(np.prod(counts.astype(np.float64))) > TET_LIMIT:
+        raise ValueError(f"cells is {counts.tolist()}; that is more than {TET_LIMIT} tets: choose fewer cells")
+    return lengths, counts.astype(np.int64)
+
+
+def _checked_fine_layers(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_depth: float | None) -> int:
+    """How many layers of cells below the top face are fine."""
+    if coarsening not in COARSENINGS:
+        raise ValueError(f"coarsening is {coarsening}; the rule is 1, 2 or 4")
+    if (coarsening == 1) != (fine_depth is None):
+        raise ValueError(
+            f"coarsening is {coarsening} and fine_depth {fine_depth}: give a fine_depth with a coarsening of 2 or 4, "
+            "and none where all cells are alike"
+        )
+    if (counts % coarsening).any():
+        raise ValueError(
+            f"cells is {counts.tolist()} with coarsening {coarsening}; the rule is multiples of {coarsening}"
+        )
+    if fine_depth is None:
+        return int(counts[2])
+    if not 0 < fine_depth <= lengths[2]:
+        raise ValueError(
+            f"fine_depth is {fine_depth:g} m; the rule is above 0 and at most the height, {lengths[2]:g} m"
+        )
+    # Rounding must not add a layer to a depth of whole layers.
+    return int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
+
+
+def _graded_box(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_layers: int) -> TetMesh:
+    permitted = np.full(counts, COARSENINGS.index(coarsening), dtype=np.int64)
+    permitted[:, :, counts[2] - fine_layers :] = 0
+    used, renumbered = np.unique(octree_tets(balanced_levels(permitted)), return_inverse=True)
+    grid_places = np.stack(np.unravel_index(used, tuple(2 * counts + 1)), axis=1)
+    points = grid_places / (2 * counts) * lengths
+    return _swept_mesh(points, renumbered.reshape(-1, 4))
+
+
+def _face_tets(corners: Int64Array, centres: Int64Array, axis: int) -> Int64Array:
+    """Tets at the cell faces across one axis: four per inner face, two per outer face, shape (n, 4)."""
+    corners, centres = np.moveaxis(corners, axis, 0), np.moveaxis(centres, axis, 0)
+    faces = np.stack([corners[:, :-1, :-1], corners[:, 1:, :-1], corners[:, 1:, 1:], corners[:, :-1, 1:]], axis=-1)
+    inner = faces[1:-1].reshape(-1, 4)
+    below, above = centres[:-1].ravel(), centres[1:].ravel()
+    tets = [np.column_stack([below, above, inner[:, k], inner[:, (k + 1) % 4]]) for k in range(4)]
+    row, column = np.indices(centres.shape[1:]).reshape(2, -1)
+    shift = (row + column) % 2
+    for layer in (0, -1):
+        centre = centres[layer].ravel()
+        turned = np.take_along_axis(faces[layer].reshape(-1, 4), (np.arange(4) + shift[:, None]) % 4, axis=1)
+        tets += [np.column_stack([centre, turned[:, [0, 1, 2]]]), np.column_stack([centre, turned[:, [0, 2, 3]]])]
+    return np.concatenate(tets)
+
+
+def mesh_surface(
+    vertices: ArrayLike,
+    triangles: ArrayLike,
+    *,
+    cell_size: float,
+    coarse_cell_size: float | None = None,
+    fine_triangles: ArrayLike | None = None,
+    fine_depth: float = 0.0,
+) -> TetMesh:
+    """Fill a closed surface with tets of a BCC lattice by isosurface stuffing (Labelle and Shewchuk 2007).
+
+    Dihedral angles stay between 9.3 and 161.7 degrees where all cells are alike, above 9 in a graded lattice;
+    boundary nodes lie on the surface. Parts thinner than about a cell can be lost. The same input always gives the
+    same mesh, to the bit.
+
+    Args:
+        vertices: of the surface [m], shape (n_vertex, 3).
+        triangles: vertex indices, shape (n_triangle, 3); turned outward where needed.
+        cell_size: cube edge of the lattice, of its fine cells where it is graded [m].
+        coarse_cell_size: edge of the largest cells, 2 or 4 times `cell_size` [m]; left out, all cells are alike.
+        fine_triangles: where the lattice is fine if it is graded: triangle indices or one bool per triangle, such as
+            `triangles_facing` gives; left out, along the whole surface.
+        fine_depth: cells that come within this distance of such a triangle along each axis are fine [m].
+
+    Warns:
+        UserWarning: says what was dropped where thin parts fell off the largest body, or how many edges of the
+            boundary belong to more than two boundary triangles (a wall of thickness 0 there).
+
+    Raises:
+        MeshError: names what is wrong with the surface (see `check_surface`), or a cell size that would work.
+    """
+    size = float(cell_size)
+    if not (np.isfinite(size) and size > 0):
+        raise MeshError(f"cell_size is {cell_size}; the rule is a positive length in metres")
+    coarsest = checked_coarsest(size, coarse_cell_size, fine_triangles, fine_depth)
+    points, corners = check_surface(vertices, triangles)
+    check_cell_size(np.ptp(points, axis=0), surface_volume(points, corners), size)
+    if coarsest:
+        check_coarse_cell_size(points, size, coarsest)
+        fine = checked_fine_triangles(fine_triangles, len(corners))
+        nodes, tets = stuff_graded(points, corners, fine, size, float(fine_depth), coarsest)
+    else:
+        nodes, tets = stuff(points, corners, lattice_around(points, size))
+    if not len(tets):
+        raise MeshError(
+            f"cell_size {size:g} m leaves no tets: every part of the surface is thinner than a cell; try {size / 2:g} m"
+        )
+    finer = f"a coarse_cell_size below {coarse_cell_size:g} m" if coarsest else f"a cell_size below {size:g} m"
+    return largest_body_mesh(nodes, tets, finer)
+
+
+def largest_body_mesh(nodes: FloatArray, tets: Int64Array, finer: str) -> TetMesh:
+    """The largest body of tets of any orientation, in the order of the kernels; warns as `mesh_surface` does.
+
+    Args:
+        nodes: points [m], shape (n, 3).
+        tets: shape (n_tet, 4), not oriented.
+        finer: what keeps thinner parts, for the warnings.
+    """
+    tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), finer)
+    used, renumbered = np.unique(tets, return_inverse=True)
+    mesh = _swept_mesh(nodes[used], renumbered.reshape(-1, 4))
+    _warn_of_pinches(mesh, finer)
+    return mesh
+
+
+def check_cell_size(extent: FloatArray, volume: float, size: float) -> None:
+    """Refuse cells that are too coarse or too fine for a body of an extent (3,) [m] and a volume [m^3]."""
+    smallest = extent.min()
+    if smallest < CELLS_ACROSS_MIN * size:
+        raise MeshError(
+            f"cell_size {size:g} m is too coarse: the body is {smallest:.4g} m across its smallest extent, the "
+            f"rule is at least {CELLS_ACROSS_MIN} cells: use {smallest / (2 * CELLS_ACROSS_MIN):.2g} m or less"
+        )
+    tet_count = TETS_PER_CELL * volume / size**3
+    grid_count = np.prod(2 * extent / size)
+    finest = max((TETS_PER_CELL * volume / TET_LIMIT) ** (1 / 3), 2 * (np.prod(extent) / GRID_LIMIT) ** (1 / 3))
+    if tet_count > TET_LIMIT or grid_count > GRID_LIMIT:
+        raise MeshError(
+            f"cell_size {size:g} m would give about {tet_count:.3g} tets in {grid_count / 8:.3g} cells; the rule is "
+            f"at most {TET_LIMIT:g} tets: use {1.05 * finest:.2g} m or more (is it in metres?)"
+        )
+
+
+def _swept_mesh(points: FloatArray, tets: Int64Array) -> TetMesh:
+    """The mesh of the tets, oriented, in the order of the kernels."""
+    return TetMesh(points, _positive(points, tets)[swept(points, tets)])
+
+
+def _positive(points: FloatArray, tets: Int64Array) -> Int64Array:
+    """The tets with corners ordered so that every volume is positive, shape (n_tet, 4)."""
+    negative = tet_volumes(points, tets) < 0
+    return np.where(negative[:, None], tets[:, [0, 1, 3, 2]], tets)
+
+
+def _largest_body(tets: Int64Array, volumes: FloatArray, finer: str) -> Int64Array:
+    """The tets of the largest part that is connected through faces; a common edge or node alone is a hinge."""
+    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    twin = np.flatnonzero((np.diff(faces[order], axis=0) == 0).all(axis=1))
+    left, right = order[twin] // 4, order[twin + 1] // 4
+    graph = coo_array((np.ones(len(twin), dtype=np.int8), (left, right)), shape=(len(tets), len(tets)))
+    count, label = connected_components(graph, directed=False)
+    if count == 1:
+        return tets
+    kept = label == np.argmax(np.bincount(label))
+    share = np.abs(volumes[~kept]).sum() / np.abs(volumes).sum()
+    warnings.warn(
+        f"{count - 1} part(s) of {int((~kept).sum())} tets ({share:.2%} of the volume) hang on the body by less than "
+        f"a face and were dropped; {finer} keeps thinner parts",
+        UserWarning,
+        stacklevel=4,
+    )
+    return tets[kept]
+
+
+def _warn_of_pinches(mesh: TetMesh, finer: str) -> None:
+    sides = np.sort(mesh.boundary_triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, count = np.unique(sides, axis=0, return_counts=True)
+    pinched = np.flatnonzero(count > 2)
+    if pinched.size:
+        first, second = edges[pinched[0]].tolist()
+        warnings.warn(
+            f"{pinched.size} edge(s) of the boundary, first {first}-{second}, belong to more than two boundary "
+            f"triangles: the body has no thickness there; {finer} resolves the wall",
+            UserWarning,
+            stacklevel=4,
+        )

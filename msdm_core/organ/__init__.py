@@ -1,0 +1,1 @@
+"""Compiling an organ, its supports, its stable step, and advancing it."""

@@ -1,0 +1,239 @@
+"""Compiling an organ from its specification, and its state at rest."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
+from msdm_core.kernels.structure_kernels import LaneModel, OrganModel, OrganState
+from msdm_core.kernels.vector_kernels import aligned_zeros
+from msdm_core.material.lumping import MassScheme, lump_mass
+from msdm_core.material.regions import (
+    Capsule,
+    Damping,
+    Lesion,
+    Material,
+    averaged_volume_modulus,
+    boundary_layer,
+    lesion_fraction,
+    mixed_moduli,
+    nodal_average,
+)
+from msdm_core.material.stiffness import membrane_stiffness, spring_network
+from msdm_core.mesh.ordering import spring_order
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
+from msdm_core.organ.settling import settle
+from msdm_core.organ.stability import own_step
+from msdm_core.organ.support import Support, SupportLaw, support_fields
+
+
+@dataclass(frozen=True)
+class OrganSpec:
+    """The specification of an organ, for `compile_organ`.
+
+    Args:
+        mesh: its tets.
+        materials: one Material, or a mapping from mesh region name to Material that covers every region.
+        capsule: the outer layer, or None.
+        lesions: regions of their own material, applied in order.
+        anchors: indices of the nodes held fixed, shape (n_anchor,).
+        damping: Rayleigh damping; the default damps a 10 Hz mode with ratio 0.1.
+        mass_scheme: "barycentric" (eq. 2) or "voronoi" (eq. 5).
+        stiffness_rule: "lloyd" (eq. 6), "fitted" (eq. 6 times factors fitted to the mesh) or "van_gelder".
+        gravity: [m/s^2]; off by default, because a scanned shape is the equilibrium.
+        supports: fixed solids that it rests on.
+        support_law: how they hold it off.
+    """
+
+    mesh: TetMesh
+    materials: Material | Mapping[str, Material]
+    capsule: Capsule | None = None
+    lesions: tuple[Lesion, ...] = ()
+    anchors: ArrayLike = ()
+    damping: Damping = field(default_factory=lambda: Damping(alpha=4.0 * math.pi))
+    mass_scheme: MassScheme = "barycentric"
+    stiffness_rule: str = "lloyd"
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    supports: tuple[Support, ...] = ()
+    support_law: SupportLaw = field(default_factory=SupportLaw)
+
+
+def compile_organ(spec: OrganSpec) -> OrganModel:
+    """Masses, springs and volume moduli of an organ, as read-only arrays for the kernels.
+
+    A tet that a lesion fills in part has the mean density by volume, and `mixed_moduli`.
+
+    Raises:
+        OrganError: an organ of impossible size, a region without material, a lesion outside the organ or smaller than
+            a cell, an anchor that is no node, a support smaller than a cell.
+    """
+    mesh = spec.mesh
+    _check_extent(mesh)
+    spring_modulus, bulk, density = _tet_properties(spec)
+    averaged_bulk = averaged_volume_modulus(spring_modulus, bulk)
+    node_volume, node_bulk = nodal_average(mesh, averaged_bulk)
+    nodes, stiffness = spring_network(mesh, spring_modulus, rule=spec.stiffness_rule)
+    if spec.capsule is not None and spec.capsule.thickness is not None:
+        stiffness = stiffness + membrane_stiffness(mesh, spec.capsule.youngs_modulus, spec.capsule.thickness)
+    mass = lump_mass(mesh, density, scheme=spec.mass_scheme)
+    order = spring_order(mesh)
+    nodes, stiffness = nodes[order.springs], stiffness[order.springs]
+    anchored = _anchor_mask(spec.anchors, mesh.node_count)
+    surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
+    corners = mesh.points[surface]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    model = OrganModel(
+        node_rest_position=_read_only(mesh.points),
+        node_mass=_read_only(mass),
+        node_inverse_mass=_read_only(np.where(anchored, 0.0, 1.0 / mass)),
+        spring_nodes=_read_only(nodes),
+        spring_stiffness=_read_only(stiffness),
+        spring_rest_length=_read_only(np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
+        tet_nodes=_read_only(order.tet_nodes),
+        tet_rest_volume=_read_only(mesh.volumes),
+        tet_inverse_volume=_read_only(1.0 / mesh.volumes),
+        tet_bulk=_read_only(bulk - averaged_bulk),
+        tet_averaged_bulk=_read_only(averaged_bulk),
+        node_rest_volume=_read_only(node_volume),
+        node_inverse_volume=_read_only(1.0 / node_volume),
+        node_bulk=_read_only(node_bulk),
+        averages_volume=bool(node_bulk.any()),
+        surface_triangles=_read_only(np.ascontiguousarray(surface)),
+        surface_rest_area=_read_only(area),
+        **support_fields(spec.supports, spec.support_law, mesh, surface, anchored),
+        gravity=_read_only(_checked_gravity(spec.gravity)),
+        alpha=float(spec.damping.alpha),
+        beta=float(spec.damping.beta),
+        stable_step=0.0,
+        added_mass=0.0,
+    )
+    return model._replace(stable_step=own_step(model))
+
+
+def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
+    """A state at rest, with contact memory for `shape_count` shapes; under gravity the settled static equilibrium.
+
+    The organ settles from its undeformed shape onto its supports, their friction included; the organs settled last are
+    remembered (`settling.settle`).
+
+    Raises:
+        OrganDivergedError: gravity turns the organ inside out or it does not settle.
+    """
+    state = blank_state(model, shape_count=shape_count)
+    if np.any(model.gravity != 0.0):
+        settle(model, state)
+    return state
+
+
+def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
+    """The undeformed organ at rest, without contact, with contact memory for `shape_count` shapes."""
+    point_count = len(model.surface_triangles) * QUADRATURE_COUNT
+    return OrganState(
+        node_position=model.node_rest_position.copy(),
+        node_velocity=np.zeros_like(model.node_rest_position),
+        node_force=np.zeros_like(model.node_rest_position),
+        node_tension=np.zeros_like(model.node_mass),
+        row_position=aligned_zeros((len(model.node_mass), 4)),
+        row_velocity=aligned_zeros((len(model.node_mass), 4)),
+        row_force=aligned_zeros((len(model.node_mass), 4)),
+        squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
+        contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
+        contact_stretch=np.zeros((shape_count, point_count, 3)),
+        contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
+        contact_passed=np.zeros(2, dtype=np.int32),
+        support_stretch=np.zeros(support_shape(model)),
+        volume_ratio_smallest=np.ones(1),
+        lane_fault=np.zeros(1, dtype=np.int32),
+        moving=np.ones(1),
+        finite_sum=np.zeros(1),
+        candidate_count=np.zeros(1, dtype=np.int32),
+        contact_kept=np.ones(1, dtype=np.uint8),
+    )
+
+
+def support_shape(model: OrganModel | LaneModel) -> tuple[int, int, int]:
+    """Shape of the memory of supports, `support_stretch`: nodes that may be held, supports, 3."""
+    return len(model.support_nodes), len(model.support_kind), 3
+
+
+def _check_extent(mesh: TetMesh) -> None:
+    extent = float(np.ptp(mesh.points, axis=0).max())
+    if not SMALLEST_EXTENT <= extent <= LARGEST_EXTENT:
+        raise OrganError(
+            f"the organ is {extent:.4g} m long; between {SMALLEST_EXTENT:g} and {LARGEST_EXTENT:g} m is possible: "
+            'was its length unit forgotten? (length_unit="mm")'
+        )
+
+
+def _checked_gravity(gravity: tuple[float, float, float]) -> FloatArray:
+    vector = np.array(gravity, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise OrganError(f"gravity is {gravity}; it must be three finite numbers, such as (0, 0, -9.81) m/s^2")
+    return vector
+
+
+def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Modulus for the springs [Pa], modulus of the volume term [Pa] and density [kg/m^3] of each tet."""
+    mesh = spec.mesh
+    spring_modulus = np.empty(mesh.tet_count)
+    bulk = np.empty(mesh.tet_count)
+    density = np.empty(mesh.tet_count)
+    layer = boundary_layer(mesh) if spec.capsule is not None and spec.capsule.thickness is None else None
+    for tag, material in _materials_by_tag(spec).items():
+        members = slice(None) if tag is None else mesh.region == tag
+        spring_modulus[members] = material.spring_modulus
+        bulk[members] = material.volume_modulus
+        density[members] = material.density
+        if layer is not None:
+            stroma = Material(cast(Capsule, spec.capsule).youngs_modulus, material.density, material.poisson_ratio)
+            in_layer = layer if tag is None else layer & (mesh.region == tag)
+            spring_modulus[in_layer] = stroma.spring_modulus
+            bulk[in_layer] = stroma.volume_modulus
+    for lesion in spec.lesions:
+        material = cast(Material, lesion.material)
+        fraction = lesion_fraction(mesh, lesion)
+        spring_modulus, bulk = mixed_moduli(spring_modulus, bulk, material, fraction)
+        density += fraction * (material.density - density)
+    return spring_modulus, bulk, density
+
+
+def _materials_by_tag(spec: OrganSpec) -> dict[int | None, Material]:
+    if isinstance(spec.materials, Material):
+        return {None: spec.materials}
+    mesh = spec.mesh
+    by_tag: dict[int | None, Material] = {mesh.region_tag(name): part for name, part in spec.materials.items()}
+    missing = sorted(set(np.unique(mesh.region).tolist()) - set(by_tag))
+    if missing:
+        names = dict(mesh.region_names)
+        raise OrganError(
+            f"mesh region {names.get(missing[0], missing[0])!r} has no material; "
+            "give one for every region in `materials`"
+        )
+    return by_tag
+
+
+def _anchor_mask(anchors: ArrayLike, node_count: int) -> NDArray[np.bool_]:
+    nodes = np.asarray(anchors)
+    mask = np.zeros(node_count, dtype=bool)
+    if nodes.size == 0:
+        return mask
+    if nodes.dtype.kind not in "iu" or nodes.min() < 0 or nodes.max() >= node_count:
+        raise OrganError(
+            f"anchors are node indices in 0..{node_count - 1}; got {nodes.dtype} from {nodes.min()} to {nodes.max()}"
+        )
+    mask[nodes] = True
+    return mask
+
+
+def _read_only(array: NDArray) -> NDArray:
+    array = np.ascontiguousarray(array)
+    if array.flags.writeable:
+        array = array.copy() if array.base is not None else array
+        array.setflags(write=False)
+    return array

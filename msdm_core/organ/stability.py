@@ -1,0 +1,244 @@
+"""The largest stable step of an organ, and the mass that makes a longer one stable.
+
+The step follows from springs, volume term, damping, supports and contact together.
+"""
+
+import math
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels.linear_kernels import multiply_stiffness
+from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray
+
+# Relative accuracy of the largest eigenvalue: 1 % of the step. Lanczos converges from below, so it is added back.
+EIGENVALUE_TOLERANCE = 0.02
+LANCZOS_VECTORS = 12
+
+
+def apply_stiffness(model: OrganModel, displacement: FloatArray, force: FloatArray) -> None:
+    """Fill `force` with the linearised internal forces at rest, K u [N], of a displacement u [m]; both (n_node, 3)."""
+    multiply_stiffness(
+        model.node_rest_position, model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_rest_volume,
+        model.tet_bulk, model.node_rest_volume, model.node_bulk, displacement, np.empty(len(model.node_mass)), force,
+    )  # fmt: skip
+
+
+def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = None) -> float:
+    """Largest angular frequency at rest, w_max = sqrt(lambda_max(M^-1 (K + diag))) [rad/s] (Lanczos, fixed start).
+
+    Args:
+        model: the organ.
+        node_stiffness: stiffness that holds each node, such as contact's [N/m], shape (n_node,).
+    """
+    shape = model.node_rest_position.shape
+    scale = np.sqrt(model.node_inverse_mass)[:, None]
+    held = np.zeros((shape[0], 1)) if node_stiffness is None else node_stiffness[:, None]
+    force = np.empty(shape)
+
+    def apply(vector: FloatArray) -> FloatArray:
+        displacement = scale * vector.reshape(shape)
+        apply_stiffness(model, displacement, force)
+        return (scale * (force + held * displacement)).ravel()
+
+    count = 3 * shape[0]
+    if not model.node_inverse_mass.any():
+        return 0.0
+    if count < 60:
+        matrix = np.column_stack([apply(column) for column in np.eye(count)])
+        return math.sqrt(max(float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[-1]), 0.0))
+    # A fixed start without symmetry: the same organ gives the same step, to the bit.
+    start = np.sin(1.0 + 1.7 * np.arange(count) ** 1.1)
+    # scipy's stubs know neither the factory form of LinearOperator nor a real tolerance.
+    operator = LinearOperator((count, count), matvec=apply, dtype=np.float64)  # pyright: ignore[reportCallIssue]
+    settings = {"which": "LA", "v0": start, "ncv": LANCZOS_VECTORS, "tol": EIGENVALUE_TOLERANCE}
+    value = eigsh(operator, k=1, return_eigenvectors=False, **settings)[0]
+    return math.sqrt(float(value) * (1.0 + EIGENVALUE_TOLERANCE))
+
+
+def contact_node_area(model: OrganModel) -> FloatArray:
+    """Surface area that belongs to each node, a third of each triangle around it [m^2], shape (n_node,)."""
+    thirds = np.repeat(model.surface_rest_area / 3.0, 3)
+    return np.bincount(model.surface_triangles.ravel(), thirds, len(model.node_mass)).astype(np.float64)
+
+
+def contact_node_stiffness(model: OrganModel, contact: ContactLaw) -> FloatArray:
+    """The most that contact can hold each node with, in any direction x [N/m], shape (n_node,).
+
+    A patch of normal n, touched along e (the shape's own normal), holds x with k_p (n.e)^2 (e.x)^2 + k_t (1 - (e.x)^2)
+    per area, at most k_t + (k_p - k_t) ((1 + n.x) / 2)^2 for any e. Over the areas A around a node (a third of each
+    triangle; the rows of its contact stiffness sum to that) and for any x this is at most
+    k_t sum A + (k_p - k_t) (sum A + 2 |sum A n| + lambda_max(sum A n n^T)) / 4: k_p A on a plane, less than three times
+    that where three faces meet in a corner.
+    """
+    corners = model.node_rest_position[model.surface_triangles]
+    share = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6.0
+    nodes, count = model.surface_triangles.ravel(), len(model.node_mass)
+    outer = np.einsum("ti,tj->tij", share, share) / (model.surface_rest_area / 3.0)[:, None, None]
+    vector, matrix = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    np.add.at(vector, nodes, np.repeat(share, 3, axis=0))
+    np.add.at(matrix, nodes, np.repeat(outer, 3, axis=0))
+    area = contact_node_area(model)
+    facing = 0.25 * (area + 2.0 * np.linalg.norm(vector, axis=1) + np.linalg.eigvalsh(matrix)[:, -1])
+    across = contact.tangential_stiffness if contact.friction > 0.0 else 0.0
+    return across * area + max(0.0, contact.stiffness - across) * facing
+
+
+def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) -> float:
+    """Stable step of symplectic Euler for one mode, v' = e^(-alpha dt) v - dt (w^2 x + (beta w^2 + drag) v) [s].
+
+    The characteristic polynomial leaves the unit circle at z = -1, where
+    2 (1 + e^(-alpha dt)) = 2 dt (beta w^2 + drag) + w^2 dt^2; without damping this is dt = 2 / w.
+    """
+    if omega == 0.0 and drag_rate == 0.0:
+        return math.inf
+    rate = beta * omega * omega + drag_rate
+
+    def margin(dt: float) -> float:
+        return 2.0 * (1.0 + math.exp(-alpha * dt)) - 2.0 * dt * rate - (omega * dt) ** 2
+
+    ceiling = 2.0 / omega if omega > 0.0 else 2.0 / rate
+    return ceiling if margin(ceiling) >= 0.0 else float(brentq(margin, 0.0, ceiling, xtol=1e-12))  # pyright: ignore
+
+
+def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
+    """Largest stable step [s]: springs, volume term, alpha, beta, supports, and contact of instruments if given.
+
+    Contact holds each node with `contact_node_stiffness` and drags it with c_p times its area A, supports hold and
+    drag it with `support_hold`, both at once where an instrument presses against a bed; the guard of the shapes' axes
+    needs none, since it is integrated implicitly. Beta damps the organ alone. The step is stable where
+    (K + k_contact) dt^2 + 2 (beta K + c_p A) dt <= 2 (1 + e^(-alpha dt)) M: damping counts as stiffness over dt / 2,
+    taken at a step that is surely stable, as if the stiffest and the most damped mode were the same.
+    """
+    if contact is None:
+        return model.stable_step
+    held, drag = support_hold(model)
+    return _held_step(
+        model, held + contact_node_stiffness(model, contact), drag + contact.damping * contact_node_area(model)
+    )
+
+
+def own_step(model: OrganModel) -> float:
+    """Largest stable step without instruments [s]: springs, volume term, alpha, beta and supports."""
+    if not len(model.support_kind):
+        return step_limit(largest_frequency(model), model.alpha, model.beta)
+    return _held_step(model, *support_hold(model))
+
+
+def support_hold(model: OrganModel) -> tuple[FloatArray, FloatArray]:
+    """The most that supports can hold each node with in any direction [N/m] and drag it with [N s/m], (n_node,) each.
+
+    One support holds a node of area A with k_p A along its normal and less across it; all of them may meet in it.
+    """
+    area = np.zeros(len(model.node_mass))
+    area[model.support_nodes] = len(model.support_kind) * model.support_area
+    return max(model.support_stiffness, model.support_tangential_stiffness) * area, model.support_damping * area
+
+
+def _held_step(model: OrganModel, held: FloatArray, drag: FloatArray) -> float:
+    """Stable step [s] with what holds each node [N/m] and drags it [N s/m], shape (n_node,) each."""
+    most_drag = float((drag * model.node_inverse_mass).max())
+    dt = step_limit(largest_frequency(model, held), model.alpha, model.beta, most_drag)
+    if (not drag.any() and model.beta == 0.0) or not math.isfinite(dt):
+        return dt
+    # From below: damping counts as stiffer, the shorter the step. With beta the first guess is far off.
+    for _ in range(1 if model.beta == 0.0 else 3):
+        organ = 1.0 + 2.0 * model.beta / dt
+        omega = math.sqrt(organ) * largest_frequency(model, (held + 2.0 * drag / dt) / organ)
+        dt = max(dt, step_limit(omega, model.alpha, 0.0))
+    return dt
+
+
+# ---- mass scaling -------------------------------------------------------------------------------------------------
+
+# Largest share of the organ's mass that may be added.
+ADDED_SHARE_LIMIT = 0.1
+# Relative accuracy of w^2 in the bisection, and the most steps of a tenth by which the first guess is lowered.
+FREQUENCY_TOLERANCE = 2.0**-6
+LOWERINGS = 20
+
+
+def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None) -> OrganModel:
+    """The organ with mass added to those nodes that limit the step, so that `step` [s] is stable; itself if it is.
+
+    A node of stiffness k_i (the largest eigenvalue of its own 3 x 3 block of K, with contact) gets the mass
+    max(m_i, k_i / w^2), with the largest w, found by bisection to 1 %, for which `stable_dt` reaches the step.
+
+    Raises:
+        OrganError: a step that is not above 0, an organ under gravity (the added mass would have weight), or an
+            organ that needs more than a tenth of its mass; says how much.
+    """
+    if not (np.isfinite(step) and step > 0.0):
+        raise OrganError(f"step is {step} s; it must be finite and above 0")
+    before = stable_dt(model, contact)
+    if before >= step:
+        return model
+    if np.any(model.gravity != 0.0):
+        raise OrganError(
+            f"gravity is {model.gravity.tolist()}: added mass would have weight: leave out mass scaling or gravity"
+        )
+    stiffness = _node_stiffness(model, contact)
+    free = model.node_inverse_mass > 0.0
+    high = float((stiffness * model.node_inverse_mass).max())
+
+    def is_stable(trial: OrganModel) -> bool:
+        return (own_step(trial) if contact is None else stable_dt(trial, contact)) >= step
+
+    def with_frequency(square: float) -> OrganModel:
+        return _with_mass(model, np.where(free, np.maximum(model.node_mass, stiffness / square), model.node_mass))
+
+    # The step grows as 1 / w at most: the first guess. Neighbouring nodes may make a lower w necessary.
+    low, scaled = high * (before / step) ** 2, model
+    for _ in range(LOWERINGS):
+        trial = with_frequency(low)
+        if is_stable(trial):
+            scaled = trial
+            break
+        low, high = 0.9 * low, low
+    while scaled is not model and high - low > FREQUENCY_TOLERANCE * high:
+        middle = 0.5 * (low + high)
+        trial = with_frequency(middle)
+        if is_stable(trial):
+            low, scaled = middle, trial
+        else:
+            high = middle
+    share = scaled.added_mass / float(model.node_mass.sum())
+    if scaled is model or share > ADDED_SHARE_LIMIT:
+        raise OrganError(
+            f"a stable step of {step * 1e3:.3g} ms instead of {before * 1e3:.3g} ms would add "
+            f"{share:.0%} to the organ's mass; the rule is at most {ADDED_SHARE_LIMIT:.0%}: use more substeps, softer "
+            "lesions or larger cells"
+        )
+    return scaled._replace(stable_step=own_step(scaled))
+
+
+def _with_mass(model: OrganModel, mass: FloatArray) -> OrganModel:
+    """The organ with other masses [kg] (n_node,); its stable step is left to the caller."""
+    inverse = np.where(model.node_inverse_mass > 0.0, 1.0 / mass, 0.0)
+    for array in (mass, inverse):
+        array.setflags(write=False)
+    added = float((mass - model.node_mass).sum()) + model.added_mass
+    return model._replace(node_mass=mass, node_inverse_mass=inverse, added_mass=added)
+
+
+def _node_stiffness(model: OrganModel, contact: ContactLaw | None) -> FloatArray:
+    """Stiffness of each node while all others are fixed, with contact and supports [N/m], shape (n_node,)."""
+    block = np.zeros((len(model.node_mass), 3, 3))
+    span = model.node_rest_position[model.spring_nodes]
+    along = (span[:, 1] - span[:, 0]) / model.spring_rest_length[:, None]
+    springs = model.spring_stiffness[:, None, None] * np.einsum("si,sj->sij", along, along)
+    for end in range(2):
+        np.add.at(block, model.spring_nodes[:, end], springs)
+    corners = model.node_rest_position[model.tet_nodes]
+    modulus = (model.tet_bulk + model.tet_averaged_bulk) * model.tet_inverse_volume
+    for corner in range(4):
+        p, q, r = (corners[:, (corner + turn) % 4] for turn in (1, 2, 3))
+        gradient = np.cross(q - p, r - p) / 6.0
+        np.add.at(
+            block, model.tet_nodes[:, corner], modulus[:, None, None] * np.einsum("ti,tj->tij", gradient, gradient)
+        )
+    held = 0.0 if contact is None else contact_node_stiffness(model, contact)
+    return np.linalg.eigvalsh(block)[:, -1].astype(np.float64) + held + support_hold(model)[0]

@@ -1,0 +1,199 @@
+"""Advancing an organ: contact shapes of tools, symplectic Euler substeps against them, messages about faults."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.errors import OrganDivergedError, OrganError
+from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
+from msdm_core.kernels.structure_kernels import (
+    FAULT_CONTACT_LOST,
+    FAULT_INVERTED_TET,
+    FAULT_NONE,
+    ContactLaw,
+    ContactShapes,
+    OrganModel,
+    OrganState,
+    ToolResponse,
+)
+from msdm_core.kernels.substep_kernels import advance_substeps
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.measure import volume_ratios
+from msdm_core.organ.stability import stable_dt
+
+
+def round_shapes(
+    ends: ArrayLike,
+    radius: ArrayLike,
+    *,
+    span: ArrayLike | None = None,
+    friction: ArrayLike = 1.0,
+    tool: ArrayLike | None = None,
+    centre: ArrayLike | None = None,
+    twist: ArrayLike | None = None,
+) -> ContactShapes:
+    """Contact shapes, all points within a radius of a core: equal ends make a ball, a span makes a rounded box.
+
+    Args:
+        ends: of each core's axis [m], (n_shape, 2, 3).
+        radius: [m], (n_shape,).
+        span: from the axis to the border of a rounded box's core, square to the axis [m], (n_shape, 3); default 0.
+        friction: Coulomb coefficient over that of the contact law, (n_shape,) or one for all.
+        tool: which tool carries each shape, (n_shape,); default the first.
+        centre: each tool's centre of mass [m], (n_tool, 3); default the middle of the first shape that it carries.
+        twist: of each tool [m/s, rad/s], (n_tool, 6); default 0.
+    """
+    axes = np.array(ends, dtype=np.float64).reshape(-1, 2, 3)
+    count = len(axes)
+    carrier = np.zeros(count, dtype=np.int32) if tool is None else np.array(tool, dtype=np.int32)
+    if centre is None:
+        tools, first = np.unique(carrier, return_index=True)
+        centre = axes[first].mean(axis=1).reshape(len(tools), 3)
+    centres: FloatArray = np.array(centre, dtype=np.float64).reshape(-1, 3)
+    return ContactShapes(
+        shape_ends=axes,
+        shape_radius=np.array(radius, dtype=np.float64).reshape(count),
+        shape_tool=carrier,
+        tool_centre=centres,
+        tool_twist=np.zeros((len(centres), 6)) if twist is None else np.array(twist, dtype=np.float64).reshape(-1, 6),
+        shape_span=np.zeros((count, 3)) if span is None else np.array(span, dtype=np.float64).reshape(count, 3),
+        shape_friction=np.broadcast_to(np.asarray(friction, dtype=np.float64), (count,)).copy(),
+    )
+
+
+NO_SHAPES = round_shapes(np.zeros((0, 2, 3)), np.zeros(0), centre=np.zeros((0, 3)))
+NO_CONTACT = ContactLaw(stiffness=1.0, damping=0.0, friction=0.0, tangential_stiffness=1.0)
+
+
+def advance(
+    model: OrganModel,
+    state: OrganState,
+    *,
+    dt: float,
+    substep_count: int = 1,
+    shapes: ContactShapes = NO_SHAPES,
+    contact: ContactLaw = NO_CONTACT,
+) -> FloatArray:
+    """Advance an organ in place by `substep_count` symplectic Euler steps of dt [s], shapes moving along their twist.
+
+    Returns:
+        The mean wrench on each tool over the substeps, torque about its centre of mass at the start: force [N], torque
+        [N m], shape (n_tool, 6).
+
+    Raises:
+        OrganError: dt above the organ's stable step (that with contact where there are shapes), no substep, a state
+            of another organ, shapes that are not finite or name no tool, contact memory that does not fit them.
+        OrganDivergedError: an inverted tet (named, with its volume ratio) or a number that is not finite.
+    """
+    touching = len(shapes.shape_radius) > 0
+    _check_state(model, state, shapes)
+    _check_shapes(shapes)
+    if isinstance(substep_count, bool) or not isinstance(substep_count, int | np.integer) or substep_count < 1:
+        raise OrganError(f"substep_count is {substep_count!r}; it must be a whole number of at least 1")
+    limit = _contact_step(model, contact) if touching else model.stable_step
+    if not 0.0 < dt <= limit:
+        with_contact = " with contact" if touching else ""
+        raise OrganError(
+            f"dt is {dt:g} s; it must be above 0 and at most the stable step{with_contact} {limit:.4g} s: "
+            "use more, shorter substeps"
+        )
+    wrench = np.zeros((len(shapes.tool_centre), 6))
+    fault = advance_organ(model, state, shapes, contact, dt, substep_count, wrench)
+    if fault != FAULT_NONE:
+        raise OrganDivergedError(describe_fault(model, state, fault))
+    return wrench
+
+
+def _check_state(model: OrganModel, state: OrganState, shapes: ContactShapes) -> None:
+    points = len(model.surface_triangles) * QUADRATURE_COUNT
+    nodes = model.node_rest_position.shape
+    arrays = (state.node_position, state.node_velocity, state.node_force)
+    supports = (len(model.support_nodes), len(model.support_kind), 3)
+    fits = state.contact_engaged.shape[1] == points and state.support_stretch.shape == supports
+    if any(array.shape != nodes for array in arrays) or not fits:
+        raise OrganError(
+            f"the state has {len(state.node_position)} nodes with {state.contact_engaged.shape[1]} contact points and "
+            f"memory of supports {state.support_stretch.shape}, the organ {len(model.node_mass)}, {points} and "
+            f"{supports}: make the state with rest_state(model, ...)"
+        )
+    if len(shapes.shape_radius) > len(state.contact_engaged):
+        raise OrganError(
+            f"{len(shapes.shape_radius)} contact shapes, but the state remembers {len(state.contact_engaged)}: "
+            "make it with rest_state(model, shape_count=...)"
+        )
+
+
+def _check_shapes(shapes: ContactShapes) -> None:
+    count, tools = len(shapes.shape_radius), len(shapes.tool_centre)
+    wanted = {
+        **{"shape_ends": (count, 2, 3), "shape_tool": (count,), "shape_span": (count, 3), "shape_friction": (count,)},
+        **{"tool_centre": (tools, 3), "tool_twist": (tools, 6)},
+    }
+    for name, shape in wanted.items():
+        if getattr(shapes, name).shape != shape:
+            raise OrganError(
+                f"{name} has shape {getattr(shapes, name).shape}; with these shapes and tools it is {shape}"
+            )
+    for name in ("shape_ends", "shape_radius", "shape_span", "shape_friction", "tool_centre", "tool_twist"):
+        if not np.isfinite(getattr(shapes, name)).all():
+            raise OrganError(f"{name} has a number that is not finite: check the tool's pose and twist")
+    if count and not (0 <= shapes.shape_tool.min() and shapes.shape_tool.max() < tools):
+        raise OrganError(f"shape_tool names tools {shapes.shape_tool.tolist()}; there are tools 0 to {tools - 1}")
+
+
+_contact_step_known: list[tuple[OrganModel, ContactLaw, float]] = []
+
+
+def _contact_step(model: OrganModel, contact: ContactLaw) -> float:
+    """`stable_dt` with contact, remembered for the last organ: it takes as long as many steps."""
+    for known, law, step in _contact_step_known:
+        if known is model and law == contact:
+            return step
+    _contact_step_known[:] = [(model, contact, stable_dt(model, contact))]
+    return _contact_step_known[0][2]
+
+
+def advance_organ(
+    model: OrganModel,
+    state: OrganState,
+    shapes: ContactShapes,
+    contact: ContactLaw,
+    dt: float,
+    substep_count: int,
+    wrench: FloatArray,
+    response: ToolResponse | None = None,
+) -> int:
+    """`advance` without its checks, for loops that checked once: fills `wrench`, returns a FAULT_ code.
+
+    With a `response` the force of the tissue changes `shapes.tool_twist` within the call.
+    """
+    decay = math.exp(-model.alpha * dt)
+    reference = shapes.tool_centre.copy()
+    if response is None:
+        response = unyielding(len(reference))
+    return advance_substeps(model, state, shapes, contact, response, dt, decay, substep_count, reference, wrench)
+
+
+def unyielding(tool_count: int) -> ToolResponse:
+    """The response of tools that follow their twist whatever force the tissue exerts."""
+    return ToolResponse(*(np.zeros((tool_count, *shape)) for shape in ((6,), (tool_count, 6, 6), (6,), (6,))))
+
+
+def describe_fault(model: OrganModel, state: OrganState, fault: int) -> str:
+    """One sentence on a FAULT_ code: what happened and where."""
+    bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
+    if fault == FAULT_INVERTED_TET and not bad.size:
+        ratios = volume_ratios(model, state)
+        tet = int(np.argmin(ratios))
+        return (
+            f"tet {tet} turned inside out: volume ratio {ratios[tet]:.3g}, it must stay above 0: press less deep, use "
+            "smaller cells or a higher Poisson's ratio"
+        )
+    if fault == FAULT_CONTACT_LOST:
+        shape, triangle = state.contact_passed.tolist()
+        return (
+            f"contact lost: contact shape {shape} passed through surface triangle {triangle}: press less deep or more "
+            "slowly, use smaller cells or a larger shape"
+        )
+    return f"node {int(bad[0]) if bad.size else 0} is no longer finite: the step is too long for the forces at work"

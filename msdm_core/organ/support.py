@@ -1,0 +1,181 @@
+"""Supports: fixed planes, boxes, spheres and capsules on which an organ rests, such as a bed."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels.support_kernels import BOX, CAPSULE, PLANE, SPHERE
+from msdm_core.mesh.quality import surface_cell
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+
+Vector = tuple[float, float, float]
+
+KINDS = {"plane": PLANE, "sphere": SPHERE, "capsule": CAPSULE, "box": BOX}
+# What the numbers of `Support.size` are, as in MuJoCo [m].
+SIZES = {
+    "plane": (),
+    "sphere": ("radius",),
+    "capsule": ("radius", "half length along its z axis"),
+    "box": ("half size along x", "half size along y", "half size along z"),
+}
+
+
+@dataclass(frozen=True)
+class Support:
+    """A fixed solid that an organ rests on; kinds, sizes and frames as in MuJoCo.
+
+    Args:
+        name: used in messages and pictures.
+        kind: "plane" (solid below, infinite), "box", "sphere" or "capsule".
+        position: of a plane's point, of the others' middle [m].
+        axis: where its z axis points, turned there the shortest way: a plane's normal, a capsule's axis.
+        rotation: the whole orientation as a quaternion (w, x, y, z), in place of `axis`.
+        size: empty for a plane; radius; radius and half length; three half sizes [m].
+        friction: Coulomb coefficient between it and the organ.
+    """
+
+    name: str
+    kind: str
+    position: Vector = (0.0, 0.0, 0.0)
+    axis: Vector | None = None
+    rotation: tuple[float, float, float, float] | None = None
+    size: tuple[float, ...] = ()
+    friction: float = 0.3
+
+    def __post_init__(self) -> None:
+        what = f"support {self.name!r}"
+        if not self.name or self.kind not in KINDS:
+            raise OrganError(f"{what}: kind is {self.kind!r}; give a name and one of the kinds {', '.join(KINDS)}")
+        _require_numbers(f"{what}: position", self.position, 3)
+        if self.axis is not None and self.rotation is not None:
+            raise OrganError(f"{what}: axis and rotation are both given; give one of them")
+        for entry, count in (("axis", 3), ("rotation", 4)):
+            value = getattr(self, entry)
+            if value is not None:
+                _require_numbers(f"{what}: {entry}", value, count)
+                if math.hypot(*value) < 1e-9:
+                    raise OrganError(f"{what}: {entry} is {value}; it must not be zero")
+        _require_numbers(f"{what}: size", self.size, len(SIZES[self.kind]), SIZES[self.kind])
+        if not all(number > 0.0 for number in self.size):
+            raise OrganError(f"{what}: size is {self.size} m; every number must be above 0")
+        if not (math.isfinite(self.friction) and self.friction >= 0.0):
+            raise OrganError(f"{what}: friction is {self.friction:g}; it must be finite and at least 0")
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """Its orientation (w, x, y, z) of length 1, shape (4,)."""
+        if self.rotation is not None:
+            return np.array(self.rotation) / math.hypot(*self.rotation)
+        x, y, z = np.array(self.axis or (0.0, 0.0, 1.0)) / math.hypot(*(self.axis or (1.0,)))
+        # From z to the axis: half the angle about z x axis; straight down is a half turn about x.
+        turn = np.array([1.0 + z, -y, x, 0.0])
+        length = float(np.linalg.norm(turn))
+        return np.array([0.0, 1.0, 0.0, 0.0]) if length < 1e-9 else turn / length
+
+    @property
+    def frame(self) -> FloatArray:
+        """Its axes in the world, one a column, shape (3, 3)."""
+        w, x, y, z = self.quaternion
+        return np.array(
+            [
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+                [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+                [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+            ]
+        )
+
+    def reach(self, direction: FloatArray) -> float:
+        """Its largest coordinate along a unit direction [m]; infinite for a plane."""
+        along = direction @ self.frame
+        if self.kind == "plane":
+            return math.inf
+        if self.kind == "box":
+            out = float(np.abs(along) @ self.size)
+        else:
+            out = self.size[0] + (self.size[1] * abs(float(along[2])) if self.kind == "capsule" else 0.0)
+        return float(direction @ np.array(self.position)) + out
+
+
+@dataclass(frozen=True)
+class SupportLaw:
+    """Contact law of supports, per unit of the surface area of the organ; sticking friction is half as stiff.
+
+    Args:
+        stiffness: pressure per penetration, k_p [N/m^3].
+        damping: pressure per closing speed [N s/m^3].
+    """
+
+    stiffness: float = 1e7
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.stiffness) and self.stiffness > 0.0):
+            raise OrganError(f"supports: stiffness is {self.stiffness:g} N/m^3; it must be finite and above 0")
+        if not (math.isfinite(self.damping) and self.damping >= 0.0):
+            raise OrganError(f"supports: damping is {self.damping:g} N s/m^3; it must be finite and at least 0")
+
+
+def support_fields(
+    supports: Sequence[Support], law: SupportLaw, mesh: TetMesh, surface: IntArray, anchored: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """The fields of an OrganModel that describe its supports.
+
+    Args:
+        supports: the solids.
+        law: their contact law.
+        mesh: the organ.
+        surface: its triangles that may be touched, shape (n_surface, 3).
+        anchored: the nodes held fixed, shape (n_node,); supports do not act on them.
+
+    Raises:
+        OrganError: two supports of one name, or one too small for the organ's cells to feel.
+    """
+    names = [support.name for support in supports]
+    for name in names:
+        if names.count(name) > 1:
+            raise OrganError(f"two supports are named {name!r}; names must differ: rename one")
+    if supports:
+        _check_sizes(supports, surface_cell(mesh, surface))
+    corners = mesh.points[surface]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    node_area = np.bincount(surface.ravel(), np.repeat(area / 3.0, 3), mesh.node_count)
+    nodes = np.flatnonzero((node_area > 0.0) & ~anchored) if supports else np.zeros(0, dtype=np.int64)
+    fields = {
+        "support_kind": np.array([KINDS[support.kind] for support in supports], dtype=np.int32),
+        "support_position": np.array([support.position for support in supports]).reshape(-1, 3),
+        "support_rotation": np.array([support.frame for support in supports]).reshape(-1, 3, 3),
+        "support_size": np.array([(*support.size, 0.0, 0.0, 0.0)[:3] for support in supports]).reshape(-1, 3),
+        "support_friction": np.array([support.friction for support in supports], dtype=np.float64),
+        "support_nodes": nodes.astype(np.int32),
+        "support_area": node_area[nodes].astype(np.float64),
+    }
+    for array in fields.values():
+        array.setflags(write=False)
+    return fields | {
+        "support_stiffness": float(law.stiffness),
+        "support_damping": float(law.damping),
+        "support_tangential_stiffness": 0.5 * float(law.stiffness),
+    }
+
+
+def _check_sizes(supports: Sequence[Support], cell: float) -> None:
+    """Refuse solids small enough to fit between nodes: contact acts on nodes only."""
+    for support in supports:
+        widths = support.size[:1] if support.kind == "capsule" else support.size
+        if widths and min(widths) < cell:
+            raise OrganError(
+                f"support {support.name!r}: {SIZES[support.kind][int(np.argmin(widths))]} is {min(widths) * 1e3:.3g} "
+                f"mm; it must be at least the organ's surface cells, {cell * 1e3:.3g} mm, or the nodes miss it: make "
+                "it larger or the cells smaller"
+            )
+
+
+def _require_numbers(what: str, values: Sequence[float], count: int, meaning: tuple[str, ...] = ()) -> None:
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        means = f" ({', '.join(meaning)})" if meaning else ""
+        raise OrganError(f"{what} is {values}; it must be {count} finite numbers{means}")

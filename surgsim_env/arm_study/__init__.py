@@ -1,0 +1,1 @@
+"""Evaluation of two arms on a patient: reach, clearance, dexterity, forces."""

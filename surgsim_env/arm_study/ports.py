@@ -1,0 +1,239 @@
+"""Where two arms and the endoscope enter a patient: a ports file, its defaults, and the body wall they pass."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.arm_study.clearance import outside_ball, point_segment_distance
+from surgsim_env.arm_study.kinematics import dot
+from surgsim_env.instruments.arm.arm_instrument import inside_surface
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.load import fill, read_toml
+from surgsim_env.scene.model import Port
+from surgsim_env.scene.palpable_surface import tangent_axes
+
+Vector = tuple[float, float, float]
+# The camera's port lies 10 to 20 cm from the target, the instruments' 8 cm beside it (6 to 10 cm), all on a line across
+# the line of sight (port placement for da Vinci, aischannel 2019).
+CAMERA_DISTANCE, PORT_SPACING = 0.15, 0.08
+
+
+@dataclass(frozen=True)
+class PortPlace:
+    """An instrument's port.
+
+    Args:
+        point: the trocar [m].
+        into: direction into the body, or
+        target: the point that the instrument points at [m].
+        roll: turn of the arm's base about that direction [rad].
+    """
+
+    point: Vector
+    into: Vector | None = None
+    target: Vector | None = None
+    roll: float = 0.0
+
+    def __post_init__(self) -> None:
+        if (self.into is None) == (self.target is None):
+            raise ValueError(f"port at {self.point}: give exactly one of into and target")
+        self.port  # noqa: B018  raises for an invalid port
+
+    @property
+    def port(self) -> Port:
+        """The port's frame."""
+        return Port(self.point, self.into or _towards(self.point, self.target), self.roll)
+
+
+@dataclass(frozen=True)
+class EndoscopePort:
+    """The port of the endoscope [m] and the point that it looks at [m]."""
+
+    point: Vector
+    target: Vector
+
+    def __post_init__(self) -> None:
+        _towards(self.point, self.target)
+
+
+@dataclass(frozen=True)
+class InnerTarget:
+    """A point inside the patient that both arms should reach [m]."""
+
+    point: Vector
+    name: str = "target"
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.point).all():
+            raise ValueError(f"target {self.name!r} is at {self.point}; every number must be finite")
+
+
+@dataclass(frozen=True)
+class Wall:
+    """The insufflated body wall: a dome of even thickness (of a sphere) or a plate, its middle through the trocars.
+
+    Args:
+        thickness: [m].
+        hole: distance from a trocar within which shapes may pass [m].
+        radius: of the dome [m]; 20 cm is chosen for an insufflated abdomen.
+        plate: an infinite plate instead of the dome.
+        normal: out of the body; found from the ports where none is given.
+    """
+
+    thickness: float = 0.02
+    hole: float = 0.03
+    radius: float = 0.20
+    plate: bool = False
+    normal: Vector | None = None
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.thickness < math.inf and 0.5 * self.thickness < self.hole < math.inf):
+            raise ValueError(
+                f"wall: thickness {self.thickness:g} m, hole {self.hole:g} m; the rule is "
+                "0 <= thickness < 2 hole, finite"
+            )
+        if not self.thickness < self.radius < math.inf:
+            raise ValueError(f"wall.radius is {self.radius:g} m; it must be finite and above the thickness")
+        if self.normal is not None and not (np.isfinite(self.normal).all() and any(self.normal)):
+            raise ValueError(f"wall.normal is {self.normal}; it must be a direction such as [0, 0, 1]")
+
+
+@dataclass(frozen=True)
+class Ports:
+    """A ports file: two instruments, the endoscope, inner targets and the wall; `name` is the file's stem."""
+
+    left: PortPlace
+    right: PortPlace
+    endoscope: EndoscopePort
+    targets: tuple[InnerTarget, ...] = ()
+    wall: Wall = Wall()
+    name: str = "ports"
+
+    def __post_init__(self) -> None:
+        if math.dist(self.left.point, self.right.point) < 1e-3:
+            raise ValueError(f"the left and the right port both lie at {self.left.point}: move them apart")
+        apart = math.dist(self.left.point, self.right.point)
+        if not self.wall.plate and not 0.5 * apart < self.wall.radius:
+            raise ValueError(
+                f"the ports lie {apart * 1e3:.0f} mm apart, more than the dome is wide: raise wall.radius above "
+                f"{0.5 * apart:.3f} m, or use wall.plate = true"
+            )
+
+    def wall_clearance(self, segments: FloatArray, trocar: FloatArray) -> FloatArray:
+        """Distances of segments (..., 2, 3) from the wall [m]; negative within it, inf where all lies in the hole.
+
+        With heights from h0 to h1 above the wall's middle surface and a thickness t:
+        max(h0 - t/2, -t/2 - h1): how far a segment is, or would have to be moved to be, clear of it.
+        """
+        parts, left = outside_ball(segments, trocar, self.wall.hole)
+        low, high = self._heights(parts)
+        half = 0.5 * self.wall.thickness
+        return np.where(left, np.maximum(low - half, -half - high), np.inf).min(axis=-1)
+
+    def _heights(self, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest height of segments (..., 2, 3) above the middle of the wall [m]."""
+        if self.wall.plate:
+            middle = 0.5 * (np.array(self.left.point) + np.array(self.right.point))
+            heights = (segments - middle) @ self.wall_normal
+            return heights.min(axis=-1), heights.max(axis=-1)
+        centre, radius = self.dome_centre, self.wall.radius
+        nearest = point_segment_distance(centre, segments)
+        furthest = np.sqrt(dot(segments - centre, segments - centre)).max(axis=-1)
+        return nearest - radius, furthest - radius
+
+    @property
+    def dome_centre(self) -> FloatArray:
+        """Middle of the dome's sphere [m] (3,): both ports lie on it, below them along the wall's normal."""
+        left, right = np.array(self.left.point), np.array(self.right.point)
+        depth = math.sqrt(self.wall.radius**2 - 0.25 * float((right - left) @ (right - left)))
+        return 0.5 * (left + right) - depth * self.wall_normal
+
+    @property
+    def wall_normal(self) -> FloatArray:
+        """Out of the body (3,): across the line of both ports, as given or against their mean direction inwards."""
+        line = np.array(self.right.point) - np.array(self.left.point)
+        line /= np.linalg.norm(line)
+        given = self.wall.normal
+        out = self.left.port.rotation[:, 2] + self.right.port.rotation[:, 2] if given is None else np.array(given)
+        out = out - (out @ line) * line
+        length = float(np.linalg.norm(out))
+        if length < 1e-6:
+            raise ValueError(
+                "the wall's normal lies along the line of the ports, which defines no wall: give wall.normal"
+            )
+        return out / length
+
+    @property
+    def frames(self) -> dict[str, Port]:
+        """The frames of all three ports by name; the endoscope's looks at its target."""
+        scope = self.endoscope
+        direction = _towards(scope.point, scope.target)
+        return {"left": self.left.port, "right": self.right.port, "endoscope": Port(scope.point, direction)}
+
+    def check_outside(self, anatomy: Anatomy) -> None:
+        """Refuse a port inside the organ.
+
+        Raises:
+            ValueError: names the port, its place and the organ.
+        """
+        mesh = anatomy.mesh
+        for name, point in (
+            ("left", self.left.point),
+            ("right", self.right.point),
+            ("endoscope", self.endoscope.point),
+        ):
+            if inside_surface(point, mesh.points, mesh.boundary_triangles):
+                place = ", ".join(f"{value * 1e3:.1f}" for value in point)
+                raise ValueError(
+                    f"the {name} port at ({place}) mm lies inside the organ of scene {anatomy.scene.name!r}: "
+                    "move it out through the body wall"
+                )
+
+
+def read_ports(path: str | Path) -> Ports:
+    """The ports that a TOML file describes.
+
+    Raises:
+        ValueError: a file that cannot be read, or the entry that is wrong in it.
+    """
+    table = read_toml(Path(path), "ports")
+    return ports_from_table(table, name=Path(path).stem)
+
+
+def ports_from_table(table: dict[str, Any], *, name: str) -> Ports:
+    """Ports from a table such as a TOML file holds."""
+    return fill(Ports, {"name": name, **table}, f"ports {name!r}")
+
+
+def default_ports(anatomy: Anatomy) -> Ports:
+    """Ports by the rules of laparoscopy: the camera 15 cm before the palpable face, the others 8 cm to both sides.
+
+    All three lie on a line across the line of sight (the scene's approach) and look at the middle of the face.
+    """
+    face = anatomy.face
+    corners = face.points[face.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    target = area @ corners.mean(axis=1) / area.sum()
+    aside, _ = tangent_axes(face.approach)
+    camera = target - CAMERA_DISTANCE * face.approach
+    return Ports(
+        left=PortPlace(_vector(camera - PORT_SPACING * aside), target=_vector(target)),
+        right=PortPlace(_vector(camera + PORT_SPACING * aside), target=_vector(target)),
+        endoscope=EndoscopePort(_vector(camera), _vector(target)),
+        name="default",
+    )
+
+
+def _vector(values: FloatArray) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _towards(point: Vector, target: Vector | None) -> Vector:
+    if target is None or not np.isfinite([*point, *target]).all() or math.dist(point, target) < 1e-6:
+        raise ValueError(f"port at {point}: its target {target} must be another, finite point")
+    return _vector(np.array(target) - np.array(point))

@@ -1,0 +1,261 @@
+"""Points that an arm reaches, reasons for the others, and its dexterity there; points that both arms reach at once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from surgsim_env.arm_study import dexterity
+from surgsim_env.arm_study.candidates import (
+    REACHED,
+    Candidates,
+    approach_directions,
+    approach_share,
+    from_directions,
+    from_neighbours,
+    from_starts,
+    spread_starts,
+    still_open,
+)
+from surgsim_env.arm_study.collisions import Surroundings, arm_distances
+from surgsim_env.arm_study.kinematics import BatchKinematics
+from surgsim_env.arm_study.results import ArmReach
+
+# Number of candidates whose clearance is computed at once.
+CANDIDATES_AT_ONCE = 20_000
+# Arms at once keep this apart [m].
+ARM_DISTANCE = 0.005
+# Candidates of each arm that are paired where the reported joints come too close.
+WAYS = 6
+
+
+@dataclass(frozen=True)
+class Sites:
+    """Targets of the arms: points and outward normals (n, 3) [m], and which lie inside the organ (n,)."""
+
+    points: FloatArray
+    normals: FloatArray
+    inner: NDArray[np.bool_]
+
+    def tips(self, ball: float) -> FloatArray:
+        """Where the tip is when its ball [m] touches the surface; at an inner target, the target itself."""
+        return self.points + np.where(self.inner, 0.0, ball)[:, None] * self.normals
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Reach of an arm: its report, all candidates, and which of these pass every test (n, k)."""
+
+    report: ArmReach
+    kinematics: BatchKinematics
+    candidates: Candidates
+    usable: NDArray[np.bool_]
+
+
+def tip_ball(kinematics: BatchKinematics) -> float:
+    """Radius of the ball at whose centre the tip lies [m], 0 without one."""
+    arm = kinematics.arm
+    name = arm.description.tip.ball
+    if name is None:
+        return 0.0
+    geom = arm.model.geom(name)
+    same_body = geom.bodyid[0] == arm.model.site_bodyid[arm.tip_site]
+    centred = np.linalg.norm(geom.pos - arm.model.site_pos[arm.tip_site]) < 1e-6
+    return float(geom.size[0]) if same_body and centred else 0.0
+
+
+def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Surroundings) -> Reach:
+    """Reach and dexterity of one arm at every site.
+
+    A point is reached if among the candidates from all starts, directions and neighbours one puts the tip within 1 mm
+    of it, keeps limits and trocar and clears organ and wall. The reported joints are those of the
+    usable candidate furthest from the joint limits.
+    """
+    ports = around.ports
+    directions = approach_directions(
+        sites.normals,
+        np.array(ports.endoscope.point) - sites.points,
+        np.array(ports.right.point) - np.array(ports.left.point),
+    )
+    search = _Search(kinematics, sites, around, sites.tips(around.ball), directions)
+    found, clear = search.all_around(*search.from_starts())
+    usable = _every(clear)
+    report = _report(search, found, usable, _reasons(search, found, clear))
+    return Reach(report, kinematics, found, usable)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """An arm, its targets and obstacles; positions of its tip (n, 3) [m] and approach directions (n, 32, 3)."""
+
+    kinematics: BatchKinematics
+    sites: Sites
+    around: Surroundings
+    tips: FloatArray
+    directions: FloatArray
+
+    def from_starts(self) -> tuple[Candidates, NDArray[np.bool_]]:
+        """Candidates from spread starts and from neighbours, and what they clear (3, n, k)."""
+        starts = spread_starts(self.kinematics)
+        found = from_neighbours(self.kinematics, self.tips, from_starts(self.kinematics, self.tips, starts))
+        return found, self.clear(found)
+
+    def all_around(self, found: Candidates, clear: NDArray[np.bool_]) -> tuple[Candidates, NDArray[np.bool_]]:
+        """More candidates, from every direction, twice: begun at any that meets the point, then at the usable ones."""
+        for begin in (found.met, None):
+            if begin is None:
+                # Where none is usable, the second round too begins at candidates that meet the point.
+                usable = _every(clear)
+                begin = np.where(np.any(usable, axis=1, keepdims=True), usable, found.met)
+            wanted = still_open(self.directions, found, _every(clear)) & np.any(found.met, axis=1, keepdims=True)
+            rows = np.flatnonzero(np.any(wanted, axis=1))
+            more = _empty_like(found, self.directions.shape[1])
+            if rows.size:
+                directions, tips = self.directions[rows], self.tips[rows]
+                part = from_directions(self.kinematics, tips, directions, _rows(found, rows), begin[rows])
+                for name in vars(more):
+                    getattr(more, name)[rows] = getattr(part, name)
+            clear = np.concatenate([clear, self.clear(more)], axis=2)
+            found = found.add(more)
+        return found, clear
+
+    def clear(self, found: Candidates) -> NDArray[np.bool_]:
+        """Which candidates meet their point, and of these which clear the organ, and the wall: (3, n, k)."""
+        result = np.zeros((3, *found.met.shape), dtype=bool)
+        result[0] = found.met
+        points, places = np.nonzero(found.met)
+        for low in range(0, len(points), CANDIDATES_AT_ONCE):
+            point, place = points[low : low + CANDIDATES_AT_ONCE], places[low : low + CANDIDATES_AT_ONCE]
+            chain = self.kinematics.at(found.joints[point, place])
+            off_organ = self.around.organ_clearance(self.kinematics, chain, exact=False) >= 0.0
+            result[1, point, place] = off_organ | self.sites.inner[point]
+            result[2, point, place] = self.around.wall_clearance(self.kinematics, chain) >= 0.0
+        return result
+
+
+def _every(clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which candidates pass every test, (n, k)."""
+    return np.logical_and.reduce(clear, axis=0)
+
+
+def _rows(found: Candidates, rows: NDArray) -> Candidates:
+    return Candidates(*(values[rows] for values in vars(found).values()))
+
+
+def _empty_like(found: Candidates, count: int) -> Candidates:
+    """Candidates that meet nothing."""
+    points, _, joints = found.joints.shape
+    errors = np.full((points, count), np.inf)
+    return Candidates(np.zeros((points, count, joints)), errors, errors.copy(), np.zeros((points, count, 3)))
+
+
+def _reasons(search: _Search, found: Candidates, clear: NDArray[np.bool_]) -> IntArray:
+    """Index into REASONS of each point: the first test that no candidate passes, (n,)."""
+    kinematics, tips = search.kinematics, search.tips
+    reason = np.where(np.any(_every(clear[:2]), axis=1), 5, 4)
+    reason[np.any(_every(clear), axis=1)] = 0
+    lost = np.flatnonzero(~np.any(clear[0], axis=1))
+    if lost.size:
+        starts = spread_starts(kinematics)
+        best = np.argmin(found.position_error[lost] + found.trocar_error[lost], axis=1)
+        own = np.concatenate(
+            [np.broadcast_to(starts, (lost.size, *starts.shape)), found.joints[lost, best][:, None]], axis=1
+        )
+        reason[lost] = 1
+        free = from_starts(kinematics, tips[lost], own, limits=False, trocar=False)
+        reason[lost[np.any(free.position_error <= REACHED, axis=1)]] = 2
+        held = from_starts(kinematics, tips[lost], own, trocar=False)
+        reason[lost[np.any(held.position_error <= REACHED, axis=1)]] = 3
+    return reason.astype(np.int32)
+
+
+def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
+    kinematics, sites, around = search.kinematics, search.sites, search.around
+    rows, good = np.arange(len(reason)), reason == 0
+    worth = np.where(usable, dexterity.limit_margin(kinematics, found.joints), -np.inf)
+    nearest = np.argmin(found.position_error + found.trocar_error, axis=1)
+    best = np.where(good, worth.argmax(axis=1), nearest)
+    joints = found.joints[rows, best]
+    chain = kinematics.at(joints)
+    values = dexterity.scaled_singular_values(kinematics, chain)
+    organ = np.full(len(rows), np.nan)
+    outer = np.flatnonzero(good & ~sites.inner)
+    if outer.size:
+        organ[outer] = around.organ_clearance(kinematics, kinematics.at(joints[outer]), exact=True)
+
+    def where_reached(quantity: FloatArray) -> FloatArray:
+        return np.where(good & np.isfinite(quantity), quantity, np.nan)
+
+    return ArmReach(
+        name=kinematics.arm.description.name,
+        reason=reason,
+        joints=joints,
+        position_error=found.position_error[rows, best],
+        approach_share=where_reached(approach_share(found.pointing, usable, search.directions)),
+        manipulability=where_reached(dexterity.manipulability(values)),
+        isotropy=where_reached(dexterity.isotropy(values)),
+        limit_margin=where_reached(dexterity.limit_margin(kinematics, joints)),
+        tip_force=where_reached(dexterity.tip_force(kinematics, chain, -sites.normals)),
+        trocar_load=where_reached(dexterity.trocar_load(kinematics, chain, -sites.normals)),
+        camera_angle=where_reached(dexterity.camera_angle(chain, sites.points, np.array(around.ports.endoscope.point))),
+        organ_clearance=organ,
+        wall_clearance=where_reached(around.wall_clearance(kinematics, chain)),
+        trocar_error=where_reached(kinematics.trocar_error(chain)),
+    )
+
+
+@dataclass(frozen=True)
+class BothArms:
+    """Which points both reach at once (n,), and the pair's smallest distances inside and outside the body [m] (n,)."""
+
+    reachable: NDArray[np.bool_]
+    inside: FloatArray
+    outside: FloatArray
+
+
+def evaluate_both(left: Reach, right: Reach, points: FloatArray) -> BothArms:
+    """Points that both arms reach at once: with the reported joints, else with the best of 6 x 6 other pairs."""
+    inside, outside = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    rows = np.flatnonzero(left.report.reachable & right.report.reachable)
+    if rows.size:
+        inside[rows], outside[rows] = _distances(
+            left, right, left.report.joints[rows], right.report.joints[rows], points[rows]
+        )
+    close = rows[np.minimum(inside[rows], outside[rows]) < ARM_DISTANCE]
+    if close.size:
+        _improve(left, right, points, close, inside, outside)
+    with np.errstate(invalid="ignore"):
+        return BothArms(np.minimum(inside, outside) >= ARM_DISTANCE, inside, outside)
+
+
+def _improve(
+    left: Reach, right: Reach, points: FloatArray, rows: NDArray, inside: FloatArray, outside: FloatArray
+) -> None:
+    """Put the distances of the widest pair of candidates at rows into inside and outside."""
+    ways = [_ways(arm, rows) for arm in (left, right)]
+    for first in range(WAYS):
+        for second in range(WAYS):
+            near, far = _distances(left, right, ways[0][:, first], ways[1][:, second], points[rows])
+            wider = np.minimum(near, far) > np.minimum(inside[rows], outside[rows])
+            inside[rows[wider]], outside[rows[wider]] = near[wider], far[wider]
+
+
+def _ways(arm: Reach, rows: NDArray) -> FloatArray:
+    """Joint values of usable candidates, the furthest from limits to the nearest, (len(rows), WAYS, n_joint)."""
+    usable = arm.usable[rows]
+    margin = np.where(usable, dexterity.limit_margin(arm.kinematics, arm.candidates.joints[rows]), -np.inf)
+    order = np.argsort(-margin, axis=1, kind="stable")
+    count = usable.sum(axis=1)
+    rank = (np.linspace(0.0, 1.0, WAYS) * (count[:, None] - 1)).astype(np.int64)
+    chosen = np.take_along_axis(order, rank, axis=1)
+    return arm.candidates.joints[rows[:, None], chosen]
+
+
+def _distances(
+    left: Reach, right: Reach, left_joints: FloatArray, right_joints: FloatArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    sides = [
+        (arm.kinematics, arm.kinematics.at(joints)) for arm, joints in ((left, left_joints), (right, right_joints))
+    ]
+    return arm_distances(sides[0], sides[1], points)

@@ -1,0 +1,177 @@
+"""`surgsim arms`: two arms evaluated on an organ, with a report."""
+
+import hashlib
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from surgsim_env.cli.values import writable_folder
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.arm_description import ArmDescription, read_description
+from surgsim_env.scene.load import make_scene, read_toml
+
+if TYPE_CHECKING:
+    from surgsim_env.arm_study.job import ArmSetup
+    from surgsim_env.arm_study.ports import Ports
+
+FEWEST_POINTS = 10
+# A file of --compare with one of these tables is a ports file, any other an arm.
+PORT_TABLES = {"left", "right", "endoscope"}
+
+
+@dataclass(frozen=True)
+class Arms:
+    """Evaluate two arms on a patient's organ: reach of each and of both at once, clearances, forces, dexterity.
+
+    Writes report.html (self-contained), points.csv, heat maps (PNG) and summary.json. See docs/arms_report.md.
+    """
+
+    left: str
+    """The left arm: a shipped arm's name (psm_grasper, psm_retractor, ...) or a TOML file (docs/arms.md)."""
+    right: str
+    """The right arm, likewise."""
+    ports: Path | None = None
+    """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into` or `target`; default:
+    ports as in laparoscopy (docs/evaluation.md)."""
+    scene: str = "liver"
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
+    compare: tuple[str, ...] = ()
+    """Other ports files, or arms for both sides, to be ranked in one table with reasons."""
+    points: int = 500
+    """Number of points of the organ to be tried."""
+    episodes: int = 3
+    """Number of scripted episodes in which the arms lift a lobe and touch the target under it; 0: none."""
+    seed: int = 0
+    """Seed of the points and of the starts of the searches for joints."""
+    out: Path = Path("runs/arms")
+    """Folder for the results."""
+
+    @property
+    def command_line(self) -> str:
+        """The command that makes the same report, without --out; files outside the working folder by name alone."""
+        words = ["surgsim", "arms", "--scene", _shown(self.scene), "--left", _shown(self.left)]
+        words += ["--right", _shown(self.right)]
+        if self.ports is not None:
+            words += ["--ports", _shown(self.ports)]
+        if self.compare:
+            words += ["--compare", *map(_shown, self.compare)]
+        counts = ["--points", self.points, "--episodes", self.episodes, "--seed", self.seed]
+        return shlex.join([*words, *map(str, counts)])
+
+    def run(self, console: Console) -> int:
+        """Evaluate and write report.html, points.csv, the heat maps and summary.json.
+
+        Raises:
+            ValueError: one line about an option that is not possible.
+        """
+        from surgsim_env.arm_study.job import POINTS_NAME, REPORT_NAME, SUMMARY_NAME, StudyPlan, run_study
+
+        for name, least in (("points", FEWEST_POINTS), ("episodes", 0), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
+        anatomy = load_anatomy(make_scene(self.scene))
+        setups = [_setup(self, anatomy), *(_compared(one, self, anatomy) for one in self.compare)]
+        # Checked before the work, which takes minutes.
+        folder = writable_folder(self.out, (REPORT_NAME, POINTS_NAME, SUMMARY_NAME))
+        plan = StudyPlan(
+            self.points, self.seed, self.episodes, (self.left, self.right), _inputs(self), self.command_line
+        )
+        run_study(setups, anatomy, plan, folder, console)
+        return 0
+
+
+def _setup(command: Arms, anatomy: Anatomy) -> "ArmSetup":
+    ports = _checked_ports(command.ports, anatomy)
+    left, right = _read("--left", command.left), _read("--right", command.right)
+    return _placed(_ports_name(command), f"{left.name} left, {right.name} right, as given", left, right, ports, anatomy)
+
+
+def _compared(source: str, command: Arms, anatomy: Anatomy) -> "ArmSetup":
+    """The setup of a file of --compare: other ports for the same arms, or an arm on both sides at the same ports."""
+    path = Path(source)
+    if _is_ports_file(source):
+        left, right = _read("--left", command.left), _read("--right", command.right)
+        ports = _checked_ports(path, anatomy)
+        return _placed(path.name, f"ports, with {left.name} left, {right.name} right", left, right, ports, anatomy)
+    arm = _read("--compare", source)
+    ports = _checked_ports(command.ports, anatomy)
+    return _placed(path.name, f"arm on both sides, at the ports of {_ports_name(command)}", arm, arm, ports, anatomy)
+
+
+def _is_ports_file(source: str) -> bool:
+    return source.endswith(".toml") and bool(PORT_TABLES & read_toml(Path(source), "--compare").keys())
+
+
+def _placed(
+    name: str, what: str, left: ArmDescription, right: ArmDescription, ports: "Ports", anatomy: Anatomy
+) -> "ArmSetup":
+    from surgsim_env.arm_study.job import ArmSetup
+    from surgsim_env.instruments.arm.arm import load_arm
+
+    radius = anatomy.scene.instrument.tip_radius
+    left_arm = load_arm(left, ports.left.port, tip_radius=radius)
+    return ArmSetup(name, what, left_arm, load_arm(right, ports.right.port, tip_radius=radius), ports)
+
+
+def _read(option: str, source: str) -> ArmDescription:
+    try:
+        return read_description(source)
+    except ValueError as error:
+        raise ValueError(f"{option}: {error}") from None
+
+
+def _ports_name(command: Arms) -> str:
+    return "default ports" if command.ports is None else command.ports.name
+
+
+def _checked_ports(path: Path | None, anatomy: Anatomy) -> "Ports":
+    from surgsim_env.arm_study.ports import default_ports, read_ports
+
+    if path is None:
+        return default_ports(anatomy)
+    ports = read_ports(path)
+    try:
+        ports.check_outside(anatomy)
+    except ValueError as error:
+        raise ValueError(f"ports file {path.name}: {error}") from None
+    return ports
+
+
+def _shown(source: str | Path) -> str:
+    """A path that does not depend on the machine: relative to the working folder, or its name alone."""
+    path = Path(source)
+    if not path.is_absolute():
+        return path.as_posix()
+    return path.relative_to(Path.cwd()).as_posix() if path.is_relative_to(Path.cwd()) else path.name
+
+
+def _inputs(command: Arms) -> dict[str, Any]:
+    """The inputs by name with checksums; default ports are in the evaluation's own summary."""
+    inputs: dict[str, Any] = {
+        "scene": _file_input(Path(command.scene)) if command.scene.endswith(".toml") else _shown(command.scene),
+        "left": _arm_input(command.left),
+        "right": _arm_input(command.right),
+        "compare": [_file_input(Path(one)) if _is_ports_file(one) else _arm_input(one) for one in command.compare],
+    }
+    if command.ports is not None:
+        inputs["ports"] = {"file": _shown(command.ports), **read_toml(command.ports, "ports")}
+    return inputs
+
+
+def _file_input(path: Path) -> dict[str, str]:
+    return {"file": _shown(path), path.name: _checksum(path)}
+
+
+def _checksum(path: Path) -> str:
+    return f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+
+
+def _arm_input(source: str) -> dict[str, str]:
+    """An arm's name with the checksums of its files, which identify it wherever they were."""
+    description = read_description(source)
+    files = (description.folder / f"{description.name}.toml", description.folder / description.model)
+    sums = {file.name: _checksum(file) for file in files}
+    return {"arm": _shown(source), **sums}

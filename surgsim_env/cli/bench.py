@@ -1,0 +1,41 @@
+"""`surgsim bench`: timings of the tissue, the environments and the start, beside other simulators."""
+
+from dataclasses import dataclass
+
+from rich.console import Console
+
+from surgsim_env.cli.values import MaybePath, report_folder, writable_folder
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Time the tissue, the environments and the start, beside MuJoCo flex and Newton; print and write the figures.
+
+    Prints `name value unit` lines and writes benchmarks.md. Simulators that are not installed are listed as absent.
+    """
+
+    quick: bool = False
+    """Smaller blocks and fewer repetitions: minutes instead of a quarter of an hour."""
+    out: MaybePath = None
+    """Folder for benchmarks.md. Default: docs/ of a checkout; runs/benchmarks elsewhere or with --quick."""
+
+    def run(self, console: Console) -> int:
+        """Measure every part, print its figures at once, write the report; returns 0, also if peers are absent.
+
+        Raises:
+            ValueError: the folder cannot be written (checked before the work).
+        """
+        from surgsim_env.bench import control, haptic, measurement, report, side_by_side, start, substeps
+
+        folder = writable_folder(report_folder(self.out, "benchmarks", quick=self.quick), [report.REPORT_NAME])
+        before = report.load()
+        sections: list[report.Section] = []
+        # In the order of the report.
+        for part in (substeps, haptic, control, side_by_side, start):
+            section = part.measure(measurement.QUICK if self.quick else measurement.FULL)
+            sections.append(section)
+            for line in section.lines():
+                console.print(line, highlight=False, soft_wrap=True, markup=False)
+        path = report.write_report(sections, report.describe(before), folder, quick=self.quick)
+        console.print(f"written: {path}", highlight=False, soft_wrap=True)
+        return 0

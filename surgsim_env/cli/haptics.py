@@ -1,0 +1,209 @@
+"""`surgsim haptics`: a device holds a scene's instrument in real time."""
+
+import csv
+import gc
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from surgsim_env.cli.values import writable_folder
+from surgsim_env.haptics.packet import PORT
+from surgsim_env.scene.load import make_scene, pair_names
+from surgsim_env.scene.model import Scene
+
+if TYPE_CHECKING:
+    from surgsim_env.haptics.loop import HapticLoop
+    from surgsim_env.haptics.pacing import Pacer
+    from surgsim_env.haptics.settings import HapticSettings
+    from surgsim_env.haptics.telemetry import HapticTelemetry
+    from surgsim_env.haptics.trajectory import TrajectoryDevice
+    from surgsim_env.haptics.udp import UdpDevice
+
+TELEMETRY_NAME = "telemetry.csv"
+VECTORS = ("target", "tip", "coupling_force", "force", "contact_force")
+NUMBERS = ("depth", "share", "energy")
+FLAGS = ("fresh", "clamped", "slewed", "approaching", "speed_limited", "workspace_limited")
+
+
+@dataclass(frozen=True)
+class Haptics:
+    """Let a haptic device hold the instrument in real time: a bridge on this machine over UDP, or a recorded file.
+
+    docs/haptics.md describes the packets. Ctrl-C ends it; it then prints rate, lateness and packet counts.
+    """
+
+    scene: str = "liver"
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
+    port: int = PORT
+    """UDP port on 127.0.0.1 to which the bridge sends its poses; 0 for a free one."""
+    trajectory: Path | None = None
+    """A CSV file with columns time [s], x, y, z [m], instead of a bridge."""
+    device_damping: float | None = None
+    """Damping of a device that pushes back [N s/m]; without it, the force is assumed to be displayed and not felt."""
+    device_mass: float = 0.05
+    """Mass of a device that pushes back, at its handle [kg]."""
+    device_delay: float = 0.0
+    """Delay of pose and force together [s]."""
+    stiffness: float | None = None
+    """Stiffness of the coupling [N/m]; default: the largest that is stable with the device, or 500."""
+    damping: float | None = None
+    """Damping of the coupling [N s/m]; default: as in docs/haptics.md, or 0 if a stiffness is given."""
+    force_largest: float = 3.0
+    """Largest force on the device and on the tip [N]."""
+    absolute: bool = False
+    """The device's position is a position in the scene; otherwise its first position is the tip's start."""
+    seconds: float | None = None
+    """Duration [s]; default: until Ctrl-C, or the end of the trajectory."""
+    out: Path | None = None
+    """Folder for telemetry.csv: time, target, tip, forces, depth and active limits in each haptic step."""
+
+    def run(self, console: Console) -> int:
+        """Run the loop until its time is over, the trajectory ends, or Ctrl-C.
+
+        Raises:
+            ValueError: an unknown scene, a bad trajectory, a coupling that is unstable with the device, two arms.
+            OSError: the port is taken, or a file cannot be read.
+        """
+        import numpy as np
+
+        from surgsim_env.coupling.simulation import Simulation
+        from surgsim_env.haptics.loop import HapticLoop
+        from surgsim_env.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
+        from surgsim_env.haptics.trajectory import TrajectoryDevice
+        from surgsim_env.haptics.udp import UdpDevice
+        from surgsim_env.instruments.arm.arm_instrument import parked_place
+        from surgsim_env.scene.anatomy import load_anatomy
+
+        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
+            raise ValueError(f"--seconds is {self.seconds:g}; it must be finite and above 0")
+        scene = _scene(self.scene)
+        simulation = Simulation(load_anatomy(scene))
+        anatomy = simulation.anatomy
+        simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
+        with _device(self, simulation.haptic_dt) as device, _telemetry(self.out) as note:
+            loop = HapticLoop(simulation, device, _settings(self))
+            coupling = loop.held[0].coupling
+            console.print(f"scene {scene.name}: coupling {coupling.stiffness:.4g} N/m, {coupling.damping:.3g} N s/m")
+            if isinstance(device, UdpDevice):
+                host, port = device.address
+                console.print(f"poses to UDP {host}:{port}; Ctrl-C ends")
+            # Compiles, or loads compiled code, before the clock runs.
+            loop.step()
+            loop.reset(tip_position=parked_place(anatomy))
+            if isinstance(device, TrajectoryDevice):
+                device.rewind()
+            # Objects made so far stay alive, and a step makes no reference cycles: no garbage collection delays a step.
+            gc.collect()
+            gc.freeze()
+            timing = np.zeros((), dtype=TIMING)
+            begin = time.perf_counter()
+            pacer = Pacer(PaceSettings(simulation.haptic_dt), timing)
+            try:
+                _hold(self, loop, device, pacer, note, console)
+            finally:
+                kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
+                console.print(
+                    f"{kept.rate:.1f} haptic steps a second; late by {kept.late_p50 * 1e3:.2f} ms (half), "
+                    f"{kept.late_p99 * 1e3:.2f} ms (99 %), {kept.late_most * 1e3:.2f} ms (all); "
+                    f"{kept.skipped} steps given up"
+                )
+                if isinstance(device, UdpDevice):
+                    console.print(f"packets: {device.counts}")
+        return 0
+
+
+def _hold(
+    command: Haptics,
+    loop: "HapticLoop",
+    device: "UdpDevice | TrajectoryDevice",
+    pacer: "Pacer",
+    note: Callable[["HapticTelemetry"], object],
+    console: Console,
+) -> None:
+    """Step the loop at its pace, note each step, print one line a second."""
+    from surgsim_env.haptics.trajectory import TrajectoryDevice
+    from surgsim_env.instruments.arm.arm_instrument import parked_place
+
+    every = round(1.0 / loop.simulation.haptic_dt)
+    count = None if command.seconds is None else round(command.seconds / loop.simulation.haptic_dt)
+    step = 0
+    while count is None or step < count:
+        pacer.wait()
+        told = loop.step()
+        note(told)
+        step += 1
+        if step % every == 0:
+            tip = told.tip
+            size = float((tip.contact_force @ tip.contact_force) ** 0.5)
+            console.print(f"{told.time:6.1f} s  force {size:.3f} N  depth {tip.depth * 1e3:.2f} mm")
+        if told.fault:
+            console.print(f"the organ diverged and is reset: {told.fault}")
+            loop.reset(tip_position=parked_place(loop.simulation.anatomy))
+        pacer.done(loop.simulation.haptic_dt)
+        if count is None and isinstance(device, TrajectoryDevice) and device.over:
+            break
+
+
+def _scene(name: str) -> Scene:
+    scene = make_scene(name)
+    if pair_names(scene.instrument.model) is not None:
+        raise ValueError(f"scene {scene.name!r} has two arms; one device holds one tip: choose a scene with one")
+    return scene
+
+
+@contextmanager
+def _device(command: Haptics, haptic_step: float) -> Iterator["UdpDevice | TrajectoryDevice"]:
+    """The device that the options choose, closed at the end."""
+    from surgsim_env.haptics.device import DeviceDynamics
+    from surgsim_env.haptics.trajectory import TrajectoryDevice
+    from surgsim_env.haptics.udp import UdpDevice
+
+    if command.trajectory is not None:
+        yield TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
+        return
+    dynamics = None
+    if command.device_damping is not None:
+        dynamics = DeviceDynamics(command.device_damping, command.device_mass, command.device_delay)
+    with closing(UdpDevice(command.port, dynamics=dynamics)) as device:
+        yield device
+
+
+def _settings(command: Haptics) -> "HapticSettings":
+    from surgsim_env.haptics.coupling import VirtualCoupling
+    from surgsim_env.haptics.settings import ForceLimits, HapticSettings
+
+    coupling = None
+    if command.stiffness is not None:
+        coupling = VirtualCoupling(command.stiffness, command.damping or 0.0)
+    elif command.damping is not None:
+        raise ValueError("--damping needs --stiffness: give both")
+    return HapticSettings(coupling, ForceLimits(command.force_largest), relative=not command.absolute)
+
+
+@contextmanager
+def _telemetry(folder: Path | None) -> Iterator[Callable[["HapticTelemetry"], object]]:
+    """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing."""
+    if folder is None:
+        yield lambda told: None
+        return
+    with (writable_folder(folder, [TELEMETRY_NAME]) / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
+        yield lambda told: writer.writerow(_row(told))
+
+
+def _row(told: "HapticTelemetry") -> list[float | int]:
+    tip = told.tip
+    vectors = [value for name in VECTORS for value in getattr(tip, name).tolist()]
+    return [
+        told.time,
+        *vectors,
+        *(getattr(tip, name) for name in NUMBERS),
+        *(int(getattr(tip, name)) for name in FLAGS),
+    ]

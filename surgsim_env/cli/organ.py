@@ -1,0 +1,118 @@
+"""`surgsim organ`: an organ with its scene from a scan's labels, closed surfaces or a tetrahedral mesh."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from surgsim_env.cli.values import MaybeNumber, MaybePath, MaybeText, command_text, unit_of, vector_of
+
+
+@dataclass(frozen=True)
+class Organ:
+    """Build an organ from a scan's labels, closed surfaces or a tetrahedral mesh, report on it, and write it.
+
+    With --out patient.vtu, labels and surfaces also give patient.toml, a scene for every command and environment of
+    palpation, and report.html. See docs/patient.md.
+    """
+
+    files: tyro.conf.Positional[tuple[Path, ...]]
+    """A label image (nii, nii.gz, nrrd, dcm); or closed surfaces (STL, OBJ, PLY), the organ first, then a file for each
+    region in it, which names the region; or one file of tets (vtu, vtk, msh, mesh)."""
+    labels: MaybeText = None
+    """NAME=LABEL,...: the labels of an image, the organ first, such as liver=1,lesion=2."""
+    region: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=FILE: a further region from a closed surface; repeatable."""
+    length_unit: MaybeText = None
+    """Unit of the file: m, cm, mm, or metres per unit as a number; required if the format states none."""
+    cell_size: MaybeNumber = None
+    """Cell size of the lattice that fills the organ [m]; default: in proportion to the organ."""
+    out: MaybePath = None
+    """File for the mesh (vtu, vtk, msh, mesh)."""
+    youngs_modulus: MaybeNumber = None
+    """Young's modulus of the healthy tissue [Pa]; default: by the organ's name, else the liver's."""
+    modulus: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=PASCAL: Young's modulus of a region; repeatable; default: by its name."""
+    approach: MaybeText = None
+    """x,y,z: direction of the probe; default: from the front and above in a scan, 0,0,-1 for surfaces."""
+    mend: bool = False
+    """Close holes, resolve self-intersections and fill cavities, and report it."""
+    mesher: MaybeText = None
+    """lattice (default), or tetwild for conforming region surfaces (extra `tetwild`)."""
+
+    @property
+    def command_line(self) -> str:
+        """The command line with these options."""
+        options = {name: value for name, value in vars(self).items() if name != "files"}
+        return command_text(["surgsim", "organ", *map(str, self.files)], options)
+
+    def run(self, console: Console) -> int:
+        """Make an organ, print a summary of it, and with `out` write its mesh, its scenes and its report.
+
+        Raises:
+            MeshError: a file that cannot become an organ.
+            ValueError: options that do not go together, or a place that cannot be written.
+        """
+        from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
+        from surgsim_env.palpation.surface_scene import SurfaceOptions
+        from surgsim_env.patient import make_patient as patient
+        from surgsim_env.patient.label_image import IMAGE_SUFFIXES, is_image
+        from surgsim_env.patient.retract_scene import told
+
+        if not self.files:
+            raise ValueError(f"give a file: a label image ({', '.join(IMAGE_SUFFIXES)}), surfaces or a mesh of tets")
+        unit, first = unit_of(self.length_unit), self.files[0]
+        if not is_image(first) and first.suffix.lower() not in SURFACE_SUFFIXES:
+            unused = ("labels", "region", "cell_size", "modulus", "approach", "mend", "mesher")
+            _refuse(self, unused, "a label image or surfaces")
+            if len(self.files) > 1:
+                raise ValueError(f"{first}: one file of tets is taken, {len(self.files)} are given")
+            patient.convert_tets(first, unit, self.youngs_modulus, self.out, console)
+            return 0
+        if is_image(first):
+            _refuse(self, ("region", "length_unit"), "surfaces; an image has its own")
+        else:
+            _refuse(self, ("labels",), "a label image; regions of surfaces have a file each")
+        if self.out is not None:
+            patient.check_targets(self.out)
+        out = self.out or Path("patient.vtu")
+        found = patient.make_patient(
+            self.files,
+            out,
+            labels=self.labels,
+            regions=self.region,
+            length_unit=unit,
+            cell_size=self.cell_size,
+            mesher=self.mesher or patient.MESHERS[0],
+            mend=self.mend,
+            options=SurfaceOptions(approach=vector_of("--approach", self.approach), youngs_modulus=self.youngs_modulus),
+            moduli=_moduli(self.modulus),
+        )
+        found, retraction = patient.add_retraction(found, out)
+        patient.print_patient(found, console)
+        console.print(f"retraction: {told(retraction)}", highlight=False)
+        if self.out is not None:
+            written = patient.write_patient(found, self.out, self.command_line, retraction)
+            console.print(f"written: {', '.join(map(str, written))}", highlight=False, soft_wrap=True)
+        return 0
+
+
+def _refuse(command: Organ, names: Sequence[str], what: str) -> None:
+    for name in names:
+        if getattr(command, name) not in (None, ()) and getattr(command, name) is not False:
+            raise ValueError(f"--{name.replace('_', '-')} goes with {what}")
+
+
+def _moduli(texts: Sequence[str]) -> Mapping[str, float]:
+    moduli = {}
+    for text in texts:
+        name, found, value = text.partition("=")
+        try:
+            moduli[name.strip()] = float(value)
+        except ValueError:
+            found = ""
+        if not found:
+            raise ValueError(f"--modulus is {text!r}; the form is NAME=PASCAL, such as lesion=40000")
+    return moduli

@@ -1,0 +1,242 @@
+"""`surgsim palpate`: find or make the scene, palpate it, write the results."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+from rich.console import Console
+
+from surgsim_env.cli.values import (
+    MaybeCount,
+    MaybeNumber,
+    MaybePath,
+    MaybeText,
+    command_text,
+    numbers_of,
+    unit_of,
+    vector_of,
+    writable_folder,
+)
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import load_scene, make_scene
+from surgsim_env.scene.model import Ball, Scene, Vector
+
+if TYPE_CHECKING:
+    from surgsim_env.palpation.surface_scene import SurfaceOptions
+
+
+@dataclass(frozen=True)
+class Palpate:
+    """Press an organ site by site, map its stiffness, and report where lesions were felt.
+
+    Lengths are in metres, forces in newtons. Writes palpation.csv, stiffness_map.png and summary.json.
+    """
+
+    scene: MaybeText = None
+    """A shipped scene (see `surgsim scenes`); liver if neither --organ nor --surface is given."""
+    organ: MaybePath = None
+    """Your own scene file (TOML), instead of --scene."""
+    surface: MaybePath = None
+    """A closed surface (STL, OBJ, PLY), instead of --scene; tissue and touch are those of the scene liver."""
+    segmentation: MaybePath = None
+    """A label image of a scan (NIfTI, NRRD, DICOM), instead of --scene; makes the organ like `surgsim organ`."""
+    labels: MaybeText = None
+    """NAME=LABEL,...: the labels of --segmentation, the organ first, such as liver=1,lesion=2."""
+    length_unit: MaybeText = None
+    """Unit of --surface: m, cm, mm, or metres per unit as a number."""
+    cell_size: MaybeNumber = None
+    """Cell size of the lattice that fills --surface or --segmentation [m]; default: in proportion to the organ, and so
+    are tip, press depth and spacing (docs/patient.md)."""
+    lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """x,y,z,radius,ratio: centre and radius [m], ratio of its modulus to the healthy one; repeatable; replaces the
+    scene's lesions."""
+    anchors: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """x,y,z,radius: a ball [m]; the surface inside it is held. Default: the deepest 15 % along the approach."""
+    approach: MaybeText = None
+    """x,y,z: direction of the probe. Default: the scene's; 0,0,-1 for --surface (from the head where z is up)."""
+    around: MaybeText = None
+    """x,y,z,radius: press only the sites inside this ball [m]; default: the whole palpable face."""
+    press_depth: MaybeNumber = None
+    """Depth of a press [m]; default: the scene's."""
+    tip_radius: MaybeNumber = None
+    """Radius of the ball tip [m]; default: the scene's."""
+    spacing: MaybeNumber = None
+    """Distance between sites [m]; default: the scene's."""
+    youngs_modulus: MaybeNumber = None
+    """Young's modulus of the healthy tissue [Pa]; default: the scene's."""
+    out: MaybePath = None
+    """Folder for the results; default: the next free runs/palpate-SCENE-NUMBER."""
+    seed: int = 0
+    """Seed of the sensor's noise and of the pre-operative model's errors."""
+    workers: MaybeCount = None
+    """Number of threads; default: one for each core."""
+
+    @property
+    def options(self) -> "SurfaceOptions":
+        """Options that replace values of the scene or the file."""
+        from surgsim_env.palpation.surface_scene import SurfaceOptions
+
+        balls = (numbers_of("--anchors", text, "x,y,z,radius") for text in self.anchors)
+        return SurfaceOptions(
+            approach=vector_of("--approach", self.approach),
+            anchors=tuple((x, y, z, radius) for x, y, z, radius in balls),
+            press_depth=self.press_depth,
+            tip_radius=self.tip_radius,
+            spacing=self.spacing,
+            youngs_modulus=self.youngs_modulus,
+        )
+
+    @property
+    def command_line(self) -> str:
+        """The command line with these options."""
+        return command_text(["surgsim", "palpate"], vars(self))
+
+    @property
+    def makes_organ(self) -> bool:
+        """Whether an organ is made from a file in proportion to its size, as `surgsim organ` makes it."""
+        return self.segmentation is not None or (self.surface is not None and self.cell_size is None)
+
+    def run(self, console: Console) -> int:
+        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the lesions found.
+
+        Raises:
+            ValueError: options that do not go together, impossible values, files that cannot become an organ.
+        """
+        from surgsim_env.palpation.figures import write_stiffness_map
+        from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, run_palpation
+        from surgsim_env.palpation.report import (
+            CSV_NAME,
+            PICTURE_NAME,
+            SUMMARY_NAME,
+            print_report,
+            write_csv,
+            write_summary,
+        )
+        from surgsim_env.palpation.surface_scene import load_stable_anatomy
+
+        _check(self)
+        # Checked before an organ is made, which takes a minute.
+        around, asked = _around(self), _asked_lesions(self)
+        names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
+        scene, folder = _scene(self, names, console)
+        anatomy = load_anatomy(scene)
+        lesions = anatomy.demonstration_lesions()
+        if asked:
+            lesions = [anatomy.lesion_at(*one, f"lesion {number}") for number, one in enumerate(asked, start=1)]
+        anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
+        # Checked before the work, which takes minutes.
+        folder = folder or writable_folder(self.out or _free_folder(scene.name), names)
+        found = run_palpation(
+            anatomy, lesions=lesions, around=around, seed=self.seed, workers=self.workers, console=console
+        )
+        write_csv(found, folder / CSV_NAME)
+        write_summary(found, folder / SUMMARY_NAME, vars(self))
+        write_stiffness_map(found, folder / PICTURE_NAME)
+        print_report(found, console)
+        console.print(
+            f"written: {folder}/{{{CSV_NAME},{SUMMARY_NAME},{PICTURE_NAME}}}", highlight=False, soft_wrap=True
+        )
+        return 0
+
+
+def _check(command: Palpate) -> None:
+    sources = (command.scene, command.organ, command.surface, command.segmentation)
+    if sum(source is not None for source in sources) > 1:
+        raise ValueError("give only one of --scene, --organ, --surface and --segmentation")
+    if command.labels is not None and command.segmentation is None:
+        raise ValueError("--labels goes with --segmentation: it names the labels of an image")
+    if command.segmentation is not None and command.length_unit is not None:
+        raise ValueError("--length-unit goes with --surface; an image's header states its own")
+    if command.surface is None and command.segmentation is None:
+        for option in ("anchors", "cell_size", "length_unit"):
+            if getattr(command, option):
+                name = option.replace("_", "-")
+                raise ValueError(f"--{name} goes with --surface; a scene states its own mesh and anchors")
+    if command.surface is not None and command.length_unit is None:
+        raise ValueError('--surface needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none')
+    if command.seed < 0:
+        raise ValueError(f"--seed is {command.seed}; it must be a whole number of at least 0")
+
+
+def _around(command: Palpate) -> Ball | None:
+    if command.around is None:
+        return None
+    x, y, z, radius = numbers_of("--around", command.around, "x,y,z,radius")
+    if not 0.0 < radius < float("inf"):
+        raise ValueError(f"--around {command.around}: the radius is {radius:g} m; it must be finite and above 0")
+    return Ball((x, y, z), radius)
+
+
+def _asked_lesions(command: Palpate) -> list[tuple[Vector, float, float]]:
+    """Centre [m], radius [m] and modulus ratio of each --lesion."""
+    asked = []
+    for text in command.lesion:
+        x, y, z, radius, ratio = numbers_of("--lesion", text, "x,y,z,radius,ratio")
+        if not ratio > 0.0:
+            raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
+        asked.append(((x, y, z), radius, ratio))
+    return asked
+
+
+def _scene(command: Palpate, names: tuple[str, ...], console: Console) -> tuple[Scene, Path | None]:
+    """The scene, and the folder where the organ was written if one was made."""
+    if command.makes_organ:
+        file = command.segmentation or command.surface
+        assert file is not None
+        folder = writable_folder(command.out or _free_folder(_stem(file)), names)
+        return _patient_scene(command, file, folder, console), folder
+    if command.surface is None:
+        from surgsim_env.palpation.surface_scene import with_options
+
+        scene = load_scene(command.organ) if command.organ else make_scene(command.scene or "liver")
+        return with_options(scene, command.options), None
+    return _surface_scene(command, command.surface, console), None
+
+
+def _patient_scene(command: Palpate, file: Path, folder: Path, console: Console) -> Scene:
+    """Make an organ from a file, write it to a folder, and read its scene."""
+    from surgsim_env.patient.make_patient import check_targets, make_patient, print_patient, write_patient
+
+    out = folder / f"{_stem(file)}.vtu"
+    check_targets(out)
+    found = make_patient(
+        (file,),
+        out,
+        labels=command.labels,
+        length_unit=unit_of(command.length_unit),
+        cell_size=command.cell_size,
+        options=command.options,
+    )
+    print_patient(found, console)
+    write_patient(found, out, command.command_line)
+    return load_scene(out.with_suffix(".toml"))
+
+
+def _surface_scene(command: Palpate, file: Path, console: Console) -> Scene:
+    from surgsim_env.palpation.surface_scene import surface_scene
+
+    unit, cell_size = unit_of(command.length_unit), command.cell_size
+    assert unit is not None and cell_size is not None
+    scene = surface_scene(file, length_unit=unit, cell_size=cell_size, options=command.options)
+    x, y, z = scene.instrument.approach
+    held = "the anchors given" if command.anchors else "its bed, the deepest 15 % along the approach"
+    material, depth, tip = scene.material, scene.palpation.press_depth, scene.instrument.tip_radius
+    console.print(
+        f"{file.name}: pressed along {x:.3g}, {y:.3g}, {z:.3g} of the file's axes (--approach), "
+        f"held by {held}; E {material.youngs_modulus:g} Pa, nu {material.poisson_ratio:g}, tip {tip * 1e3:g} mm, "
+        f"depth {depth * 1e3:g} mm, capsule and damping as in the scene liver",
+        highlight=False,
+    )
+    return scene
+
+
+def _stem(file: Path) -> str:
+    return file.name.split(".")[0]
+
+
+def _free_folder(scene: str) -> Path:
+    number = 1
+    while (folder := Path("runs") / f"palpate-{scene}-{number}").exists():
+        number += 1
+    return folder

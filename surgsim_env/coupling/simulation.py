@@ -1,0 +1,278 @@
+"""The simulation: an organ and an instrument that exchange forces at haptic rate, and the clock."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
+from msdm_core.kernels.structure_kernels import SCRATCH_FIELDS, OrganModel, OrganState
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.compile import blank_state, rest_state
+from msdm_core.organ.stability import stable_dt
+from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
+from surgsim_env.coupling.haptic_record import HapticRecord
+from surgsim_env.coupling.mujoco_library import runs_compiled
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.jaw import Grasp, read_grasp
+from surgsim_env.instruments.make import make_instrument
+from surgsim_env.instruments.tool_mass import check_tool_masses
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.model import substeps_needed
+
+# The fields of an organ's state that are saved.
+KEPT_FIELDS = tuple(name for name in OrganState._fields if name not in SCRATCH_FIELDS)
+# The tip may move this far beyond the organ's bounding box [m].
+WORKSPACE_MARGIN = 0.04
+
+
+class Simulation:
+    """An organ and an instrument in contact; advanced by `control_step` or `haptic_step`, read by tasks.
+
+    Fields:
+        compiled: whether haptic steps run compiled or in Python, with the same bits
+        pull_peak: largest pull of a jaw in the last control step [N]
+        fault: what ended the last steps, or ""
+    """
+
+    def __init__(self, anatomy: Anatomy) -> None:
+        """Set up the healthy organ and the instrument of a scene, with the tip parked away from the organ.
+
+        Raises:
+            OrganError: the scene's number of substeps is too small for its organ, or a tool too light for its contact.
+            ValueError: an invalid description of an arm, or a port from which it does not reach the palpable face.
+        """
+        scene = anatomy.scene
+        self.anatomy = anatomy
+        self.contact = scene.contact.law
+        self.haptic_dt = scene.timing.haptic_step
+        self.substep_count = scene.timing.substep_count
+        self.substep_dt = self.haptic_dt / self.substep_count
+        margin = WORKSPACE_MARGIN + scene.instrument.tip_radius
+        points = anatomy.mesh.points
+        lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+        self.instrument: Instrument = make_instrument(anatomy, lower, upper)
+        healthy = anatomy.organ()
+        check_tool_masses(scene.name, self.instrument, self.contact, float(healthy.surface_rest_area.sum()))
+        self._wrench = np.zeros((self.instrument.tool_count, 6))
+        self._step = 0
+        self.fault = ""
+        self.compiled = runs_compiled()
+        self.pull_peak = 0.0
+        self._taken: StepsTaken | None = None
+        self._record: HapticRecord | None = None
+        self.organ_model: OrganModel
+        self.organ_state: OrganState
+        self.reset(healthy, self.instrument.parked)
+
+    @property
+    def time(self) -> float:
+        """Simulated time since the reset [s]."""
+        return self._step * self.haptic_dt
+
+    @property
+    def taken_over(self) -> bool:
+        """Whether a group of lanes has already computed the next `control_step`."""
+        return self._taken is not None
+
+    @property
+    def contact_wrench(self) -> FloatArray:
+        """Mean force [N] of the tissue and torque about the centre of mass [N m] on each tool, last haptic step."""
+        return self._wrench.copy()
+
+    @property
+    def contact_force(self) -> FloatArray:
+        """Force of the tissue on all tools together in the last haptic step [N], shape (3,)."""
+        return self._wrench[:, :3].sum(axis=0)
+
+    @property
+    def grasp(self) -> Grasp | None:
+        """The jaw's hold on tissue in the last haptic step; None for an instrument without a jaw."""
+        return read_grasp(self.instrument.jaw, self._wrench, self.contact.friction)
+
+    @property
+    def rest_position(self) -> FloatArray:
+        """Positions of the organ's nodes at rest [m], (n_node, 3): as scanned, or settled under gravity."""
+        return self._rest_position.copy()
+
+    @property
+    def contact_centre(self) -> FloatArray | None:
+        """Area-weighted centre of the contact patch on the surface AT REST [m], shape (3,); None without contact."""
+        model = self.organ_model
+        engaged = self.organ_state.contact_engaged.any(axis=0).reshape(-1, QUADRATURE_COUNT)
+        if not engaged.any():
+            return None
+        corners = model.node_rest_position[model.surface_triangles]
+        weights = engaged * model.surface_rest_area[:, None]
+        return np.einsum("tq,qc,tcx->x", weights, QUADRATURE_BARYCENTRIC, corners) / weights.sum()
+
+    def reset(self, organ_model: OrganModel, tip_position: FloatArray) -> None:
+        """Start with an organ at rest, and with the tip at rest at a position [m].
+
+        Raises:
+            OrganError: the scene's number of substeps is too small for this organ (says how many it needs); the
+                simulation keeps its present organ.
+        """
+        self._check_step(organ_model)
+        self.organ_model = organ_model
+        self.organ_state = rest_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        # The organ at rest, as scanned or settled under gravity, and its sticking friction on supports.
+        self._rest_position = self.organ_state.node_position.copy()
+        self._rest_stretch = self.organ_state.support_stretch.copy()
+        self.restart(tip_position)
+
+    def restart(self, tip_position: FloatArray) -> None:
+        """Return the same organ to rest, place the tip at a position [m], and reset the clock."""
+        state = self.organ_state
+        state.node_position[:] = self._rest_position
+        state.support_stretch[:] = self._rest_stretch
+        state.node_velocity[:] = 0.0
+        state.node_force[:] = 0.0
+        state.contact_engaged[:] = 0
+        state.contact_stretch[:] = 0.0
+        state.contact_passed[:] = 0
+        state.volume_ratio_smallest[:] = 1.0
+        self.instrument.place(tip_position)
+        self._wrench[:] = 0.0
+        self._step = 0
+        self.fault = ""
+        self.pull_peak = 0.0
+        self._taken = None
+
+    def haptic_step(self) -> bool:
+        """Advance by one haptic step; False, with `fault` saying why, on divergence of the organ."""
+        return not self._advance(1, math.inf, math.inf).fault
+
+    def control_step(self, count: int, force_limit: float = math.inf, pull_limit: float = math.inf) -> float:
+        """Advance by `count` haptic steps, fewer after a `fault` or beyond a limit.
+
+        Args:
+            count: number of haptic steps.
+            force_limit: the step whose total force of the tissue exceeds it is the last [N].
+            pull_limit: the same for the pull of a jaw, the size of the sum of its fingers' forces [N].
+
+        Returns:
+            The largest total force of the tissue in these steps [N]; `pull_peak` is the largest pull.
+        """
+        if self._taken is not None:
+            taken, self._taken = self._taken, None
+            self.pull_peak = taken.pull_peak
+            return taken.force_peak
+        force_peak = self.pull_peak = 0.0
+        # A recording reads the instrument after each step.
+        for size in [count] if self._record is None else [1] * count:
+            taken = self._advance(size, force_limit, pull_limit)
+            force_peak = max(force_peak, taken.force_peak)
+            self.pull_peak = max(self.pull_peak, taken.pull_peak)
+            if taken.ended:
+                break
+        return force_peak
+
+    @contextmanager
+    def recording(self) -> Iterator[HapticRecord]:
+        """Record the haptic steps of a `with` block; each is then a call of its own, with the same bits.
+
+        Raises:
+            RuntimeError: the simulation is being recorded already.
+        """
+        if self._record is not None:
+            raise RuntimeError("this simulation is being recorded already: end that recording first")
+        self._record = HapticRecord(self.instrument)
+        try:
+            yield self._record
+        finally:
+            self._record = None
+
+    def take_over(self, organ_state: OrganState, wrench: FloatArray, taken: StepsTaken) -> None:
+        """Accept a control step that a group of lanes has computed; the next `control_step` only returns its result.
+
+        Args:
+            organ_state: the organ's state after it; the instrument's own data has been advanced too.
+            wrench: of the last good haptic step [N, N m], shape (n_tool, 6).
+            taken: the result.
+
+        Raises:
+            RuntimeError: the simulation is being recorded, and these steps would be missing.
+        """
+        if self._record is not None:
+            raise RuntimeError("a simulation that advances among others is not recorded: step its environment alone")
+        self.organ_state = organ_state
+        self._wrench[:] = wrench
+        self._step += taken.step_count
+        self.fault = taken.fault or self.fault
+        self._taken = taken
+
+    def end_control_step(self) -> bool:
+        """Update the instrument's poses and read MuJoCo's warnings; False if there is one."""
+        self.instrument.refresh()
+        self.fault = self.instrument.warning()
+        return not self.fault
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that changes, as arrays by name; the caller keeps the organ's model."""
+        arrays = {f"organ_{name}": getattr(self.organ_state, name).copy() for name in KEPT_FIELDS}
+        return {
+            **arrays,
+            "instrument": self.instrument.get_state(),
+            "rest_position": self._rest_position.copy(),
+            "rest_stretch": self._rest_stretch.copy(),
+            "wrench": self._wrench.copy(),
+            "pull_peak": np.array(self.pull_peak),
+            "step": np.array(self._step),
+            "fault": np.array(self.fault),
+        }
+
+    def state_shapes(self, organ_model: OrganModel) -> dict[str, tuple[int, ...]]:
+        """Shapes of the arrays of `get_state` with another organ of the same scene, by name."""
+        shapes = {name: array.shape for name, array in self.get_state().items()}
+        blank = blank_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        shapes |= {f"organ_{name}": getattr(blank, name).shape for name in KEPT_FIELDS}
+        return shapes | {"rest_position": blank.node_position.shape, "rest_stretch": blank.support_stretch.shape}
+
+    def set_state(self, organ_model: OrganModel, arrays: dict[str, np.ndarray]) -> None:
+        """Restore arrays from `get_state`, to the bit."""
+        self.organ_model = organ_model
+        # Scratch arrays have the size of this organ.
+        blank = blank_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        self.organ_state = blank._replace(**{name: arrays[f"organ_{name}"].copy() for name in KEPT_FIELDS})
+        self.instrument.set_state(arrays["instrument"])
+        self._rest_position = arrays["rest_position"].copy()
+        self._rest_stretch = arrays["rest_stretch"].copy()
+        self._wrench[:] = arrays["wrench"]
+        self.pull_peak = float(arrays["pull_peak"])
+        self._step = int(arrays["step"])
+        self.fault = str(arrays["fault"])
+        self._taken = None
+
+    def _advance(self, count: int, force_limit: float, pull_limit: float) -> StepsTaken:
+        """Advance by up to `count` haptic steps; after a fault the wrench of the last good step stays."""
+        taken = haptic_steps(
+            self.organ_model,
+            self.organ_state,
+            self.instrument,
+            self.contact,
+            self.substep_dt,
+            self.substep_count,
+            self._wrench,
+            count,
+            force_limit=force_limit,
+            pull_limit=pull_limit,
+            compiled=self.compiled,
+        )
+        self._step += taken.step_count
+        self.fault = taken.fault or self.fault
+        if self._record is not None and taken.step_count:
+            self._record.note(self.time, self._wrench)
+        return taken
+
+    def _check_step(self, organ_model: OrganModel) -> None:
+        limit = stable_dt(organ_model, self.contact)
+        needed = substeps_needed(self.haptic_dt, limit)
+        if needed > self.substep_count:
+            raise OrganError(
+                f"scene {self.anatomy.scene.name!r}: {self.substep_count} substeps of {self.substep_dt * 1e3:.3g} ms "
+                f"are too long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: "
+                f"set timing.substep_count = {needed}, timing.mass_scaling = true, or use softer lesions"
+            )

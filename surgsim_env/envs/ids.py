@@ -1,0 +1,114 @@
+"""The environments' ids: the shipped classes, and tasks of a user's own that become environments."""
+
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import parse_env_id
+
+from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
+from surgsim_env.tasks.palpate import PalpateTask
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.tasks.task import Task
+
+# The task of each registered id.
+TASKS: dict[str, type[Task]] = {}
+
+
+class PalpateEnv(SurgicalEnv):
+    """SurgSim/Palpate-v0."""
+
+    task_class = PalpateTask
+    task: PalpateTask
+
+
+class RetractEnv(SurgicalEnv):
+    """SurgSim/Retract-v0."""
+
+    task_class = RetractTask
+    task: RetractTask
+
+
+class BimanualRetractEnv(SurgicalEnv):
+    """SurgSim/BimanualRetract-v0."""
+
+    task_class = BimanualRetractTask
+    task: BimanualRetractTask
+
+
+def register_task(
+    id: str, task_class: type[Task], *, entry_point: str | None = None, vector_entry_point: str | None = None
+) -> None:
+    """Make a task a Gymnasium environment: `gym.make(id)`, and `gym.make_vec(id, ...)` for many side by side.
+
+    The environment takes the arguments of `SurgicalEnv` and the task's own. Registering a class of the same module and
+    name again replaces it, so that its file can be reloaded.
+
+    Args:
+        id: "Namespace/Name-v0".
+        task_class: declares channels and rewards (`surgsim_env.Task`).
+        entry_point: "module:class" of the environment, for a task that needs a class of its own.
+        vector_entry_point: likewise of the vector environment.
+
+    Raises:
+        TypeError: not a subclass of `Task`, or an entry of its declaration of another type.
+        ValueError: an id that is malformed or belongs to another environment, or a declaration that is incomplete.
+    """
+    if not (isinstance(task_class, type) and issubclass(task_class, Task)):
+        raise TypeError(f"{id}: {task_class!r} is no task; give a subclass of surgsim_env.Task")
+    task_class.check_declaration()
+    try:
+        namespace, _, version = parse_env_id(id)
+    except (gym.error.Error, TypeError):
+        namespace = version = None
+    if namespace is None or version is None:
+        raise ValueError(f'id {id!r} is malformed; the rule is "Namespace/Name-v0", such as "MyLab/TracePath-v0"')
+    known = TASKS.get(id)
+    if id in gym.registry and (known is None or _full_name(known) != _full_name(task_class)):
+        owner = gym.registry[id].entry_point if known is None else _full_name(known)
+        raise ValueError(f"id {id!r} belongs to {owner}: choose another name or version")
+    TASKS[id] = task_class
+    gym.registry.pop(id, None)
+    gym.register(
+        id=id,
+        entry_point=entry_point or f"surgsim_env.envs.ids:{id}",
+        vector_entry_point=(vector_entry_point or f"surgsim_env.envs.vector_env:{id}") if task_class.lanes else None,
+        max_episode_steps=task_class.episode_steps,
+    )
+
+
+def __getattr__(name: str) -> Any:
+    """The environment class of a task of a user's own, whose entry point has its id as the name."""
+    if name not in TASKS:
+        hint = "; register_task has not run for it in this process: import the file that calls it" * ("/" in name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
+    return environment_class(TASKS[name])
+
+
+@cache
+def environment_class(task_class: type[Task]) -> type[SurgicalEnv]:
+    """The environment class of a task: a shipped one, or one that is made for it."""
+    for shipped in (PalpateEnv, RetractEnv, BimanualRetractEnv):
+        if shipped.task_class is task_class:
+            return shipped
+    name = task_class.__name__.removesuffix("Task") + "Env"
+    return type(name, (SurgicalEnv,), {"task_class": task_class, "__module__": task_class.__module__})
+
+
+def _full_name(task_class: type[Task]) -> str:
+    return f"{task_class.__module__}.{task_class.__qualname__}"
+
+
+def register() -> None:
+    """Register the shipped ids with Gymnasium; importing `surgsim_env` does it."""
+    register_task("SurgSim/Palpate-v0", PalpateTask)
+    register_task("SurgSim/Retract-v0", RetractTask)
+    register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask)
+    register_task(
+        "SurgSim/PalpateSites-v0",
+        PalpateSitesTask,
+        entry_point="surgsim_env.envs.palpate_sites_env:PalpateSitesEnv",
+        vector_entry_point="surgsim_env.envs.palpate_sites_env:PalpateSitesVectorEnv",
+    )

@@ -1,0 +1,373 @@
+"""The Gymnasium environment: it puts a simulation and a task together and computes no physics and no reward itself."""
+
+import io
+import json
+import zipfile
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown
+from surgsim_env.rendering.renderer import OrganRenderer
+from surgsim_env.rendering.window import Window
+from surgsim_env.tasks.declaration import documentation
+from surgsim_env.tasks.task import Task
+
+# Numbers as float32, or a picture as uint8.
+Observation = NDArray[Any]
+Action = NDArray[np.float32]
+Info = dict[str, Any]
+
+# How far an action may leave [-1, 1] by rounding.
+ACTION_SLACK = 1e-6
+# Draws of an episode until the task has to accept one.
+DRAWS_MOST = 20
+# Kinds of observation, and the size of an observed picture [pixels].
+OBSERVATION_MODES = ("state", "rgb")
+PICTURE_SIZE = 84
+
+
+class SurgicalEnv(gym.Env[Observation, Action]):
+    """One organ, one instrument and one task as a Gymnasium environment.
+
+    A subclass says in `task_class` which task; its docstring and its arguments follow from the task's declaration.
+
+    Args:
+        scene: name or file of a scene; the task's default by default.
+        instrument: name of an arm, or its TOML file; the task's default, else the scene's own, by default.
+        obs_mode: "state" observes the task's vector, "rgb" the endoscope's picture, uint8 of shape (84, 84, 3).
+        observe_force: False observes all channels that depend on force sensing as 0.
+        render_mode: None, "rgb_array" or "human".
+        settings: the task's own arguments, and fields of `RenderOptions`.
+
+    Raises:
+        ValueError: an obs_mode, a render_mode or a setting that is unknown, or what the task refuses.
+    """
+
+    metadata: ClassVar[Info] = {"render_modes": list(RENDER_MODES), "render_fps": 20}
+    task_class: ClassVar[type[Task]]
+    task: Any
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if "task_class" in vars(cls):
+            cls.__doc__ = documentation(cls.task_class)
+
+    def __init__(
+        self,
+        scene: str | None = None,
+        instrument: str | None = None,
+        *,
+        obs_mode: str = "state",
+        observe_force: bool = True,
+        render_mode: str | None = None,
+        **settings: Any,
+    ) -> None:
+        if obs_mode not in OBSERVATION_MODES:
+            raise ValueError(f"obs_mode {obs_mode!r} is unknown; the modes are {', '.join(OBSERVATION_MODES)}")
+        kind = self.task_class
+        own = {name: settings.pop(name) for name in kind.setting_names() & set(settings)}
+        simulation, task = kind.make(
+            kind.default_scene if scene is None else scene,
+            kind.default_instrument if instrument is None else instrument,
+            **own,
+        )
+        self.scene = simulation.anatomy.scene
+        self.simulation = simulation
+        self._view = EpisodeView(self.simulation, render_mode, settings)
+        self.render_mode = render_mode
+        # The modes that this machine offers; the class names all that there are.
+        self.metadata = self._view.metadata()  # type: ignore[misc]
+        self.task = task
+        bounds = task.bounds(self.simulation.instrument)
+        self._low, self._high = bounds.low.astype(np.float32), bounds.high.astype(np.float32)
+        self._eye: EpisodeView | None = None
+        if obs_mode == "rgb":
+            sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_force": False}
+            self._eye = EpisodeView(self.simulation, "rgb_array", sight)
+            self.observation_space = gym.spaces.Box(0, 255, (PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
+        else:
+            self.observation_space = gym.spaces.Box(self._low, self._high, dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (task.action_size,), dtype=np.float32)
+        self._observation = np.zeros(self._low.shape, dtype=np.float32)
+        self._unobserved = [] if observe_force else task.force_entries
+        # The eye's picture of the last observation; None until it is drawn.
+        self._picture: NDArray[np.uint8] | None = None
+        # The action of the last step, after wrappers changed it.
+        self.last_action = np.zeros(task.action_size)
+        self._begun = False
+        self._running = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+        """Draw an episode and put its organ and instrument at rest; no options are known."""
+        super().reset(seed=seed)
+        if options:
+            raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
+        self._draw()
+        values, saturated = self.task.observe(self.simulation, self.np_random)
+        if wrong := self._out_of_bounds(values):
+            raise ValueError(
+                f"{type(self.task).__name__}, after a reset: {wrong}; a channel's read must stay within its low and "
+                "high: widen them, or correct read"
+            )
+        self._take(values)
+        self._begun = self._running = True
+        rewards = dict.fromkeys(self.task.weights, 0.0)
+        info = self._info("", saturated, self.task.blank_info(), rewards)
+        self._show()
+        return self._observed(), info
+
+    def command(self, action: Action) -> None:
+        """Check an action and give the commands that it holds; the first part of `step`, which repeats it.
+
+        Raises:
+            ResetNeeded: no episode is running.
+            ValueError: names the entry of the action that is out of bounds.
+        """
+        if not self._running:
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
+        values = self._checked(action)
+        if not self.simulation.taken_over:
+            self.task.command(values, self.simulation.instrument)
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
+        """One control step: haptic steps until it is over, a force limit is passed or the simulation faults."""
+        self.command(action)
+        self.last_action = self._checked(action)
+        self.task.begin(self.last_action)
+        force_peak = self._advance()
+        fault = self.simulation.fault
+        saturated = False
+        if not fault:
+            self.simulation.end_control_step()
+            values, saturated = self.task.observe(self.simulation, self.np_random)
+            fault = self.simulation.fault or self._out_of_bounds(values)
+            if not fault:
+                self._take(values)
+        verdict = self.task.judge(self.simulation, force_peak, fault)
+        self._running = not (verdict.terminated or verdict.truncated)
+        info = self._info(fault, saturated, verdict.info, verdict.rewards)
+        self._show()
+        return self._observed(), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The picture of this moment in mode "rgb_array", shape (height, width, 3); a window shows each step by itself.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to show.
+            NoGLError: there is no OpenGL to draw with; names the packages that are missing.
+        """
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() without a render_mode shows nothing: make the environment with "
+                f'gym.make("{self.spec.id if self.spec else "SurgSim/..."}", render_mode="rgb_array")'
+            )
+            return None
+        if self.render_mode == "human":
+            self._shown()
+            return None
+        return self._view.frame(self._shown())
+
+    @property
+    def renderer(self) -> OrganRenderer:
+        """Draws the episode in any render_mode: `rgb(camera)`, `depth(camera)` [m], `segmentation(camera)`.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to show.
+        """
+        return self._view.renderer(self._shown())
+
+    @property
+    def observation_slices(self) -> dict[str, slice]:
+        """The entries of an observation that each channel has: `observation[observation_slices["contact_force"]]`."""
+        return dict(self.task.observation_slices)
+
+    @property
+    def observation(self) -> Observation:
+        """The last observation that reset or step gave."""
+        return self._observed()
+
+    @property
+    def task_observation(self) -> NDArray[np.float32]:
+        """The task's own numbers of that moment, whatever `obs_mode` and `observe_force` leave of them."""
+        return self._observation.copy()
+
+    @property
+    def window(self) -> Window | None:
+        """The window of render_mode "human", once the first reset has opened it; else None."""
+        return self._view.window
+
+    def close(self) -> None:
+        """Close the window and give back the graphics; more than once is no harm."""
+        self._view.close()
+        if self._eye is not None:
+            self._eye.close()
+
+    def save_state(self) -> bytes:
+        """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed.
+
+        Wrappers keep counts of their own (TimeLimit): load a state into an environment that was just reset.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to save.
+        """
+        if not self._begun:
+            raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
+        arrays = self.simulation.get_state()
+        arrays["made_by"] = np.array(self._maker())
+        arrays["task"] = np.array(self.task.get_state())
+        arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
+        arrays["observation"] = self._observation.copy()
+        arrays["running"] = np.array(self._running)
+        return packed(arrays)
+
+    def load_state(self, state: bytes) -> None:
+        """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene.
+
+        Raises:
+            ValueError: bytes that are no saved state, or one of another scene or mesh (names both).
+        """
+        arrays = unpacked(state, made_by=self._maker())
+        shapes = {"task": (), "random": (), "running": (), "observation": self._observation.shape}
+        check_entries(arrays, shapes)
+        before = self.task.get_state() if self._begun else None
+        organ = self.task.set_state(str(arrays["task"]))
+        try:
+            check_entries(arrays, self.simulation.state_shapes(organ))
+        except ValueError:
+            # Nothing is changed by what is refused.
+            if before is not None:
+                self.task.set_state(before)
+            raise
+        self.simulation.set_state(organ, arrays)
+        self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
+        self._take(arrays["observation"])
+        self._begun, self._running = True, bool(arrays["running"])
+
+    def _draw(self) -> None:
+        """Draw episodes until the task accepts one."""
+        for _ in range(DRAWS_MOST):
+            start = self.task.reset(self.np_random)
+            self.simulation.reset(start.organ, start.tip_position)
+            if self.task.accepts(self.simulation):
+                return
+        raise ValueError(
+            f"scene {self.scene.name!r}: none of {DRAWS_MOST} draws is an episode that the task accepts: "
+            "narrow the ranges of the scene's draw"
+        )
+
+    def _advance(self) -> float:
+        """Advance the simulation by what a step lasts; returns the largest contact force [N]."""
+        count = self.scene.timing.haptic_steps_per_control
+        return self.simulation.control_step(count, self.task.force_limit, self.task.pull_limit)
+
+    def _take(self, values: NDArray[np.floating]) -> None:
+        """Take the task's numbers as the last observation; its picture is of this moment too."""
+        self._observation, self._picture = values.astype(np.float32), None
+
+    def _observed(self) -> Observation:
+        """The last observation, as obs_mode has it."""
+        if self._eye is None:
+            observed = self._observation.copy()
+            observed[self._unobserved] = 0.0
+            return observed
+        if self._picture is None:
+            self._picture = self._eye.frame(self._shown())
+        return self._picture.copy()
+
+    def _shown(self) -> Shown:
+        if not self._begun:
+            raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
+        return Shown(self.task.lesions, self.task.target, self.task.endoscope)
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._view.show(self._shown())
+
+    def _maker(self) -> str:
+        return fingerprint(type(self).__name__, self.simulation)
+
+    def _checked(self, action: Action | FloatArray) -> FloatArray:
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape:
+            raise ValueError(f"action has shape {values.shape}; the rule is {self.action_space.shape}")
+        bad = np.flatnonzero(~(np.abs(values) <= 1.0 + ACTION_SLACK))
+        if bad.size:
+            raise ValueError(
+                f"action[{bad[0]}] is {values[bad[0]]}; every entry must be finite and in [-1, 1]: "
+                "wrap the environment in gymnasium.wrappers.ClipAction"
+            )
+        return values
+
+    def _out_of_bounds(self, values: FloatArray) -> str:
+        single = values.astype(np.float32)
+        bad = np.flatnonzero(~((single >= self._low) & (single <= self._high)))
+        if not bad.size:
+            return ""
+        index = int(bad[0])
+        return (
+            f"observation {self.task.entry_name(index)} = {values[index]:g} left its bounds, {self._low[index]:g} to "
+            f"{self._high[index]:g}"
+        )
+
+    def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
+        residual = self.simulation.instrument.trocar_residual
+        return {
+            "sim_fault": fault,
+            "sensor_saturated": saturated,
+            "workspace_limited": self.simulation.instrument.workspace_limited,
+            "added_mass": self.simulation.organ_model.added_mass,
+            "trocar_error_mm": -1.0 if residual is None else residual * 1000.0,
+            **task_info,
+            **{f"reward_{name}": value for name, value in rewards.items()},
+        }
+
+
+def packed(arrays: dict[str, np.ndarray]) -> bytes:
+    """Arrays in numpy's own format; nothing in it is executed."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
+    """The arrays of `packed`, whose entry `made_by` must be this one.
+
+    Raises:
+        ValueError: bytes that are no saved state, or one that another environment made (names both).
+    """
+    try:
+        with np.load(io.BytesIO(state), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        maker = str(arrays["made_by"])
+    except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"not a saved state of this kind of environment: {error}") from None
+    if maker != made_by:
+        raise ValueError(f"the state was saved by {maker}, this is {made_by}: use the same scene")
+    return arrays
+
+
+def fingerprint(kind: str, simulation: Simulation) -> str:
+    """What a saved state must agree with: the kind of environment, its scene and mesh, the rates."""
+    scene, mesh = simulation.anatomy.scene, simulation.anatomy.mesh
+    digest = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
+    digest = zlib.crc32(repr(replace(scene, folder=Path())).encode(), digest)
+    return (
+        f"{kind} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
+        f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest:08x})"
+    )
+
+
+def check_entries(arrays: dict[str, np.ndarray], shapes: dict[str, tuple[int, ...]]) -> None:
+    """Refuse an archive that lacks an entry or has one of another shape."""
+    for name, shape in shapes.items():
+        if name not in arrays or arrays[name].shape != shape:
+            found = arrays[name].shape if name in arrays else "nothing"
+            raise ValueError(f"not a saved state of this environment: {name} has shape {shape}, found {found}")

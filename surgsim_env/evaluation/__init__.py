@@ -1,1 +1,0 @@
-"""Evaluation: of robot arms on a patient's anatomy."""

@@ -1,0 +1,1 @@
+"""Robot arms: one arm, two arms, inverse kinematics, placement at ports."""

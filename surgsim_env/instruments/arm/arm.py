@@ -1,0 +1,203 @@
+"""Kinematics of an arm: tip, shaft, shapes and Jacobians at given joint values."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.support import Support
+from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
+from surgsim_env.scene.arm_description import ArmDescription, read_description
+from surgsim_env.scene.model import Port
+
+
+class Pose(NamedTuple):
+    """A position [m] (3,) and the axes of a frame there as columns (3, 3), world frame."""
+
+    position: FloatArray
+    rotation: FloatArray
+
+
+class Arm:
+    """Kinematics of an arm at a port, as functions of joint values; no state is kept.
+
+    Fields:
+        description, port: as given
+        model: MuJoCo's model of the arm alone
+        joints: names of the driven joints, base to tip
+        qpos, dof: their indices in MuJoCo's coordinates and velocities          (n,)
+        lower, upper: limits [rad or m]                                          (n,)
+        speed_limit: [rad/s or m/s]                                              (n,)
+        home: [rad or m]                                                         (n,)
+        jaw_range: smallest and largest opening of the jaw [rad], (0, 0) without one
+        shape_names, shape_radius: outer shapes (felt ones first) and radii [m]; a box counts as the capsule of the
+            same length around its cross-section                                 (n_shape,)
+        shape_half_axis: from the middle of each shape to its end, in its geom's frame [m]  (n_shape, 3)
+        felt: whether tissue feels a shape                                       (n_shape,)
+    """
+
+    def __init__(self, description: ArmDescription, port: Port, model: mujoco.MjModel) -> None:
+        """Take a model compiled for the description and the port."""
+        self.description, self.port, self.model = description, port, model
+        self.joints = description.joints
+        index = [model.joint(name).id for name in self.joints]
+        self.qpos, self.dof = model.jnt_qposadr[index], model.jnt_dofadr[index]
+        self.lower, self.upper = model.jnt_range[index, 0].copy(), model.jnt_range[index, 1].copy()
+        self.speed_limit = np.array(description.control.speed_limit)
+        self.home = np.array([description.home[name] for name in self.joints])
+        jaw = [model.joint(name).range for name in description.jaw]
+        self.jaw_range = (float(sum(low for low, _ in jaw)), float(sum(high for _, high in jaw)))
+        groups = [np.flatnonzero(model.geom_group == group) for group in (CONTACT_GROUP, LINK_GROUP)]
+        self._shapes = np.concatenate(groups)
+        self.felt = np.arange(len(self._shapes)) < len(groups[0])
+        self.shape_names = [model.geom(geom).name for geom in self._shapes]
+        size, kind = model.geom_size[self._shapes], model.geom_type[self._shapes]
+        box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+        thin, middle, long = np.sort(size, axis=1).T
+        self.shape_radius = np.where(box, np.hypot(thin, middle), size[:, 0])
+        half_length = np.where(box, long, np.where(capsule, size[:, 1], 0.0))
+        self.shape_half_axis = np.eye(3)[np.where(box, size.argmax(axis=1), 2)] * half_length[:, None]
+        self.tip_site = model.site(description.tip.site or TIP_SITE).id
+        self._tip_axis = _unit(description.tip.direction)
+        trocar = description.trocar
+        self._shaft = model.body(trocar.shaft_body).id
+        self._shaft_point, self._shaft_axis = np.array(trocar.shaft_point), _unit(trocar.shaft_axis)
+        self._trocar = np.array(port.point)
+        self._data = mujoco.MjData(model)
+        self._jacobian = np.zeros((6, model.nv))
+
+    @property
+    def joint_count(self) -> int:
+        """Number of driven joints."""
+        return len(self.joints)
+
+    @property
+    def remote_centre_fixed(self) -> bool:
+        """Whether the mechanism itself keeps the shaft in the trocar."""
+        return self.description.trocar.fixed
+
+    def tip_pose(self, joints: ArrayLike) -> Pose:
+        """Pose of the tip at joint values (n,); the frame is that of the description's site or body."""
+        data = self._at(joints)
+        return Pose(data.site_xpos[self.tip_site].copy(), data.site_xmat[self.tip_site].reshape(3, 3).copy())
+
+    def tip_direction(self, joints: ArrayLike) -> FloatArray:
+        """Unit vector out of the tip at joint values (n,), shape (3,)."""
+        return self._at(joints).site_xmat[self.tip_site].reshape(3, 3) @ self._tip_axis
+
+    def tip_jacobian(self, joints: ArrayLike) -> FloatArray:
+        """Jacobian from joint speeds to the tip's velocity [m/s] and angular velocity [rad/s], world frame, (6, n)."""
+        data = self._at(joints, moving=True)
+        mujoco.mj_jacSite(self.model, data, self._jacobian[:3], self._jacobian[3:], self.tip_site)
+        return self._jacobian[:, self.dof]
+
+    def shaft_line(self, joints: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """The point of the shaft's axis nearest to the trocar [m] and its direction to the tip, each (3,)."""
+        data = self._at(joints)
+        rotation = data.xmat[self._shaft].reshape(3, 3)
+        start, along = data.xpos[self._shaft] + rotation @ self._shaft_point, rotation @ self._shaft_axis
+        return start + ((self._trocar - start) @ along) * along, along
+
+    def trocar_residual(self, joints: ArrayLike) -> float:
+        """Distance of the shaft's axis from the trocar at joint values (n,) [m]."""
+        return float(np.linalg.norm(self._trocar - self.shaft_line(joints)[0]))
+
+    def trocar_task(self, joints: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Lateral distance of the trocar from the shaft's axis [m] (2,), and the Jacobian of the shaft there (2, n)."""
+        near, along = self.shaft_line(joints)
+        data = self._at(joints, moving=True)
+        mujoco.mj_jac(self.model, data, self._jacobian[:3], None, near, self._shaft)
+        across = np.linalg.svd(along[None])[2][1:]
+        return across @ (self._trocar - near), across @ self._jacobian[:3, self.dof]
+
+    def shape_ends(self, joints: ArrayLike, jaw: float = 0.0) -> FloatArray:
+        """Ends of the outer shapes' axes at joint values (n,) and a jaw angle [rad], shape (n_shape, 2, 3) [m]."""
+        data = self._at(joints, jaw)
+        rotations = data.geom_xmat[self._shapes].reshape(-1, 3, 3)
+        axis = np.einsum("sxy,sy->sx", rotations, self.shape_half_axis)
+        centre = data.geom_xpos[self._shapes]
+        return np.stack([centre - axis, centre + axis], axis=1)
+
+    def manipulability(self, joints: ArrayLike) -> float:
+        """Yoshikawa's sqrt(det J J^T) of the tip's velocity over all joints; units follow from those of the joints."""
+        linear = self.tip_jacobian(joints)[:3]
+        return float(np.sqrt(max(np.linalg.det(linear @ linear.T), 0.0)))
+
+    def write(self, data: mujoco.MjData, joints: ArrayLike, jaw: float = 0.0) -> None:
+        """Write joint values (n,) and a jaw angle [rad], shared by its fingers, into MuJoCo's coordinates."""
+        data.qpos[self.qpos] = joints
+        for name in self.description.jaw:
+            data.qpos[self.model.joint(name).qposadr[0]] = jaw / len(self.description.jaw)
+
+    def _at(self, joints: ArrayLike, jaw: float = 0.0, *, moving: bool = False) -> mujoco.MjData:
+        values = np.asarray(joints, dtype=np.float64)
+        if values.shape != (self.joint_count,):
+            raise ValueError(f"joint values have shape {values.shape}; the arm has {self.joint_count} driven joints")
+        self.write(self._data, values, jaw)
+        mujoco.mj_kinematics(self.model, self._data)
+        if moving:
+            mujoco.mj_comPos(self.model, self._data)
+        return self._data
+
+
+def load_arm(
+    source: str | Path | ArmDescription,
+    port: Port | None = None,
+    *,
+    tip_radius: float | None = None,
+    timestep: float = 0.001,
+    supports: Sequence[Support] = (),
+) -> Arm:
+    """Load an arm with its trocar at a port, by default at the world's origin.
+
+    Args:
+        source: a shipped arm's name, the path of a TOML file, or a description.
+        port: where the arm enters the body.
+        tip_radius: of the tip's ball [m]; by default the model's.
+        timestep: of MuJoCo [s].
+        supports: fixed bodies in the world that its tools touch.
+
+    Raises:
+        ValueError: a wrong entry (names the arm, the entry and the remedy).
+    """
+    description = source if isinstance(source, ArmDescription) else read_description(source)
+    port = port or Port()
+    arm = Arm(description, port, compile_arm(description, port, tip_radius, timestep, supports))
+    _check_trocar(arm)
+    return arm
+
+
+def _check_trocar(arm: Arm) -> None:
+    """Check that the shaft passes through the trocar at home, and at any joint values for a fixed remote centre."""
+    trocar, where = arm.description.trocar, f"arm {arm.description.name!r}"
+    missed = arm.trocar_residual(arm.home)
+    if not missed <= trocar.tolerance:
+        raise ValueError(
+            f"{where}: at home the shaft's axis passes the trocar at {missed * 1e3:.3g} mm, more than "
+            f"trocar.tolerance = {trocar.tolerance * 1e3:.3g} mm: change home, trocar.point or trocar.shaft_axis"
+        )
+    near, along = arm.shaft_line(arm.home)
+    if (arm.tip_pose(arm.home).position - near) @ along <= 0.0:
+        raise ValueError(
+            f"{where}: at home the tip has not passed the trocar: move home further in, or turn trocar.shaft_axis, "
+            "which points towards the tip"
+        )
+    if not trocar.fixed:
+        return
+    for share in np.random.default_rng(0).random((32, arm.joint_count)):
+        missed = arm.trocar_residual(arm.lower + share * (arm.upper - arm.lower))
+        if not missed <= trocar.tolerance:
+            raise ValueError(
+                f"{where}: trocar.fixed says that the mechanism keeps the shaft in the trocar, but it leaves it by "
+                f"{missed * 1e3:.3g} mm within the joints' limits: use fixed = false"
+            )
+
+
+def _unit(vector: ArrayLike) -> FloatArray:
+    values = np.asarray(vector, dtype=np.float64)
+    return values / np.linalg.norm(values)

@@ -1,0 +1,263 @@
+"""One arm as the instrument of a scene, and the parts that two arms share: ports, servos, wrist sensor."""
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from surgsim_env.instruments.arm.arm import Arm, load_arm
+from surgsim_env.instruments.arm.model import position_actuator, speed_actuator
+from surgsim_env.instruments.arm.steering import SteeredArm, millimetres, missing, placed
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.jaw import Jaw
+from surgsim_env.instruments.tool_bodies import make_servo
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.model import Port, Scene
+from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
+
+# Ports are 10 to 20 cm from their target, and instrument ports about 8 cm beside the camera's: 13 cm away at 30 degrees
+# from the approach is 6.5 cm beside it (port placement for da Vinci: docs/arms.md).
+PORT_DISTANCE = 0.13
+PORT_TILT = math.radians(30.0)
+# Before the first reset the tip is this far above the middle of the palpable face [m].
+PARKED_GAP = 0.010
+# Number of places on the palpable face that an arm must reach.
+PLACES_TRIED = 24
+
+
+class ArmInstrument(Instrument):
+    """An arm at a scene's port, steered by its tip's velocity through inverse kinematics.
+
+    Fields:
+        arm: its kinematics
+        steered: its control
+        wrist: its force sensor, None if the model has none
+    """
+
+    turning_size = 3
+
+    def __init__(self, anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> None:
+        """Place the scene's arm at its port; the tip may move in the box from lower to upper [m].
+
+        Raises:
+            ValueError: a wrong description or model, a port inside the organ, a palpable face out of reach.
+        """
+        scene = anatomy.scene
+        self.arm = load_scene_arm(anatomy, scene.instrument.model, scene.port or default_port(anatomy.face))
+        arm, model = self.arm, self.arm.model
+        super().__init__(model, lower, upper, arm.tip_site)
+        count = arm.joint_count
+        self.servo = joint_servo(model, (*arm.joints, *arm.description.jaw))
+        self.servo.lower[:count], self.servo.upper[:count] = arm.lower, arm.upper
+        if arm.description.jaw:
+            self._set_jaw(Jaw(self, arm.description.jaw, count + np.arange(len(arm.description.jaw))))
+        self.steered = SteeredArm(
+            arm,
+            self,
+            np.arange(count),
+            direction=start_direction(scene),
+            control_step=scene.timing.control_step,
+            jaw=self.jaw,
+        )
+        self.wrist = WristSensor.of(model)
+        self.parked = parked_place(anatomy)
+        self._check_reach(anatomy)
+        self.place(self.parked)
+
+    @property
+    def workspace_limited(self) -> bool:
+        """Whether the box, a joint's limit or its speed limit stopped the commanded motion of the tip."""
+        return self.steered.limited
+
+    @property
+    def direction(self) -> FloatArray:
+        """Commanded direction of the tip, (3,)."""
+        wanted = self.steered.wanted
+        return wanted.copy() if wanted.ndim == 1 else wanted @ np.asarray(self.arm.description.tip.direction)
+
+    @property
+    def joint_positions(self) -> FloatArray:
+        """Values of the driven joints [rad or m], (n,)."""
+        return self.steered.joint_positions
+
+    @property
+    def trocar_residual(self) -> float:
+        """Distance of the shaft's axis from the trocar at the current joint values [m]."""
+        return self.steered.trocar_residual
+
+    def place(self, position: FloatArray) -> None:
+        """Place the tip at rest at a position [m], in the start direction as far as the joints allow.
+
+        A jaw with pads is open, another one is as when loaded.
+
+        Raises:
+            ValueError: the tip does not reach the position (gives the distance and the port).
+        """
+        self._rest()
+        self.steered.place(position)
+        mujoco.mj_forward(self.model, self.data)
+
+    def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
+        """Command the velocity [m/s] (3,) and the angular velocity [rad/s] (3,) of the tip.
+
+        Valid for one control step; after it the joints continue at the same speeds.
+        """
+        self.steered.command_velocity(velocity, self.turning_of(turning))
+
+    def command_jaw(self, target: float) -> None:
+        """Command the jaw to a target from -1 (closed) to 1 (open), which it approaches at limited speed and holds.
+
+        Raises:
+            ValueError: no jaw, or a target outside that range.
+        """
+        self.steered.command_jaw(target)
+
+    def get_state(self) -> FloatArray:
+        """All of the instrument's state, command and wanted direction included, as one vector."""
+        return np.concatenate([super().get_state(), self.steered.get_state()])
+
+    def set_state(self, state: FloatArray) -> None:
+        """Restore what `get_state` gave, to the bit."""
+        size = len(self.steered.get_state())
+        super().set_state(state[:-size])
+        self.steered.set_state(state[-size:])
+
+    def _where(self) -> str:
+        return self.steered.where
+
+    def _check_reach(self, anatomy: Anatomy) -> None:
+        """The tip comes to the parking place and to places all over the palpable face."""
+        face = anatomy.face
+        corners = face.points[face.triangles]
+        thick = np.flatnonzero(face.thickness >= face.thickness_smallest)
+        tried = thick[np.linspace(0, len(thick) - 1, min(PLACES_TRIED, len(thick))).astype(int)]
+        radius, retract = anatomy.scene.instrument.tip_radius, anatomy.scene.retract
+        places = [self.parked, *(corners[tried].mean(axis=1) - radius * face.approach)]
+        # On a flap only the edge is grasped, and the arm is parked before it.
+        for place in places[:1] if retract is not None and retract.flap is not None else places:
+            found = self.steered.reach(place)
+            if not placed(found):
+                raise ValueError(
+                    f"{self._where()} does not reach the palpable face of scene {anatomy.scene.name!r} at "
+                    f"{millimetres(place)}: {missing(found)}; move its [port]"
+                )
+
+
+def load_scene_arm(anatomy: Anatomy, name: str, port: Port) -> Arm:
+    """Load an arm by its name, or from its file beside the scene, at a port outside the organ.
+
+    Raises:
+        ValueError: a wrong description or model, or a port inside the organ.
+    """
+    scene = anatomy.scene
+    check_port_outside(port, f"scene {scene.name!r}", anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+    beside = scene.folder / name
+    return load_arm(
+        beside if beside.is_file() else name,
+        port,
+        tip_radius=scene.instrument.tip_radius,
+        timestep=scene.timing.haptic_step,
+        supports=scene.supports,
+    )
+
+
+def default_port(face: PalpableFace) -> Port:
+    """A port above the palpable face: 13 cm from its middle, at 30 degrees from the approach."""
+    corners = face.points[face.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    target = area @ corners.mean(axis=1) / area.sum()
+    aside, _ = tangent_axes(face.approach)
+    out = math.cos(PORT_TILT) * -face.approach + math.sin(PORT_TILT) * aside
+    x, y, z = (target + PORT_DISTANCE * out).tolist()
+    u, v, w = (-out).tolist()
+    return Port((x, y, z), (u, v, w))
+
+
+def inside_surface(point: ArrayLike, points: FloatArray, triangles: IntArray) -> bool:
+    """Whether a point [m] lies within a closed surface, by its solid angle (van Oosterom & Strackee 1983)."""
+    a, b, c = (points[triangles[:, corner]] - np.asarray(point, dtype=np.float64) for corner in range(3))
+    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    triple = (a * np.cross(b, c)).sum(axis=1)
+    rest = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return bool(abs(2.0 * np.arctan2(triple, rest).sum()) > 2.0 * math.pi)
+
+
+def check_port_outside(port: Port, name: str, points: FloatArray, triangles: IntArray) -> None:
+    """Refuse a port inside an organ, whose closed surface has points (n, 3) [m] and triangles (m, 3).
+
+    Raises:
+        ValueError: the port is inside (names its place and the organ).
+    """
+    if inside_surface(port.point, points, triangles):
+        place = millimetres(np.array(port.point))
+        raise ValueError(f"the port at {place} lies inside the organ of {name}: move it out through the body wall")
+
+
+def start_direction(scene: Scene) -> FloatArray:
+    """Direction of a scene's tip at the start, (3,)."""
+    return np.asarray(scene.instrument.tip_direction or scene.instrument.approach, dtype=np.float64)
+
+
+def joint_servo(model: mujoco.MjModel, joints: tuple[str, ...]):
+    """A servo at rest that drives joints of a model, in the order given, within their limits."""
+    pairs = [(position_actuator(model, name), speed_actuator(model, name)) for name in joints]
+    position, speed = np.array(pairs, dtype=np.int64).T.copy()
+    lower, upper = np.array([model.joint(name).range for name in joints]).T
+    return make_servo(lower, upper, position, speed)
+
+
+def parked_place(anatomy: Anatomy) -> FloatArray:
+    """Position of the tip before the first reset [m], (3,).
+
+    It is above the middle of the palpable face, or for a flap where a retraction begins.
+    """
+    retract = anatomy.scene.retract
+    if retract is not None and retract.flap is not None:
+        return 0.5 * (np.array(retract.start_lower) + np.array(retract.start_upper))
+    corners = anatomy.face.points[anatomy.face.triangles]
+    middle = anatomy.face.project(corners.mean(axis=(0, 1)))[0]
+    return middle - (anatomy.scene.instrument.tip_radius + PARKED_GAP) * anatomy.face.approach
+
+
+def is_arm(model: str) -> bool:
+    """Whether a scene's instrument is an arm (a TOML file or a shipped arm's name), not an MJCF probe."""
+    return Path(model).suffix != ".xml"
+
+
+FORCE, TORQUE = "wrist_force", "wrist_torque"
+
+
+class WristSensor:
+    """Load on the parts distal to a site, from MuJoCo's sensors `wrist_force` and `wrist_torque` there.
+
+    MuJoCo gives force and torque between the site's body and its parent link, in the site's frame, including the weight
+    of the distal parts, whether or not the joints compensate for it. That weight is subtracted, as a tared sensor does:
+    at rest the load remains. In motion the reading contains the inertia of the distal parts too.
+    """
+
+    def __init__(self, model: mujoco.MjModel, site: int) -> None:
+        """Take a model with both sensors on a site."""
+        self._model, self._site = model, site
+        self._force = int(model.sensor(FORCE).adr[0])
+        self._torque = int(model.sensor(TORQUE).adr[0])
+        self._body = int(model.site_bodyid[site])
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> "WristSensor | None":
+        """The sensor of a model, None without one."""
+        names = {model.sensor(index).name for index in range(model.nsensor)}
+        if not {FORCE, TORQUE} <= names:
+            return None
+        return cls(model, int(model.sensor(FORCE).objid[0]))
+
+    def read(self, data: mujoco.MjData) -> FloatArray:
+        """Load on the distal parts in the last step: force [N], torque about the site [N m], world frame, (6,)."""
+        rotation = data.site_xmat[self._site].reshape(3, 3)
+        force = rotation @ data.sensordata[self._force : self._force + 3]
+        torque = rotation @ data.sensordata[self._torque : self._torque + 3]
+        weight = self._model.body_subtreemass[self._body] * self._model.opt.gravity
+        arm = data.subtree_com[self._body] - data.site_xpos[self._site]
+        return np.concatenate([-force - weight, -torque - np.cross(arm, weight)])

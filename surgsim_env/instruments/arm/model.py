@@ -1,0 +1,249 @@
+"""An arm's MuJoCo model: read from MJCF or URDF, checked against its description, placed at a port, compiled."""
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from msdm_core.organ.support import Support
+from surgsim_env.instruments.supports import add_supports
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
+from surgsim_env.scene.arm_description import ArmDescription
+from surgsim_env.scene.load import nearest
+from surgsim_env.scene.model import Port, frame_into
+
+# Groups of geoms: visual only, outer links for clearances; geoms of CONTACT_GROUP are felt by tissue.
+VISUAL_GROUP, LINK_GROUP = 1, 2
+TIP_SITE = "surgsim_tip"
+# For URDF: keep visual geoms, keep every link as a separate body, look for meshes beside the file.
+URDF_COMPILER = {"discardvisual": "false", "fusestatic": "false", "strippath": "true", "balanceinertia": "true"}
+
+
+def compile_arm(
+    description: ArmDescription,
+    port: Port,
+    tip_radius: float | None,
+    timestep: float,
+    supports: Sequence[Support] = (),
+) -> mujoco.MjModel:
+    """Compile the model of an arm alone with its trocar at a port; `tip_radius` [m] overrides that of the tip's ball.
+
+    In MuJoCo geoms collide only with supports. Bodies are gravity-compensated; gravity is that of the model file.
+
+    Raises:
+        ValueError: a missing or broken file, or a part of the description that is not in the model.
+    """
+    where = f"arm {description.name!r}"
+    try:
+        spec = arm_spec(description, port, tip_radius, timestep)
+        add_supports(spec, supports)
+        model = spec.compile()
+    except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
+        raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
+    _check_joints(model, description, where)
+    return model
+
+
+def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, timestep: float) -> mujoco.MjSpec:
+    """The specification that `compile_arm` compiles, also for a model with several arms."""
+    spec = _read_spec(description)
+    _check_parts(spec, description)
+    _set_up(spec, description, port, tip_radius, timestep)
+    return spec
+
+
+def _read_spec(description: ArmDescription) -> mujoco.MjSpec:
+    path = description.folder / description.model
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except OSError as error:
+        raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None
+    except ElementTree.ParseError as error:
+        raise ValueError(f"model file {path} is not valid XML: {error}") from None
+    if root.tag not in ("mujoco", "robot"):
+        raise ValueError(f"model file {path} begins with <{root.tag}>; it must be MJCF (<mujoco>) or URDF (<robot>)")
+    _check_repeated_names(root)
+    if root.tag == "mujoco":
+        spec = mujoco.MjSpec.from_file(str(path))
+    else:
+        if root.find("mujoco") is None:
+            ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec.modelfiledir = str(path.parent)
+    _check_meshes(spec, path)
+    return spec
+
+
+def _check_repeated_names(root: ElementTree.Element) -> None:
+    """Refuse two parts of the same kind and name, such as two sites "tip"."""
+    if root.tag == "robot":
+        parts = [part for part in root if part.tag in ("link", "joint")]
+    else:
+        worlds = root.findall("worldbody")
+        parts = [part for kind in ("body", "joint", "geom", "site") for world in worlds for part in world.iter(kind)]
+    seen: set[tuple[str, str]] = set()
+    for part in parts:
+        name = part.get("name")
+        if name and (part.tag, name) in seen:
+            raise ValueError(f"two parts <{part.tag}> are named {name!r}; names must differ: rename one")
+        seen.add((part.tag, name or ""))
+
+
+def _check_meshes(spec: mujoco.MjSpec, path: Path) -> None:
+    for mesh in spec.meshes:
+        file = path.parent / spec.meshdir / mesh.file
+        if mesh.file and not file.is_file():
+            raise ValueError(f"mesh file {file} is missing: put it there, or take the mesh out of {path.name}")
+
+
+def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
+    """Check that every part of the description is in the model and of a permitted kind."""
+    joints = {joint.name: joint for joint in spec.joints}
+    for name in (*description.joints, *description.jaw):
+        what = "jaw joint" if name in description.jaw else "joint"
+        _require_part(what, name, joints)
+        if joints[name].type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            raise ValueError(f"{what} {name!r} is neither a hinge nor a slide; give single joints")
+    for name, joint in joints.items():
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+            raise ValueError(f"the model hangs on the free joint {name!r}: take it out, the port places the arm")
+    geoms = {geom.name: geom for geom in spec.geoms}
+    tip, trocar = description.tip, description.trocar
+    for name in (*description.contact, *description.links, *([tip.ball] if tip.ball else [])):
+        what = "contact geom" if name in description.contact else "geom"
+        _require_part(what, name, geoms)
+        round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        pad = name in description.contact and geoms[name].type == mujoco.mjtGeom.mjGEOM_BOX
+        if geoms[name].type not in round_ones and not pad:
+            kind = geoms[name].type.name.removeprefix("mjGEOM_").lower()
+            raise ValueError(
+                f"{what} {name!r} is a {kind}; only spheres and capsules can be felt, and boxes as contact: draw one "
+                "around it"
+            )
+    bodies = {body.name: body for body in spec.bodies}
+    _require_part("trocar.shaft_body", trocar.shaft_body, bodies)
+    if tip.site is not None:
+        _require_part("tip site", tip.site, {site.name: site for site in spec.sites})
+    if tip.body is not None:
+        _require_part("tip body", tip.body, bodies)
+
+
+def _require_part(what: str, name: str, known: Iterable[str]) -> None:
+    names = sorted(item for item in known if item)
+    if name not in names:
+        listed = ", ".join(names) if names else "none with a name"
+        raise ValueError(f"{what} {name!r} is not in the model{nearest(name, names)}; the model has {listed}")
+
+
+def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: float | None, timestep: float) -> None:
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    for geom in spec.geoms:
+        geom.contype, geom.conaffinity = 0, 0
+        if geom.name and geom.name in arm.contact:
+            geom.group = CONTACT_GROUP
+        elif geom.name and geom.name in arm.links:
+            geom.group = LINK_GROUP
+        elif geom.group in (CONTACT_GROUP, LINK_GROUP):
+            geom.group = VISUAL_GROUP
+        if tip_radius is not None and geom.name and geom.name == arm.tip.ball:
+            geom.size = [tip_radius, *geom.size[1:]]
+    for body in spec.bodies:
+        body.gravcomp = 1.0
+    if arm.tip.body is not None:
+        spec.body(arm.tip.body).add_site(name=TIP_SITE, pos=arm.tip.offset, size=[0.001, 0.001, 0.001])
+    _check_crossing_limits(spec, arm)
+    if arm.control.mode == "servo":
+        _add_servos(spec, arm)
+    _place(spec, arm, port)
+
+
+def _check_crossing_limits(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
+    for name in (*arm.joints, *arm.jaw):
+        lower, upper = spec.joint(name).range
+        if lower > upper or (lower == upper != 0.0):
+            raise ValueError(f"the limits of joint {name!r} cross: lower {lower:g}, upper {upper:g}; swap them")
+
+
+def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
+    """Add a position and a speed servo to each joint; the joint's effort limits their sum."""
+    control = arm.control
+    for index, name in enumerate(arm.joints):
+        joint, effort = spec.joint(name), control.effort[index]
+        joint.actfrcrange = [-effort, effort]
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        shared: dict[str, Any] = {"trntype": mujoco.mjtTrn.mjTRN_JOINT, "target": name}
+        hold = spec.add_actuator(name=f"hold_{name}", **shared)
+        hold.set_to_position(kp=control.stiffness[index])
+        drive = spec.add_actuator(name=f"drive_{name}", **shared)
+        drive.set_to_velocity(kv=control.damping[index])
+
+
+def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
+    """Move everything in the model's world so that its trocar coincides with the port."""
+    trocar = arm.trocar
+    rotation = port.rotation @ frame_into(np.array(trocar.into)).T
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    world = spec.worldbody
+    rooted = [part for kind in (world.bodies, world.geoms, world.sites, world.frames) for part in kind]
+    rooted = [part for part in rooted if part.frame is None]
+    frame = world.add_frame(pos=np.array(port.point) - rotation @ np.array(trocar.point), quat=quaternion)
+    for part in rooted:
+        part.set_frame(frame)
+
+
+def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> None:
+    """Check that every driven joint has limits around its home position, and a position actuator."""
+    for name in (*arm.joints, *arm.jaw):
+        joint = model.joint(name)
+        lower, upper = joint.range
+        if not joint.limited[0]:
+            raise ValueError(f"{where}: joint {name!r} has no limits; give it a range")
+        home = arm.home.get(name)
+        if home is not None and not lower - 1e-9 <= home <= upper + 1e-9:
+            raise ValueError(
+                f"{where}: home of joint {name!r} is {home:g}, outside its limits {lower:g} to {upper:g} (rad or m)"
+            )
+        actuator = position_actuator(model, name)
+        if actuator < 0:
+            raise ValueError(
+                f"{where}: joint {name!r} has no position actuator of gear 1; give the model one"
+                + (', or use control.mode = "servo"' if name in arm.joints else "")
+            )
+        least, most = model.actuator_ctrlrange[actuator]
+        if model.actuator_ctrllimited[actuator] and (least > lower + 1e-9 or most < upper - 1e-9):
+            raise ValueError(
+                f"{where}: the position actuator of joint {name!r} takes {least:g} to {most:g}, less than the joint's "
+                f"limits {lower:g} to {upper:g}: widen its ctrlrange, or leave it out"
+            )
+
+
+def position_actuator(model: mujoco.MjModel, joint: str) -> int:
+    """Index of a joint's position actuator, force = kp (ctrl - q) - kv qdot, or -1."""
+    return next((a for a in _actuators(model, joint) if _is_servo(model, a, bias=1)), -1)
+
+
+def speed_actuator(model: mujoco.MjModel, joint: str) -> int:
+    """Index of a joint's speed actuator, force = kv (ctrl - qdot), or -1."""
+    return next((a for a in _actuators(model, joint) if _is_servo(model, a, bias=2)), -1)
+
+
+def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
+    index = model.joint(joint).id
+    of_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == index)
+    return [int(actuator) for actuator in np.flatnonzero(of_joint)]
+
+
+def _is_servo(model: mujoco.MjModel, actuator: int, bias: int) -> bool:
+    """Whether an actuator's force is exactly gain (ctrl - x), where x is position (bias 1) or speed (bias 2)."""
+    gain, biases = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
+    plain = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE and model.actuator_gear[actuator, 0] == 1.0
+    simple = plain and gain > 0.0
+    return bool(simple and math.isclose(biases[bias], -gain) and (bias == 1 or biases[1] == 0.0))

@@ -1,0 +1,257 @@
+"""Control of one arm of an instrument, alone or one of two: tip velocity to joint speeds by inverse kinematics."""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.instruments.arm.arm import Arm
+from surgsim_env.instruments.arm.inverse_kinematics import (
+    PoseSolution,
+    follow,
+    frame_towards,
+    reach_pose,
+    turn_matrix,
+    turn_towards,
+)
+from surgsim_env.instruments.cartesian import frame_along
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.jaw import Jaw
+
+# The tip has reached a place within this distance [m]; its direction is as the joints allow.
+PLACE_TOLERANCE = 1e-6
+# The commanded orientation of a tip with a jaw may be ahead of the actual one by at most this angle [rad].
+TURN_AHEAD = 0.2
+
+
+class SteeredArm:
+    """An arm within an instrument's model, whose tip follows a commanded velocity and direction.
+
+    Once per control step `command_velocity` computes the joint values that bring the tip to its target at the end of
+    the step (`inverse_kinematics.follow`) and commands the constant joint speeds that lead there; the servo integrates
+    them at haptic rate. Joint targets continue from the last ones, so that the path does not drift.
+
+    For a tip without pads only the direction is controlled, and it may roll. For a jaw with pads the whole frame is, so
+    that the pads face each other vertically.
+
+    Fields:
+        arm: its kinematics, compiled alone
+        lower, upper: the box that the tip may move in [m]                       (3,)
+        jaw: None without one
+        wanted: commanded direction of the tip (3,), or its frame if a jaw has pads (3, 3)
+        short: whether the box, a joint's limit or its speed limit stopped the commanded motion
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        instrument: Instrument,
+        places: NDArray[np.int64],
+        *,
+        direction: FloatArray,
+        control_step: float,
+        jaw: Jaw | None = None,
+        prefix: str = "",
+    ) -> None:
+        """Control an arm within the model of an instrument.
+
+        Args:
+            arm: its kinematics, at its port.
+            instrument: with a servo for the arm's joints.
+            places: indices of the arm's joints in the servo, (n,).
+            direction: of the tip at the start, (3,).
+            control_step: for which a commanded velocity is valid [s].
+            jaw: of the arm.
+            prefix: of the names of the arm's parts in the instrument's model.
+        """
+        model = instrument.model
+        self.arm, self.jaw = arm, jaw
+        self.lower, self.upper = instrument.lower, instrument.upper
+        self._instrument, self._places, self._control_step = instrument, places, control_step
+        self._qpos = np.array([int(model.joint(prefix + name).qposadr[0]) for name in arm.joints])
+        self._tip = model.site(prefix + arm.model.site(arm.tip_site).name).id
+        self._velocity = np.zeros(6)
+        self._starts = [direction / np.linalg.norm(direction)]
+        if jaw is not None and jaw.has_pads:
+            # Either pad may be the upper one.
+            frame = frame_along(direction) @ _jaw_frame(arm).T
+            half_turn = turn_matrix(np.pi * self._starts[0])
+            self._starts = [frame, half_turn @ frame]
+        self.wanted = self._starts[0].copy()
+        self.short = False
+
+    @property
+    def tip_position(self) -> FloatArray:
+        """The tip [m], shape (3,): centre of the ball, or the middle between the pads."""
+        return self._instrument.data.site_xpos[self._tip].copy()
+
+    @property
+    def tip_rotation(self) -> FloatArray:
+        """Axes of the tip's frame as columns, world frame, (3, 3)."""
+        return self._instrument.data.site_xmat[self._tip].reshape(3, 3).copy()
+
+    @property
+    def tip_velocity(self) -> FloatArray:
+        """Velocity of the tip [m/s], shape (3,)."""
+        data, site = self._instrument.data, mujoco.mjtObj.mjOBJ_SITE
+        mujoco.mj_objectVelocity(self._instrument.model, data, site, self._tip, self._velocity, 0)
+        return self._velocity[3:].copy()
+
+    @property
+    def joint_positions(self) -> FloatArray:
+        """Values of the driven joints [rad or m], (n,)."""
+        return self._instrument.data.qpos[self._qpos]
+
+    @property
+    def opening(self) -> float | None:
+        """Gap between the pads of the jaw [m]; None without one."""
+        return None if self.jaw is None else self.jaw.opening
+
+    @property
+    def trocar_residual(self) -> float:
+        """Distance of the shaft's axis from the trocar at the current joint values [m]."""
+        return self.arm.trocar_residual(self.joint_positions)
+
+    @property
+    def limited(self) -> bool:
+        """Whether the box, a joint's limit or its speed limit stopped the commanded motion of the tip."""
+        return self.short or bool(self._instrument.servo.limited[self._places].any())
+
+    @property
+    def where(self) -> str:
+        """The arm's name and place in error messages."""
+        return f"arm {self.arm.description.name!r} at its port {millimetres(np.array(self.arm.port.point))}"
+
+    def place(self, position: FloatArray) -> None:
+        """Place the tip at rest at a position [m], in the start direction as far as the joints allow.
+
+        A jaw with pads is open. The caller brings MuJoCo's positions up to date.
+
+        Raises:
+            ValueError: the tip does not reach the position (gives the distance and the port).
+        """
+        found, self.wanted = self._reach(position)
+        if not placed(found):
+            raise ValueError(f"{self.where} cannot put its tip at {millimetres(position)}: {missing(found)}")
+        self.short = False
+        data, servo = self._instrument.data, self._instrument.servo
+        data.qpos[self._qpos] = found.joints
+        data.ctrl[servo.position[self._places]] = found.joints
+        servo.command[self._places] = 0.0
+        if self.jaw is not None:
+            self.jaw.rest()
+
+    def reach(self, position: FloatArray) -> PoseSolution:
+        """Joint values that reach a position [m], with the tip as close to the start direction as possible."""
+        return self._reach(position)[0]
+
+    def command_velocity(self, velocity: FloatArray, turning: FloatArray) -> None:
+        """Command the velocity [m/s] (3,) and the angular velocity [rad/s] (3,) of the tip.
+
+        Valid for one control step; after it the joints continue at the same speeds.
+        """
+        duration, servo = self._control_step, self._instrument.servo
+        joints = self._instrument.data.ctrl[servo.position[self._places]]
+        if not np.isfinite(joints).all():
+            # MuJoCo's own warning ends the episode.
+            servo.command[self._places] = 0.0
+            return
+        pose = self.arm.tip_pose(joints)
+        if np.any(turning):
+            self._turn_wanted(turning * duration, pose.rotation)
+        wanted = pose.position + np.asarray(velocity, dtype=np.float64) * duration
+        held = np.clip(wanted, self.lower, self.upper)
+        if not np.any(velocity) and self._points_well(joints, pose.rotation):
+            self.short = False
+            servo.command[self._places] = 0.0
+            return
+        direction, frame = (None, self.wanted) if self.wanted.ndim == 2 else (self.wanted, None)
+        step = follow(self.arm, joints, held, direction, duration, rotation=frame)
+        self.short = step.limited or bool((held != wanted).any())
+        servo.command[self._places] = (step.joints - joints) / duration
+
+    def command_jaw(self, target: float) -> None:
+        """Command the jaw to a target from -1 (closed) to 1 (open), which it approaches at limited speed and holds.
+
+        Raises:
+            ValueError: no jaw, or a target outside that range.
+        """
+        if self.jaw is None:
+            raise ValueError(f"{self.where} has no jaw: it carries a {self.arm.description.kind}")
+        self.jaw.command(target)
+
+    def get_state(self) -> FloatArray:
+        """The state beyond MuJoCo's and the servo's, `wanted` and `short`, as one vector."""
+        return np.append(self.wanted.ravel(), float(self.short))
+
+    def set_state(self, state: FloatArray) -> None:
+        """Restore a state from `get_state`, to the bit."""
+        self.wanted = state[:-1].reshape(self.wanted.shape).copy()
+        self.short = bool(state[-1])
+
+    def _turn_wanted(self, turn: FloatArray, rotation: FloatArray) -> None:
+        if self.wanted.ndim == 2:
+            near = frame_towards(rotation, self.wanted, TURN_AHEAD)
+            left, _, right = np.linalg.svd(turn_matrix(turn) @ near)
+            self.wanted = left @ right
+        else:
+            self.wanted = _rotated(self.wanted, turn)
+
+    def _points_well(self, joints: FloatArray, rotation: FloatArray) -> bool:
+        if self.wanted.ndim == 2:
+            return bool(np.abs(rotation - self.wanted).max() < 1e-6)
+        return bool(np.linalg.norm(turn_towards(self.arm.tip_direction(joints), self.wanted)) < 1e-6)
+
+    def _reach(self, position: FloatArray) -> tuple[PoseSolution, FloatArray]:
+        """Joint values that reach a position [m], and the direction or frame that was sought."""
+        found: list[tuple[PoseSolution, FloatArray]] = []
+        for start in self._starts:
+            given = {"rotation": start} if start.ndim == 2 else {"direction": start}
+            found.append((reach_pose(self.arm, position, starts=2, **given), start.copy()))
+        best = min(found, key=lambda one: (round(one[0].angle_error, 6), _turned_far(self.arm, one[0])))
+        if placed(best[0]):
+            return best
+        return reach_pose(self.arm, position, starts=4), best[1]
+
+
+def _turned_far(arm: Arm, found: PoseSolution) -> float:
+    """Distance of the joints from home, as shares of their ranges, summed."""
+    return float((np.abs(found.joints - arm.home) / (arm.upper - arm.lower)).sum())
+
+
+def _jaw_frame(arm: Arm) -> FloatArray:
+    """Frame of the open jaw in the tip's frame: -z out of the tip, y between the fingers, (3, 3)."""
+    data = mujoco.MjData(arm.model)
+    arm.write(data, arm.home, arm.jaw_range[1])
+    mujoco.mj_kinematics(arm.model, data)
+    first, second = (data.xipos[arm.model.body(arm.model.joint(name).bodyid[0]).id] for name in arm.description.jaw)
+    rotation = data.site_xmat[arm.tip_site].reshape(3, 3)
+    direction = rotation @ np.asarray(arm.description.tip.direction)
+    z = -direction / np.linalg.norm(direction)
+    y = (first - second) - ((first - second) @ z) * z
+    y /= np.linalg.norm(y)
+    return rotation.T @ np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def placed(found: PoseSolution) -> bool:
+    """Whether joint values bring the tip to its place and the shaft through the trocar."""
+    return found.position_error <= PLACE_TOLERANCE and found.trocar_error <= PLACE_TOLERANCE
+
+
+def missing(found: PoseSolution) -> str:
+    """The remaining errors of joint values, for an error message."""
+    away, off = found.position_error * 1e3, found.trocar_error * 1e3
+    return f"its tip stays {away:.3f} mm away, its shaft {off:.3f} mm off the trocar"
+
+
+def millimetres(point: FloatArray) -> str:
+    """A position in millimetres, for a message."""
+    return "(" + ", ".join(f"{value * 1e3:.1f}" for value in point) + ") mm"
+
+
+def _rotated(direction: FloatArray, turn: FloatArray) -> FloatArray:
+    quaternion, result = np.zeros(4), np.zeros(3)
+    angle = float(np.linalg.norm(turn))
+    mujoco.mju_axisAngle2Quat(quaternion, turn / angle, angle)
+    mujoco.mju_rotVecQuat(result, direction, quaternion)
+    return result / np.linalg.norm(result)

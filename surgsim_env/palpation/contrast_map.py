@@ -1,0 +1,315 @@
+"""Contrast maps: stiffness over a healthy baseline at each site, the lesions felt on a map, and their errors."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from msdm_core.material.regions import Lesion, lesion_extent
+from msdm_core.mesh.geodesic import SurfaceDistance
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from surgsim_env.palpation.lesion_estimator import strongest_apart
+
+# Rounds of reweighting: first Huber's weights, whose problem is convex, then Tukey's, which reject lesions.
+HUBER_ROUNDS = 8
+ROUNDS = 30
+HUBER_LIMIT = 1.345  # 95 % efficient for normal residuals (Holland & Welsch 1977)
+TUKEY_LIMIT = 4.685
+# A baseline needs this many sites for each of its coefficients; with fewer it is a plane, then the median.
+SITES_PER_COEFFICIENT = 3
+# Ridge penalty of each coefficient, as a share of its regressor's spread.
+RIDGE = 0.03
+# Least scale of the residuals [log stiffness]: those of a map without noise have none.
+SMALLEST_SCALE = 1e-3
+
+# A maximum is felt where the smoothed contrast exceeds its surroundings by the floor, and by this many times the
+# scatter from site to site. The floor was set by trial on 15 lesions in the shipped and the CT liver, none of
+# them at the places of tests/palpation/places.json; no model map without a lesion came near it.
+SCATTERS_ABOVE = 5.0
+CONTRAST_FLOOR = 0.17
+# Its surroundings: the lower quartile between these distances, in site spacings; lesions only raise contrast.
+SURROUNDINGS_SPACINGS = (2.0, 4.5)
+FEWEST_SURROUNDING = 4
+# In site spacings: width of the smoothing, least distance between two maxima, reach of the centroid around one.
+KERNEL_SPACINGS = 0.6
+APART_SPACINGS = 2.5
+CENTROID_SPACINGS = 1.7
+# Sites with less than this share of the peak's excess do not pull at the centroid.
+EXCESS_SHARE = 0.25
+# Sites farther than radius + HEALTHY_DISTANCE [m] from every lesion count as healthy.
+HEALTHY_DISTANCE = 0.015
+# Distances are capped at this [m] when estimates are matched with lesions.
+MATCHING_REACH = 0.05
+
+Projection = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """An estimated lesion: point [m] (3,), peak contrast, and its excess over the surroundings."""
+
+    point: FloatArray
+    contrast: float
+    excess: float
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A lesion seen from the surface: the face's point nearest to its centre [m], the normal there, its radius."""
+
+    name: str
+    centre: FloatArray
+    point: FloatArray
+    normal: FloatArray
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class LesionScore:
+    """One lesion's best match on a map: index of the estimate or None, its error along the surface [m], felt or not."""
+
+    truth: Truth
+    estimate: int | None
+    error: float
+    contrast: float
+
+    @property
+    def felt(self) -> bool:
+        """Whether the estimate lies within the lesion's radius."""
+        return self.error <= self.truth.radius
+
+
+@dataclass(frozen=True, eq=False)
+class ContrastMap:
+    """A contrast map with the lesions estimated on it and their errors.
+
+    Fields:
+        name: of the baseline.
+        contrast: stiffness / baseline at each site                                                 (n_site,)
+        estimates: lesions, strongest first
+        scores: one for each lesion
+        false_alarms: estimates that lie within no lesion's radius
+        healthy_std, healthy_robust_std: of the contrast over sites far from every lesion
+    """
+
+    name: str
+    contrast: FloatArray
+    estimates: tuple[Estimate, ...]
+    scores: tuple[LesionScore, ...]
+    false_alarms: int
+    healthy_std: float
+    healthy_robust_std: float
+
+    @property
+    def felt_count(self) -> int:
+        """How many lesions were felt within their radius."""
+        return sum(score.felt for score in self.scores)
+
+
+# ---- baselines -------------------------------------------------------------------------------------------------------
+
+
+def healthy_majority(values: FloatArray) -> tuple[float, float]:
+    """Middle and spread of the shortest half of the values (Rousseeuw 1984), the spread as a standard deviation.
+
+    Lesions only raise contrast, and a large one covers many sites, which shifts a median; the densest half is healthy.
+    """
+    if len(values) == 0:
+        return 1.0, 0.0
+    ordered = np.sort(values)
+    half = len(ordered) // 2 + 1
+    width = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
+    start = int(np.argmin(width))
+    # The middle half of normal data is 1.349 standard deviations wide.
+    return float(np.median(ordered[start : start + half])), float(width[start]) / 1.349
+
+
+def robust_spread(values: FloatArray) -> float:
+    """1.4826 times the median distance from the median: the standard deviation of normal data, robust to outliers."""
+    if len(values) == 0:
+        return 0.0
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def contrast_with_neighbours(
+    stiffness: FloatArray, plane: FloatArray, geometry: FloatArray | None = None
+) -> FloatArray:
+    """Stiffness over a baseline that follows the healthy majority of the sites, shape (n_site,).
+
+    The baseline is a robust regression of log stiffness on a quadratic in the projection plane and on further
+    geometric regressors; lesions are its outliers.
+
+    Args:
+        stiffness: above 0 [N/m], shape (n_site,).
+        plane: coordinates of the sites across the approach [m], shape (n_site, 2).
+        geometry: further regressors such as the reciprocal thickness, shape (n_site, n_regressor).
+
+    Raises:
+        ValueError: names the site whose stiffness is not above 0.
+    """
+    _check_stiffness(stiffness, "stiffness")
+    log_stiffness = np.log(stiffness)
+    contrast = np.exp(log_stiffness - _robust_fit(_regressors(plane, geometry), log_stiffness))
+    return contrast / healthy_majority(contrast)[0]
+
+
+def contrast_with_model(stiffness: FloatArray, model_stiffness: FloatArray) -> FloatArray:
+    """Stiffness over a pre-operative model's at the same sites, over that ratio's healthy majority, shape (n_site,).
+
+    Dividing by the majority cancels the patient's modulus, which the model does not know.
+
+    Raises:
+        ValueError: names the site whose stiffness is not above 0.
+    """
+    _check_stiffness(stiffness, "stiffness")
+    _check_stiffness(model_stiffness, "the model's stiffness")
+    ratio = stiffness / model_stiffness
+    return ratio / healthy_majority(ratio)[0]
+
+
+def _check_stiffness(stiffness: FloatArray, what: str) -> None:
+    bad = np.flatnonzero(~(np.isfinite(stiffness) & (stiffness > 0.0)))
+    if bad.size:
+        raise ValueError(
+            f"{what} of site {bad[0]} is {stiffness[bad[0]]:g} N/m; it must be above 0: press deeper, or use a sensor "
+            "with less bias and noise"
+        )
+
+
+def _regressors(plane: FloatArray, geometry: FloatArray | None) -> FloatArray:
+    """Columns of the regression, scaled to order 1; fewer of them where there are few sites, (n_site, n_column)."""
+    count = len(plane)
+    constant = np.ones((count, 1))
+    if count == 0:
+        return constant
+    u, v = ((plane - plane.mean(axis=0)) / max(float(np.ptp(plane, axis=0).max()), 1e-9)).T
+    linear = np.column_stack([constant, u, v])
+    extra = np.zeros((count, 0)) if geometry is None else _standardised(geometry)
+    full = np.column_stack([linear, u * u, u * v, v * v, extra])
+    for columns in (full, full[:, :6], linear):
+        if count >= SITES_PER_COEFFICIENT * columns.shape[1]:
+            return columns
+    return constant
+
+
+def _standardised(columns: FloatArray) -> FloatArray:
+    spread = columns.std(axis=0)
+    varying = spread > 1e-12
+    return (columns[:, varying] - columns[:, varying].mean(axis=0)) / spread[varying]
+
+
+def _robust_fit(columns: FloatArray, values: FloatArray) -> FloatArray:
+    """Fitted values of an iteratively reweighted least-squares regression, shape (n_site,)."""
+    if columns.shape[1] == 1:
+        return np.full(len(values), np.median(values)) if len(values) else values
+    # Ridge on all but the constant, so that the baseline does not bend at the ends of the raster without data.
+    held = np.sqrt(RIDGE * len(values)) * np.diag(columns.std(axis=0))
+    zeros = np.zeros(len(held))
+    weight = np.ones(len(values))
+    fitted = values
+    for round_ in range(ROUNDS):
+        root = np.sqrt(weight)
+        matrix = np.concatenate([columns * root[:, None], held])
+        coefficients = np.linalg.lstsq(matrix, np.concatenate([values * root, zeros]), rcond=None)[0]
+        fitted = columns @ coefficients
+        scaled = np.abs(values - fitted) / max(robust_spread(values - fitted), SMALLEST_SCALE)
+        if round_ < HUBER_ROUNDS:
+            weight = np.minimum(1.0, HUBER_LIMIT / np.maximum(scaled, HUBER_LIMIT))
+        else:
+            weight = np.maximum(1.0 - (scaled / TUKEY_LIMIT) ** 2, 0.0) ** 2
+    return fitted
+
+
+# ---- lesions felt on a map -------------------------------------------------------------------------------------------
+
+
+def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> list[Estimate]:
+    """Local maxima of the smoothed contrast that stand out from the healthy majority, strongest first.
+
+    The contrast is smoothed by a Gaussian; maxima near a stronger one are dropped; each is placed at the centroid of
+    the excess contrast around it.
+
+    Args:
+        sites: on the surface [m], shape (n_site, 3).
+        contrast: shape (n_site,).
+        spacing: of the raster [m].
+    """
+    if len(sites) < 2:
+        return []
+    distance = np.linalg.norm(sites[:, None] - sites[None], axis=2) / spacing
+    kernel = np.exp(-0.5 * (distance / KERNEL_SPACINGS) ** 2)
+    smooth = kernel @ contrast / kernel.sum(axis=1)
+    middle = healthy_majority(smooth)[0]
+    threshold = max(CONTRAST_FLOOR, SCATTERS_ABOVE * robust_spread(contrast - smooth))
+    near = distance <= CENTROID_SPACINGS
+    maxima = np.flatnonzero(smooth >= np.where(near, smooth, -np.inf).max(axis=1))
+    excess = np.array([smooth[one] - _surroundings(smooth, distance[one], middle) for one in maxima])
+    maxima, excess = maxima[excess > threshold], excess[excess > threshold]
+    chosen, _ = strongest_apart(smooth[maxima], sites[maxima], APART_SPACINGS * spacing)
+    estimates = []
+    for peak, above in zip(maxima[chosen], excess[chosen], strict=True):
+        pull = smooth - middle - EXCESS_SHARE * (smooth[peak] - middle)
+        weight = np.where(near[peak], np.maximum(pull, 0.0), 0.0)
+        point = weight @ sites / weight.sum() if weight.any() else sites[peak]
+        largest = float(contrast[distance[peak] <= 1.0].max())
+        estimates.append(Estimate(point=point, contrast=largest, excess=float(above)))
+    return estimates
+
+
+def _surroundings(smooth: FloatArray, distance: FloatArray, majority: float) -> float:
+    """The healthy level around a site; that of the whole map where the raster ends too soon."""
+    low, high = SURROUNDINGS_SPACINGS
+    ring = (distance > low) & (distance <= high)
+    return float(np.quantile(smooth[ring], 0.25)) if ring.sum() >= FEWEST_SURROUNDING else majority
+
+
+def seen_from_surface(lesions: Sequence[Lesion], mesh: TetMesh, project: Projection) -> list[Truth]:
+    """The lesions with the nearest point of the palpable face and the normal there."""
+    truths = []
+    for lesion in lesions:
+        centre, half_axes = lesion_extent(mesh, lesion)
+        point, normal = project(centre)
+        truths.append(Truth(lesion.name, centre, point, normal, float(half_axes.max())))
+    return truths
+
+
+def score_map(
+    name: str,
+    sites: FloatArray,
+    contrast: FloatArray,
+    estimates: Sequence[Estimate],
+    truths: Sequence[Truth],
+    surface: SurfaceDistance,
+) -> ContrastMap:
+    """Match estimates to lesions one to one by the least sum of distances along the surface, and measure the map."""
+    places = np.array([estimate.point for estimate in estimates]).reshape(-1, 3)
+    error = np.array([surface(truth.point, places) for truth in truths]).reshape(len(truths), len(places))
+    rows, columns = linear_sum_assignment(np.minimum(error, MATCHING_REACH))
+    matched = dict(zip(rows.tolist(), columns.tolist(), strict=True))
+    from_lesion = [np.linalg.norm(sites - truth.point, axis=1) for truth in truths]
+    scores = []
+    for index, truth in enumerate(truths):
+        over = contrast[from_lesion[index] <= truth.radius]
+        column = matched.get(index)
+        scores.append(
+            LesionScore(
+                truth=truth,
+                estimate=column,
+                error=float(error[index, column]) if column is not None else np.inf,
+                contrast=float(over.max()) if len(over) else np.nan,
+            )
+        )
+    healthy = np.ones(len(sites), dtype=bool)
+    for truth, distance in zip(truths, from_lesion, strict=True):
+        healthy &= distance > truth.radius + HEALTHY_DISTANCE
+    inside = error <= np.array([truth.radius for truth in truths])[:, None]
+    return ContrastMap(
+        name=name,
+        contrast=contrast,
+        estimates=tuple(estimates),
+        scores=tuple(scores),
+        false_alarms=int((~inside.any(axis=0)).sum()) if len(places) else 0,
+        healthy_std=float(contrast[healthy].std()) if healthy.any() else np.nan,
+        healthy_robust_std=robust_spread(contrast[healthy]) if healthy.any() else np.nan,
+    )

@@ -1,0 +1,284 @@
+"""Presses along the surface normal: a plan of control steps that one simulation, lanes or many threads execute."""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.model import Limits, Scene
+
+# Speed of the tip on the way in [m/s], rest at depth [s], and the end of the rest over which force is averaged [s].
+PRESS_SPEED = 0.04
+HOLD_TIME = 0.10
+AVERAGE_TIME = 0.04
+# Interval of the readings that `press_phases` averages [s]; `recorded_phases` reads every haptic step.
+READING_TIME = 0.010
+
+
+@dataclass(frozen=True)
+class PressPhase:
+    """A part of a press, executed in one call.
+
+    Args:
+        count: haptic steps.
+        inward: the tip moves inward; else it rests.
+        force_limit: contact force [N] that ends the phase with the haptic step that exceeds it.
+        read: force and depth are read at its end.
+        command: the instrument's velocity is commanded at its start; False continues the previous command.
+    """
+
+    count: int
+    inward: bool
+    force_limit: float
+    read: bool = False
+    command: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class PressResult:
+    """Outcome of a press.
+
+    Fields:
+        force: of the tissue on the tip, mean of the readings at the end of the hold [N]           (3,)
+        depth: of the tip below the rest surface along the normal, mean of the same readings [m]
+        force_peak: largest contact force of any haptic step [N]
+        stopped: the way in ended by force before it ended by depth
+        fault: fault of the simulation, or an empty string
+        duration: simulated time [s]
+        workspace_limited: the instrument could not follow its command in some phase
+    """
+
+    force: FloatArray
+    depth: float
+    force_peak: float
+    stopped: bool
+    fault: str
+    duration: float
+    workspace_limited: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Press:
+    """A press recorded at every haptic step.
+
+    Fields:
+        site, normal: surface point [m] and unit outward normal at rest                            (3,)
+        depth: of the tip below the rest surface at the end [m]
+        force: along the normal, mean over the end of the hold [N]
+        force_peak: largest contact force of any haptic step [N]
+        curve: depth [m] and force along the normal [N] at each haptic step of contact             (n, 2)
+        volume_ratio_smallest: of any tet at any substep
+        end: why it ended early (the hard limit or a fault); empty for a complete press
+        duration: simulated time [s]
+    """
+
+    site: FloatArray
+    normal: FloatArray
+    depth: float
+    force: float
+    force_peak: float
+    curve: FloatArray
+    volume_ratio_smallest: float
+    end: str
+    duration: float
+
+
+def stop_force(limits: Limits) -> float:
+    """Contact force [N] that ends the way in of `press_phases`: half way from the soft to the hard limit.
+
+    A press executed as commanded thus cannot exceed the hard limit, however stiff the tissue below.
+    """
+    return 0.5 * (limits.soft_force + limits.hard_force)
+
+
+def press_phases(scene: Scene) -> tuple[PressPhase, ...]:
+    """A press in few control steps: in to the scene's depth or `stop_force`, hold, readings READING_TIME apart."""
+    inward, hold, longest = _step_counts(scene)
+    apart, readings = max(1, round(READING_TIME / scene.timing.haptic_step)), round(AVERAGE_TIME / READING_TIME)
+    hard, stop = scene.limits.hard_force, stop_force(scene.limits)
+    phases = [PressPhase(count, True, stop) for count in _parts(inward, longest)]
+    phases += [PressPhase(count, False, hard) for count in _parts(hold - (readings - 1) * apart, longest)]
+    phases[-1] = PressPhase(phases[-1].count, False, hard, read=True)
+    return (*phases, *[PressPhase(apart, False, hard, read=True)] * (readings - 1))
+
+
+def recorded_phases(scene: Scene) -> tuple[PressPhase, ...]:
+    """A press that is read at every haptic step and that only the hard limit ends."""
+    inward, hold, longest = _step_counts(scene)
+    return tuple(
+        PressPhase(1, step < inward, scene.limits.hard_force, True, step == inward or step % longest == 0)
+        for step in range(inward + hold)
+    )
+
+
+def _step_counts(scene: Scene) -> tuple[int, int, int]:
+    """Haptic steps of the way in, of the hold, and at most of one control step."""
+    dt = scene.timing.haptic_step
+    inward = round((scene.palpation.clearance + scene.palpation.press_depth) / (PRESS_SPEED * dt))
+    return inward, round(HOLD_TIME / dt), scene.timing.haptic_steps_per_control
+
+
+def _parts(count: int, most: int) -> list[int]:
+    whole, rest = divmod(count, most)
+    return [most] * whole + [rest] * (rest > 0)
+
+
+class SitePress:
+    """A press in progress: for each phase `begin`, a control step of its simulation, `end`.
+
+    `readings` holds force [N] (3,) and depth [m] of each phase that is read, and of one that exceeds the hard limit.
+    """
+
+    def __init__(self, simulation: Simulation, point: FloatArray, normal: FloatArray) -> None:
+        """Put the organ at rest and the tip above a surface point [m] (3,), along its unit outward normal (3,)."""
+        scene = simulation.anatomy.scene
+        self.simulation, self.point, self.normal = simulation, point, normal
+        self.readings: list[tuple[FloatArray, float]] = []
+        self.force_peak = 0.0
+        self._radius = scene.instrument.tip_radius
+        self._hard_force = scene.limits.hard_force
+        self._stopped = self._over = self._limited = False
+        simulation.restart(point + normal * (self._radius + scene.palpation.clearance))
+
+    def begin(self, phase: PressPhase) -> bool:
+        """Command the instrument for a phase; False where the press skips it: over, or stopped on the way in."""
+        if self._over or (phase.inward and self._stopped):
+            return False
+        # A velocity holds for one control step: an arm's joint speeds are solved anew.
+        if phase.command:
+            self.simulation.instrument.command_velocity(-PRESS_SPEED * self.normal if phase.inward else np.zeros(3))
+        return True
+
+    def end(self, phase: PressPhase, force_peak: float) -> None:
+        """Record an executed phase and its largest contact force [N]."""
+        self.force_peak = max(self.force_peak, force_peak)
+        self._limited |= self.simulation.instrument.workspace_limited
+        if self.simulation.fault or not self.simulation.end_control_step():
+            self._over = True
+            return
+        self._stopped |= phase.inward and force_peak > phase.force_limit
+        self._over = force_peak > self._hard_force
+        if phase.read or self._over:
+            below = (self.point - self.simulation.instrument.tip_position) @ self.normal + self._radius
+            self.readings.append((self.simulation.contact_force, float(below)))
+
+    def result(self) -> PressResult:
+        """The outcome so far; after a fault force and depth are 0."""
+        fault = self.simulation.fault
+        readings = self.readings if not fault else [(np.zeros(3), 0.0)]
+        return PressResult(
+            force=np.mean([force for force, _ in readings], axis=0),
+            depth=float(np.mean([depth for _, depth in readings])),
+            force_peak=self.force_peak,
+            stopped=self._stopped,
+            fault=fault,
+            duration=self.simulation.time,
+            workspace_limited=self._limited,
+        )
+
+
+def press_alone(press: SitePress, phases: Sequence[PressPhase]) -> PressResult:
+    """Execute a press with its simulation alone."""
+    for phase in phases:
+        if press.begin(phase):
+            press.end(phase, press.simulation.control_step(phase.count, phase.force_limit))
+    return press.result()
+
+
+def press_in_lanes(group: LaneGroup, presses: Sequence[SitePress | None], phases: Sequence[PressPhase]) -> None:
+    """Execute one press with each simulation of a group side by side, None for none; `SitePress.result` has each."""
+    for phase in phases:
+        moving = [press for press in presses if press is not None and press.begin(phase)]
+        if not moving:
+            continue
+        group.control_step(np.array([press in moving for press in presses]), phase.count, phase.force_limit)
+        for press in moving:
+            # The group has advanced it: this only reports the largest force.
+            press.end(phase, press.simulation.control_step(phase.count, phase.force_limit))
+
+
+def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press:
+    """Press the resting organ of a simulation once, along the inward normal, to its scene's depth or hard limit."""
+    scene = simulation.anatomy.scene
+    pressed = SitePress(simulation, site, normal)
+    result = press_alone(pressed, recorded_phases(scene))
+    end = result.fault
+    if not end and pressed.force_peak > scene.limits.hard_force:
+        end = f"force limit {scene.limits.hard_force:g} N"
+    curve = np.array([(depth, force @ normal) for force, depth in pressed.readings]).reshape(-1, 2)
+    last = curve[-1 if end else -round(AVERAGE_TIME / simulation.haptic_dt) :]
+    return Press(
+        site=site,
+        normal=normal,
+        depth=float(last[:, 0].mean()),
+        force=float(last[:, 1].mean()),
+        force_peak=result.force_peak,
+        curve=curve[curve[:, 1] > 0.0],
+        volume_ratio_smallest=float(simulation.organ_state.volume_ratio_smallest[0]),
+        end=end,
+        duration=result.duration,
+    )
+
+
+def scan(
+    anatomy: Anatomy,
+    organ_model: OrganModel,
+    sites: FloatArray,
+    normals: FloatArray,
+    *,
+    progress: Callable[[], None] = lambda: None,
+    workers: int | None = None,
+) -> list[Press]:
+    """Press each site of a resting organ; presses are independent, so the result does not depend on the workers.
+
+    Args:
+        anatomy: the scene's organ.
+        organ_model: the organ that is pressed, with or without lesions.
+        sites: surface points [m], shape (n_site, 3).
+        normals: unit outward normals there, shape (n_site, 3).
+        progress: called after each press.
+        workers: threads (the kernels hold no interpreter lock); all cores by default.
+
+    Raises:
+        ValueError: workers below 1.
+    """
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers is {workers}; it must be at least 1, or left out for one per core")
+    count = min(workers or _core_count(), max(1, len(sites)))
+    stopped = threading.Event()
+    presses: list[Press | None] = [None] * len(sites)
+
+    def run(first: int) -> None:
+        simulation = Simulation(anatomy)
+        simulation.reset(organ_model, sites[0] + normals[0] * 0.05)
+        try:
+            for index in range(first, len(sites), count):
+                if stopped.is_set():
+                    break
+                presses[index] = press(simulation, sites[index], normals[index])
+                progress()
+        except BaseException:
+            stopped.set()
+            raise
+
+    with ThreadPoolExecutor(count) as pool:
+        try:
+            list(pool.map(run, range(count)))
+        except BaseException:
+            # Ctrl-C, or an error in one thread: the others end after their current press.
+            stopped.set()
+            raise
+    return [one for one in presses if one is not None]
+
+
+def _core_count() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

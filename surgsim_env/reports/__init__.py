@@ -1,0 +1,1 @@
+"""Reports of the arm study and of a patient's organ as HTML pages."""

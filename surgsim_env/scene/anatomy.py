@@ -1,0 +1,262 @@
+"""The anatomy of a scene: its organ's mesh, anchored nodes and palpable face, and organs compiled with lesions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Lesion, Material
+from msdm_core.mesh.geodesic import SurfaceDistance, nearest_triangle
+from msdm_core.mesh.ordering import in_sweep_order
+from msdm_core.mesh.quality import surface_cell
+from msdm_core.mesh.surface import triangles_facing
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
+from msdm_core.organ.compile import OrganSpec, compile_organ
+from msdm_core.organ.stability import scale_mass
+from msdm_core.organ.support import SupportLaw
+from surgsim_env.scene.model import Anchor, FixedLesion, LesionDraw, Scene, SurfaceMesh, step_needed
+from surgsim_env.scene.palpable_surface import PalpableFace, find_palpable_face, warn_of_coarse_cells
+
+# How exactly a drawn lesion's cover is met [m].
+COVER_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """A scene with its mesh, anchored nodes [n_anchor] and palpable face."""
+
+    scene: Scene
+    mesh: TetMesh
+    anchors: IntArray
+    face: PalpableFace
+
+    @cached_property
+    def palpable_cell(self) -> float:
+        """Edge of the cells at the palpable face [m]."""
+        return surface_cell(self.mesh, self.face.triangles)
+
+    @cached_property
+    def downward(self) -> FloatArray:
+        """Unit vector that points down in pictures: gravity's direction, or without gravity the approach."""
+        gravity = np.asarray(self.scene.gravity, dtype=np.float64)
+        return gravity / np.linalg.norm(gravity) if gravity.any() else self.face.approach
+
+    @cached_property
+    def along_surface(self) -> SurfaceDistance:
+        """Distances along the resting surface."""
+        return SurfaceDistance(self.mesh.points, self.mesh.boundary_triangles)
+
+    def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
+        """The organ with given lesions, all moduli of the healthy tissue and its capsule multiplied by a factor.
+
+        With the scene's `mass_scaling`, mass is added as its number of substeps needs (`OrganModel.added_mass`).
+        """
+        return self.compiled(self.specification(lesions, modulus_factor=modulus_factor))
+
+    def specification(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganSpec:
+        """The specification that `organ` compiles, for further changes by an episode's draw."""
+        scene, capsule = self.scene, self.scene.capsule
+        material = _stiffer(scene.material, modulus_factor)
+        if capsule is not None:
+            capsule = replace(capsule, youngs_modulus=capsule.youngs_modulus * modulus_factor)
+        return OrganSpec(
+            mesh=self.mesh,
+            materials=material,
+            capsule=capsule,
+            lesions=(*self._standing_regions(modulus_factor), *lesions),
+            anchors=self.anchors,
+            damping=scene.damping,
+            stiffness_rule=scene.stiffness_rule,
+            gravity=scene.gravity,
+            supports=scene.supports,
+            support_law=scene.support_law or SupportLaw(scene.contact.stiffness, scene.contact.damping),
+        )
+
+    def _standing_regions(self, modulus_factor: float) -> list[Lesion]:
+        """The regions of every organ of the scene, their moduli multiplied by a factor."""
+        standing = [region.as_lesion for region in self.scene.regions if not region.lesion]
+        return [replace(one, material=_stiffer(one.material, modulus_factor)) for one in standing]
+
+    def compiled(self, specification: OrganSpec) -> OrganModel:
+        """The organ of a specification, with mass added as in `organ`."""
+        organ, timing = compile_organ(specification), self.scene.timing
+        if not timing.mass_scaling:
+            return organ
+        needed = step_needed(timing.haptic_step, timing.substep_count)
+        return scale_mass(organ, needed, self.scene.contact.law)
+
+    def random_lesion(
+        self, rng: np.random.Generator, draw: LesionDraw | None = None, *, modulus_factor: float = 1.0
+    ) -> Lesion:
+        """A lesion below a random point of the palpable face.
+
+        Its cover is the distance from its ball to the organ's surface, to 0.1 mm; a place where no ball of that size
+        has that cover (thin or strongly curved) is drawn again.
+
+        Args:
+            rng: source of random numbers.
+            draw: its ranges; the scene's by default.
+            modulus_factor: of the tissue around it, to which its modulus ratio refers.
+
+        Raises:
+            ValueError: the scene has no [lesion] table, or 200 draws find no room for the lesion.
+        """
+        draw = self.scene.lesion if draw is None else draw
+        if draw is None:
+            raise ValueError(f"scene {self.scene.name!r} has no [lesion] table to draw a lesion from: add one")
+        radius = float(rng.uniform(*draw.radius))
+        cover = float(rng.uniform(*draw.cover))
+        ratio = float(rng.uniform(*draw.modulus_ratio)) * modulus_factor
+        for _ in range(200):
+            point, normal = self.face.random_point(rng, draw.rim_distance)
+            centre = self._centre_below(point, normal, cover + radius)
+            if centre is not None:
+                return self.lesion_at(centre, radius, ratio, "lesion")
+        raise ValueError(
+            f"scene {self.scene.name!r}: no room for a lesion of radius {radius * 1000:.3g} mm under "
+            f"{cover * 1000:.3g} mm of tissue: use smaller lesions"
+        )
+
+    def _centre_below(self, point: FloatArray, normal: FloatArray, distance: float) -> FloatArray | None:
+        """The point on the inward normal at a distance from the surface [m]; None if there is none."""
+        depth = distance
+        for _ in range(20):
+            centre = point - normal * depth
+            gap = distance - self.surface_distance(centre)
+            if abs(gap) <= COVER_TOLERANCE:
+                return centre
+            depth += gap
+            # A curved surface needs a little more depth; far more means that another side of the organ is near.
+            if not distance - 0.01 <= depth <= distance + 0.01:
+                return None
+        return None
+
+    def surface_distance(self, point: FloatArray) -> float:
+        """Distance from a point to the free part of the organ's surface [m]."""
+        triangles = self.mesh.boundary_triangles
+        held = np.isin(triangles, self.anchors).all(axis=1)
+        corners = self.mesh.points[triangles[~held]]
+        triangle, weights = nearest_triangle(corners, point)
+        return float(np.linalg.norm(weights @ corners[triangle] - point))
+
+    def lesion_below(self, point: FloatArray, radius: float, cover: float, ratio: float, name: str) -> Lesion:
+        """A sphere whose top lies `cover` below a point of the surface [m], `ratio` times as stiff as the tissue."""
+        surface_point, normal = self.face.project(point)
+        centre = surface_point - normal * (cover + radius)
+        return self.lesion_at(centre, radius, ratio, name)
+
+    def lesion_at(self, centre: ArrayLike, radius: float, ratio: float, name: str) -> Lesion:
+        """A sphere at a centre [m], `ratio` times as stiff as the tissue."""
+        return self.lesion_of_modulus(centre, radius, ratio * self.scene.material.youngs_modulus, name)
+
+    def lesion_of_modulus(self, centre: ArrayLike, radius: float, youngs_modulus: float, name: str) -> Lesion:
+        """A sphere at a centre [m] with a Young's modulus [Pa], otherwise like the tissue."""
+        x, y, z = np.asarray(centre, dtype=np.float64).tolist()
+        material = replace(self.scene.material, youngs_modulus=youngs_modulus)
+        return Lesion(centre=(x, y, z), radius=radius, material=material, name=name)
+
+    def demonstration_lesions(self) -> list[Lesion]:
+        """The lesions of the scene file: regions of its mesh, and balls."""
+        regions = [region.as_lesion for region in self.scene.regions if region.lesion]
+        return regions + [self._fixed(lesion) for lesion in self.scene.demonstration]
+
+    def _fixed(self, lesion: FixedLesion) -> Lesion:
+        return self.lesion_below(
+            np.asarray(lesion.below), lesion.radius, lesion.cover, lesion.modulus_ratio, lesion.name
+        )
+
+
+def _stiffer(material: Material | None, factor: float) -> Material:
+    assert material is not None
+    return replace(material, youngs_modulus=material.youngs_modulus * factor)
+
+
+def load_anatomy(scene: Scene) -> Anatomy:
+    """Mesh a scene's organ and find its anchors and palpable face; the same scene and files give the same object.
+
+    Warns once if the cells of its palpable face are larger than the contact radius: the mesh would be felt.
+    """
+    source = scene.mesh.surface or scene.mesh.tets
+    file = None if source is None else scene.folder / source.file
+    return _load_anatomy(scene, file.stat().st_mtime_ns if file is not None and file.is_file() else None)
+
+
+@lru_cache(maxsize=8)
+def _load_anatomy(scene: Scene, file_time: int | None) -> Anatomy:
+    """`load_anatomy`, cached until the mesh file's modification time changes [ns]."""
+    anatomy = anatomy_of(scene, _load_mesh(scene))
+    # The organ of a retraction is not palpated.
+    if scene.retract is None:
+        warn_of_coarse_cells(
+            f"scene {scene.name!r}", anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth
+        )
+    return anatomy
+
+
+def anatomy_of(scene: Scene, mesh: TetMesh) -> Anatomy:
+    """The anatomy of a scene on a given mesh; the scene's own mesh is not read."""
+    for region in scene.regions:
+        mesh.region_tag(region.name)
+    face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)
+    return Anatomy(scene, mesh, _anchored_nodes(mesh, scene.anchors), face)
+
+
+def _load_mesh(scene: Scene) -> TetMesh:
+    source = scene.mesh
+    if source.block is not None:
+        block = source.block
+        return box_mesh(block.size, block.cells, coarsening=block.coarsening, fine_depth=block.fine_depth)
+    # Reading files imports meshio and trimesh: only where a scene needs them.
+    from msdm_core.mesh_files.mesh_io import read_mesh
+    from msdm_core.mesh_files.surface_io import read_surface
+
+    if source.surface is not None:
+        return _filled_surface(
+            scene,
+            source.surface,
+            *read_surface(scene.folder / source.surface.file, length_unit=source.surface.length_unit),
+        )
+    assert source.tets is not None
+    return in_sweep_order(read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit))
+
+
+def _filled_surface(scene: Scene, source: SurfaceMesh, vertices: FloatArray, triangles: NDArray) -> TetMesh:
+    """The organ's tets: of one size, or fine at the palpable face if the scene gives a coarser size for the rest."""
+    if source.coarse_cell_size is None:
+        return mesh_surface(vertices, triangles, cell_size=source.cell_size)
+    return mesh_surface(
+        vertices,
+        triangles,
+        cell_size=source.cell_size,
+        coarse_cell_size=source.coarse_cell_size,
+        fine_triangles=triangles_facing(vertices, triangles, scene.instrument.approach, scene.palpation.face_angle_deg),
+        fine_depth=source.fine_depth,
+    )
+
+
+def _anchored_nodes(mesh: TetMesh, anchors: Sequence[Anchor]) -> IntArray:
+    held: NDArray[np.bool_] = np.zeros(mesh.node_count, dtype=bool)
+    on_surface = np.zeros(mesh.node_count, dtype=bool)
+    on_surface[mesh.boundary_nodes] = True
+    for anchor in anchors:
+        if anchor.box is not None:
+            inside = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
+        elif anchor.bed is not None:
+            depth = mesh.points @ np.asarray(anchor.bed.direction)
+            inside = on_surface & (depth >= depth.max() - anchor.bed.share * np.ptp(depth))
+        else:
+            assert anchor.ball is not None
+            distance = np.linalg.norm(mesh.points - np.asarray(anchor.ball.centre), axis=1)
+            inside = on_surface & (distance <= anchor.ball.radius)
+        if not inside.any():
+            raise ValueError(
+                f"anchor {anchor.name!r} holds no node of the organ; move or enlarge it (coordinates are metres)"
+            )
+        held |= inside
+    if not held.any():
+        raise ValueError("nothing holds the organ: give at least one anchor, or it is pushed away")
+    return np.flatnonzero(held).astype(np.int32)

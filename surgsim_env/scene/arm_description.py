@@ -1,0 +1,195 @@
+"""The TOML file that describes an arm beside its MJCF or URDF model: contact geoms, tip, trocar, control."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from surgsim_env.scene.load import fill, list_arms, nearest, read_toml, scenes_folder
+from surgsim_env.scene.model import Vector, require_direction, require_number
+
+KINDS = ("palpator", "grasper")
+CONTROL_MODES = ("position", "servo")
+
+
+@dataclass(frozen=True)
+class Tip:
+    """The controlled point of an arm: a site of the model, or a body and an offset in it.
+
+    Args:
+        site: a site of the model.
+        body: a body of the model, where there are no sites, as in URDF.
+        offset: of the tip in that body's frame [m].
+        direction: in which the tip points, in the frame of the site or body.
+        ball: the geom (a sphere) whose radius a scene may set.
+    """
+
+    site: str | None = None
+    body: str | None = None
+    offset: Vector = (0.0, 0.0, 0.0)
+    direction: Vector = (0.0, 0.0, 1.0)
+    ball: str | None = None
+
+    def __post_init__(self) -> None:
+        if (self.site is None) == (self.body is None):
+            raise ValueError("tip: give exactly one of tip.site and tip.body (with tip.offset)")
+        _require_finite("tip.offset", self.offset)
+        require_direction("tip.direction", self.direction)
+
+
+@dataclass(frozen=True)
+class Trocar:
+    """The point at which the shaft passes through the body wall.
+
+    Args:
+        shaft_body: the body whose straight shaft passes through it.
+        shaft_point: a point of the shaft's axis in that body's frame [m].
+        shaft_axis: direction of the shaft's axis in that frame, towards the tip.
+        point: the trocar in the model's own world frame [m].
+        into: direction into the patient in that frame.
+        fixed: whether the mechanism keeps the shaft there (remote centre of motion); otherwise control does.
+        tolerance: largest distance of the shaft's axis from the trocar [m], at home, or in all poses with `fixed`.
+    """
+
+    shaft_body: str
+    shaft_point: Vector = (0.0, 0.0, 0.0)
+    shaft_axis: Vector = (0.0, 0.0, 1.0)
+    point: Vector = (0.0, 0.0, 0.0)
+    into: Vector = (0.0, 0.0, -1.0)
+    fixed: bool = False
+    tolerance: float = 0.001
+
+    def __post_init__(self) -> None:
+        _require_finite("trocar.point", self.point)
+        _require_finite("trocar.shaft_point", self.shaft_point)
+        require_direction("trocar.into", self.into)
+        require_direction("trocar.shaft_axis", self.shaft_axis)
+        require_number("trocar.tolerance", self.tolerance, 0.0, "m", above=True)
+
+
+@dataclass(frozen=True)
+class JointControl:
+    """How the joints are driven: "position" by the model's own actuators, "servo" by actuators that are added.
+
+    Args:
+        mode: "position" or "servo".
+        speed_limit: of each joint [rad/s or m/s].
+        stiffness: of each added servo [N m/rad or N/m].
+        damping: of each added servo [N m s/rad or N s/m].
+        effort: largest torque or force of each added servo [N m or N].
+    """
+
+    mode: str
+    speed_limit: tuple[float, ...]
+    stiffness: tuple[float, ...] = ()
+    damping: tuple[float, ...] = ()
+    effort: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.mode not in CONTROL_MODES:
+            raise ValueError(f"control.mode is {self.mode!r}; it must be one of {', '.join(CONTROL_MODES)}")
+        for name in ("stiffness", "damping", "effort"):
+            if bool(getattr(self, name)) != (self.mode == "servo"):
+                rule = "must be given" if self.mode == "servo" else "must be left out"
+                raise ValueError(f"control.{name} {rule} with control.mode = {self.mode!r}")
+
+
+@dataclass(frozen=True)
+class ArmDescription:
+    """An arm and the instrument it carries.
+
+    Args:
+        name: the TOML file's stem.
+        folder: of that file; `model` is relative to it.
+        model: MJCF or URDF file.
+        kind: "palpator" or "grasper".
+        joints: the driven joints, from base to tip.
+        contact: geoms in contact with tissue (spheres and capsules).
+        links: other geoms of the arm (spheres and capsules), for clearances only.
+        tip, trocar, control: see there.
+        home: value of each joint with the shaft in the trocar [rad or m].
+        jaw: joints whose sum is the jaw's opening angle; none for a rigid tip.
+        description: one line.
+    """
+
+    name: str
+    folder: Path
+    model: str
+    kind: str
+    joints: tuple[str, ...]
+    contact: tuple[str, ...]
+    tip: Tip
+    trocar: Trocar
+    control: JointControl
+    home: dict[str, float]
+    links: tuple[str, ...] = ()
+    jaw: tuple[str, ...] = ()
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind is {self.kind!r}; it must be one of {', '.join(KINDS)}")
+        if self.kind == "grasper" and not self.jaw:
+            raise ValueError('a grasper needs a jaw: name its joints, such as jaw = ["jaw"]')
+        for name in ("joints", "contact"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} is empty; name at least one")
+        _require_distinct("joints and jaw", (*self.joints, *self.jaw))
+        _require_distinct("contact and links", (*self.contact, *self.links))
+        self._check_control()
+        self._check_home()
+
+    def _check_control(self) -> None:
+        control = self.control
+        for name in ("speed_limit", "stiffness", "damping", "effort"):
+            values = getattr(control, name)
+            if not values and control.mode == "position" and name != "speed_limit":
+                continue
+            if len(values) != len(self.joints):
+                raise ValueError(f"control.{name} has {len(values)} numbers for {len(self.joints)} joints; one each")
+            for joint, value in zip(self.joints, values, strict=True):
+                if not 0.0 < value < math.inf:
+                    raise ValueError(f"control.{name} of joint {joint!r} is {value:g}; it must be finite and above 0")
+
+    def _check_home(self) -> None:
+        for joint in self.joints:
+            if joint not in self.home:
+                raise ValueError(f"home gives no value for joint {joint!r}; it needs one for each of joints")
+        for joint, value in self.home.items():
+            if joint not in self.joints:
+                raise ValueError(f"home names {joint!r}, which is not among joints{nearest(joint, list(self.joints))}")
+            if not math.isfinite(value):
+                raise ValueError(f"home of joint {joint!r} is {value:g}; it must be finite")
+
+
+def read_description(source: str | Path) -> ArmDescription:
+    """The description of a shipped arm's name (see `list_arms`) or of a TOML file's path.
+
+    Raises:
+        ValueError: an unknown name (lists the known), a file that cannot be read, a missing or wrong entry.
+    """
+    if not isinstance(source, str | Path):
+        raise ValueError(f"arm is {source!r}; it must be a shipped arm's name or the path of a TOML file")
+    path = Path(source)
+    if path.suffix != ".toml":
+        known = list_arms()
+        if str(source) not in known:
+            hint = nearest(str(source), known)
+            raise ValueError(f"arm {str(source)!r} is unknown; the arms are {', '.join(known)}{hint}")
+        path = scenes_folder() / "instruments" / f"{source}.toml"
+    table = read_toml(path, "arm")
+    for entry in ("name", "folder"):
+        if entry in table:
+            raise ValueError(f"arm {path.stem!r}: entry {entry!r} is unknown there; the file's name and folder say it")
+    where = {"name": path.stem, "folder": path.parent}
+    return fill(ArmDescription, {**table, **where}, f"arm {path.stem!r}")
+
+
+def _require_finite(what: str, values: Vector) -> None:
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"{what} is {values}; every number must be finite")
+
+
+def _require_distinct(what: str, names: tuple[str, ...]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{what} name {name!r} twice; each may be named once")

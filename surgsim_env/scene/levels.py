@@ -1,0 +1,207 @@
+"""Difficulty levels of palpation: the lesions that an episode hides, as shares of a scene's ranges, and their draw."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Capsule, Lesion
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.load import nearest
+from surgsim_env.scene.model import LesionDraw, Range, Scene
+
+# Least distance between lesions' balls under a tip of radius REFERENCE_TIP [m], in proportion for other tips: nearer
+# lesions are felt as one.
+LESION_GAP = 0.006
+REFERENCE_TIP = 0.008
+# Draws of one lesion that is too near to the others, and draws of all lesions, before giving up.
+PLACES_MOST = 20
+TRIES_MOST = 200
+# A drawn capsule is this thick [m]; what counts is its modulus times this, 5 to 20 N/m: that of the scene `liver`
+# is 20 N/m, which adds some 7 % to an indentation, as a human one does (Roan 2010, doi 10.1115/1.4002369).
+CAPSULE_THICKNESS = 2e-5
+CAPSULE_STIFFNESS = (5.0, 20.0)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A difficulty level. A share f of a scene's range [low, high] is low + f (high - low); f may lie outside [0, 1].
+
+    Args:
+        name: as arguments give it.
+        lesion_count_weights: probabilities of 0, 1, 2, ... lesions.
+        radius, cover, modulus_ratio: shares of the scene's `[lesion]` ranges, from and to.
+        background: range of the factor on the healthy tissue's modulus; lesions keep their ratio to it.
+        capsule_share: probability that an organ without a capsule gets one, drawn from CAPSULE_STIFFNESS.
+        sensor_noise, sensor_bias: factors on the scene's force sensor.
+    """
+
+    name: str
+    lesion_count_weights: tuple[float, ...]
+    radius: Range
+    cover: Range
+    modulus_ratio: Range
+    background: Range
+    capsule_share: float
+    sensor_noise: float
+    sensor_bias: float
+
+    def scene(self, scene: Scene) -> Scene:
+        """A scene at this level: with its sensor, and mass scaling where stiffer tissue needs shorter substeps.
+
+        Raises:
+            ValueError: the scene has no [lesion] table, or the level's share of one of its ranges is invalid.
+        """
+        self.lesion_draw(scene)
+        sensor = replace(
+            scene.sensor, noise=scene.sensor.noise * self.sensor_noise, bias=scene.sensor.bias * self.sensor_bias
+        )
+        return replace(scene, sensor=sensor, timing=replace(scene.timing, mass_scaling=True))
+
+    def lesion_draw(self, scene: Scene) -> LesionDraw:
+        """The lesion ranges of a scene at this level."""
+        draw = scene.lesion
+        if draw is None:
+            raise ValueError(
+                f"scene {scene.name!r} has no [lesion] table, so that level {self.name!r} has nothing to hide in it: "
+                "add one, or take a scene that has it, such as 'phantom'"
+            )
+        shares = {name: _share(getattr(draw, name), getattr(self, name)) for name in ("radius", "cover")}
+        ratio = _share(draw.modulus_ratio, self.modulus_ratio)
+        for name, (low, high) in {**shares, "modulus_ratio": ratio}.items():
+            least = 1.0 if name == "modulus_ratio" else 0.0
+            if not low > least:
+                raise ValueError(
+                    f"level {self.name!r} of scene {scene.name!r} draws lesion.{name} from [{low:g}, {high:g}], which "
+                    f"must lie above {least:g}: narrow lesion.{name} = {list(getattr(draw, name))} of the scene"
+                )
+        return replace(draw, **shares, modulus_ratio=ratio)
+
+    def draw(self, anatomy: Anatomy, rng: np.random.Generator, *, lesion_count: int | None = None) -> "DrawnOrgan":
+        """Draw an organ.
+
+        Args:
+            anatomy: of a scene made by `scene`.
+            rng: source of random numbers.
+            lesion_count: number of lesions; None: drawn.
+
+        Raises:
+            ValueError: TRIES_MOST draws find no room for the lesions.
+        """
+        weights = self.lesion_count_weights
+        count = int(rng.choice(len(weights), p=weights)) if lesion_count is None else lesion_count
+        background = float(rng.uniform(*self.background))
+        capsule = 0.0
+        if anatomy.scene.capsule is None and rng.random() < self.capsule_share:
+            capsule = float(rng.uniform(*CAPSULE_STIFFNESS))
+        for _ in range(TRIES_MOST):
+            lesions = self._lesions(anatomy, rng, count, background)
+            if lesions is not None:
+                return DrawnOrgan(tuple(lesions), background, capsule)
+        raise ValueError(
+            f"scene {anatomy.scene.name!r}: {count} lesions of level {self.name!r} found no room beside each other in "
+            f"{TRIES_MOST} draws: use smaller lesions, or a larger palpable face"
+        )
+
+    def _lesions(
+        self, anatomy: Anatomy, rng: np.random.Generator, count: int, background: float
+    ) -> list[Lesion] | None:
+        """Draw lesions apart from each other; None if one of them finds no place in PLACES_MOST draws."""
+        ranges, lesions = self.lesion_draw(anatomy.scene), []
+        gap = LESION_GAP * anatomy.scene.instrument.tip_radius / REFERENCE_TIP
+        for number in range(count):
+            for _ in range(PLACES_MOST):
+                lesion = anatomy.random_lesion(rng, ranges, modulus_factor=background)
+                if _apart(lesion, lesions, gap):
+                    lesions.append(replace(lesion, name=f"lesion {number + 1}"))
+                    break
+            else:
+                return None
+        return lesions
+
+
+@dataclass(frozen=True)
+class DrawnOrgan:
+    """The organ that an episode draws.
+
+    Args:
+        lesions: spheres.
+        background: factor on the modulus of the healthy tissue and its own capsule.
+        capsule_stiffness: modulus times thickness of a capsule beside the scene's own [N/m], 0 for none.
+    """
+
+    lesions: tuple[Lesion, ...]
+    background: float = 1.0
+    capsule_stiffness: float = 0.0
+
+    def compiled(self, anatomy: Anatomy) -> OrganModel:
+        """The compiled organ of an anatomy with everything that was drawn."""
+        specification = anatomy.specification(self.lesions, modulus_factor=self.background)
+        if self.capsule_stiffness > 0.0:
+            membrane = Capsule(self.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
+            specification = replace(specification, capsule=membrane)
+        return anatomy.compiled(specification)
+
+    def places(self, anatomy: Anatomy) -> FloatArray:
+        """The palpable face's point nearest to each lesion's centre [m], shape (n_lesion, 3)."""
+        points = [anatomy.face.project(np.asarray(lesion.centre))[0] for lesion in self.lesions]
+        return np.array(points).reshape(-1, 3)
+
+    def to_json(self) -> str:
+        """The draw as JSON, with numbers written exactly."""
+        lesions = [[*lesion.centre, lesion.radius, lesion.material.youngs_modulus] for lesion in self.lesions]  # type: ignore[misc, union-attr]
+        return json.dumps({**asdict(self), "lesions": lesions})
+
+    @classmethod
+    def from_json(cls, text: str, anatomy: Anatomy) -> "DrawnOrgan":
+        """The draw that `to_json` wrote for the same anatomy."""
+        table: dict[str, Any] = json.loads(text)
+        lesions = [
+            anatomy.lesion_of_modulus(numbers[:3], numbers[3], numbers[4], f"lesion {n + 1}")
+            for n, numbers in enumerate(table["lesions"])
+        ]
+        return cls(tuple(lesions), table["background"], table["capsule_stiffness"])
+
+
+def _share(bounds: Range, share: Range) -> Range:
+    low, high = bounds
+    return low + share[0] * (high - low), low + share[1] * (high - low)
+
+
+def _apart(lesion: Lesion, others: Sequence[Lesion], gap: float) -> bool:
+    """Whether a ball keeps a gap [m] from all others."""
+    return all(
+        math.dist(lesion.centre, other.centre) >= lesion.radius + other.radius + gap  # type: ignore[arg-type, operator]
+        for other in others
+    )
+
+
+# Ranges: normal liver by elastography 6.63 +- 1.65 kPa, +-25 % from one person to the next, HCC and metastases 8 times
+# that, malignant lesions at large 3 times (doi 10.1177/8756479317733713, 10.1186/s43055-020-00186-2), adenomas twice
+# (PMID 26299323); sensors of minimally invasive tools 5 to 50 mN.
+LEVELS: Mapping[str, Level] = {
+    level.name: level
+    for level in (
+        Level("easy", (0.0, 1.0), (0.5, 1.0), (0.0, 0.5), (0.5, 1.0), (0.9, 1.1), 0.0, 1.0, 1.0),
+        Level("standard", (0.1, 0.5, 0.25, 0.15), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (0.7, 1.3), 0.5, 2.0, 1.0),
+        Level("hard", (0.15, 0.3, 0.3, 0.25), (-0.25, 0.5), (0.0, 2.0), (-1.0 / 3.0, 0.5), (0.7, 1.3), 0.5, 4.0, 2.0),
+    )
+}
+
+
+def find_level(name: str) -> Level:
+    """The level of a name.
+
+    Raises:
+        ValueError: an unknown name; lists the known, suggests the nearest.
+    """
+    if not isinstance(name, str) or name not in LEVELS:
+        raise ValueError(
+            f"level {name!r} is unknown{nearest(str(name), list(LEVELS))}; the levels are {', '.join(LEVELS)}"
+        )
+    return LEVELS[name]

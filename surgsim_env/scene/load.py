@@ -1,0 +1,191 @@
+"""Scene files read into frozen dataclasses, every entry checked; shipped scenes and arms by name."""
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+import dacite
+
+from msdm_core.errors import OrganError
+from surgsim_env.scene.model import CARTESIAN, PAIRS, Scene
+
+Table = TypeVar("Table")
+PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
+
+
+def scenes_folder(package_folder: Path = PACKAGE_FOLDER) -> Path:
+    """The folder with `organs/`, `instruments/` and `meshes/`.
+
+    A wheel carries it inside the package, a checkout next to the package. Both are looked for beside this file and
+    nowhere else: an editable install also leaves a copy in site-packages, which goes stale and is never read.
+
+    Args:
+        package_folder: the folder of the package `surgsim_env`.
+
+    Raises:
+        FileNotFoundError: neither place has it; names both and the way out.
+    """
+    places = (package_folder / "assets", package_folder.parent / "scenes")
+    for place in places:
+        if (place / "organs").is_dir():
+            return place
+    looked = " nor in ".join(str(place) for place in places)
+    raise FileNotFoundError(
+        f"surgsim's scene files are neither in {looked} (a folder with `organs` in it is expected); "
+        "reinstall surgsim, or run from a complete checkout"
+    )
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """The table in a TOML file; a ValueError names a file that cannot be read, or where it is no valid TOML."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        if isinstance(error, tomllib.TOMLDecodeError | UnicodeDecodeError):
+            raise ValueError(f"{what} file {path} is not valid TOML: {error}") from None
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ValueError(f"{what} file {path} cannot be read: {reason}") from None
+
+
+def fill(kind: type[Table], table: dict[str, Any], where: str) -> Table:
+    """Fill a dataclass from a table of a TOML file, with every entry checked.
+
+    Raises:
+        ValueError: an unknown entry (suggests the nearest), a missing or a wrong one; the message begins with `where`.
+    """
+    lists = {hint: _listed for part in dataclasses_in(kind) for hint in _tuples_in(*get_type_hints(part).values())}
+    hooks: dict[Any, Any] = {float: _real, int: _whole, **lists}
+    try:
+        return dacite.from_dict(kind, table, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
+    except dacite.UnexpectedDataError as error:
+        entry = sorted(map(str, error.keys))[0]
+        known = sorted({one.name for part in dataclasses_in(kind) for one in fields(part)})
+        raise ValueError(f"{where}: entry {entry!r} is unknown there{nearest(entry, known)}") from None
+    except (dacite.DaciteError, OrganError, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def dataclasses_in(kind: Any) -> Iterator[Any]:
+    """A dataclass and those in its fields, at any depth; of another type, the dataclasses in its arguments."""
+    if is_dataclass(kind):
+        yield kind
+        for hint in get_type_hints(kind).values():
+            yield from dataclasses_in(hint)
+    for part in get_args(kind):
+        yield from dataclasses_in(part)
+
+
+def _tuples_in(*hints: Any) -> Iterator[Any]:
+    """The tuple types among type hints and their arguments."""
+    for hint in hints:
+        if get_origin(hint) is tuple:
+            yield hint
+        yield from _tuples_in(*get_args(hint))
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """A hint at the nearest known name, or an empty string."""
+    found = get_close_matches(name, known, n=1)
+    return f"; did you mean {found[0]!r}?" if found else ""
+
+
+def _listed(value: Any) -> Any:
+    # Python would make a tuple of a table's keys, or of a text's letters.
+    if isinstance(value, dict | str):
+        raise ValueError(f"{value!r} is not a list")
+    return value
+
+
+def _whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{value!r} is not a whole number")
+    return value
+
+
+def _real(value: Any) -> float:
+    """Accept 5000 for 5000.0, which TOML tells apart."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{value!r} is not a number")
+    return float(value)
+
+
+def list_scenes() -> list[str]:
+    """Names of the scenes that are shipped."""
+    return sorted(path.stem for path in (scenes_folder() / "organs").glob("*.toml"))
+
+
+def make_scene(name: str | Path) -> Scene:
+    """The scene of a name (see `list_scenes`) or of a TOML file's path.
+
+    Raises:
+        ValueError: an unknown name (lists the known, suggests the nearest) or a file that breaks the format.
+    """
+    if not isinstance(name, str | Path):
+        raise ValueError(f"scene is {name!r}; it must be a scene's name or the path of a scene file")
+    name = str(name)
+    if name.endswith(".toml"):
+        return load_scene(Path(name))
+    known = list_scenes()
+    if name not in known:
+        close = get_close_matches(name, known, n=1, cutoff=0.4)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"scene {name!r} is unknown; the scenes are {', '.join(known)}{hint}")
+    return load_scene(scenes_folder() / "organs" / f"{name}.toml")
+
+
+def with_instrument(scene: Scene, instrument: str | None) -> Scene:
+    """The scene with another instrument: a name in CARTESIAN or PAIRS, an arm, its path, a pair; None: its own."""
+    if instrument is None:
+        return scene
+    if not isinstance(instrument, str | Path):
+        raise ValueError(f"instrument is {instrument!r}; it must be an instrument's name or the path of a TOML file")
+    known = [*CARTESIAN, *list_arms(), *PAIRS]
+    if Path(instrument).suffix != ".toml" and instrument not in known and pair_names(str(instrument)) is None:
+        raise ValueError(
+            f"instrument {str(instrument)!r} is unknown{nearest(str(instrument), known)}; the instruments are "
+            f"{', '.join(known)}, the path of an arm's TOML file, or two arms as LEFT+RIGHT"
+        )
+    model = f"{instrument}.xml" if instrument in CARTESIAN else str(instrument)
+    return replace(scene, instrument=replace(scene.instrument, model=model))
+
+
+def pair_names(model: str) -> tuple[str, str] | None:
+    """Left and right arm of a pair: a name in PAIRS, or two arms joined by "+"; None for any other instrument."""
+    known = list_arms()
+    for place in (place for place, sign in enumerate(model) if sign == "+"):
+        left, right = model[:place], model[place + 1 :]
+        if all(name in known or Path(name).suffix == ".toml" for name in (left, right)):
+            return left, right
+    return PAIRS.get(model)
+
+
+def load_scene(path: Path) -> Scene:
+    """Read a scene file; a ValueError names the file, the entry and its fault."""
+    return scene_from_table(read_toml(path, "scene"), name=path.stem, folder=path.parent)
+
+
+def scene_from_table(table: dict[str, Any], *, name: str, folder: Path) -> Scene:
+    """A scene from the table of a scene file; paths in it are relative to `folder`."""
+    return fill(Scene, {**table, "name": name, "folder": folder}, f"scene {name!r}")
+
+
+def make_retract_scene(name: str | Path) -> Scene:
+    """The retraction scene of a name or path: the scene itself, or the one of the same organ to which it refers.
+
+    Raises:
+        ValueError: as in `make_scene`; the scene states why its organ cannot be retracted.
+    """
+    scene = make_scene(name)
+    if scene.retract is not None or (scene.retract_scene is None and scene.retract_refusal is None):
+        return scene
+    if scene.retract_scene is None:
+        raise ValueError(f"scene {scene.name!r} cannot be retracted: {scene.retract_refusal}")
+    return load_scene(scene.folder / scene.retract_scene)
+
+
+def list_arms() -> list[str]:
+    """Names of the arms that are shipped."""
+    return sorted(path.stem for path in (scenes_folder() / "instruments").glob("*.toml"))

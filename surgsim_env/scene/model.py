@@ -1,0 +1,554 @@
+"""The contents of a scene file as frozen dataclasses. All values are SI; comments in the files give their sources."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from msdm_core.kernels.structure_kernels import ContactLaw
+from msdm_core.material.regions import Capsule, Damping, Lesion, Material
+from msdm_core.material.stiffness import check_stiffness_rule
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.support import Support, SupportLaw
+
+Vector = tuple[float, float, float]
+Range = tuple[float, float]
+
+
+def require_number(what: str, value: float, least: float, unit: str, *, above: bool = False) -> None:
+    """Raise a ValueError for an entry that is not finite and at least (or above) a bound."""
+    if not (math.isfinite(value) and (value > least if above else value >= least)):
+        rule = f"above {least:g}" if above else f"at least {least:g}"
+        raise ValueError(f"{what} is {value:g} {unit}".rstrip() + f"; it must be finite and {rule}")
+
+
+def require_direction(what: str, values: Vector) -> None:
+    """Raise a ValueError for a direction that is zero or not finite."""
+    if not 0.0 < math.hypot(*values) < math.inf:
+        raise ValueError(f"{what} is {values}; it must be a direction such as [0, 0, -1]")
+
+
+def _require_range(what: str, bounds: Range) -> None:
+    low, high = bounds
+    if not 0.0 < low <= high < math.inf:
+        raise ValueError(f"{what} = [{low:g}, {high:g}]; the rule is 0 < low <= high, finite")
+
+
+@dataclass(frozen=True)
+class BlockMesh:
+    """A block on a cubic lattice (`box_mesh`): size [m], cells along x, y, z, and coarsening from the top down."""
+
+    size: Vector
+    cells: tuple[int, int, int]
+    coarsening: int = 1
+    fine_depth: float | None = None
+
+
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """A closed surface file (STL, OBJ, PLY), filled with cells of the given edge [m].
+
+    With a coarse_cell_size of 2 or 4 times that, only cells within fine_depth [m] of the palpable face keep it.
+    """
+
+    file: str
+    length_unit: str | float
+    cell_size: float
+    coarse_cell_size: float | None = None
+    fine_depth: float = 0.0
+
+
+@dataclass(frozen=True)
+class TetFile:
+    """A file of tets (vtu, vtk, gmsh, medit) and its length unit."""
+
+    file: str
+    length_unit: str | float
+
+
+@dataclass(frozen=True)
+class MeshSource:
+    """Where the organ's tets come from: exactly one of block, surface, tets."""
+
+    block: BlockMesh | None = None
+    surface: SurfaceMesh | None = None
+    tets: TetFile | None = None
+
+    def __post_init__(self) -> None:
+        if sum(part is not None for part in (self.block, self.surface, self.tets)) != 1:
+            raise ValueError("mesh: give exactly one of mesh.block, mesh.surface, mesh.tets")
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box: lower and upper corner [m]."""
+
+    lower: Vector
+    upper: Vector
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball: centre [m] and radius [m]."""
+
+    centre: Vector
+    radius: float
+
+
+@dataclass(frozen=True)
+class Bed:
+    """The side on which an organ lies: the deepest share of its extent along a direction, such as 0.15."""
+
+    direction: Vector
+    share: float
+
+    def __post_init__(self) -> None:
+        if not any(self.direction) or not 0.0 < self.share < 1.0:
+            raise ValueError(f"bed: direction {self.direction}, share {self.share}; give a direction and 0 < share < 1")
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A place where the organ is held: every surface node inside is fixed; inside a box, every node."""
+
+    name: str
+    box: Box | None = None
+    ball: Ball | None = None
+    bed: Bed | None = None
+
+    def __post_init__(self) -> None:
+        if sum(part is not None for part in (self.box, self.ball, self.bed)) != 1:
+            raise ValueError(f"anchor {self.name!r}: give one of a box, a ball and a bed")
+
+
+@dataclass(frozen=True)
+class TissueRegion:
+    """A region of the mesh with a material of its own.
+
+    Args:
+        name: of the region in the mesh file.
+        material: of its tets.
+        lesion: whether palpation looks for it. It is then a demonstration lesion, and healthy organs (pre-operative
+            models, episodes that hide a lesion of their own) do not have it. Otherwise every organ has it.
+    """
+
+    name: str
+    material: Material
+    lesion: bool = False
+
+    @property
+    def as_lesion(self) -> Lesion:
+        """The region as `compile_organ` takes it."""
+        return Lesion(region=self.name, material=self.material, name=self.name)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact between tissue and instrument; the law is msdm_core.kernels.structure_kernels.ContactLaw.
+
+    Args:
+        stiffness: pressure per penetration [N/m^3].
+        damping: pressure per closing speed [N s/m^3].
+        friction: Coulomb coefficient.
+    """
+
+    stiffness: float
+    damping: float
+    friction: float
+
+    def __post_init__(self) -> None:
+        require_number("contact.stiffness", self.stiffness, 0.0, "N/m^3", above=True)
+        require_number("contact.damping", self.damping, 0.0, "N s/m^3")
+        require_number("contact.friction", self.friction, 0.0, "")
+
+    @property
+    def law(self) -> ContactLaw:
+        """The contact law for the kernels; sticking friction is half as stiff as the normal direction."""
+        return ContactLaw(self.stiffness, self.damping, self.friction, 0.5 * self.stiffness)
+
+
+# Instruments carried by slides; their models are NAME.xml in scenes/instruments.
+CARTESIAN = ("probe", "grasper")
+
+
+# Instruments of two arms, left and right. "LEFT+RIGHT" makes a pair of any two arms, see `load.pair_names`.
+PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
+
+
+@dataclass(frozen=True)
+class SceneInstrument:
+    """The instrument of a scene, and its direction of approach.
+
+    Args:
+        model: MJCF file of a probe or grasper in scenes/instruments, a shipped arm's name, the path of an arm's TOML
+            file, or a pair of arms: one of PAIRS, or two as "LEFT+RIGHT".
+        tip_radius: of the ball tip [m].
+        approach: direction in which it approaches the organ, and of its shaft.
+        tip_direction: direction of a grasper's jaw and an arm's tip; by default the approach.
+    """
+
+    model: str = "probe.xml"
+    tip_radius: float = 0.008
+    approach: Vector = (0.0, 0.0, -1.0)
+    tip_direction: Vector | None = None
+
+    def __post_init__(self) -> None:
+        require_number("instrument.tip_radius", self.tip_radius, 0.0, "m", above=True)
+        for name in ("approach", "tip_direction"):
+            value = getattr(self, name)
+            if value is not None:
+                require_direction(f"instrument.{name}", value)
+
+
+@dataclass(frozen=True)
+class Port:
+    """The frame of a port: its origin is the trocar, its -z points into the body.
+
+    Args:
+        point: the trocar [m], world frame.
+        into: direction into the body, any length.
+        roll: turn of the frame about its z axis [rad]; 0 has x as near to world x (else y) as can be.
+    """
+
+    point: Vector = (0.0, 0.0, 0.0)
+    into: Vector = (0.0, 0.0, -1.0)
+    roll: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not np.isfinite([*self.point, *self.into, self.roll]).all() or not math.hypot(*self.into) > 0.0:
+            raise ValueError(
+                f"port at {self.point} into {self.into}, roll {self.roll}: every number must be finite, and `into` a "
+                "direction such as [0, 0, -1]"
+            )
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Axes of the port's frame as columns, world frame, (3, 3)."""
+        return frame_into(np.array(self.into), self.roll)
+
+
+def frame_into(into: FloatArray, roll: float = 0.0) -> FloatArray:
+    """A right-handed frame whose -z is a direction, its x near world x (else y), turned by roll [rad]; (3, 3)."""
+    z = -into / np.linalg.norm(into)
+    near = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = near - (near @ z) * z
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    c, s = math.cos(roll), math.sin(roll)
+    return np.stack([c * x + s * y, c * y - s * x, z], axis=1)
+
+
+# Largest substep over the stable step of the organ at rest; a pressed organ is stiffer and needs the margin.
+STABLE_STEP_SHARE = 0.9
+
+
+def step_needed(haptic_step: float, substep_count: int) -> float:
+    """The stable step [s] that a number of substeps of a haptic step needs; the inverse of `substeps_needed`."""
+    # A little more, so that rounding does not add a substep.
+    return haptic_step / (STABLE_STEP_SHARE * substep_count) * (1.0 + 1e-9)
+
+
+def substeps_needed(haptic_step: float, stable_step: float) -> int:
+    """Fewest organ substeps of a haptic step that keep each below STABLE_STEP_SHARE of the stable step."""
+    return math.ceil(haptic_step / (STABLE_STEP_SHARE * stable_step))
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Time steps: haptic_step [s], organ substeps per haptic step, haptic steps per control step.
+
+    With mass_scaling, nodes that need more substeps than that are given more mass (`msdm_core.organ.stability`).
+    """
+
+    haptic_step: float = 0.001
+    substep_count: int = 5
+    haptic_steps_per_control: int = 50
+    mass_scaling: bool = False
+
+    def __post_init__(self) -> None:
+        require_number("timing.haptic_step", self.haptic_step, 0.0, "s", above=True)
+        require_number("timing.substep_count", self.substep_count, 1, "")
+        require_number("timing.haptic_steps_per_control", self.haptic_steps_per_control, 1, "")
+
+    @property
+    def control_step(self) -> float:
+        """Duration of a control step [s]."""
+        return self.haptic_step * self.haptic_steps_per_control
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Force limits [N]: more than soft_force costs reward, more than hard_force ends an episode, and so does tearing.
+
+    A jaw that pulls with more than tear_force tears the tissue; by default nothing tears.
+    """
+
+    soft_force: float
+    hard_force: float
+    tear_force: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.soft_force < self.hard_force:
+            raise ValueError(
+                f"limits: 0 < soft_force < hard_force must hold; got {self.soft_force}, {self.hard_force} N"
+            )
+        if not self.tear_force > 0.0:
+            raise ValueError(f"limits.tear_force is {self.tear_force:g} N; it must be above 0")
+
+    def excess(self, force: float) -> float:
+        """A force [N] on a scale from the soft limit (0) to the hard limit (1), not clipped."""
+        return (force - self.soft_force) / (self.hard_force - self.soft_force)
+
+
+@dataclass(frozen=True)
+class ForceSensor:
+    """A force sensor per axis: reading = force + bias + noise, clipped at +-range and flagged.
+
+    Args:
+        noise: standard deviation of each reading [N].
+        bias: largest bias [N]; each episode draws one uniformly from [-bias, bias].
+        range: largest reading [N].
+    """
+
+    noise: float
+    bias: float
+    range: float
+
+    def __post_init__(self) -> None:
+        require_number("sensor.noise", self.noise, 0.0, "N")
+        require_number("sensor.bias", self.bias, 0.0, "N")
+        require_number("sensor.range", self.range, 0.0, "N", above=True)
+
+
+@dataclass(frozen=True)
+class PalpationSettings:
+    """How the organ is palpated.
+
+    Args:
+        press_depth: depth of a press along the surface normal [m].
+        face_angle_deg: largest angle between the inward normal of a palpable point and the approach [degrees].
+        face_margin: least distance of a palpable point from the rim of the palpable face [m].
+        thickness_smallest: least thickness of the organ below a palpable point [m].
+        site_spacing: of the raster [m].
+        clearance: gap between tip and surface before a press [m].
+    """
+
+    press_depth: float
+    face_angle_deg: float = 35.0
+    face_margin: float = 0.0
+    thickness_smallest: float = 0.0
+    site_spacing: float = 0.010
+    clearance: float = 0.001
+
+    def __post_init__(self) -> None:
+        require_number("palpation.press_depth", self.press_depth, 0.0, "m", above=True)
+        require_number("palpation.site_spacing", self.site_spacing, 0.0, "m", above=True)
+        for name in ("face_margin", "thickness_smallest", "clearance"):
+            require_number(f"palpation.{name}", getattr(self, name), 0.0, "m")
+        if not 0.0 < self.face_angle_deg <= 90.0:
+            raise ValueError(f"palpation.face_angle_deg is {self.face_angle_deg}; it must be above 0 and at most 90")
+
+
+@dataclass(frozen=True)
+class LesionDraw:
+    """The hidden lesion of an episode, drawn uniformly below the palpable face.
+
+    Args:
+        radius: range of its radius [m].
+        cover: range of the distance from its ball to the surface [m].
+        modulus_ratio: range of its modulus over the healthy one.
+        rim_distance: least distance of its place from the border of the palpable face [m].
+    """
+
+    radius: Range
+    cover: Range
+    modulus_ratio: Range
+    rim_distance: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "cover", "modulus_ratio"):
+            _require_range(f"lesion.{name}", getattr(self, name))
+        require_number("lesion.rim_distance", self.rim_distance, 0.0, "m")
+
+
+@dataclass(frozen=True)
+class FixedLesion:
+    """A lesion of the demonstration: below a surface point [m], with cover [m], radius [m] and modulus ratio."""
+
+    name: str
+    below: Vector
+    radius: float
+    cover: float
+    modulus_ratio: float
+
+
+@dataclass(frozen=True)
+class Endoscope:
+    """The endoscope: position and target of its camera [m], vertical field of view [degrees]."""
+
+    position: Vector
+    target: Vector
+    fov_deg: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < math.dist(self.position, self.target) < math.inf or not 0.0 < self.fov_deg < 180.0:
+            raise ValueError(
+                f"endoscope: position {self.position}, target {self.target}, fov_deg {self.fov_deg:g}; the rule is two "
+                "places that differ and 0 < fov_deg < 180"
+            )
+
+
+@dataclass(frozen=True)
+class RetractionCamera:
+    """Random displacement of the endoscope in an episode.
+
+    Args:
+        shift: radius of the ball in which its position is drawn uniformly [m].
+        turn_deg: largest rotation of its view about an axis across it [degrees].
+    """
+
+    shift: float = 0.0
+    turn_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_number("retract.camera.shift", self.shift, 0.0, "m")
+        require_number("retract.camera.turn_deg", self.turn_deg, 0.0, "degrees")
+
+
+@dataclass(frozen=True)
+class Flap:
+    """The part of an organ that is lifted, if not the whole organ: corners of its box [m]."""
+
+    lower: Vector
+    upper: Vector
+
+    def __post_init__(self) -> None:
+        for low, high, axis in zip(self.lower, self.upper, "xyz"):
+            if not -math.inf < low < high < math.inf:
+                raise ValueError(f"retract.flap: it reaches from {axis} = {low:g} to {high:g} m; give low < high")
+
+
+@dataclass(frozen=True)
+class Retraction:
+    """Ranges from which each episode of a retraction is drawn: the lobe, the target it hides, the tip's start.
+
+    The lobe is a block with x along its anchored edge, y from that edge (y = 0) to the free one, and z up; it lies on a
+    bed whose top is z = 0. For an organ of another shape this holds for its `flap`, and scale and held share are 1.
+
+    Args:
+        target_distance: range of the target's distance from the anchored edge, along y [m].
+        target_along: range of its position along the edge, x [m].
+        start_lower, start_upper: corners of the box in which the tip starts [m].
+        target_radius: of the disc to be exposed [m].
+        scale: range of the factor on the whole lobe, its thickness included (cells stay cubic).
+        youngs_modulus: range [Pa].
+        capsule_share: share of the episodes in which the lobe has a capsule.
+        capsule_stiffness: range of that capsule's modulus times thickness [N/m].
+        held_share: range of the share of the anchored edge, about its middle, that is held.
+        camera: displacement of the endoscope.
+        right_start_lower, right_start_upper: corners of the box in which the right one of two tips starts [m].
+        flap: the part of the organ that is lifted; None: all of it.
+    """
+
+    target_distance: Range
+    target_along: Range
+    start_lower: Vector
+    start_upper: Vector
+    target_radius: float = 0.008
+    scale: Range = (1.0, 1.0)
+    youngs_modulus: Range = (5000.0, 5000.0)
+    capsule_share: float = 0.0
+    capsule_stiffness: Range = (1.0, 1.0)
+    held_share: Range = (1.0, 1.0)
+    camera: RetractionCamera = RetractionCamera()
+    right_start_lower: Vector | None = None
+    right_start_upper: Vector | None = None
+    flap: Flap | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("target_distance", "target_along", "scale", "youngs_modulus", "capsule_stiffness", "held_share"):
+            _require_range(f"retract.{name}", getattr(self, name))
+        if self.held_share[1] > 1.0:
+            raise ValueError(f"retract.held_share = {list(self.held_share)}; no more than 1 can be held")
+        if self.flap is not None and (self.scale != (1.0, 1.0) or self.held_share != (1.0, 1.0)):
+            raise ValueError(
+                f"retract: scale {list(self.scale)} and held_share {list(self.held_share)} go with a whole lobe; with "
+                "retract.flap both are [1, 1]"
+            )
+        require_number("retract.target_radius", self.target_radius, 0.0, "m", above=True)
+        if not 0.0 <= self.capsule_share <= 1.0:
+            raise ValueError(f"retract.capsule_share is {self.capsule_share:g}; it must be from 0 to 1")
+        for lower, upper in (
+            (self.start_lower, self.start_upper),
+            (self.right_start_lower or (), self.right_start_upper or ()),
+        ):
+            for low, high, axis in zip(lower, upper, "xyz"):
+                if not -math.inf < low <= high < math.inf:
+                    raise ValueError(f"retract: the tip starts from {axis} = {low:g} to {high:g} m; give low <= high")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene.
+
+    Args:
+        name: stem of its file.
+        description: one line.
+        folder: of its file; paths in the file are relative to it.
+        mesh: source of the organ's tets.
+        material: of the healthy tissue.
+        damping: of the organ.
+        anchors: places where the organ is held.
+        contact: between tissue and instruments.
+        instrument: the tool, its tip and its approach.
+        timing: of haptic and control steps.
+        limits: of forces.
+        sensor: of forces on the tool.
+        palpation: of the palpable face and presses on it.
+        lesion: ranges of the lesion that an episode hides.
+        retract: ranges from which a retraction is drawn.
+        capsule: on the organ's boundary.
+        demonstration: lesions that the scene shows.
+        stiffness_rule: one of msdm_core.material.stiffness.STIFFNESS_RULES.
+        port: where an arm enters the body; None: `instruments.arm.arm_instrument.default_port` finds one.
+        ports: those of two arms, the left one's first.
+        endoscope: camera of retractions.
+        gravity: [m/s^2]; the organ is settled under it onto anchors and supports.
+        supports: solids on which the organ rests.
+        support_law: their contact law; None: that of `contact`.
+        regions: of the mesh, with materials of their own.
+        retract_scene: file of the scene in which this organ is retracted.
+        retract_refusal: why this organ cannot be retracted.
+    """
+
+    name: str
+    description: str
+    folder: Path
+    mesh: MeshSource
+    material: Material
+    damping: Damping
+    anchors: tuple[Anchor, ...]
+    contact: Contact
+    instrument: SceneInstrument
+    timing: Timing
+    limits: Limits
+    sensor: ForceSensor
+    palpation: PalpationSettings
+    lesion: LesionDraw | None = None
+    retract: Retraction | None = None
+    capsule: Capsule | None = None
+    demonstration: tuple[FixedLesion, ...] = field(default=())
+    stiffness_rule: str = "lloyd"
+    port: Port | None = None
+    ports: tuple[Port, ...] = ()
+    endoscope: Endoscope | None = None
+    gravity: Vector = (0.0, 0.0, 0.0)
+    supports: tuple[Support, ...] = ()
+    support_law: SupportLaw | None = None
+    regions: tuple[TissueRegion, ...] = ()
+    retract_scene: str | None = None
+    retract_refusal: str | None = None
+
+    def __post_init__(self) -> None:
+        check_stiffness_rule(self.stiffness_rule)

@@ -1,0 +1,240 @@
+"""The palpable part of an organ's surface: points, normals, rasters, random places; whether its cells are felt."""
+
+import math
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.kernels.ray_kernels import nearest_hits
+from msdm_core.mesh.geodesic import nearest_triangle
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from surgsim_env.scene.model import PalpationSettings
+
+# A raster of more points means a spacing in the wrong unit.
+SITES_MOST = 100_000
+
+# A ray that starts on the surface meets its own triangle nearer than this [m].
+HIT_LEAST = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PalpableFace:
+    """The surface triangles that face the instrument.
+
+    Fields:
+        points, normals: surface nodes' positions [m] and unit outward normals                      (n_node, 3)
+        triangles: of the palpable face, outward                                                    (n_face, 3)
+        rim: edges of the face's border                                                             (n_rim, 2)
+        approach: unit vector of the instrument's approach                                           (3,)
+        thickness: organ below each triangle along its inward normal [m]                            (n_face,)
+        margin: least distance of raster sites from the rim [m]
+        thickness_smallest: least thickness of the organ below a site [m]
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    triangles: IntArray
+    rim: IntArray
+    approach: FloatArray
+    thickness: FloatArray
+    margin: float
+    thickness_smallest: float
+
+    def project(self, point: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """The face's point nearest to a point [m] and the unit outward normal there, each (3,)."""
+        return self._at(*nearest_triangle(self.points[self.triangles], np.asarray(point, dtype=np.float64)))
+
+    def _at(self, face: int, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        nodes = self.triangles[face]
+        normal = weights @ self.normals[nodes]
+        return weights @ self.points[nodes], normal / np.linalg.norm(normal)
+
+    def rim_distance(self, point: FloatArray) -> float:
+        """Distance from a point to the face's border [m]."""
+        start, end = self.points[self.rim[:, 0]], self.points[self.rim[:, 1]]
+        span = end - start
+        along = np.clip(((point - start) * span).sum(axis=1) / (span**2).sum(axis=1), 0.0, 1.0)
+        return float(np.sqrt((((start + along[:, None] * span) - point) ** 2).sum(axis=1).min()))
+
+    def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
+        """A point drawn uniformly over the face, thick enough and rim_distance [m] from its border, with its normal.
+
+        Raises:
+            ValueError: no such point in 1000 draws.
+        """
+        corners = self.points[self.triangles]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        cumulative = np.cumsum(area)
+        for _ in range(1000):
+            face = int(np.searchsorted(cumulative, rng.random() * cumulative[-1]))
+            u, v = rng.random(2)
+            root = math.sqrt(u)
+            weights = np.array([1.0 - root, root * (1.0 - v), root * v])
+            if self.thickness[face] < self.thickness_smallest:
+                continue
+            point, normal = self._at(face, weights)
+            if self.rim_distance(point) >= rim_distance:
+                return point, normal
+        raise ValueError(
+            f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: "
+            "widen palpation.face_angle_deg"
+        )
+
+    @cached_property
+    def _plane(self) -> tuple[FloatArray, FloatArray]:
+        """The triangles' corners projected across the approach (n_face, 3, 2), and their heights (n_face, 3) [m]."""
+        across, along = tangent_axes(self.approach)
+        corners = self.points[self.triangles]
+        return np.stack([corners @ across, corners @ along], axis=2), corners @ -self.approach
+
+    def drop(self, u: float, v: float) -> tuple[FloatArray, FloatArray] | None:
+        """The uppermost point of the face over a point of the plane of `tangent_axes` [m], and its normal, each (3,).
+
+        None outside the face.
+        """
+        hit = _drop(*self._plane, u, v)
+        return None if hit is None else self._at(*hit)
+
+    def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
+        """`drop`, but None also where the organ is thin or the border is nearer than the margin less a slack [m]."""
+        hit = _drop(*self._plane, u, v)
+        if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
+            return None
+        point, normal = self._at(*hit)
+        return (point, normal) if self.rim_distance(point) >= self.margin - slack else None
+
+    def raster(self, spacing: float) -> tuple[FloatArray, FloatArray]:
+        """Points on a square grid seen along the approach, dropped onto the face, and their normals, each (n_site, 3).
+
+        Points nearer to the border than the face's margin, or where the organ is too thin, are left out.
+        """
+        plane = self._plane[0]
+        lower, upper = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
+        points, normals = [], []
+        for u, v in _grid(lower, upper, spacing):
+            site = self.site(u, v)
+            if site is not None:
+                points.append(site[0])
+                normals.append(site[1])
+        return np.array(points).reshape(-1, 3), np.array(normals).reshape(-1, 3)
+
+
+def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: PalpationSettings) -> PalpableFace:
+    """The surface triangles whose inward normal is within the scene's angle of the approach direction.
+
+    Raises:
+        ValueError: no triangle faces the instrument.
+    """
+    direction = np.asarray(approach, dtype=np.float64)
+    direction = direction / np.linalg.norm(direction)
+    triangles = mesh.boundary_triangles
+    corners = mesh.points[triangles]
+    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
+    chosen = -unit @ direction >= math.cos(math.radians(palpation.face_angle_deg))
+    if not chosen.any():
+        raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
+    face = triangles[chosen]
+    normals = np.zeros_like(mesh.points)
+    for corner in range(3):
+        np.add.at(normals, face[:, corner], area_vector[chosen])
+    length = np.linalg.norm(normals, axis=1)
+    normals[length > 0.0] /= length[length > 0.0, None]
+    thickness = np.full(len(face), np.inf)
+    if palpation.thickness_smallest > 0.0:
+        thickness = _thickness(corners[chosen].mean(axis=1), -unit[chosen], corners)
+    return PalpableFace(
+        points=mesh.points,
+        normals=normals,
+        triangles=face,
+        rim=_rim(face),
+        approach=direction,
+        thickness=thickness,
+        margin=palpation.face_margin,
+        thickness_smallest=palpation.thickness_smallest,
+    )
+
+
+def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors across a direction, the first as near to world x (else y) as possible."""
+    start = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = start - (start @ direction) * direction
+    first /= np.linalg.norm(first)
+    return first, np.cross(direction, first) * (-1.0)
+
+
+def _rim(face: IntArray) -> IntArray:
+    edges = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
+    unique, counts = np.unique(edges, axis=0, return_counts=True)
+    return unique[counts == 1]
+
+
+def _grid(lower: FloatArray, upper: FloatArray, spacing: float) -> FloatArray:
+    """Points of a square grid centred in a rectangle, row by row (boustrophedon), shape (n, 2)."""
+    wanted = float(np.prod((upper - lower) / spacing + 1.0))
+    if not wanted <= SITES_MOST:
+        raise ValueError(
+            f"site spacing {spacing * 1000:g} mm gives {wanted:.3g} raster points; at most {SITES_MOST} are allowed: "
+            "use a larger spacing"
+        )
+    axes = []
+    for low, high in zip(lower, upper, strict=True):
+        count = int((high - low) / spacing)
+        axes.append(0.5 * (low + high) + (np.arange(count + 1) - 0.5 * count) * spacing)
+    rows = []
+    for row, v in enumerate(axes[1]):
+        us = axes[0] if row % 2 == 0 else axes[0][::-1]
+        rows.append(np.column_stack([us, np.full(len(us), v)]))
+    return np.concatenate(rows)
+
+
+def _drop(plane: FloatArray, height: FloatArray, u: float, v: float) -> tuple[int, FloatArray] | None:
+    """The uppermost triangle over a point of the projection plane, with the barycentric weights there."""
+    a, b, c = plane[:, 0], plane[:, 1], plane[:, 2]
+    determinant = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    wb = ((u - a[:, 0]) * (c[:, 1] - a[:, 1]) - (v - a[:, 1]) * (c[:, 0] - a[:, 0])) / determinant
+    wc = ((b[:, 0] - a[:, 0]) * (v - a[:, 1]) - (b[:, 1] - a[:, 1]) * (u - a[:, 0])) / determinant
+    wa = 1.0 - wb - wc
+    inside = np.flatnonzero((wa >= -1e-9) & (wb >= -1e-9) & (wc >= -1e-9))
+    if inside.size == 0:
+        return None
+    weights = np.column_stack([wa, wb, wc])[inside]
+    best = int(np.argmax((weights * height[inside]).sum(axis=1)))
+    return int(inside[best]), weights[best]
+
+
+def _thickness(origins: FloatArray, directions: FloatArray, corners: FloatArray) -> FloatArray:
+    """Length of the chord inside the organ from each origin along each direction [m]."""
+    result = np.empty(len(origins))
+    nearest_hits(origins, directions, corners, HIT_LEAST, result)
+    return result
+
+
+# Largest cell over contact radius; on coarser cells the force varies more between sites than over a deep lesion.
+SHARE_LARGEST = 1.0
+
+
+def contact_radius(tip_radius: float, press_depth: float) -> float:
+    """Contact radius of a pressed ball, sqrt(tip radius x press depth) (Hertz) [m]."""
+    return math.sqrt(tip_radius * press_depth)
+
+
+def share_text(cell: float, tip_radius: float, press_depth: float) -> str:
+    """Cell over contact radius in words, with the consequence above SHARE_LARGEST."""
+    share = cell / contact_radius(tip_radius, press_depth)
+    text = f"{share:.2f} (cell {cell * 1e3:.3g} mm, tip {tip_radius * 1e3:.3g} mm, pressed {press_depth * 1e3:.3g} mm)"
+    return f"{text}: above {SHARE_LARGEST:g}, the mesh itself is felt" if share > SHARE_LARGEST else text
+
+
+def warn_of_coarse_cells(what: str, cell: float, tip_radius: float, press_depth: float) -> None:
+    """Warn if the mesh itself would be felt."""
+    radius = contact_radius(tip_radius, press_depth)
+    if cell > SHARE_LARGEST * radius:
+        warnings.warn(
+            f"{what}: cell / contact radius is {share_text(cell, tip_radius, press_depth)}; use cells of at most "
+            f"{radius * 1e3:.3g} mm, a larger tip or a deeper press",
+            stacklevel=2,
+        )

@@ -1,0 +1,110 @@
+"""Scenes as the text of TOML files, written from the dataclasses' fields, so that no field can be left out."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, fields, is_dataclass
+from typing import Any, get_args, get_type_hints
+
+import tomlkit
+from tomlkit.items import AbstractTable, Item, Table
+
+from surgsim_env.scene.model import Ball, Bed, Box, Scene
+
+# A file's own name and folder, which it does not state.
+PATH_FIELDS = ("name", "folder")
+# Tables that are written on one line.
+INLINE_TABLES = (Box, Ball, Bed)
+# Comments begin here [characters], or behind an entry that is longer.
+COMMENT_COLUMN = 23
+
+
+def scene_toml(scene: Scene, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None) -> str:
+    """A scene as TOML; `scene_from_table` reads an equal one.
+
+    Args:
+        scene: to be written.
+        head: comment lines at the top.
+        comments: texts by the path of their entry or table, such as "contact.stiffness" or "regions[0].material";
+            "regions.material" is for each of the regions.
+
+    Raises:
+        ValueError: a comment's path names no field; a field is None while its default is not (TOML has no null).
+    """
+    for path in comments or {}:
+        _check_path(path)
+    document = tomlkit.document()
+    for line in head:
+        document.add(tomlkit.comment(_printable(line)))
+    _fill(document, scene, "", comments or {})
+    return tomlkit.dumps(document)
+
+
+def _check_path(path: str) -> None:
+    """Refuse a comment that would be lost, as no scene has a field at its path."""
+    kind: Any = Scene
+    for name in re.sub(r"\[\d+\]", "", path).split("."):
+        hints = get_type_hints(kind) if is_dataclass(kind) else {}
+        if name not in hints:
+            raise ValueError(f"the comment at {path!r} is for no field of a scene")
+        kind = next((part for part in (hints[name], *get_args(hints[name])) if is_dataclass(part)), None)
+
+
+def _fill(table: tomlkit.TOMLDocument | AbstractTable, values: Any, path: str, comments: Mapping[str, str]) -> None:
+    """Add all fields of a dataclass to the table at a path of the document."""
+    found = [(one, getattr(values, one.name)) for one in fields(values) if path or one.name not in PATH_FIELDS]
+    # TOML wants a table's entries before its sub-tables.
+    for one, value in sorted(found, key=lambda pair: _is_table(pair[1])):
+        if value in (None, ()) and value == _default(one):
+            continue
+        if value is None:
+            raise ValueError(f"{path}{one.name} is None, which TOML cannot hold; its default is {_default(one)!r}")
+        table.add(one.name, _item(one.name, value, f"{path}{one.name}", comments))
+
+
+def _item(name: str, value: Any, path: str, comments: Mapping[str, str]) -> Item:
+    """The item of one field, with its comment."""
+    if _is_tables(value):
+        array = tomlkit.aot()
+        for number, one in enumerate(value):
+            array.append(_item(name, one, f"{path}[{number}]", comments))
+        return array
+    if is_dataclass(value):
+        item = tomlkit.inline_table() if isinstance(value, INLINE_TABLES) else tomlkit.table()
+        _fill(item, value, f"{path}.", comments)
+    else:
+        item = tomlkit.item(_plain(value))
+    plain = re.sub(r"\[\d+\]", "", path)
+    comment = comments.get(path) or comments.get(plain)
+    if comment:
+        head = f"[[{plain}]]" if path.endswith("]") else f"[{plain}]"
+        before = head if isinstance(item, Table) else f"{name} = {item.as_string()}"
+        item.comment(_printable(comment))
+        item.trivia.comment_ws = " " * max(COMMENT_COLUMN - len(before), 1)
+    return item
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, tuple) and bool(value) and is_dataclass(value[0])
+
+
+def _is_table(value: Any) -> bool:
+    return _is_tables(value) or (is_dataclass(value) and not isinstance(value, INLINE_TABLES))
+
+
+def _default(one: Field) -> Any:
+    return one.default if one.default_factory is MISSING else one.default_factory()
+
+
+def _plain(value: Any) -> Any:
+    """A value as TOML holds it: tuples as lists, and no halves of surrogate pairs.
+
+    Python has such halves for the bytes of file names that are not UTF-8; they become the replacement character.
+    """
+    if isinstance(value, str):
+        return re.sub("[\ud800-\udfff]", "\ufffd", value)
+    return [_plain(one) for one in value] if isinstance(value, tuple) else value
+
+
+def _printable(text: str) -> str:
+    """One line without control characters, as a TOML comment must be."""
+    return "".join(one if one.isprintable() else " " for one in text)

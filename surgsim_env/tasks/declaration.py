@@ -1,0 +1,284 @@
+"""What a task declares once: its commands, observation channels and reward terms, and the tables that document them."""
+
+import inspect
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from surgsim_env.coupling.simulation import Simulation
+
+Size = int | Callable[[Any], int]
+Bound = float | Sequence[float] | Callable[[Any, Any], ArrayLike]
+Period = Literal["step", "change", "success", "failure", "step left"]
+
+# How the documentation explains a reward's period.
+PERIODS: dict[str, str] = {
+    "step": "control step",
+    "change": "change of the value",
+    "success": "end in success",
+    "failure": "end in failure",
+    "step left": "control step left after a failure",
+}
+HEADINGS = (
+    *("Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End"),
+    *("Info", "Arguments", "Version History"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """A named part of the action.
+
+    Fields:
+        name: an identifier; `Task.action` takes it as a keyword
+        size: number of entries, or a function `(task)`; 0 leaves the command out
+        scale: SI value of an entry of 1; entries lie in [-1, 1]
+        unit: SI unit, "" for none
+        meaning: what it does, for the table of actions
+        size_text: what the table shows for a size that is a function
+    """
+
+    name: str
+    size: Size
+    scale: float = 1.0
+    unit: str = ""
+    meaning: str = ""
+    size_text: str = "by the scene"
+
+    def __post_init__(self) -> None:
+        _check_name("command", self.name)
+        _check_size("command", self.name, self.size)
+        _check_meaning("command", self.name, self.meaning)
+        if not 0.0 < self.scale < math.inf:
+            raise ValueError(
+                f"command {self.name!r}: scale is {self.scale!r}; it is the SI value of an entry of 1: give a finite "
+                "number above 0"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """A named part of the observation.
+
+    Fields:
+        name: an identifier; `observation_slices` has it as a key
+        size: number of entries, or a function `(task)`; 0 leaves the channel out
+        unit: SI unit, "" for none
+        low, high: bounds: a number, one for each entry, or a function `(task, instrument)` that returns them; a value
+            outside is a fault. Left out where there is a `sensor`: plus and minus its range
+        read: function `(task, simulation)` that returns the value, `size` numbers
+        meaning: what it is, for the table of observations
+        sensor: 0, or the factor on noise, bias and range of the scene's force sensor, whose model the value (3 numbers)
+            passes through
+        felt: whether it depends on force sensing, so that `observe_force=False` observes it as 0; true with a `sensor`
+        size_text, bounds_text: what the table shows for a size and for bounds that are functions
+    """
+
+    name: str
+    size: Size
+    unit: str = ""
+    low: Bound | None = None
+    high: Bound | None = None
+    read: Callable[[Any, Any], ArrayLike] | None = None
+    meaning: str = ""
+    sensor: float = 0.0
+    felt: bool = False
+    size_text: str = "by the scene"
+    bounds_text: str = "by the scene"
+
+    def __post_init__(self) -> None:
+        _check_name("channel", self.name)
+        _check_size("channel", self.name, self.size)
+        _check_meaning("channel", self.name, self.meaning)
+        if not callable(self.read):
+            raise ValueError(
+                f"channel {self.name!r}: read is {self.read!r}; it must be a function (task, simulation) that returns "
+                "the value"
+            )
+        if self.sensor:
+            object.__setattr__(self, "felt", True)
+            if self.size != 3 or not 0.0 < self.sensor < math.inf:
+                raise ValueError(
+                    f"channel {self.name!r}: sensor is {self.sensor!r} with size {self.size!r}; the force sensor has "
+                    "three axes and its factor is a finite number above 0: give size 3, or no sensor"
+                )
+        elif self.low is None or self.high is None:
+            raise ValueError(f"channel {self.name!r} has no bounds: give low and high, finite numbers or functions")
+        if not (self.low is None or self.high is None or callable(self.low) or callable(self.high)):
+            low, high = np.asarray(self.low, dtype=np.float64), np.asarray(self.high, dtype=np.float64)
+            if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+                raise ValueError(
+                    f"channel {self.name!r}: bounds are {self.low!r} and {self.high!r}; low must be below high and "
+                    "both finite: widen them"
+                )
+
+    @property
+    def bounds_shown(self) -> str:
+        """Its bounds as the table of observations shows them."""
+        if self.low is None or self.high is None:
+            return "+-range"
+        if isinstance(self.low, int | float) and isinstance(self.high, int | float):
+            return f"+-{self.high:g}" if self.low == -self.high else f"{self.low:g} to {self.high:g}"
+        return self.bounds_text
+
+
+@dataclass(frozen=True)
+class ControlStep:
+    """A control step as the simulation left it; a reset counts as one without force.
+
+    Fields:
+        simulation: between two control steps
+        force_peak: largest contact force of its haptic steps [N]
+        fault: of the simulation or the observation; "" for none
+    """
+
+    simulation: Simulation
+    force_peak: float = 0.0
+    fault: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Reward:
+    """A named reward term; it pays `weight` times an amount.
+
+    Fields:
+        name: an identifier; `info["reward_<name>"]` shows what was paid
+        weight: of the term
+        per: what the amount is. "step": `value` in each control step (1 without one); "change": the change of `value`
+            since the control step before, so that it cannot be earned twice; "success" and "failure": 1 in the control
+            step in which the episode ends with this name (see `Task.end`); "step left": the control steps left when
+            the episode ends in failure, or `value` then
+        meaning: what it is for, for the table of rewards
+        value: function `(task, control_step)`, best in [0, 1]
+    """
+
+    name: str
+    weight: float
+    per: Period
+    meaning: str = ""
+    value: Callable[[Any, Any], float] | None = None
+
+    def __post_init__(self) -> None:
+        _check_name("reward", self.name)
+        _check_meaning("reward", self.name, self.meaning)
+        if not math.isfinite(self.weight):
+            raise ValueError(f"reward {self.name!r}: weight is {self.weight!r}; it must be a finite number")
+        if self.per not in PERIODS:
+            raise ValueError(f"reward {self.name!r}: per is {self.per!r}; it must be one of {', '.join(PERIODS)}")
+        if self.per == "change" and self.value is None:
+            raise ValueError(f"reward {self.name!r} pays a change, but has no value that could: give `value`")
+        if self.per in ("success", "failure") and self.value is not None:
+            raise ValueError(f"reward {self.name!r} pays once at the end of an episode: leave `value` out")
+
+
+def check_declared(owner: str, what: str, parts: Sequence[Any], kind: type) -> None:
+    """Refuse a declaration that is empty, holds anything but `kind`, or holds a name twice.
+
+    Raises:
+        TypeError: an entry of another type (says which).
+        ValueError: no entry, or two of one name.
+    """
+    if not parts:
+        raise ValueError(f"{owner} declares no {what}: give it `{what} = ({kind.__name__}(...), ...)`")
+    for place, part in enumerate(parts):
+        if not isinstance(part, kind):
+            raise TypeError(f"{owner}.{what}[{place}] is {part!r}; every entry must be a {kind.__name__}")
+    names = [part.name for part in parts]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{owner}.{what} has two entries called {name!r}; give each its own name")
+
+
+def _check_name(what: str, name: object) -> None:
+    if not isinstance(name, str) or not name.isidentifier():
+        raise ValueError(f"{what} name {name!r}: it must be a Python identifier such as 'contact_force'")
+
+
+def _check_size(what: str, name: str, size: object) -> None:
+    if callable(size) or (isinstance(size, int) and not isinstance(size, bool) and size > 0):
+        return
+    raise ValueError(f"{what} {name!r}: size is {size!r}; it must be a whole number above 0 or a function of the task")
+
+
+def _check_meaning(what: str, name: str, meaning: object) -> None:
+    if not isinstance(meaning, str) or not meaning.strip():
+        raise ValueError(f"{what} {name!r} has no meaning: say in a few words what it is, for the documentation")
+
+
+# ---- tables -------------------------------------------------------------------------------------------------------
+
+
+def table(heading: str, rows: Sequence[Sequence[object]]) -> str:
+    """A Markdown table; `heading` names its columns, separated by commas."""
+    columns = heading.split(", ")
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def action_table(task_class: Any) -> str:
+    """Commands of a task: size, meaning, full scale."""
+    rows = []
+    for one in task_class.commands:
+        scale = f"{one.scale:g} {one.unit}".strip() if one.unit else ""
+        rows.append((f"`{one.name}`", _size_shown(one), one.meaning, scale))
+    return table("command, size, meaning, full scale", rows)
+
+
+def observation_table(task_class: Any) -> str:
+    """Channels of a task: size, meaning with unit, bounds; then those that `observe_force=False` observes as 0."""
+    rows = []
+    for one in task_class.channels:
+        unit = f" [{one.unit}]" if one.unit else ""
+        rows.append((f"`{one.name}`", _size_shown(one), one.meaning + unit, one.bounds_shown))
+    felt = ", ".join(f"`{one.name}`" for one in task_class.channels if one.felt)
+    note = f"\n\nWith `observe_force=False` these are observed as 0: {felt}." if felt else ""
+    return table("channel, size, meaning, bounds", rows) + note
+
+
+def reward_table(task_class: Any) -> str:
+    """Reward terms of a task: weight, what it is paid for, meaning."""
+    rows = [(f"`{one.name}`", f"{one.weight:g}", PERIODS[one.per], one.meaning) for one in task_class.rewards]
+    return table("term, weight, paid per, meaning", rows)
+
+
+def documentation(task_class: Any) -> str:
+    """The documentation of an environment in Gymnasium's form: the task's docstring with the declared tables.
+
+    Sections that the docstring lacks are left out, but for those that the declaration fills.
+    """
+    summary, sections = docstring_sections(inspect.getdoc(task_class) or "")
+    filled = {
+        "Action Space": action_table(task_class),
+        "Observation Space": observation_table(task_class),
+        "Rewards": reward_table(task_class),
+        "Arguments": COMMON_ARGUMENTS,
+    }
+    box = {"Action Space": "`Box(-1, 1, float32)`", "Observation Space": "`Box(float32)`, all bounds finite"}
+    first = f"* `scene`: the name or file of a scene; default {task_class.default_scene!r}.\n* `instrument`: likewise."
+    for heading, text in filled.items():
+        told = sections.get(heading) or {**box, "Arguments": first}.get(heading, "")
+        sections[heading] = f"{told}\n{text}".strip() if heading == "Arguments" else f"{told}\n\n{text}".strip()
+    order = sorted(sections, key=lambda one: HEADINGS.index(one) if one in HEADINGS else len(HEADINGS))
+    return "\n\n".join([summary, *(f"## {heading}\n{sections[heading]}" for heading in order)])
+
+
+def docstring_sections(docstring: str) -> tuple[str, dict[str, str]]:
+    """The summary of a docstring, and the text under each of its `## ` headings."""
+    summary, *parts = re.split(r"^## (.+)$", inspect.cleandoc(docstring), flags=re.MULTILINE)
+    return summary.strip(), {title.strip(): text.strip() for title, text in zip(parts[::2], parts[1::2])}
+
+
+def _size_shown(part: Command | Channel) -> str:
+    return part.size_text if callable(part.size) else str(part.size)
+
+
+COMMON_ARGUMENTS = """* `observe_force`: False observes all channels that depend on force sensing as 0.
+* `obs_mode`: "state" (default), or "rgb" for the endoscope's picture, `Box(0, 255, (84, 84, 3), uint8)` (needs OpenGL).
+* `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
+* `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of
+  `surgsim_env.rendering.options.RenderOptions`: what pictures show."""

@@ -1,0 +1,118 @@
+"""How much of a target an eye sees past an organ's surface and an instrument: rays to points, no picture."""
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
+from surgsim_env.scene.palpable_surface import tangent_axes
+from surgsim_env.tasks.visibility_kernels import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    ELLIPSOID,
+    PLANE,
+    SPHERE,
+    hide_behind_shapes,
+    hide_behind_triangles,
+)
+
+# Points of a disc that are looked at: enough for a share to be right to about half a percent.
+POINT_COUNT = 500
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Disc:
+    """A flat disc: centre [m] (3,), unit normal (3,) and radius [m]."""
+
+    centre: FloatArray
+    normal: FloatArray
+    radius: float
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Columns are two unit vectors along the disc and its normal, shape (3, 3)."""
+        across, _ = tangent_axes(self.normal)
+        return np.stack([across, np.cross(self.normal, across), self.normal], axis=1)
+
+    def points(self, count: int = POINT_COUNT) -> FloatArray:
+        """Points spread evenly over the disc as a sunflower's seeds are [m], shape (count, 3).
+
+        Each stands for as much of the disc's area, not of its picture, in which what is nearer is larger.
+        """
+        index = np.arange(count)
+        distance = self.radius * np.sqrt((index + 0.5) / count)
+        angle = index * GOLDEN_ANGLE
+        level = np.stack([distance * np.cos(angle), distance * np.sin(angle)])
+        return self.centre + (self.rotation[:, :2] @ level).T
+
+
+def hiding_geoms(model: mujoco.MjModel) -> NDArray[np.int64]:
+    """The shapes of an instrument's model that hide what is behind them: all that is visible or that tissue feels.
+
+    Meshes count by the shapes that tissue feels of them.
+    """
+    solid = np.isin(model.geom_type, (PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX))
+    seen = (model.geom_group < CONTACT_GROUP) & (model.geom_rgba[:, 3] > 0.0)
+    return np.flatnonzero(solid & (seen | (model.geom_group == CONTACT_GROUP)))
+
+
+def visible(
+    eye: FloatArray,
+    points: FloatArray,
+    node_position: FloatArray,
+    triangles: IntArray,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    geoms: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Which points are seen from an eye.
+
+    Args:
+        eye: where the camera stands [m], (3,).
+        points: of the target [m], (n, 3).
+        node_position: of the organ's nodes, as deformed as they are [m], (n_node, 3).
+        triangles: of its whole surface, (m, 3).
+        model: an instrument's.
+        data: the same's, poses up to date.
+        geoms: which of its shapes hide, see `hiding_geoms`.
+
+    Returns:
+        For each point whether nothing stands between it and the eye, shape (n,).
+
+    Raises:
+        ValueError: the eye stands in the middle of the points.
+    """
+    hidden, cone = _hidden_by(eye, points, node_position, triangles)
+    hide_behind_shapes(
+        *cone, geoms, model.geom_type, model.geom_size, model.geom_rbound, data.geom_xpos, data.geom_xmat,
+        np.zeros(3), hidden,
+    )  # fmt: skip
+    return hidden == 0
+
+
+def uncovered(eye: FloatArray, points: FloatArray, node_position: FloatArray, triangles: IntArray) -> NDArray[np.bool_]:
+    """Which points are seen from an eye past triangles alone; arguments, result and errors as those of `visible`."""
+    return _hidden_by(eye, points, node_position, triangles)[0] == 0
+
+
+def _hidden_by(
+    eye: FloatArray, points: FloatArray, node_position: FloatArray, triangles: IntArray
+) -> tuple[NDArray[np.uint8], tuple[FloatArray, FloatArray, FloatArray, float, float, float]]:
+    """1 where triangles hide a point, (n,), and the cone from the eye around the points as kernels take it."""
+    rays = points - eye
+    middle = rays.mean(axis=0)
+    distances = np.linalg.norm(rays, axis=1)
+    cosine = float((rays @ middle / (distances * np.linalg.norm(middle))).min()) if distances.all() else -1.0
+    if not cosine > 0.0:
+        raise ValueError(f"the eye at {eye} m stands among the points that it looks at; move it away from them")
+    axis, sine = middle / np.linalg.norm(middle), math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    hidden = np.zeros(len(points), dtype=np.uint8)
+    cone = (np.asarray(eye, dtype=np.float64), points, axis, cosine, sine, float(distances.max()))
+    hide_behind_triangles(*cone, node_position, triangles, hidden)
+    return hidden, cone

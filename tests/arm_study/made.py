@@ -1,0 +1,108 @@
+"""An evaluation of two arms made up for tests: an ellipsoid with points on it and in it, every figure drawn."""
+
+import math
+
+import numpy as np
+
+from surgsim_env.arm_study.episodes import Episode, Episodes, StandIn
+from surgsim_env.arm_study.results import ArmReach, ArmsEvaluation
+from surgsim_env.palpation.surface_drawing import tube
+from surgsim_env.scene.model import Port
+
+HALF_AXES = np.array([0.09, 0.06, 0.04])
+PORTS = {
+    "left": Port((0.08, -0.09, 0.09), (-0.55, 0.6, -0.6)),
+    "right": Port((-0.08, -0.09, 0.09), (0.55, 0.6, -0.6)),
+    "endoscope": Port((0.0, -0.12, 0.11), (0.0, 0.74, -0.67)),
+}
+PICTURE = np.arange(40 * 60 * 3, dtype=np.int64).reshape(40, 60, 3).astype(np.uint8)
+
+
+def made_episodes(*, failing=False):
+    """Two made-up episodes with a stand-in on the left; failing: the second one failed, a third never began."""
+    first = Episode(3, True, 11.2, 0.37, 0.26, 0.46, 0.56, 0.0112, 0.0, 0.0)
+    runs = (first, Episode(4, True, 12.4, 0.41, 0.20, 0.52, 0.60, 0.05, 0.1, 2.0))
+    if failing:
+        why = "step 4 of 9, 'lift', tore the tissue (1.203 N); tip at (40.00, 45.00, 20.00) mm, contact force 1.3 N"
+        runs = (
+            first,
+            Episode(4, False, 5.0, 0.41, 0.20, 1.20, 0.0, 0.05, 0.1, 2.0, failure=why),
+            Episode(5, False, failure="it could not begin: <no way>"),
+        )
+    ports = (Port((-0.01, 0.2, 0.06), (0.2, -0.9, -0.35)), Port((0.09, 0.2, 0.06), (-0.2, -0.9, -0.35)))
+    stand_ins = (StandIn("left", "psm_retractor", "psm_grasper", "jaw with flat pads to hold tissue with"),)
+    pictures = {"How the episode of seed 3 ended": PICTURE}
+    return Episodes("lobe", "psm_retractor", "psm_palpator", ports, stand_ins, runs=runs, pictures=pictures)
+
+
+def made_reach(name, points, reachable, generator, *, joint_count=6, force=(2.0, 9.0), clearance=(0.004, 0.05)):
+    count = len(points)
+
+    def drawn(low, high):
+        smooth = 0.5 + 0.5 * np.sin(points @ generator.normal(size=3) * 25.0)
+        return np.where(reachable, low + (high - low) * smooth, np.nan)
+
+    reason = np.where(reachable, 0, 1 + (generator.random(count) ** 2 * 5).astype(np.int32)).astype(np.int32)
+    joints = np.where(reachable[:, None], generator.uniform(-1.0, 1.0, (count, joint_count)), np.nan)
+    return ArmReach(
+        name=name,
+        reason=reason,
+        joints=joints,
+        position_error=drawn(0.0, 2e-5),
+        approach_share=drawn(0.05, 0.9),
+        manipulability=drawn(1e-4, 3e-3),
+        isotropy=drawn(0.02, 0.4),
+        limit_margin=drawn(0.01, 0.95),
+        tip_force=drawn(*force),
+        trocar_load=drawn(0.1, 0.8),
+        camera_angle=drawn(math.radians(15), math.radians(80)),
+        organ_clearance=drawn(*clearance),
+        wall_clearance=drawn(clearance[0] + 0.004, clearance[1] + 0.004),
+        trocar_error=drawn(0.0, 1e-6),
+    )
+
+
+def made_evaluation(
+    *, count=120, inner_count=10, seed=0, left_to=0.3, right_to=0.3, joint_counts=(6, 6), pictures=True, **reach
+):
+    """Two arms, the left one reaching what lies at x > -left_to of the half axis, the right one at x < right_to."""
+    generator = np.random.default_rng(seed)
+    sphere, triangles = tube(np.zeros(3), np.zeros(3), 1.0)
+    directions = generator.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    normals = directions / HALF_AXES
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = directions * HALF_AXES
+    points[count - inner_count :] *= 0.4
+    inner = np.arange(count) >= count - inner_count
+    front = points @ np.array([0.0, -0.74, 0.67]) > -0.015
+    left = front & (points[:, 0] > -left_to * HALF_AXES[0])
+    right = front & (points[:, 0] < right_to * HALF_AXES[0])
+    arms = [
+        made_reach(name, points, reachable, generator, joint_count=joints, **reach)
+        for name, reachable, joints in zip(("psm_grasper", "psm_palpator"), (left, right), joint_counts, strict=True)
+    ]
+    together = left & right
+    both = together & (generator.random(count) > 0.1)
+    inside = np.where(together, np.where(both, 0.012, 0.002), np.nan)
+    outside = np.where(together, 0.08 + points[:, 0], np.nan)
+    return ArmsEvaluation(
+        points=points,
+        normals=normals,
+        inner=inner,
+        left=arms[0],
+        right=arms[1],
+        both=both,
+        arm_distance_inside=inside,
+        arm_distance_outside=outside,
+        summary={
+            "seed": seed,
+            "inputs": {"scene": "ellipsoid", "left": "psm_grasper", "right": "psm_palpator", "points": count},
+            "versions": {"surgsim": "0.1.0", "numpy": np.__version__},
+        },
+        scene="ellipsoid",
+        surface_points=sphere * HALF_AXES,
+        surface_triangles=triangles,
+        pictures={"both arms at one point, from the camera": PICTURE} if pictures else {},
+        ports=PORTS,
+    )

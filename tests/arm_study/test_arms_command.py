@@ -1,0 +1,264 @@
+"""`surgsim arms` as a user meets it: files that repeat to the byte, a table of placements, one line for bad input."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from surgsim_env.arm_study import job
+from surgsim_env.arm_study.ports import default_ports
+from surgsim_env.cli.main import main
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene, scenes_folder
+from tests.arm_study.made import made_evaluation
+
+INSTRUMENTS = scenes_folder() / "instruments"
+PORTS = """
+[left]
+point = [-0.03, 0.03, 0.15]
+target = [0.03, 0.03, 0.03]
+[right]
+point = [0.09, 0.03, 0.15]
+target = [0.03, 0.03, 0.03]
+[endoscope]
+point = [0.03, -0.02, 0.15]
+target = [0.03, 0.03, 0.03]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working folder with a ports file, a wider one, and an arm of one's own, its model beside it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ports.toml").write_text(PORTS)
+    (tmp_path / "wide.toml").write_text(PORTS.replace("-0.03, 0.03, 0.15", "-0.06, 0.03, 0.15"))
+    for suffix in ("toml", "xml"):
+        shutil.copy(INSTRUMENTS / f"psm_grasper.{suffix}", tmp_path / f"psm_grasper.{suffix}")
+    (tmp_path / "psm_grasper.toml").rename(tmp_path / "mine.toml")
+    return tmp_path
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """In place of the evaluation, made-up ones: wider ports reach more, another arm less. Lists what was asked for."""
+    asked = []
+
+    def evaluate(setup, anatomy, plan, console, *, pictures):
+        asked.append((setup, plan))
+        reach = {"wide.toml": 0.6, "six_axis": 0.1}.get(setup.name, 0.3)
+        return made_evaluation(count=plan.points, seed=plan.seed, left_to=reach, right_to=reach)
+
+    monkeypatch.setattr(job, "evaluate", evaluate)
+    return asked
+
+
+def arguments(*more, left="psm_grasper", right="psm_palpator", ports="ports.toml", out="out"):
+    return [
+        *("arms", "--scene", "phantom", "--left", left, "--right", right, "--ports", ports),
+        *("--points", "40", "--episodes", "0", "--out", str(out), *more),
+    ]
+
+
+def test_the_files_and_the_summary(folder, made, capsys):
+    assert main(arguments("--seed", "3", left="mine.toml")) == 0
+    names = {path.name for path in (folder / "out").iterdir()}
+    assert {"report.html", "points.csv", "summary.json", "map_reach.png", "map_tip_force.png", "arms_1.png"} <= names
+    text = (folder / "out" / "summary.json").read_text(encoding="utf-8")
+    summary = json.loads(text)
+    assert text == json.dumps(summary, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
+    assert summary["seed"] == 3 and summary["inputs"]["points"] == 40 and summary["inputs"]["scene"] == "phantom"
+    assert {"surgsim", "python", "numpy", "scipy", "mujoco", "matplotlib"} <= summary["versions"].keys()
+    assert summary["inputs"]["ports"]["endoscope"]["point"] == [0.03, -0.02, 0.15]
+    assert summary["inputs"]["left"]["mine.toml"].startswith("sha256 ")
+    assert set(summary["inputs"]["left"]) == {"arm", "mine.toml", "psm_grasper.xml"}
+    made_one = made_evaluation(count=40, seed=3)
+    least = min(np.nanmin(arm.tip_force) for arm in (made_one.left, made_one.right))
+    assert summary["smallest_tip_force"]["value_N"] == pytest.approx(least, abs=1e-11)
+    assert summary["compared"] == [] and summary["episodes"] == [] and summary["inputs"]["episodes"] == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert summary["verdict"] in said and "written: out/{report.html" in said
+    assert made[0][0].ports.endoscope.point == (0.03, -0.02, 0.15)
+
+
+@pytest.mark.usefixtures("few_maps")
+def test_a_run_repeats_to_the_byte_wherever_it_is_written(folder, made, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other") / "deep" / "er"
+    outside = tmp_path_factory.mktemp("outside") / "wide.toml"
+    shutil.copy(folder / "wide.toml", outside)
+    compared = ("--compare", str(outside))
+    assert main(arguments(*compared, ports=str(folder / "ports.toml"), out="a")) == 0
+    assert main(arguments(*compared, ports=str(folder / "ports.toml"), out=other)) == 0
+    assert main(arguments(*compared, "--seed", "1", out="c")) == 0
+    names = {path.name for path in other.iterdir()}
+    assert {"map_reach.png", "map_tip_force.png", "map_arm_distance.png", "arms_1.png", "report.html"} < names
+    for name in names:
+        first = (folder / "a" / name).read_bytes()
+        assert first == (other / name).read_bytes(), name
+        assert str(folder).encode() not in first and str(other).encode() not in first
+        assert str(outside.parent).encode() not in first
+    assert (folder / "a" / "points.csv").read_bytes() != (folder / "c" / "points.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_real_run_repeats_to_the_byte_and_says_what_was_found(folder):
+    for out in ("a", "b"):
+        assert main(arguments("--compare", "wide.toml", "--episodes", "1", out=out)) == 0
+    names = {path.name for path in (folder / "a").iterdir()}
+    for name in names:
+        assert (folder / "a" / name).read_bytes() == (folder / "b" / name).read_bytes(), name
+    summary = json.loads((folder / "a" / "summary.json").read_text(encoding="utf-8"))
+    assert "episode_1.png" in names and summary["episodes"][0]["success"]
+    assert summary["points"] == 40 and summary["reachable"]["both"] > 0.5
+    assert f"both at once {100 * summary['reachable']['both']:.0f} %" in summary["verdict"]
+    assert [one["place"] for one in summary["compared"]] == [1, 2]
+    (row,) = [one for one in summary["compared"] if one["name"] == "ports.toml"]
+    assert row["both"] == pytest.approx(summary["reachable"]["both"])
+
+
+@pytest.mark.usefixtures("few_maps")
+def test_the_command_in_the_report_makes_it_again(folder, made):
+    assert (
+        main(arguments("--compare", "wide.toml", "six_axis", left="mine.toml", ports=str(folder / "ports.toml"))) == 0
+    )
+    text = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    command = text.split("<pre><code>")[1].split("</code>")[0]
+    assert command == (
+        "surgsim arms --scene phantom --left mine.toml --right psm_palpator --ports ports.toml "
+        "--compare wide.toml six_axis --points 40 --episodes 0 --seed 0"
+    )
+    assert main([*command.split()[1:], "--out", "again"]) == 0
+    assert (folder / "again" / "report.html").read_bytes() == (folder / "out" / "report.html").read_bytes()
+
+
+@pytest.mark.usefixtures("few_maps")
+def test_compare_ranks_ports_and_robots(folder, made, capsys):
+    assert main(arguments("--compare", "wide.toml", "six_axis")) == 0
+    ranking = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))["compared"]
+    assert [one["name"] for one in ranking] == ["wide.toml", "ports.toml", "six_axis"]
+    assert [one["place"] for one in ranking] == [1, 2, 3]
+    inputs = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))["inputs"]["compare"]
+    assert inputs[0]["file"] == "wide.toml" and inputs[0]["wide.toml"].startswith("sha256 ")
+    assert inputs[1]["arm"] == "six_axis" and inputs[1]["six_axis.xml"].startswith("sha256 ")
+    setups = [setup for setup, _ in made]
+    assert [(one.left.description.name, one.right.description.name) for one in setups] == [
+        *[("psm_grasper", "psm_palpator")] * 2,
+        ("six_axis", "six_axis"),
+    ]
+    assert setups[1].ports.left.point == (-0.06, 0.03, 0.15) and setups[2].ports.left.point == (-0.03, 0.03, 0.15)
+    text = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    for one in ranking:
+        assert one["reasons"] in text
+    assert "Ranked by the share of the surface" in text
+    assert "more of the points with both arms" in " ".join(capsys.readouterr().out.split())
+
+
+URDF = """<robot name="stick"><link name="base"><visual><geometry><mesh filename="lost.stl"/></geometry></visual></link>
+<link name="stick"/><joint name="turn" type="revolute"><parent link="base"/><child link="stick"/><axis xyz="1 0 0"/>
+<limit lower="-0.8" upper="0.8" effort="10" velocity="2"/></joint></robot>
+"""
+SITE = '<site name="tip"'
+# What is changed in which file (an empty text: the file is removed), and what is said.
+REFUSED = [
+    ("mine.toml", 'site = "tip"\n', "", "exactly one of tip.site and tip.body"),
+    ("mine.toml", 'site = "tip"', 'site = "tipp"', "tip site 'tipp' is not in the model"),
+    ("mine.toml", "insertion = 0.0963", "insertion = 0.3", "outside its limits"),
+    ("mine.toml", "fixed = true", "fixed = true\npoint = [0.02, 0.0, 0.0]", "passes the trocar at 20 mm"),
+    ("mine.toml", 'jaw = [', 'jaws = [', "entry 'jaws' is unknown"),
+    ("mine.toml", None, None, "arm file mine.toml cannot be read: No such file"),
+    ("psm_grasper.xml", 'range="0 0.24"', 'range="0.24 0.01"', "the limits of joint 'insertion' cross"),
+    ("psm_grasper.xml", SITE, f"{SITE}/>{SITE}", "two parts <site> are named 'tip'"),
+    ("psm_grasper.xml", None, None, "psm_grasper.xml cannot be read: No such file"),
+    ("ports.toml", "point = [-0.03, 0.03, 0.15]", "point = [0.03, 0.03, 0.015]", "the left port at (30.0, 30.0, "),
+    ("ports.toml", "point = [0.03, -0.02, 0.15]", "point = [0.03, 0.03, 0.015]", "the endoscope port at"),
+    ("ports.toml", "[endoscope]", "[endoskope]", "unknown"),
+    ("ports.toml", "[left]", "[left", "not valid TOML"),
+    ("ports.toml", "0.15]", '"high"]', "is not a number"),
+    ("ports.toml", "0.15]", "nan]", "finite"),
+    ("ports.toml", None, None, "ports.toml cannot be read: No such file"),
+    ("wide.toml", "point = [-0.06, 0.03, 0.15]", "point = [0.03, 0.03, 0.015]", "ports file wide.toml: the left port"),
+    ("wide.toml", None, None, "wide.toml cannot be read: No such file"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "old", "new", "message"), REFUSED)
+def test_bad_input_is_refused_in_one_line(folder, made, capsys, name, old, new, message):
+    path = folder / name
+    if old is None:
+        path.unlink()
+    else:
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+    refused(arguments("--compare", "wide.toml", left="mine.toml"), message, capsys)
+    assert made == [] and not (folder / "out").exists()
+
+
+def refused(given, message, capsys):
+    assert main(given) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("surgsim: error: ") and err.count("\n") == 1 and err.endswith("\n")
+    assert message in err and "Traceback" not in err
+    assert len(err) < 700
+
+
+def test_a_grasper_without_a_jaw_is_refused(folder, made, capsys):
+    text = (folder / "mine.toml").read_text()
+    kept = [line for line in text.splitlines() if not line.startswith("jaw =")]
+    assert len(kept) == len(text.splitlines()) - 1
+    (folder / "mine.toml").write_text("\n".join(kept))
+    refused(arguments(left="mine.toml"), "--left: arm 'mine': a grasper needs a jaw", capsys)
+
+
+def test_a_urdf_whose_mesh_is_missing_is_refused(folder, made, capsys):
+    (folder / "stick.urdf").write_text(URDF)
+    (folder / "stick.toml").write_text(
+        'model = "stick.urdf"\nkind = "palpator"\njoints = ["turn"]\ncontact = ["ball"]\n[tip]\nbody = "stick"\n'
+        '[trocar]\nshaft_body = "stick"\n[control]\nmode = "servo"\nspeed_limit = [1.0]\nstiffness = [1.0]\n'
+        "damping = [1.0]\neffort = [1.0]\n[home]\nturn = 0.0\n"
+    )
+    refused(arguments(right="stick.toml"), "lost.stl is missing", capsys)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--points", "0"], "--points is 0; it must be a whole number of at least 10"),
+        (["--points", "some"], "--points"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--episodes", "-1"], "--episodes is -1; it must be a whole number of at least 0"),
+        (["--left", "psm_grabber"], "--left: arm 'psm_grabber' is unknown; the arms are"),
+        (["--scene", "lever"], "scene 'lever' is unknown"),
+        (["--scene", "nowhere.toml"], "nowhere.toml cannot be read"),
+        (["--compare", "psm_grabber"], "--compare: arm 'psm_grabber' is unknown"),
+        (["--out", "ports.toml"], "--out ports.toml: cannot be written"),
+        (["--out", "/proc/nothing"], "--out /proc/nothing: cannot be written"),
+    ],
+)
+def test_a_bad_option_is_refused_in_one_line(folder, made, capsys, more, message):
+    refused([*arguments(), *more], message, capsys)
+    assert made == []
+
+
+def test_a_missing_option_is_refused_in_one_line(capsys):
+    refused(["arms", "--left", "psm_grasper"], "--right", capsys)
+
+
+@pytest.mark.usefixtures("few_maps")
+def test_without_a_ports_file_they_stand_as_laparoscopy_places_them(folder, made):
+    given = arguments()
+    del given[given.index("--ports") : given.index("--ports") + 2]
+    assert main(given) == 0
+    setup, _ = made[0]
+    ports = default_ports(load_anatomy(make_scene("phantom")))
+    assert setup.name == "default ports" and setup.ports == ports
+    report = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert "surgsim arms --scene phantom" in report and "--ports" not in report
+
+
+def test_help_says_what_it_does(capsys):
+    assert main(["arms", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for word in ("--left", "--compare", "--episodes", "report.html", "[endoscope]", "runs/arms"):
+        assert word in said, word

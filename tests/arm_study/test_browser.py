@@ -1,0 +1,98 @@
+"""The report as a browser shows it: nothing asked of the network, no error on its console, every picture there."""
+
+import contextlib
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from surgsim_env.arm_study.maps import ArmMaps
+from surgsim_env.arm_study.pictures import write_given_pictures
+from surgsim_env.arm_study.report import write_report
+from surgsim_env.arm_study.table import Candidate, rank
+from surgsim_env.reports.html_page import POLICY
+from tests.arm_study.made import made_episodes, made_evaluation
+from tests.chromium import Browser
+
+# What the browser made of it: the widths of its pictures, the widest part beside the window, what was fetched.
+MADE = """({
+  images: [...document.images].map(one => one.complete ? one.naturalWidth : 0),
+  widest: document.documentElement.scrollWidth, window: innerWidth,
+  loaded: performance.getEntriesByType("resource").filter(one => !one.name.startsWith("data:")).length,
+})"""
+
+
+@pytest.fixture
+def shown(chromium):
+    """A function that opens a page in a window of some size [pixels]."""
+    with contextlib.ExitStack() as stack:
+
+        def show(page: Path, width: int = 1280, height: int = 900) -> Browser:
+            browser = stack.enter_context(chromium.page(width, height))
+            browser.open(page.as_uri())
+            browser.wait_for_page()
+            return browser
+
+        yield show
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    evaluation = made_evaluation()
+    others = [Candidate("ports.toml", "as given", evaluation), Candidate("wide.toml", "ports", made_evaluation(seed=1))]
+    path = folder / "report.html"
+    episodes = made_episodes(failing=True)
+    write_report(
+        evaluation,
+        path,
+        pictures=write_given_pictures(evaluation.pictures, folder, name="arms"),
+        maps=ArmMaps(evaluation).write_all(folder),
+        command="surgsim arms --scene liver --left psm_grasper --right psm_palpator --ports ports.toml",
+        ranking=rank(others),
+        episodes=episodes,
+        episode_pictures=write_given_pictures(episodes.pictures, folder, name="episode"),
+    )
+    return path
+
+
+def test_the_report_opens_without_an_error(report, shown):
+    browser = shown(report, 1280, 2400)
+    image = imread(io.BytesIO(browser.shot()))[:, :, :3]
+    assert browser.complaints() == []
+    # Dark text and the maps' colours on white, down to the foot of the window.
+    assert (image == 1.0).all(axis=2).mean() > 0.4
+    for part in np.split(image, 4):
+        assert len(np.unique((part * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 200
+    assert (image.max(axis=2) < 0.25).mean() > 0.003
+
+
+def test_a_page_with_a_fault_is_noticed(report, tmp_path, shown):
+    """That the console is read at all: a picture from the network is refused by the page's own policy, and said."""
+    faulty = tmp_path / "faulty.html"
+    faulty.write_text(
+        report.read_text(encoding="utf-8").replace("</main>", '<img src="http://example.org/a.png"></main>')
+    )
+    assert any("Content Security Policy" in line for line in shown(faulty).complaints())
+
+
+@pytest.mark.parametrize("width", [1280, 500])
+def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, shown, width):
+    text = report.read_text(encoding="utf-8")
+    assert f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">' in text
+    browser = shown(report, width)
+    made = browser.run(MADE)
+    assert browser.complaints() == []
+    assert len(made["images"]) == text.count("<img") == 13
+    assert min(made["images"]) >= 60
+    assert made["widest"] <= made["window"] == width
+    assert made["loaded"] == 0
+
+
+def test_it_prints(report, shown):
+    browser = shown(report)
+    data = browser.printed()
+    assert browser.complaints() == []
+    assert data.startswith(b"%PDF") and len(data) > 100_000

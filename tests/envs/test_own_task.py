@@ -1,0 +1,281 @@
+"""A task follows from its declaration: one more channel or reward is one place; what is wrong with one is refused."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from surgsim_env import CONTACT_FORCE, TIP_POSITION, Channel, Command, PalpateTask, Reward, Task, register_task
+from surgsim_env.envs.ids import TASKS, environment_class
+from surgsim_env.scripting import oracle_script, run_script
+from tests.envs.own_task import load_own_task
+
+HEIGHT = Channel(
+    "height", 2, "m", -0.1, 0.1,
+    read=lambda task, simulation: [simulation.instrument.tip_position[2], 0.01],
+    meaning="height of the tip, and a hundredth",
+)  # fmt: skip
+SLOW = Reward("slow", -0.5, "step", "speed of the tip", lambda task, step: task.speed(step.simulation))
+
+
+class PalpateSlowly(PalpateTask):
+    """Palpate slowly."""
+
+    channels = (*PalpateTask.channels, HEIGHT)
+    rewards = (*PalpateTask.rewards, SLOW)
+
+    def speed(self, simulation):
+        return float(np.linalg.norm(simulation.instrument.tip_velocity))
+
+
+class Touch(Task):
+    """Touch the organ."""
+
+    channels = (TIP_POSITION, CONTACT_FORCE)
+    rewards = (Reward("time", -1.0, "step", "each control step"), Reward("success", 1.0, "success", "it was touched"))
+    default_scene = "phantom_small"
+
+    def draw(self, rng):
+        point, normal = self.anatomy.face.random_point(rng, 0.01)
+        return point + 0.012 * normal
+
+
+@pytest.fixture
+def registered():
+    """A function that registers a task under an id of this file's, which is forgotten afterwards."""
+    made = []
+
+    def register(task_class, id="Test/Own-v0", **more):
+        register_task(id, task_class, **more)
+        made.append(id)
+        return id
+
+    yield register
+    for id in made:
+        gym.registry.pop(id, None)
+        TASKS.pop(id, None)
+
+
+# ---- one place ---------------------------------------------------------------------------------------------------
+
+
+def test_one_more_channel_and_reward_in_a_shipped_task_are_one_place(registered):
+    """Bounds, slices, documentation, info and lanes follow, and what was there stays where it was."""
+    id = registered(PalpateSlowly)
+    env, plain = gym.make(id, scene="phantom_small"), gym.make("SurgSim/Palpate-v0", scene="phantom_small")
+    inner = env.unwrapped
+    slices = inner.observation_slices
+    assert slices == {**plain.unwrapped.observation_slices, "height": slice(10, 12)}
+    space = env.observation_space
+    assert space.shape == (12,) and (space.high[10:] == np.float32(0.1)).all() and (space.low[10:] < 0.0).all()
+    assert "| `height` | 2 | height of the tip, and a hundredth [m] | +-0.1 |" in inner.__doc__
+    assert "| `slow` | -0.5 | control step | speed of the tip |" in inner.__doc__
+    assert "## Starting State" in inner.__doc__ or inner.__doc__.startswith("Palpate slowly.")
+    observation, info = env.reset(seed=3)
+    np.testing.assert_array_equal(observation[:10], plain.reset(seed=3)[0])
+    assert info["reward_slow"] == 0.0
+    down = np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32)
+    for _ in range(3):
+        (observation, reward, *_, info), (expected, paid, *_) = env.step(down), plain.step(down)
+    np.testing.assert_array_equal(observation[:10], expected)
+    np.testing.assert_allclose(observation[slices["height"]], [observation[2], 0.01], atol=1e-7)
+    assert info["reward_slow"] == pytest.approx(-0.5 * 0.01, rel=0.1)
+    assert reward == pytest.approx(paid + info["reward_slow"])
+    envs = gym.make_vec(id, num_envs=2, vectorization_mode="vector_entry_point", scene="phantom_small")
+    assert envs.reset(seed=[3, 4])[0].shape == (2, 12) and envs.unwrapped.observation_slices == slices
+    envs.close()
+
+
+def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
+    class Gentle(Touch):
+        kept = ("place", "steps", "words")
+
+        def __init__(self, anatomy, instrument, *, force=0.05):
+            super().__init__(anatomy, instrument)
+            self.force = force
+
+        def draw(self, rng):
+            self.place, self.steps, self.words = rng.uniform(size=2), [0, 0.5], "none"
+            return super().draw(rng)
+
+        def update(self, step):
+            self.steps = [self.steps[0] + 1, 0.5]
+
+        def end(self, step):
+            return super().end(step) or (
+                "success" if np.linalg.norm(step.simulation.contact_force) > self.force else ""
+            )
+
+    env = gym.make(registered(Gentle), force=0.1, level="hard").unwrapped
+    assert env.task.force == 0.1
+    env.reset(seed=1)
+    assert env.task.level.name == "hard" and env.scene.timing.mass_scaling
+    down = np.array([0.0, 0.0, -0.8], dtype=np.float32)
+    env.step(down)
+    saved = env.save_state()
+    kept = env.task.place.copy()
+    expected = [env.step(down) for _ in range(20) if env._running]
+    assert expected[-1][2] and expected[-1][-1]["success"] and expected[-1][-1]["reward_success"] == 1.0
+    env.reset(seed=9)
+    env.load_state(saved)
+    assert env.save_state() == saved and (env.task.place == kept).all() and env.task.steps == [1, 0.5]
+    for one in expected:
+        observation, *rest = env.step(down)
+        np.testing.assert_array_equal(observation, one[0])
+        assert rest == list(one[1:])
+    with pytest.raises(ValueError, match="no oracle is known for GentleEnv"):
+        oracle_script(env)
+
+
+def test_the_tutorials_oracle_keeps_the_force():
+    env = gym.make(load_own_task())
+    env.reset(seed=5)
+    trace = run_script(env, oracle_script(env))
+    force = trace.between("follow").force @ env.unwrapped.task.normal
+    assert trace.info["success"] and (np.abs(force - 0.2) < 0.03).all()
+
+
+# ---- refusals of a declaration --------------------------------------------------------------------------------------
+
+
+def channel(**changes):
+    return Channel(
+        **{"name": "one", "size": 1, "low": 0.0, "high": 1.0, "read": lambda *_: 0.5, "meaning": "it", **changes}
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": "two words"}, "channel name 'two words': it must be a Python identifier"),
+        ({"size": 0}, "channel 'one': size is 0; it must be a whole number above 0"),
+        ({"size": 1.5}, "channel 'one': size is 1.5; it must be a whole number above 0"),
+        ({"low": None}, "channel 'one' has no bounds: give low and high"),
+        ({"low": 2.0}, "channel 'one': bounds are 2.0 and 1.0; low must be below high"),
+        ({"high": np.inf}, "bounds are 0.0 and inf; low must be below high and both finite"),
+        ({"read": None}, "channel 'one': read is None; it must be a function"),
+        ({"meaning": " "}, "channel 'one' has no meaning"),
+        ({"sensor": 1.0}, "channel 'one': sensor is 1.0 with size 1; the force sensor has three axes"),
+    ],
+)
+def test_wrong_channels_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        channel(**changes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("a b", 1.0, "step", "it"), "reward name 'a b'"),
+        (("one", np.nan, "step", "it"), "reward 'one': weight is nan; it must be a finite number"),
+        (("one", 1.0, "day", "it"), "reward 'one': per is 'day'; it must be one of step, change"),
+        (("one", 1.0, "step"), "reward 'one' has no meaning"),
+        (("one", 1.0, "change", "it"), "reward 'one' pays a change, but has no value"),
+        (("one", 1.0, "failure", "it", lambda *_: 1.0), "reward 'one' pays once at the end .* leave `value` out"),
+    ],
+)
+def test_wrong_rewards_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Reward(*arguments)
+
+
+def test_a_wrong_command_is_refused():
+    with pytest.raises(ValueError, match=r"command 'push': scale is 0.0; it is the SI value of an entry of 1"):
+        Command("push", 1, 0.0, "N", "it pushes")
+    task = environment_class(Touch)().task
+    with pytest.raises(TypeError, match="Touch has no command 'jaw'; its commands are velocity"):
+        task.action(np.zeros(3), jaw=1.0)
+
+
+# ---- refusals of a class and an id -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"channels": ()}, "Changed declares no channels: give it `channels = "),
+        ({"rewards": ()}, "Changed declares no rewards: give it `rewards = "),
+        ({"channels": (TIP_POSITION, TIP_POSITION)}, "Changed.channels has two entries called 'tip_position'"),
+        ({"rewards": ("time",)}, r"Changed.rewards\[0\] is 'time'; every entry must be a Reward"),
+    ],
+)
+def test_an_incomplete_class_is_refused(registered, changes, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        registered(type("Changed", (Touch,), changes))
+
+
+@pytest.mark.parametrize("id", ["Touch", "Test/Touch", "Touch-v0", "Test/My touch-v0", "", 3])
+def test_a_malformed_id_is_refused(registered, id):
+    with pytest.raises(ValueError, match=r'is malformed; the rule is "Namespace/Name-v0"'):
+        registered(Touch, id)
+
+
+def test_an_id_belongs_to_one_task(registered):
+    id = registered(Touch)
+    registered(Touch)  # the same class again: its file was reloaded
+    with pytest.raises(ValueError, match=r"id 'Test/Own-v0' belongs to .*test_own_task.Touch: choose another name"):
+        registered(PalpateSlowly)
+    with pytest.raises(ValueError, match=r"belongs to surgsim_env.tasks.palpate.PalpateTask"):
+        registered(PalpateSlowly, "SurgSim/Palpate-v0")
+    with pytest.raises(ValueError, match=r"belongs to gymnasium\.envs"):
+        gym.register("Test/Cart-v0", entry_point="gymnasium.envs.classic_control:CartPoleEnv")
+        registered(Touch, "Test/Cart-v0")
+    with pytest.raises(TypeError, match=r"is no task; give a subclass of surgsim_env\.Task"):
+        registered(dict, "Test/Dict-v0")
+    assert TASKS[id] is Touch
+    gym.registry.pop("Test/Cart-v0")
+
+
+# ---- refusals at construction and at the first reset -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"size": lambda task: -1}, "'one': its size function returned -1; it must be a whole number from 0 on"),
+        ({"low": lambda *_: np.nan}, "channel 'one': a bound is nan; it must be one finite number or 1"),
+        ({"low": lambda *_: [0.0, 0.0]}, r"channel 'one': a bound is \[0.0, 0.0\]; it must be one finite number or 1"),
+        ({"low": lambda *_: 3.0}, r"channel 'one': low is \[3.0\], above high \[1.0\]: swap them"),
+    ],
+)
+def test_wrong_sizes_and_bounds_are_refused_at_construction(changes, message):
+    with pytest.raises(ValueError, match=message):
+        environment_class(type("Wrong", (Touch,), {"channels": (CONTACT_FORCE, channel(**changes))}))()
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (
+            lambda *_: [0.1, 0.2],
+            r"channel 'one': read returned 2 numbers, shape \(2,\); its size is 1: return that many",
+        ),
+        (
+            lambda *_: np.nan,
+            r"Wrong, after a reset: observation one\[0\] = nan left its bounds, 0 to 1; .* correct read",
+        ),
+        (lambda *_: 1.5, r"observation one\[0\] = 1.5 left its bounds, 0 to 1; a channel's read must stay within"),
+    ],
+)
+def test_wrong_reads_are_refused_at_the_first_reset(read, message):
+    env = environment_class(type("Wrong", (Touch,), {"channels": (CONTACT_FORCE, channel(read=read))}))()
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=0)
+
+
+def test_a_channel_that_leaves_its_bounds_later_is_a_fault():
+    late = channel(read=lambda task, simulation: 0.5 + task.step_count)
+    env = environment_class(type("Late", (Touch,), {"channels": (CONTACT_FORCE, late)}))()
+    first = env.reset(seed=0)[0]
+    observation, _, terminated, _, info = env.step(np.zeros(3, dtype=np.float32))
+    assert terminated and info["sim_fault"] == "observation one[0] = 1.5 left its bounds, 0 to 1"
+    np.testing.assert_array_equal(observation, first)
+
+
+def test_a_task_without_a_draw_or_with_an_unsaveable_attribute_is_refused():
+    bare = type("Bare", (Touch,), {"draw": Task.draw})
+    with pytest.raises(NotImplementedError, match=r"Bare must define draw\(rng\)"):
+        environment_class(bare)().reset(seed=0)
+    env = environment_class(type("Kept", (Touch,), {"kept": ("limits",)}))()
+    env.reset(seed=0)
+    with pytest.raises(TypeError, match="kept attribute 'limits' is a Limits; a saved state holds numbers"):
+        env.save_state()

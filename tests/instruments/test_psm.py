@@ -1,0 +1,134 @@
+"""The PSM that MuJoCo computes against its modified Denavit-Hartenberg table, to 1e-9."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surgsim_env.instruments.arm.arm import load_arm
+from surgsim_env.instruments.arm.psm import JAW_RANGE, PSM_LINKS, psm_frames, psm_manipulability, psm_tip, shaft_depth
+from surgsim_env.scene.model import Port
+from tests.instruments.joints import random_joints
+
+INSTRUMENTS = Path(__file__).resolve().parents[2] / "scenes" / "instruments"
+TIP_LENGTH = {"psm_palpator": 0.020, "psm_grasper": 0.0102, "psm_retractor": 0.026}
+PORT = Port((0.11, -0.02, 0.3), (0.3, 0.2, -1.0), 0.4)
+EXACT = 1e-9
+
+
+@pytest.fixture(scope="module", params=sorted(TIP_LENGTH))
+def arm(request):
+    return load_arm(request.param, PORT)
+
+
+def in_port(position):
+    """A point of the world in the port's frame."""
+    return PORT.rotation.T @ (position - PORT.point)
+
+
+def test_forward_kinematics_are_those_of_the_table(arm):
+    for joints in random_joints(arm, 200):
+        expected = psm_tip(joints, TIP_LENGTH[arm.description.name])
+        pose = arm.tip_pose(joints)
+        assert np.abs(in_port(pose.position) - expected[:3, 3]).max() < EXACT
+        assert np.abs(PORT.rotation.T @ pose.rotation - expected[:3, :3]).max() < EXACT
+
+
+def test_a_pose_worked_out_by_hand(arm):
+    """Joints 0, insertion 0.1 m: the tip is 0.1 - 0.0156 + 0.0091 m and its own length straight down from the port."""
+    pose = arm.tip_pose([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    depth = 0.1 - 0.4318 + 0.4162 + 0.0091 + TIP_LENGTH[arm.description.name]
+    assert np.abs(in_port(pose.position) - [0.0, 0.0, -depth]).max() < EXACT
+    assert np.abs(arm.tip_direction([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]) - PORT.rotation @ [0.0, 0.0, -1.0]).max() < EXACT
+    # Yaw and pitch are the angles of spherical coordinates: |sine| of the pitch is the height over the yaw's plane.
+    yaw, pitch = 0.7, -0.4
+    tip = in_port(arm.tip_pose([yaw, pitch, 0.1, 0.0, 0.0, 0.0]).position)
+    assert np.linalg.norm(tip) == pytest.approx(depth, abs=EXACT)
+    assert abs(tip[1]) == pytest.approx(depth * math.sin(0.4), abs=EXACT)
+    assert abs(tip[0]) == pytest.approx(depth * math.cos(0.4) * math.sin(0.7), abs=EXACT)
+
+
+def test_the_shaft_meets_the_remote_centre_at_any_joint_values(arm):
+    assert max(arm.trocar_residual(joints) for joints in random_joints(arm, 500)) < EXACT
+
+
+def test_the_residual_is_a_distance_from_the_shafts_axis():
+    """Moving the trocar by 3 mm across the shaft is missed by 3 mm, along the shaft by nothing."""
+    arm = load_arm("psm_palpator")
+    arm._trocar = np.array([0.003, 0.0, 0.05])
+    assert arm.trocar_residual(arm.home) == pytest.approx(0.003, abs=EXACT)
+
+
+def test_jacobian_is_the_derivative_of_the_pose(arm):
+    """Central differences: h^2 / 6 times third derivatives below 1 m is 2e-11 at h = 1e-5, rounding 1e-11."""
+    step = 1e-5
+    for joints in random_joints(arm, 20):
+        jacobian = arm.tip_jacobian(joints)
+        for column in range(arm.joint_count):
+            change = step * np.eye(arm.joint_count)[column]
+            ahead, behind = arm.tip_pose(joints + change), arm.tip_pose(joints - change)
+            linear = (ahead.position - behind.position) / (2.0 * step)
+            spin = (ahead.rotation - behind.rotation) @ arm.tip_pose(joints).rotation.T / (2.0 * step)
+            angular = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
+            assert np.abs(jacobian[:3, column] - linear).max() < 1e-9
+            assert np.abs(jacobian[3:, column] - angular).max() < 1e-9
+
+
+def test_manipulability_of_the_first_three_joints_is_depth_squared_times_cosine(arm):
+    """sqrt(det J J^T) of yaw, pitch and insertion at the wrist's pitch axis = l^2 cos(q2)."""
+    for joints in random_joints(arm, 100):
+        arm.tip_pose(joints)
+        wrist = arm._data.xpos[arm.model.body("wrist_pitch").id]
+        axes = [arm._data.xmat[arm.model.body(name).id].reshape(3, 3)[:, 2] for name in ("yaw", "pitch", "insertion")]
+        lever = wrist - PORT.point
+        columns = np.column_stack([np.cross(axes[0], lever), np.cross(axes[1], lever), axes[2]])
+        assert np.linalg.norm(lever) == pytest.approx(abs(shaft_depth(joints[2])), abs=EXACT)
+        found = math.sqrt(np.linalg.det(columns @ columns.T))
+        assert found == pytest.approx(psm_manipulability(joints), abs=EXACT)
+
+
+def test_manipulability_of_an_arm_is_yoshikawas(arm):
+    """With the wrist straight and held, J of the first three joints at the tip: the closed form at the tip's depth."""
+    joints = np.array([0.3, -0.5, 0.12, 0.0, 0.0, 0.0])
+    three = arm.tip_jacobian(joints)[:3, :3]
+    depth = shaft_depth(0.12) + 0.0091 + TIP_LENGTH[arm.description.name]
+    assert abs(np.linalg.det(three)) == pytest.approx(depth**2 * math.cos(-0.5), abs=EXACT)
+    linear = arm.tip_jacobian(joints)[:3]
+    assert arm.manipulability(joints) == pytest.approx(np.prod(np.linalg.svd(linear)[1]), rel=1e-9)
+
+
+def test_limits_and_efforts_are_the_tables(arm):
+    for index, link in enumerate(PSM_LINKS):
+        assert (arm.lower[index], arm.upper[index]) == pytest.approx((link.lower, link.upper), abs=1e-12)
+        joint = arm.model.joint(link.joint)
+        assert tuple(arm.model.jnt_actfrcrange[joint.id]) == pytest.approx((-link.effort, link.effort))
+    assert [math.degrees(link.upper) for link in PSM_LINKS[:2]] == pytest.approx([91.0, 53.0])
+    if arm.description.jaw:
+        # The retractor's pads are 7 mm apart at 0, 26 mm from the axis: 5.5 mm at the stop.
+        stop = -2.0 * math.asin(0.00075 / 0.026), 2.0 * math.radians(19.0)
+        assert arm.jaw_range == pytest.approx(JAW_RANGE if arm.description.name == "psm_grasper" else stop)
+
+
+def test_jaw_opens_both_fingers_alike():
+    """The tips of two fingers 9.2 mm long from the yaw axis move apart as the angle opens, alike on both sides."""
+    arm = load_arm("psm_grasper")
+    left, right = (arm.shape_names.index(name) for name in ("jaw_left", "jaw_right"))
+    tip = arm.tip_pose(arm.home).position
+    yaw_axis = psm_frames(arm.home)[5][:3, 3]
+    for angle in (0.0, 0.4, 1.2):
+        both = arm.shape_ends(arm.home, angle)[[left, right]]
+        ends = both[[0, 1], np.linalg.norm(both - yaw_axis, axis=2).argmax(axis=1)]
+        assert np.linalg.norm(ends[0] - tip) == pytest.approx(np.linalg.norm(ends[1] - tip), abs=1e-12)
+        reach = ends - yaw_axis
+        between = math.acos(reach[0] @ reach[1] / np.prod(np.linalg.norm(reach, axis=1)))
+        closed = 2.0 * math.atan2(0.0011, 0.0102 - 0.001)
+        assert between == pytest.approx(angle + closed, abs=1e-9)
+
+
+def test_generator_writes_the_committed_files(tmp_path):
+    subprocess.run([sys.executable, str(INSTRUMENTS / "make_psm.py"), str(tmp_path)], check=True, timeout=600)
+    for name in TIP_LENGTH:
+        assert (tmp_path / f"{name}.xml").read_text() == (INSTRUMENTS / f"{name}.xml").read_text()

@@ -1,0 +1,161 @@
+"""Scores of palpation: who sees the truth has all of it, who guesses the middle has what chance predicts."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surgsim_env.palpation.scores import (
+    ERROR_LINE,
+    EVALUATION_SEEDS,
+    FOUND_DISTANCE,
+    MapScore,
+    PalpationRecord,
+    press_errors,
+    presses_to_line,
+    score,
+)
+
+SIDE = 0.04  # of the square that lesions are drawn in [m]
+BUDGET = 5
+CUTOFF = 0.05  # beyond the square's half diagonal
+NONE = np.zeros((0, 3))
+
+
+def record(truth: np.ndarray, estimates: list[np.ndarray], made: MapScore | None = None) -> PalpationRecord:
+    return PalpationRecord(
+        truth=truth,
+        estimates=estimates,
+        cutoff=CUTOFF,
+        force=np.full(len(estimates), 0.2),
+        force_peak=np.linspace(0.2, 0.6, len(estimates)),
+        impulse=0.1,
+        seconds=2.0,
+        path_length=0.3,
+        soft_force=0.5,
+        hard_limit=False,
+        fault="",
+        map=made,
+    )
+
+
+def places(rng: np.random.Generator, count: int) -> np.ndarray:
+    return np.column_stack([rng.uniform(0.0, SIDE, (count, 2)), np.zeros(count)])
+
+
+def map_of(excess: np.ndarray, lesion: np.ndarray) -> MapScore:
+    return MapScore(excess.ravel(), lesion.ravel(), excess > 0.5, lesion, 4e-6)
+
+
+def disc(centre: np.ndarray, radius: float = 0.008) -> np.ndarray:
+    x, y = np.meshgrid(np.linspace(0.0, SIDE, 21), np.linspace(0.0, SIDE, 21))
+    return (x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius**2
+
+
+def test_who_sees_the_truth_has_all_of_it() -> None:
+    pytest.importorskip("sklearn", reason="needs the `agents` extra")
+    rng = np.random.default_rng(0)
+    records = []
+    for count in (0, 1, 2, 3, 1, 1):
+        truth = places(rng, count)
+        lesion = np.any([disc(one) for one in truth], axis=0) if count else np.zeros((21, 21), dtype=bool)
+        records.append(record(truth, [truth] * BUDGET, map_of(lesion.astype(float), lesion)))
+    figures = score(records, BUDGET, rng)
+    for name in ("recall", "precision", "count_right", "outline_iou", "auroc", "average_precision"):
+        assert (figures[name].low, figures[name].value, figures[name].high) == (1.0, 1.0, 1.0), name
+    for name in ("error_mm", "error_median_mm", "centroid_error_mm", "outline_difference_mm2", "fault_share"):
+        assert (figures[name].low, figures[name].value, figures[name].high) == (0.0, 0.0, 0.0), name
+    assert figures["presses_to_median"].value == figures["presses_to_p90"].value == 1.0
+
+
+def test_who_guesses_the_middle_has_what_chance_predicts() -> None:
+    """Mean distance from a square's middle: side (sqrt 2 + asinh 1) / 6; share within r of it: pi r^2 / side^2."""
+    pytest.importorskip("sklearn", reason="needs the `agents` extra")
+    rng = np.random.default_rng(1)
+    middle = np.array([[0.5 * SIDE, 0.5 * SIDE, 0.0]])
+    records = []
+    for _ in range(600):
+        truth = places(rng, 1)
+        records.append(record(truth, [middle] * BUDGET, map_of(rng.random((21, 21)), disc(truth[0]))))
+    distance = np.array([1000.0 * np.linalg.norm(one.truth - middle) for one in records])
+    figures = score(records, BUDGET, rng)
+    by_chance = 1000.0 * SIDE * (math.sqrt(2.0) + math.asinh(1.0)) / 6.0
+    assert figures["error_mm"].value == pytest.approx(by_chance, abs=4.0 * distance.std() / math.sqrt(600))
+    within = math.pi * FOUND_DISTANCE**2 / SIDE**2
+    for name in ("recall", "precision"):
+        assert figures[name].value == pytest.approx(within, abs=4.0 * math.sqrt(within * (1.0 - within) / 600)), name
+    # A map that knows nothing orders a site of a lesion before another one half of the time.
+    assert figures["auroc"].value == pytest.approx(0.5, abs=0.02)
+    assert figures["presses_to_median"].value == math.inf
+
+
+def test_presses_to_a_line_count_till_it_is_crossed_for_good() -> None:
+    over, under = 2.0 * ERROR_LINE, 0.5 * ERROR_LINE
+    assert presses_to_line(np.array([[over, under, under]]), 50.0) == 2.0
+    assert presses_to_line(np.array([[over, under, over, under]]), 50.0) == 4.0
+    assert presses_to_line(np.array([[under, under]]), 50.0) == 1.0
+    assert presses_to_line(np.array([[under, over]]), 50.0) == math.inf
+    # Of three organs two are under the line from the second press on, all from the third.
+    errors = np.array([[over, under, under], [under, under, under], [over, over, under]])
+    assert presses_to_line(errors, 50.0) == 2.0
+    assert presses_to_line(errors, 100.0) == 3.0
+
+
+def test_an_episode_that_ended_early_keeps_its_last_error() -> None:
+    truth = places(np.random.default_rng(2), 1)
+    errors = press_errors(record(truth, [NONE, truth + np.array([0.003, 0.0, 0.0])]), BUDGET)
+    np.testing.assert_allclose(errors, [CUTOFF, 0.003, 0.003, 0.003, 0.003])
+    with pytest.raises(ValueError, match="0 estimates in an episode of 5 presses"):
+        press_errors(record(truth, []), BUDGET)
+    with pytest.raises(ValueError, match="6 estimates in an episode of 5 presses"):
+        press_errors(record(truth, [truth] * 6), BUDGET)
+
+
+def test_missed_and_imagined_lesions_count() -> None:
+    """Of two lesions one is found 4 mm off; of three estimates two are nowhere near."""
+    truth = np.array([[0.01, 0.01, 0.0], [0.03, 0.03, 0.0]])
+    said = np.array([[0.014, 0.01, 0.0], [0.01, 0.035, 0.0], [0.0, 0.04, 0.0]])
+    figures = score([record(truth, [said])], 1, np.random.default_rng(0))
+    assert figures["recall"].value == pytest.approx(1.0 / 2.0)
+    assert figures["precision"].value == pytest.approx(1.0 / 3.0)
+    assert figures["centroid_error_mm"].value == pytest.approx(4.0)
+    matched = 4.0 + 1000.0 * math.hypot(0.02, 0.005)
+    assert figures["error_mm"].value == pytest.approx((matched + 1000.0 * CUTOFF) / 3.0)
+    assert figures["count_right"].value == 0.0
+    # Nothing hidden, nothing said: no recall, no precision, no line, but no error either.
+    nothing = score([record(NONE, [NONE])], 1, np.random.default_rng(0))
+    assert nothing["recall"].value is nothing["precision"].value is nothing["presses_to_median"].value is None
+    assert nothing["error_mm"].value == 0.0 and nothing["count_right"].value == 1.0
+
+
+def test_forces_are_those_of_the_presses() -> None:
+    truth = places(np.random.default_rng(3), 1)
+    figures = score([replace(record(truth, [truth] * 5), hard_limit=True)], BUDGET, np.random.default_rng(0))
+    assert figures["force_mean"].value == pytest.approx(0.2)
+    assert figures["force_peak"].value == pytest.approx(0.6)
+    assert figures["force_p95"].value == pytest.approx(0.58)  # 0.2, 0.3 ... 0.6: the 95th percentile
+    assert figures["soft_force_share"].value == pytest.approx(0.2)
+    assert figures["hard_limit_share"].value == 1.0
+
+
+def test_intervals_are_those_of_the_mean() -> None:
+    """For many organs the interval is mean +- 1.96 s / sqrt(n), by the central limit theorem."""
+    rng = np.random.default_rng(4)
+    truth = np.zeros((1, 3))
+    offsets = rng.uniform(0.0, 0.02, 400)
+    figure = score([record(truth, [truth + np.array([one, 0.0, 0.0])]) for one in offsets], 1, rng)["error_mm"]
+    half = 1.96 * 1000.0 * offsets.std() / math.sqrt(400)
+    assert figure.value == pytest.approx(1000.0 * offsets.mean())
+    # 2000 draws: the ends are known to some 4 % of the half width.
+    assert figure.value - figure.low == pytest.approx(half, rel=0.15)
+    assert figure.high - figure.value == pytest.approx(half, rel=0.15)
+
+
+def test_no_episode_is_refused() -> None:
+    with pytest.raises(ValueError, match="no episode"):
+        score([], BUDGET, np.random.default_rng(0))
+
+
+def test_seeds_are_a_hundred_and_stand_apart() -> None:
+    assert len(EVALUATION_SEEDS) == 100 and EVALUATION_SEEDS[0] == 1_000_000

@@ -1,0 +1,201 @@
+"""Scene files: read, refused, found, and true to what they state."""
+
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import surgsim_env
+from msdm_core.errors import OrganError
+from msdm_core.material.fitting import spring_fit
+from msdm_core.mesh.ordering import spring_order
+from msdm_core.organ.stability import stable_dt
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene, scene_from_table, scenes_folder
+from surgsim_env.scene.model import substeps_needed
+
+PHANTOM = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
+
+
+def changed(**entries):
+    """The phantom's table with dotted entries replaced."""
+    table = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
+    for path, value in entries.items():
+        *folders, last = path.split("__")
+        place = table
+        for folder in folders:
+            place = place[folder]
+        place[last] = value
+    return scene_from_table(table, name="changed", folder=Path("."))
+
+
+WITH_LESIONS = [name for name in surgsim_env.list_scenes() if make_scene(name).lesion is not None]
+
+
+def test_the_shipped_scenes_are_listed():
+    assert set(surgsim_env.list_scenes()) >= {"phantom", "liver"}
+
+
+@pytest.mark.parametrize("name", surgsim_env.list_scenes())
+def test_every_scene_loads_with_its_palpable_face_and_sites(name):
+    scene = make_scene(name)
+    anatomy = load_anatomy(scene)
+    assert len(anatomy.anchors) > 10
+    points, normals = anatomy.face.raster(scene.palpation.site_spacing)
+    assert len(points) > 20
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+    assert (normals @ np.asarray(scene.instrument.approach) < 0.0).all()
+
+
+@pytest.mark.parametrize("name", WITH_LESIONS)
+def test_substeps_of_a_scene_bear_its_worst_randomisation(name):
+    scene = make_scene(name)
+    anatomy = load_anatomy(scene)
+    rng = np.random.default_rng(0)
+    worst = math.inf
+    # The largest, shallowest and stiffest lesions that the file allows.
+    draw = scene.lesion
+    extreme = replace(
+        draw,
+        radius=(draw.radius[1], draw.radius[1]),
+        cover=(draw.cover[0], draw.cover[0]),
+        modulus_ratio=(draw.modulus_ratio[1], draw.modulus_ratio[1]),
+    )
+    hardest = replace(anatomy, scene=replace(scene, lesion=extreme))
+    for _ in range(12):
+        lesion = hardest.random_lesion(rng)
+        assert anatomy.surface_distance(np.array(lesion.centre)) >= draw.radius[1] + draw.cover[0] - 1.01e-4
+        worst = min(worst, stable_dt(anatomy.organ([lesion]), scene.contact.law))
+    assert substeps_needed(scene.timing.haptic_step, worst) <= scene.timing.substep_count
+
+
+def test_too_few_substeps_are_refused_with_the_number_needed():
+    with pytest.raises(OrganError, match=r"2 substeps of 0\.5 ms are too long .*timing\.substep_count = 3"):
+        Simulation(load_anatomy(changed(timing__substep_count=2)))
+    anatomy = load_anatomy(make_scene("phantom"))
+    simulation = Simulation(anatomy)
+    hard = anatomy.lesion_at([0.03, 0.03, 0.015], 0.01, 40.0, "stone")
+    with pytest.raises(OrganError, match="or use softer lesions"):
+        simulation.reset(anatomy.organ([hard]), np.array([0.03, 0.03, 0.05]))
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"material__youngs_modulus": 0.0}, "youngs_modulus is 0.0 Pa"),
+        ({"material__youngs_modulus": -5.0}, "youngs_modulus is -5.0 Pa"),
+        ({"material__poisson_ratio": 0.2}, "poisson_ratio is 0.2"),
+        ({"material__poisson_ratio": 0.5}, "poisson_ratio is 0.5"),
+        ({"material__density": math.nan}, "density is nan"),
+        ({"material__stiffness": 3.0}, "stiffness"),
+        ({"limits__hard_force": 0.1}, "soft_force < hard_force"),
+        ({"lesion__radius": [0.01, 0.006]}, "radius = "),
+        ({"mesh__block": None}, "exactly one"),
+        ({"material__density": "heavy"}, "heavy"),
+        ({"contact__stiffness": 0.0}, "contact.stiffness is 0 N/m\\^3; it must be finite and above 0"),
+        ({"contact__friction": -0.1}, "contact.friction is -0.1; it must be finite and at least 0"),
+        ({"sensor__noise": -0.005}, "sensor.noise is -0.005 N"),
+        ({"sensor__range": 0.0}, "sensor.range is 0 N"),
+        ({"timing__substep_count": 0}, "timing.substep_count is 0; it must be finite and at least 1"),
+        ({"timing__haptic_step": 0.0}, "timing.haptic_step is 0 s"),
+        ({"instrument__tip_radius": 0.0}, "instrument.tip_radius is 0 m"),
+        ({"material__youngs_moduls": 3.0}, "'youngs_moduls' is unknown there; did you mean 'youngs_modulus'"),
+        ({"mesh__block__cells": [12.5, 12, 6]}, "12.5 is not a whole number"),
+        ({"lesion__radius": [0.006, math.inf]}, "finite"),
+        ({"instrument__approach": [0.0, 0.0, 0.0]}, "it must be a direction"),
+        ({"palpation__press_depth": -0.001}, "palpation.press_depth is -0.001 m"),
+        ({"palpation__site_spacing": 0.0}, "palpation.site_spacing is 0 m"),
+        ({"anchors": [{"name": "nothing"}]}, "give one of a box, a ball"),
+    ],
+)
+def test_bad_entries_are_named(entries, message):
+    with pytest.raises(ValueError, match=message):
+        changed(**entries)
+
+
+def test_a_scene_chooses_the_stiffness_rule():
+    """Of one scene's organ with formula (6) and with fitted springs, the springs differ by the mesh's factors."""
+    lloyd, fitted = load_anatomy(changed()), load_anatomy(changed(stiffness_rule="fitted"))
+    factor = spring_fit(fitted.mesh).edge_factor
+    assert not spring_fit(fitted.mesh).report.fallback
+    lesion = lloyd.demonstration_lesions()
+    springs = lloyd.organ(lesion).spring_stiffness
+    factor = factor[spring_order(fitted.mesh).springs]
+    np.testing.assert_array_equal(fitted.organ(lesion).spring_stiffness, factor * springs)
+    with pytest.raises(ValueError, match=r"scene 'changed': stiffness rule 'fited' is unknown.*did you mean 'fitted'"):
+        changed(stiffness_rule="fited")
+
+
+def test_mass_scaling_lets_a_scene_do_with_fewer_substeps():
+    """A lesion that asks for four substeps runs with three; what was added is told at reset."""
+    table = {"timing__mass_scaling": True, "lesion__modulus_ratio": [14.0, 14.0], "lesion__radius": [0.01, 0.01]}
+    simulation = Simulation(load_anatomy(changed(**table)))
+    anatomy = simulation.anatomy
+    organ = anatomy.organ([anatomy.random_lesion(np.random.default_rng(0))])
+    simulation.reset(organ, simulation.instrument.upper)
+    assert 0.0 < organ.added_mass < 0.02 * organ.node_mass.sum()
+    plain = load_anatomy(changed(**{**table, "timing__mass_scaling": False}))
+    with pytest.raises(OrganError, match=r"timing\.substep_count = 4, timing\.mass_scaling = true"):
+        Simulation(plain).reset(plain.organ([plain.random_lesion(np.random.default_rng(0))]), np.zeros(3))
+
+
+def test_an_anchor_that_holds_nothing_is_refused():
+    far = [{"name": "sky", "ball": {"centre": [1.0, 1.0, 1.0], "radius": 0.01}}]
+    with pytest.raises(ValueError, match="anchor 'sky' holds no node"):
+        load_anatomy(changed(anchors=far))
+    with pytest.raises(ValueError, match="nothing holds the organ"):
+        load_anatomy(changed(anchors=[]))
+
+
+def test_a_spacing_in_the_wrong_unit_is_refused():
+    with pytest.raises(ValueError, match="raster points; at most 100000 are allowed"):
+        load_anatomy(make_scene("phantom")).face.raster(1e-6)
+
+
+@pytest.mark.parametrize("name", [None, 3, b"phantom"])
+def test_a_scene_that_is_no_name_is_refused(name):
+    with pytest.raises(ValueError, match="must be a scene's name or the path"):
+        make_scene(name)
+
+
+def test_unknown_scene_lists_and_suggests():
+    with pytest.raises(ValueError, match=r"'livre' is unknown; the scenes are .*liver.*did you mean 'liver'"):
+        make_scene("livre")
+
+
+def test_a_scene_file_of_ones_own_is_read(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text((scenes_folder() / "organs" / "phantom.toml").read_text().replace("[12, 12, 6]", "[6, 6, 3]"))
+    scene = make_scene(str(path))
+    assert scene.name == "mine"
+    assert scene.mesh.block.cells == (6, 6, 3)
+    assert load_anatomy(scene).mesh.tet_count < 2000
+    path.write_text(path.read_text().replace("[6, 6, 3]", "[8, 8, 4]"))
+    assert make_scene(str(path)).mesh.block.cells == (8, 8, 4), "an edited file is read again"
+    with pytest.raises(ValueError, match=r"gone\.toml cannot be read"):
+        make_scene(str(tmp_path / "gone.toml"))
+    path.write_text("organ = [")
+    with pytest.raises(ValueError, match="not valid TOML"):
+        make_scene(str(path))
+
+
+def test_instrument_that_is_not_there_lists_those_that_are():
+    scene = make_scene("phantom")
+    anatomy = load_anatomy(replace(scene, instrument=replace(scene.instrument, model="scalpel.xml")))
+    with pytest.raises(ValueError, match=r"'scalpel.xml' is unknown; the instruments are grasper.xml, probe.xml"):
+        Simulation(anatomy)
+
+
+@pytest.mark.parametrize("name", WITH_LESIONS)
+def test_every_draw_finds_room_and_keeps_its_ranges(name):
+    anatomy = load_anatomy(make_scene(name))
+    draw = anatomy.scene.lesion
+    for seed in range(150):
+        lesion = anatomy.random_lesion(np.random.default_rng(seed))
+        cover = anatomy.surface_distance(np.array(lesion.centre)) - lesion.radius
+        assert draw.radius[0] <= lesion.radius <= draw.radius[1]
+        assert draw.cover[0] - 1.01e-4 <= cover <= draw.cover[1] + 1.01e-4

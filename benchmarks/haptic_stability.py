@@ -18,10 +18,9 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import DAMPING_SHARE, TipDynamics, VirtualCoupling, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import ForceLimits, HapticSettings
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings, WatchdogTimes
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.tip_drive import tip_drives
-from surgsim_env.haptics.watchdog import WatchdogTimes
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 

@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from surgsim_env.cli.values import writable_folder
-from surgsim_env.haptics.packet import PORT
+from surgsim_env.haptics.udp import PORT
 from surgsim_env.scene.load import make_scene, pair_names
 from surgsim_env.scene.model import Scene
 
 if TYPE_CHECKING:
-    from surgsim_env.haptics.loop import HapticLoop
+    from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
     from surgsim_env.haptics.pacing import Pacer
     from surgsim_env.haptics.settings import HapticSettings
-    from surgsim_env.haptics.telemetry import HapticTelemetry
     from surgsim_env.haptics.trajectory import TrajectoryDevice
     from surgsim_env.haptics.udp import UdpDevice
 

@@ -32,8 +32,7 @@ class VirtualCoupling:
 
     def __post_init__(self) -> None:
         require_positive("coupling stiffness", self.stiffness, "N/m")
-        if not (math.isfinite(self.damping) and self.damping >= 0.0):
-            raise ValueError(f"coupling damping is {self.damping!r} N s/m; it must be finite and not negative")
+        require_positive("coupling damping", self.damping, "N s/m", or_zero=True)
 
 
 @dataclass(frozen=True)

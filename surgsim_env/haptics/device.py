@@ -49,8 +49,7 @@ class DeviceDynamics:
         require_positive("device damping", self.damping, "N s/m")
         require_positive("device mass", self.mass, "kg")
         require_positive("device force_largest", self.force_largest, "N", finite=False)
-        if not (math.isfinite(self.delay) and self.delay >= 0.0):
-            raise ValueError(f"device delay is {self.delay!r} s; it must be finite and not negative")
+        require_positive("device delay", self.delay, "s", or_zero=True)
         if self.pose_interval is not None:
             require_positive("device pose_interval", self.pose_interval, "s")
 
@@ -79,11 +78,12 @@ class HapticDevice(Protocol):
         ...
 
 
-def require_positive(name: str, value: float, unit: str, *, finite: bool = True) -> None:
-    """Refuse a number that is not above zero.
+def require_positive(name: str, value: float, unit: str, *, finite: bool = True, or_zero: bool = False) -> None:
+    """Refuse a number that is not above zero, or with `or_zero` below zero.
 
     Raises:
         ValueError: names the number, its value and the rule.
     """
-    if not value > 0.0 or (finite and not math.isfinite(value)):
-        raise ValueError(f"{name} is {value!r} {unit}; it must be {'finite and ' if finite else ''}above 0")
+    if not (value > 0.0 or (or_zero and value == 0.0)) or (finite and not math.isfinite(value)):
+        rule = f"{'finite and ' if finite else ''}{'not negative' if or_zero else 'above 0'}"
+        raise ValueError(f"{name} is {value!r} {unit}; it must be {rule}")

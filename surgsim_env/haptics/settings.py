@@ -1,15 +1,41 @@
 """Configuration of a haptic loop: coupling, frame, force limits, watchdog."""
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.device import require_positive
-from surgsim_env.haptics.frame import DeviceFrame
-from surgsim_env.haptics.watchdog import WatchdogTimes
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class DeviceFrame:
+    """x = origin + scale R x_device, and F_device = scale R^T F: power is the same on both sides.
+
+    Args:
+        origin: of the device's frame in the scene [m].
+        rotation: R, three rows.
+        scale: scene metres per device metre.
+
+    Raises:
+        ValueError: names the entry, its value and the rule.
+    """
+
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[tuple[float, float, float], ...] = IDENTITY
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_positive("frame.scale", self.scale, "")
+        origin, turn = np.asarray(self.origin, dtype=np.float64), np.asarray(self.rotation, dtype=np.float64)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError(f"frame.origin is {self.origin!r}; it must be three finite numbers in metres")
+        if turn.shape != (3, 3) or not np.isfinite(turn).all() or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6:
+            raise ValueError(f"frame.rotation is {self.rotation!r}; its rows must be three perpendicular unit vectors")
+        if np.linalg.det(turn) < 0.0:
+            raise ValueError(f"frame.rotation is {self.rotation!r}; this is a reflection: reverse one axis")
 
 
 @dataclass(frozen=True)
@@ -32,32 +58,26 @@ class ForceLimits:
         require_positive("limits.slew_largest", self.slew_largest, "N/s")
 
 
-def held_within(vector: FloatArray, largest: float) -> tuple[FloatArray, bool]:
-    """The vector limited to a length, in the same direction, and whether it was longer."""
-    x, y, z = vector.tolist()
-    size = math.sqrt(x * x + y * y + z * z)
-    if size <= largest:
-        return vector, False
-    return vector * (largest / size), True
+@dataclass(frozen=True)
+class WatchdogTimes:
+    """Times of the watchdog.
 
+    Args:
+        timeout: time without a fresh pose after which the force fades [s].
+        fade: time from full force to none, linearly [s].
+        resume: time from none to full force when poses return, linearly [s].
 
-class SlewLimit:
-    """Limits the change of a device's force from step to step."""
+    Raises:
+        ValueError: names the entry, its value and the rule.
+    """
 
-    def __init__(self, slew_largest: float, haptic_step: float) -> None:
-        """Start at zero force; `slew_largest` [N/s] for steps of `haptic_step` [s]."""
-        self._most = slew_largest * haptic_step
-        self._force = np.zeros(3)
+    timeout: float = 0.05
+    fade: float = 0.1
+    resume: float = 0.5
 
-    def follow(self, force: FloatArray) -> tuple[FloatArray, bool]:
-        """The next force [N], (3,), and whether the limit changed it."""
-        change, held = held_within(force - self._force, self._most)
-        self._force = self._force + change if held else force
-        return self._force, held
-
-    def reset(self) -> None:
-        """Set the force to zero at once."""
-        self._force = np.zeros(3)
+    def __post_init__(self) -> None:
+        for name in ("timeout", "fade", "resume"):
+            require_positive(f"watchdog.{name}", getattr(self, name), "s")
 
 
 @dataclass(frozen=True)
@@ -92,8 +112,7 @@ class HapticSettings:
     jaw_button: int | None = 0
 
     def __post_init__(self) -> None:
-        if self.smoothing is not None and not (math.isfinite(self.smoothing) and self.smoothing >= 0.0):
-            raise ValueError(f"haptic smoothing is {self.smoothing!r} s; it must be finite and not negative")
+        require_positive("haptic smoothing", self.smoothing or 0.0, "s", or_zero=True)
         require_positive("haptic approach_speed", self.approach_speed, "m/s")
         require_positive("haptic speed_largest", self.speed_largest, "m/s")
         if self.jaw_button is not None and self.jaw_button not in range(32):

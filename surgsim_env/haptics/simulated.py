@@ -31,10 +31,8 @@ class Hand:
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name in ("stiffness", "damping"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise ValueError(f"hand {name} is {value!r}; it must be finite and not negative")
+        require_positive("hand stiffness", self.stiffness, "N/m", or_zero=True)
+        require_positive("hand damping", self.damping, "N s/m", or_zero=True)
 
 
 class SimulatedDevice:

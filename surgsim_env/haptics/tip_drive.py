@@ -1,7 +1,5 @@
 """Application of a coupling's force to an instrument's tip, through the instrument's velocity commands."""
 
-from typing import Protocol
-
 import mujoco
 import numpy as np
 
@@ -21,47 +19,6 @@ STEER_EVERY = 10
 STEER_TIME = 0.02
 
 
-class TipDrive(Protocol):
-    """One tip of an instrument as a coupling sees it.
-
-    Fields:
-        dynamics: mass and damping at the coupling
-        force_largest: largest force that it can exert [N]
-        has_jaw: whether it has a jaw
-    """
-
-    dynamics: TipDynamics
-    force_largest: float
-    has_jaw: bool
-
-    @property
-    def position(self) -> FloatArray:
-        """The point to which the coupling is attached [m], (3,)."""
-        ...
-
-    @property
-    def tip(self) -> FloatArray:
-        """Position of the tip [m], (3,)."""
-        ...
-
-    @property
-    def limited(self) -> bool:
-        """Whether the edge of its workspace or a joint limit stops it."""
-        ...
-
-    def push(self, force: FloatArray, contact_force: FloatArray) -> None:
-        """Apply a force [N], (3,), during the next haptic step; `contact_force` is the tissue's in the last one."""
-        ...
-
-    def command_jaw(self, target: float) -> None:
-        """`Instrument.command_jaw`."""
-        ...
-
-    def restart(self) -> None:
-        """Restart after the tip was moved."""
-        ...
-
-
 class CartesianDrive:
     """The tip of a probe or grasper on slides: its servo exerts exactly the coupling's force.
 
@@ -71,6 +28,11 @@ class CartesianDrive:
 
     makes it exert F; the lead c - q decays with kv / kp (12 ms). MuJoCo integrates kv implicitly, which makes the tip
     kv T (60 g) heavier than its slides, and the slides' damping too, so that it dissipates at any step.
+
+    Fields:
+        tool: the instrument
+        dynamics: mass and damping at the coupling
+        force_largest: largest force that it can exert [N]
     """
 
     def __init__(self, instrument: Instrument) -> None:
@@ -80,8 +42,7 @@ class CartesianDrive:
             TypeError: its first joints are not such slides.
         """
         model, servo = instrument.model, instrument.servo
-        self._instrument = instrument
-        self.has_jaw = instrument.jaw is not None
+        self.tool = instrument
         hold, pace = servo.position[:3], servo.speed[:3]
         joints = model.actuator_trnid[hold, 0]
         slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -101,29 +62,20 @@ class CartesianDrive:
 
     @property
     def position(self) -> FloatArray:
-        """The tip [m]: poses are up to date after `Instrument.refresh`."""
-        return self._instrument.tip_position
-
-    @property
-    def tip(self) -> FloatArray:
-        """The tip [m]."""
-        return self._instrument.tip_position
+        """The tip, to which the coupling is attached [m], (3,); up to date after `Instrument.refresh`."""
+        return self.tool.tip_position
 
     @property
     def limited(self) -> bool:
         """Whether the tip's box stops it."""
-        return self._instrument.workspace_limited
+        return self.tool.workspace_limited
 
     def push(self, force: FloatArray, contact_force: FloatArray) -> None:
         """Command the speed at which the servo exerts a force [N], (3,); the simulation adds the tissue's."""
-        data = self._instrument.data
+        data = self.tool.data
         lead = data.ctrl[self._hold] - data.qpos[self._place]
         speed = data.qvel[self._speed]
-        self._instrument.command_velocity((force - self._stiffness * lead + self._damping * speed) * self._gain)
-
-    def command_jaw(self, target: float) -> None:
-        """`Instrument.command_jaw`."""
-        self._instrument.command_jaw(target)
+        self.tool.command_velocity((force - self._stiffness * lead + self._damping * speed) * self._gain)
 
     def restart(self) -> None:
         """There is no state to restart."""
@@ -134,6 +86,10 @@ class SteeredDrive:
 
     m dv/dt = F + F_tissue - b v at haptic rate; the arm's inverse kinematics follow at a tenth of it. `stiffness_limit`
     does not include that lag: its guarantee is for tips on slides.
+
+    Fields:
+        tool: the arm
+        dynamics, force_largest: as in `CartesianDrive`
     """
 
     dynamics = STEERED
@@ -141,32 +97,23 @@ class SteeredDrive:
 
     def __init__(self, steered: SteeredArm, haptic_step: float, turn: int = 0) -> None:
         """Steer an arm in steps of `haptic_step` [s]; two arms take turns, 0 and 1."""
-        self._steered = steered
-        self.has_jaw = steered.jaw is not None
-        self._haptic_step = haptic_step
+        self.tool, self._haptic_step = steered, haptic_step
         self._first = (turn * STEER_EVERY // 2) % STEER_EVERY
-        self._step = 0
-        self._place = steered.tip_position
-        self._velocity = np.zeros(3)
+        self.restart()
 
     @property
     def position(self) -> FloatArray:
-        """The point that the arm follows [m]."""
+        """The point that the arm follows, to which the coupling is attached [m], (3,)."""
         return self._place
-
-    @property
-    def tip(self) -> FloatArray:
-        """The arm's tip [m]."""
-        return self._steered.tip_position
 
     @property
     def limited(self) -> bool:
         """Whether the box, a joint limit or a speed limit stops the tip."""
-        return self._steered.limited
+        return self.tool.limited
 
     def push(self, force: FloatArray, contact_force: FloatArray) -> None:
         """Move the point by one haptic step under two forces [N], (3,), and steer the arm when it is its turn."""
-        dt, steered = self._haptic_step, self._steered
+        dt, steered = self._haptic_step, self.tool
         push = force + contact_force + self.dynamics.mass / dt * self._velocity
         self._velocity = push / (self.dynamics.mass / dt + self.dynamics.damping)
         wanted = self._place + dt * self._velocity
@@ -177,13 +124,12 @@ class SteeredDrive:
             steered.command_velocity(self._velocity + behind, np.zeros(3))
         self._step += 1
 
-    def command_jaw(self, target: float) -> None:
-        """`Instrument.command_jaw`."""
-        self._steered.command_jaw(target)
-
     def restart(self) -> None:
         """Restart at rest at the tip's present position."""
-        self._place, self._velocity, self._step = self._steered.tip_position, np.zeros(3), 0
+        self._place, self._velocity, self._step = self.tool.tip_position, np.zeros(3), 0
+
+
+TipDrive = CartesianDrive | SteeredDrive
 
 
 def tip_drives(instrument: Instrument, haptic_step: float) -> list[TipDrive]:

@@ -1,19 +1,112 @@
-"""A device behind a UDP socket on this machine, such as a client of OpenHaptics, CHAI3D or ROS."""
+"""A device behind a UDP socket on this machine, such as a client of OpenHaptics, CHAI3D or ROS.
+
+`docs/haptics.md` has the table of the two packets.
+"""
 
 import ipaddress
+import math
 import socket
+import struct
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.device import DeviceDynamics, DevicePose, require_positive
-from surgsim_env.haptics.packet import POSE, ForcePacket, PosePacket, newer, pack_force, unpack_pose
 
+# UDP port of the simulation, in no list of IANA.
+PORT = 47801
+MAGIC = b"SSHP"
+VERSION = 1
+KIND_POSE, KIND_FORCE = 1, 2
+# Little-endian, without gaps. Magic, version, kind, buttons, sequence, time; position, rotation.
+POSE = struct.Struct("<4sBBHId3d4d")
+# Magic, version, kind, zero, sequence and time of the answered pose; force.
+FORCE = struct.Struct("<4sBBHId3d")
+assert FORCE.size <= POSE.size
+
+# Positions farther from the device's origin are refused [m].
+POSITION_LARGEST = 10.0
+# Tolerance on the length of a rotation's quaternion.
+ROTATION_SLACK = 1e-3
 # Packets read per haptic step; the socket drops a flood of more.
 PACKETS_PER_READ = 16
 # Receive buffer of the socket [bytes]: a few tens of packets, so that a flood leaves no old ones.
 BUFFER_SIZE = 16384
+
+
+class PosePacket(NamedTuple):
+    """A pose.
+
+    Fields:
+        sequence: increases with each packet, modulo 2^32
+        time: on the sender's clock [s]; the answer repeats it
+        position: [m], (3,)
+        buttons: one bit each, 16 of them
+        rotation: unit quaternion (w, x, y, z), or None; checked, and not used in this version
+    """
+
+    sequence: int
+    time: float
+    position: FloatArray
+    buttons: int = 0
+    rotation: FloatArray | None = None
+
+
+class ForcePacket(NamedTuple):
+    """A force as it travels: sequence and time of the pose that it answers, and the force [N], (3,)."""
+
+    sequence: int
+    time: float
+    force: FloatArray
+
+
+def pack_pose(pose: PosePacket) -> bytes:
+    """The 76 bytes of a pose."""
+    rotation = np.zeros(4) if pose.rotation is None else pose.rotation
+    header = (MAGIC, VERSION, KIND_POSE, pose.buttons, pose.sequence, pose.time)
+    return POSE.pack(*header, *pose.position.tolist(), *rotation.tolist())
+
+
+def unpack_pose(data: bytes) -> PosePacket | None:
+    """A pose of exactly 76 well-formed bytes; None for anything else."""
+    if len(data) != POSE.size:
+        return None
+    magic, version, kind, buttons, sequence, time, x, y, z, *turn = POSE.unpack(data)
+    if magic != MAGIC or version != VERSION or kind != KIND_POSE or not math.isfinite(time):
+        return None
+    # No comparison with a NaN holds.
+    if not all(abs(value) <= POSITION_LARGEST for value in (x, y, z)):
+        return None
+    rotation = None
+    if any(turn):
+        if not abs(math.hypot(*turn) - 1.0) <= ROTATION_SLACK:
+            return None
+        rotation = np.array(turn)
+    return PosePacket(sequence, time, np.array((x, y, z)), buttons, rotation)
+
+
+def pack_force(force: ForcePacket) -> bytes:
+    """The 44 bytes of a force."""
+    return FORCE.pack(MAGIC, VERSION, KIND_FORCE, 0, force.sequence, force.time, *force.force.tolist())
+
+
+def unpack_force(data: bytes) -> ForcePacket | None:
+    """A force of exactly 44 well-formed bytes; None for anything else."""
+    if len(data) != FORCE.size:
+        return None
+    magic, version, kind, _, sequence, time, *force = FORCE.unpack(data)
+    if magic != MAGIC or version != VERSION or kind != KIND_FORCE or not all(map(math.isfinite, (time, *force))):
+        return None
+    return ForcePacket(sequence, time, np.array(force))
+
+
+def newer(sequence: int, last: int) -> bool:
+    """Whether a sequence number comes after another, modulo 2^32 (RFC 1982)."""
+    return 0 < (sequence - last) % 2**32 < 2**31
 
 
 @dataclass(slots=True)
@@ -42,6 +135,10 @@ class UdpDevice:
 
     Each pose is answered by one force, a shorter packet; nothing else is sent. If the attached sender sends no new
     valid pose for `peer_timeout`, the next sender of one is attached, possibly the same one with new sequence numbers.
+
+    Fields:
+        counts: numbers of packets so far
+        dynamics: of the device; None if it exerts no force
     """
 
     def __init__(
@@ -70,7 +167,7 @@ class UdpDevice:
         if not 0 <= port <= 65535:
             raise ValueError(f"port is {port!r}; it must be from 0 to 65535, 0 for a free one")
         address = _loopback(host)
-        self._dynamics, self._peer_timeout, self._clock = dynamics, peer_timeout, clock
+        self.dynamics, self._peer_timeout, self._clock = dynamics, peer_timeout, clock
         self._socket = socket.socket(socket.AF_INET if address.version == 4 else socket.AF_INET6, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
@@ -79,32 +176,21 @@ class UdpDevice:
         except OSError:
             self._socket.close()
             raise
-        self._counts = UdpCounts()
+        self.counts = UdpCounts()
         self._peer: tuple | None = None
         self._heard = 0.0
         self._last: PosePacket | None = None
         self._unanswered = False
 
     @property
-    def dynamics(self) -> DeviceDynamics | None:
-        """Dynamics of the device."""
-        return self._dynamics
-
-    @property
     def address(self) -> tuple[str, int]:
         """Host and port of the socket."""
-        host, port = self._socket.getsockname()[:2]
-        return host, port
+        return self._socket.getsockname()[:2]
 
     @property
     def peer(self) -> tuple[str, int] | None:
         """Host and port of the attached sender, or None."""
         return None if self._peer is None else (self._peer[0], self._peer[1])
-
-    @property
-    def counts(self) -> UdpCounts:
-        """Numbers of packets; a copy."""
-        return replace(self._counts)
 
     def read(self) -> DevicePose | None:
         """The newest valid pose since the last call, or None."""
@@ -119,7 +205,7 @@ class UdpDevice:
                 break
             except OSError:
                 # Some systems raise for a packet that is too long, or for a sender that has closed its socket.
-                self._counts.malformed += 1
+                self.counts.malformed += 1
                 continue
             newest = self._checked(data, sender, now) or newest
         if newest is None:
@@ -136,9 +222,9 @@ class UdpDevice:
         try:
             self._socket.sendto(packet, self._peer)
         except OSError:
-            self._counts.unsent += 1
+            self.counts.unsent += 1
         else:
-            self._counts.answered += 1
+            self.counts.answered += 1
 
     def close(self) -> None:
         """Close the socket."""
@@ -146,18 +232,17 @@ class UdpDevice:
 
     def _checked(self, data: bytes, sender: tuple, now: float) -> PosePacket | None:
         """The pose in a valid and new packet of the attached sender; otherwise None. Counts the packet."""
-        counts = self._counts
         if self._peer is not None and sender != self._peer:
-            counts.stranger += 1
+            self.counts.stranger += 1
             return None
         pose = unpack_pose(data)
         if pose is None:
-            counts.malformed += 1
+            self.counts.malformed += 1
             return None
         if self._last is not None and not newer(pose.sequence, self._last.sequence):
-            counts.stale += 1
+            self.counts.stale += 1
             return None
-        counts.accepted += 1
+        self.counts.accepted += 1
         self._peer, self._heard, self._last = sender, now, pose
         return pose
 

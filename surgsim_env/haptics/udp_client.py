@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from surgsim_env.haptics.packet import FORCE, PORT, PosePacket, pack_pose, unpack_force
+from surgsim_env.haptics.udp import FORCE, PORT, PosePacket, pack_pose, unpack_force
 
 # Time without an answer after which the force is zero [s].
 SILENCE = 0.05

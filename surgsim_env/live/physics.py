@@ -15,10 +15,9 @@ import numpy as np
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.loop import HapticLoop
+from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_env.haptics.pacing import Pacer, PaceSettings
 from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.telemetry import HapticTelemetry
 from surgsim_env.live.browser_device import BrowserDevice, Hands, RecordedHand
 from surgsim_env.live.exchange_records import (
     TRACE_LENGTH,
@@ -163,7 +162,7 @@ class Physics:
         """After the tips were moved: restart the hands from there, and the trace."""
         self._phase = Phase.RUNNING
         for hand, held in zip(self._hands, self._loop.held, strict=True):
-            hand.browser.restart(held.drive.tip)
+            hand.browser.restart(held.drive.tool.tip_position)
         with self._exchange.trace.writing() as trace:
             trace["organ"], trace["count"] = self._organ_number, 0
         self._peak[:] = 0.0
@@ -244,7 +243,7 @@ class Physics:
             self._replaying = False
             for hand, held in zip(self._hands, self._loop.held, strict=True):
                 hand.recorded = None
-                hand.browser.restart(held.drive.tip)
+                hand.browser.restart(held.drive.tool.tip_position)
         if told.fault:
             self._phase, self._said, self._recording = Phase.FAULT, told.fault, False
             self._write_frame()
@@ -259,7 +258,7 @@ class Physics:
             frame["time"], frame["said"] = simulation.time, encoded(self._said)
             frame["added_mass"] = self._organ.added_mass
             for arm, tip in enumerate(told.tips):
-                frame["tip"][arm] = self._loop.held[arm].drive.tip
+                frame["tip"][arm] = self._loop.held[arm].drive.tool.tip_position
                 frame["place"][arm], frame["force"][arm] = tip.target, tip.contact_force
                 frame["pushed"][arm], frame["share"][arm] = tip.force, tip.share
                 frame["limited"][arm] = tip.clamped or tip.workspace_limited

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.haptics.motion_file import Motion, motion_columns, read_motion
+from surgsim_env.haptics.trajectory import Motion, motion_columns, read_motion
 from surgsim_env.live.exchange_records import RECORDING_MOST, recording_type
 
 # Tolerance on the spacing of rows, as a share of the haptic step.

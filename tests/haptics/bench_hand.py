@@ -9,9 +9,8 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import ForceLimits, HapticSettings
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings, WatchdogTimes
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
-from surgsim_env.haptics.watchdog import WatchdogTimes
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
 

@@ -59,7 +59,7 @@ def test_arm_lags_by_its_steering_alone():
 
 def test_two_hands_move_two_arms():
     loop, devices = held_arms("lobe", "psm_pair", [[0.0, 0.0, 0.006], [0.004, 0.0, 0.006]], Hand(1000.0, 10.0))
-    start = [held.drive.tip for held in loop.held]
+    start = [held.drive.tool.tip_position for held in loop.held]
     for _ in range(600):
         told = loop.step()
         for device in devices:

@@ -10,10 +10,8 @@ import pytest
 from surgsim_env.haptics.coupling import TipDynamics, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.packet import FORCE, POSE
-from surgsim_env.haptics.settings import ForceLimits, HapticSettings
-from surgsim_env.haptics.udp import UdpDevice
-from surgsim_env.haptics.watchdog import WatchdogTimes
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings, WatchdogTimes
+from surgsim_env.haptics.udp import FORCE, POSE, UdpDevice
 from tests.haptics.bench_hand import DT, touching_simulation
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "haptics.md").read_text(encoding="utf-8")

@@ -9,11 +9,9 @@ import pytest
 from msdm_core.errors import OrganError
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.device import DeviceDynamics, DevicePose
-from surgsim_env.haptics.frame import DeviceFrame
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import ForceLimits, HapticSettings, SlewLimit
+from surgsim_env.haptics.loop import HapticLoop, SlewLimit, Watchdog
+from surgsim_env.haptics.settings import DeviceFrame, ForceLimits, HapticSettings, WatchdogTimes
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
-from surgsim_env.haptics.watchdog import Watchdog, WatchdogTimes
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from tests.haptics.bench_hand import DT, START, bare_settings, held_device, run, touching_simulation

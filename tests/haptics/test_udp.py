@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.packet import FORCE, POSE, unpack_force
-from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.telemetry import TipTelemetry
-from surgsim_env.haptics.udp import PACKETS_PER_READ, UdpDevice
-from surgsim_env.haptics.watchdog import WatchdogTimes
+from surgsim_env.haptics.loop import HapticLoop, TipTelemetry
+from surgsim_env.haptics.settings import HapticSettings, WatchdogTimes
+from surgsim_env.haptics.udp import FORCE, PACKETS_PER_READ, POSE, UdpDevice, unpack_force
 from tests.haptics.bench_hand import touching_simulation
 from tests.haptics.udp_link import Sender, arrived, drained
 

@@ -8,19 +8,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from surgsim_env.haptics.packet import (
+from surgsim_env.haptics.udp import (
     MAGIC,
     POSE,
     POSITION_LARGEST,
     ForcePacket,
     PosePacket,
+    UdpDevice,
     newer,
     pack_force,
     pack_pose,
     unpack_force,
     unpack_pose,
 )
-from surgsim_env.haptics.udp import UdpDevice
 from tests.haptics.udp_link import Sender, arrived, drained
 
 coordinate = st.floats(-POSITION_LARGEST, POSITION_LARGEST)

@@ -6,8 +6,7 @@ import time
 
 import numpy as np
 
-from surgsim_env.haptics.packet import PosePacket, pack_pose
-from surgsim_env.haptics.udp import UdpDevice
+from surgsim_env.haptics.udp import PosePacket, UdpDevice, pack_pose
 
 # How long anything may take before a test gives up [s]. Nothing that passes depends on it.
 SECONDS = 600.0

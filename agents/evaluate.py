@@ -15,7 +15,8 @@ import datetime
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,56 @@ import gymnasium as gym
 import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.roster import AGENTS, POLICIES, RASTER_SIDES, REFERENCES, TASK_AGENTS, find_agent
-from agents.scoring.leaderboard import SITES, write_leaderboard
-from agents.scoring.results_files import RESULTS, Result
-from agents.scoring.site_episodes import AgentChooser, PolicyChooser, SiteChooser, play
-from agents.scoring.task_episodes import Actor, play_tasks, task_figures
+from agents.expert_palpate import PalpateExpert
+from agents.expert_retract import RetractExpert
+from agents.scoring.episodes import Actor, SiteActor, make_envs, play_sites, play_tasks, task_figures
+from agents.scoring.leaderboard import RESULTS, SITES, Result, write_leaderboard
+from agents.scoring.site_agent import SiteAgent
+from agents.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score
 
 # Seed of the bootstrap.
 BOOTSTRAP_SEED = 0
+POLICIES = Path(__file__).resolve().parent / "policies"
+
+
+@dataclass(frozen=True)
+class TaskAgent:
+    """A script for another environment than SurgSim/PalpateSites-v0.
+
+    Args:
+        env_id: the environment's.
+        make: the script, for the environment's arguments.
+        kwargs: further arguments of the environment.
+        has_places: whether the environment takes `scene` and `level`.
+    """
+
+    env_id: str
+    make: Callable[[dict[str, Any]], Actor]
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    has_places: bool = False
+
+
+TASK_AGENTS = {
+    "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all),
+    "expert_palpate": TaskAgent(
+        "SurgSim/Palpate-v0",
+        lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,
+        {"memory": True},
+        has_places=True,
+    ),
+}
+
+
+def find_agent(name: str) -> Callable[[], SiteAgent]:
+    """The factory of the site search with a name.
+
+    Raises:
+        ValueError: an unknown name (lists the known).
+    """
+    if name not in AGENTS:
+        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS])}")
+    return AGENTS[name]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -58,11 +100,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--episodes is {options.episodes}; there are 1 to {len(EVALUATION_SEEDS)} evaluation seeds")
     if options.video is not None and options.policy is None:
         parser.error("--video films a policy: give --policy as well")
-    run(options)
-
-
-def run(options: argparse.Namespace) -> None:
-    """Evaluate what the options select."""
     if options.reach:
         write_reach(options)
     elif options.agent is not None:
@@ -96,13 +133,13 @@ def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
         if script.has_places:
             kwargs = {"scene": options.scene, "level": options.level, **kwargs}
             command += f" --scene {options.scene} --level {options.level}"
-        return _evaluate_task(name, script.make(kwargs), script.env_id, kwargs, command, options)
+        return _evaluate(name, script.make(kwargs), script.env_id, kwargs, command, options)
     kwargs: dict[str, Any] = {"scene": options.scene, "level": options.level}
     if name in REFERENCES:
         # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
     command = f"python -m agents.evaluate --agent {name} --scene {options.scene} --level {options.level}"
-    return _evaluate_sites(name, AgentChooser(find_agent(name)), kwargs, command, options)
+    return _evaluate(name, SiteActor(find_agent(name)), SITES, kwargs, command, options)
 
 
 def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
@@ -121,58 +158,55 @@ def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
         film(policy, kwargs, EVALUATION_SEEDS[: options.video_episodes], options.video)
     if policy.description.env_id == SITES:
         kwargs = {"scene": "phantom", **kwargs}
-        return _evaluate_sites(path.stem, PolicyChooser(policy), kwargs, command, options)
     policy.reset(min(options.envs, options.episodes))
-    return _evaluate_task(path.stem, policy.act, policy.description.env_id, kwargs, command, options)
+    return _evaluate(path.stem, policy.act, policy.description.env_id, kwargs, command, options)
 
 
-def _evaluate_sites(
-    name: str, chooser: SiteChooser, kwargs: dict[str, Any], command: str, options: argparse.Namespace
+def _evaluate(
+    name: str, actor: Actor | SiteActor, env_id: str, kwargs: dict[str, Any], command: str, options: argparse.Namespace
 ) -> Result:
-    seeds = EVALUATION_SEEDS[: options.episodes]
-    if options.budget is not None:
+    """Play the evaluation seeds; save and print the result."""
+    seeds, rng = EVALUATION_SEEDS[: options.episodes], np.random.default_rng(BOOTSTRAP_SEED)
+    if env_id == SITES and options.budget is not None:
         kwargs = {**kwargs, "budget": options.budget}
-    envs = _environments(SITES, kwargs, options)
-    budget = envs.unwrapped.envs[0].unwrapped.task.budget  # type: ignore[attr-defined]
-    start = time.perf_counter()
-    records = play(chooser, envs, seeds, progress=_Progress(name))
-    taken = time.perf_counter() - start
-    envs.close()
-    return _saved(
-        options,
-        command,
-        taken,
-        method=name,
-        env_id=SITES,
-        env_kwargs=kwargs,
-        budget=budget,
-        figures=score(records, budget, np.random.default_rng(BOOTSTRAP_SEED)),
-        errors_mm=[np.round(1000.0 * press_errors(record, budget), 2).tolist() for record in records],
-        lesion_counts=[len(record.truth) for record in records],
-    )
-
-
-def _evaluate_task(
-    name: str, actor: Actor, env_id: str, kwargs: dict[str, Any], command: str, options: argparse.Namespace
-) -> Result:
-    seeds = EVALUATION_SEEDS[: options.episodes]
-    envs = _environments(env_id, kwargs, options, autoreset_mode="Disabled")
+    count = min(options.envs, options.episodes)
+    envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
-    start = time.perf_counter()
-    records = play_tasks(actor, envs, seeds, progress=_Progress(name))
+    start, progress = time.perf_counter(), _Progress(name)
+    scored: dict[str, Any]
+    if env_id == SITES:
+        presses, budget = play_sites(actor, envs, seeds, progress), first.task.budget
+        scored = {
+            "budget": budget,
+            "figures": score(presses, budget, rng),
+            "errors_mm": [np.round(1000.0 * press_errors(record, budget), 2).tolist() for record in presses],
+            "lesion_counts": [len(record.truth) for record in presses],
+        }
+    else:
+        control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
+        records = play_tasks(actor, envs, seeds, progress)
+        scored = {
+            "budget": gym.spec(env_id).max_episode_steps or 0,
+            "figures": task_figures(records, control_step, soft_force, rng),
+        }
     taken = time.perf_counter() - start
-    control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
     envs.close()
-    return _saved(
-        options,
-        command,
-        taken,
+    result = Result(
         method=name,
         env_id=env_id,
         env_kwargs=kwargs,
-        budget=gym.spec(env_id).max_episode_steps or 0,
-        figures=task_figures(records, control_step, soft_force, np.random.default_rng(BOOTSTRAP_SEED)),
+        seeds=(seeds[0], seeds[-1]),
+        command=_with_options(command, options),
+        wall_time=round(taken, 1),
+        date=datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        **scored,
     )
+    path = result.save(options.results)
+    shown = {name: figure.value for name, figure in result.figures.items()}
+    printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
+    figures = ", ".join(f"{name} {shown[name]:.3g}" for name in printed if shown.get(name) is not None)
+    print(f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s -> {path}", flush=True)
+    return result
 
 
 def write_reach(options: argparse.Namespace) -> None:
@@ -197,38 +231,6 @@ def write_reach(options: argparse.Namespace) -> None:
     path = options.results / f"reach_PalpateSites_{options.scene}_{options.level}.json"
     path.write_text(json.dumps(table) + "\n", encoding="utf-8")
     print(f"{table['below']} of {table['lesions']} lesions below reach -> {path}")
-
-
-def _environments(
-    env_id: str, kwargs: dict[str, Any], options: argparse.Namespace, autoreset_mode: str = "NextStep"
-) -> gym.vector.VectorEnv:
-    """Environments side by side."""
-    return gym.make_vec(
-        env_id,
-        num_envs=min(options.envs, options.episodes),
-        vectorization_mode="vector_entry_point",
-        dtype=options.dtype,
-        threads=options.threads,
-        autoreset_mode=autoreset_mode,
-        **kwargs,
-    )
-
-
-def _saved(options: argparse.Namespace, command: str, taken: float, **scored: Any) -> Result:
-    """Save and print the result of episodes that took `taken` seconds."""
-    result = Result(
-        seeds=(EVALUATION_SEEDS[0], EVALUATION_SEEDS[options.episodes - 1]),
-        command=_with_options(command, options),
-        wall_time=round(taken, 1),
-        date=_today(),
-        **scored,
-    )
-    path = result.save(options.results)
-    shown = {name: figure.value for name, figure in result.figures.items()}
-    printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
-    figures = ", ".join(f"{name} {shown[name]:.3g}" for name in printed if shown.get(name) is not None)
-    print(f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s -> {path}", flush=True)
-    return result
 
 
 class _Progress:
@@ -256,10 +258,6 @@ def _from_here(path: Path) -> str:
     """The path relative to the checkout, so that no machine's folders are written."""
     absolute, checkout = path.resolve(), POLICIES.parent.parent
     return absolute.relative_to(checkout).as_posix() if absolute.is_relative_to(checkout) else path.name
-
-
-def _today() -> str:
-    return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import surgsim_env  # noqa: F401  (registers the ids)
+from agents.scoring.episodes import make_envs, play_tasks, print_episodes
 
 ROWS_FEWEST = 5
 NEAR = 0.003  # [m] below this distance speed is proportional to it; also the zone at the end of a row
@@ -65,8 +65,8 @@ class PalpateExpert:
         self.last = marks + rows[-1] * side + (side - 1 if len(rows) % 2 else 0)
         self.start = np.array([self.chart.lower[0], self.rows[0]])
 
-    def act(self, observations: NDArray) -> NDArray[np.float32]:
-        """The next actions."""
+    def act(self, observations: NDArray, begins: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """The next actions; `begins` is not used."""
         seen = np.asarray(observations, dtype=np.float64)
         position, force, stiffest = (
             seen[:, self.slices[name]] for name in ("tip_position", "contact_force", "stiffest")
@@ -98,28 +98,6 @@ class PalpateExpert:
         return np.column_stack([x, y])
 
 
-def play(envs: gym.vector.VectorEnv, expert, episodes: int, seed: int) -> list[dict]:
-    """Last infos of episodes, with steps, largest force [N] and return; each environment plays an equal share."""
-    observation, _ = envs.reset(seed=list(range(seed, seed + envs.num_envs)))
-    records: list[list[dict]] = [[] for _ in range(envs.num_envs)]
-    share = -(-episodes // envs.num_envs)
-    steps, peak, total = np.zeros((3, envs.num_envs))
-    while any(len(one) < share for one in records):
-        observation, reward, terminated, truncated, info = envs.step(expert.act(observation))
-        over = terminated | truncated
-        steps += 1
-        total += reward
-        force = (
-            np.where(over, info["final_info"]["force_peak"], info["force_peak"]) if over.any() else info["force_peak"]
-        )
-        peak = np.maximum(peak, force)
-        for index in np.flatnonzero(over):
-            final = {name: values[index] for name, values in info["final_info"].items() if not name.startswith("_")}
-            records[index].append({**final, "steps": steps[index], "peak": peak[index], "return": total[index]})
-            steps[index] = peak[index] = total[index] = 0.0
-    return [record for one in records for record in one[:share]]
-
-
 def main() -> None:
     """Print one line per episode, and the figures of all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -128,32 +106,12 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=16)
     parser.add_argument("--envs", type=int, default=16, help="organs side by side")
     parser.add_argument("--seed", type=int, default=700_000)
-    arguments = parser.parse_args()
-    level = {} if arguments.level is None else {"level": arguments.level}
-    envs = gym.make_vec(
-        "SurgSim/Palpate-v0",
-        num_envs=arguments.envs,
-        vectorization_mode="vector_entry_point",
-        autoreset_mode="SameStep",
-        dtype="float32",
-        threads=1,
-        scene=arguments.scene,
-        memory=True,
-        **level,
-    )
-    soft = envs.envs[0].unwrapped.scene.limits.soft_force
-    records = play(envs, PalpateExpert(envs.envs[0]), arguments.episodes, arguments.seed)
-    for record in records:
-        print(
-            f"success {record['success']!s:5} declared {record['declared']!s:5} error {record['error_mm']:5.1f} mm "
-            f"{record['steps'] * 0.05:5.1f} s, peak {record['peak']:.2f} N, return {record['return']:6.2f} "
-            f"{record['sim_fault']}"
-        )
-    found, seconds = [float(one["success"]) for one in records], [one["steps"] * 0.05 for one in records]
-    gentle = [one["peak"] <= soft for one in records]
-    print(
-        f"{len(records)} episodes: success {np.mean(found):.0%}, median {np.median(seconds):.1f} s, "
-        f"under the soft limit {np.mean(gentle):.0%}"
+    given = parser.parse_args()
+    envs = make_envs("SurgSim/Palpate-v0", given.envs, scene=given.scene, level=given.level, memory=True)
+    first, seeds = envs.unwrapped.envs[0], range(given.seed, given.seed + given.episodes)  # type: ignore[attr-defined]
+    records = play_tasks(PalpateExpert(first).act, envs, seeds)
+    print_episodes(
+        records, seeds, first.unwrapped.scene.limits.soft_force, "success", "declared", "error_mm", "sim_fault"
     )
 
 

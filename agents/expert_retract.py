@@ -4,18 +4,16 @@ It performs the procedure of `surgsim_env.scripting.oracle`, but can act in any 
 DAgger requires of an expert (Ross et al. 2011). It is written for the scene `lobe` with its own grasper, whose wrist
 turns about one hinge. Run it from a checkout:
 
-    python agents/expert_retract.py --episodes 20
+    python -m agents.expert_retract --episodes 20
 """
 
 import argparse
 import math
-from collections.abc import Iterable
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import surgsim_env  # noqa: F401  (registers the ids)
+from agents.scoring.episodes import make_envs, play_tasks, print_episodes
 from surgsim_env.tasks.retract import RetractTask
 
 SPEED = 0.02  # [m/s] full scale of an action's velocity
@@ -109,31 +107,17 @@ def _levelling(now: NDArray[np.float64]) -> float:
     return -0.6 * math.atan2(-z, -y) / CONTROL_STEP
 
 
-def run_episode(env: gym.Env, expert: RetractExpert, seed: int) -> dict[str, float | bool | str]:
-    """Outcome of one episode: success, harm, steps, return, largest pull [N]."""
-    observation, info = env.reset(seed=seed)
-    total, steps, done = 0.0, 0, False
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(expert.act(observation))
-        total, steps, done = total + float(reward), steps + 1, terminated or truncated
-    names = ("success", "torn", "hard_limit", "sim_fault", "pull_force_peak", "slips", "visible")
-    return {"seed": seed, "steps": steps, "return": total, **{name: info[name] for name in names}}
-
-
-def main(arguments: Iterable[str] | None = None) -> None:
+def main() -> None:
     """Run episodes and print them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args(None if arguments is None else list(arguments))
-    env = gym.make("SurgSim/Retract-v0")
-    records = []
-    for seed in range(given.seed, given.seed + given.episodes):
-        records.append(run_episode(env, RetractExpert(), seed))
-        print(" ".join(f"{name}={value}" for name, value in records[-1].items()), flush=True)
-    share = np.mean([bool(record["success"]) for record in records])
-    steps = np.mean([float(record["steps"]) for record in records])
-    print(f"success {share:.0%} of {len(records)} episodes, {steps:.0f} control steps each")
+    given = parser.parse_args()
+    envs, seeds = make_envs("SurgSim/Retract-v0", 1, dtype="float64"), range(given.seed, given.seed + given.episodes)
+    soft_force = envs.unwrapped.envs[0].unwrapped.scene.limits.soft_force  # type: ignore[attr-defined]
+    records = play_tasks(RetractExpert().act_all, envs, seeds)
+    names = ("success", "torn", "hard_limit", "sim_fault", "pull_force_peak", "slips", "visible")
+    print_episodes(records, seeds, soft_force, *names)
 
 
 if __name__ == "__main__":

@@ -13,11 +13,11 @@ import matplotlib
 import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.roster import POLICIES, REFERENCES, find_agent
-from agents.scoring.leaderboard import SITES, best_raster_alone
+from agents.evaluate import POLICIES, find_agent
+from agents.scoring.leaderboard import SITES, Result, best_raster_alone, load_results
 from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
-from agents.scoring.results_files import Result, load_results
 from agents.scoring.site_agent import site_facts
+from agents.site_search import REFERENCES
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.scores import ERROR_LINE
 

@@ -26,10 +26,9 @@ ORDER = {
     ),
     # Shared machinery, then one script each.
     "agents": (
-        *("__init__", "scoring", "training", "press_library", "random_sites", "raster_sites", "sobol_sites"),
-        *("gp_variance", "gp_ucb", "gp_level_set", "raster", "keyboard", "expert_palpate", "expert_retract"),
-        *("learn_palpate", "learn_palpate_recurrent", "learn_retract", "record_demonstrations", "behaviour_cloning"),
-        *("train", "train_rllib", "roster", "evaluate", "palpation_figures"),
+        *("__init__", "scoring", "training", "press_library", "site_search", "raster", "keyboard", "expert_palpate"),
+        *("expert_retract", "learn_palpate", "learn_palpate_recurrent", "learn_retract", "record_demonstrations"),
+        *("behaviour_cloning", "train", "train_rllib", "evaluate", "palpation_figures"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

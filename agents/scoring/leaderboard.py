@@ -1,14 +1,90 @@
-"""agents/LEADERBOARD.md from the committed result files."""
+"""Result files agents/results/*.json, and agents/LEADERBOARD.md from them."""
 
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
+from typing import Any
 
-from agents.scoring.results_files import RESULTS, Result, load_results
 from surgsim_env.palpation.scores import Figure
 
-LEADERBOARD = Path(__file__).resolve().parents[1] / "LEADERBOARD.md"
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+LEADERBOARD = RESULTS.with_name("LEADERBOARD.md")
+# JSON has no infinity.
+NEVER = "never"
+
+
+@dataclass(frozen=True)
+class Result:
+    """One method on one environment, with the command that reproduces its figures.
+
+    Fields:
+        method: name of an agent or of a policy's file
+        env_id, env_kwargs: the environment
+        seeds: first and last of the range
+        budget: largest number of steps of an episode
+        figures: by name, each a value with its interval
+        errors_mm: OSPA after each press of each episode (PalpateSites only)
+        lesion_counts: lesions of each episode (PalpateSites only)
+        command: that produced it
+        wall_time: of all episodes [s], on a machine with other load
+        date: of its end
+    """
+
+    method: str
+    env_id: str
+    env_kwargs: dict[str, Any]
+    seeds: tuple[int, int]
+    budget: int
+    figures: dict[str, Figure]
+    command: str
+    wall_time: float
+    date: str
+    errors_mm: list[list[float]] = field(default_factory=list)
+    lesion_counts: list[int] = field(default_factory=list)
+
+    @property
+    def place(self) -> str:
+        """Environment, scene and level: the key that groups tables."""
+        parts = [self.env_id.removeprefix("SurgSim/").removesuffix("-v0"), self.env_kwargs.get("scene", "")]
+        return "_".join(part for part in [*parts, self.env_kwargs.get("level") or ""] if part)
+
+    def save(self, folder: Path = RESULTS) -> Path:
+        """Write it; replaces an older result of the same method and place."""
+        table = asdict(self)
+        table["figures"] = {
+            name: [_written(value) for value in astuple(figure)] for name, figure in self.figures.items()
+        }
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self.place}_{self.method}.json"
+        lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
+        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+        return path
+
+
+def load_result(path: Path) -> Result:
+    """Read a file of `Result.save`."""
+    table = json.loads(path.read_text(encoding="utf-8"))
+    table["figures"] = {
+        name: Figure(*(math.inf if value == NEVER else value for value in values))
+        for name, values in table["figures"].items()
+    }
+    return Result(**{**table, "seeds": tuple(table["seeds"])})
+
+
+def load_results(folder: Path = RESULTS) -> list[Result]:
+    """All results of a folder, by file name, without `reach_*.json`."""
+    return [load_result(path) for path in sorted(folder.glob("*.json")) if not path.name.startswith("reach_")]
+
+
+def _written(value: float | None) -> float | str | None:
+    if value is None:
+        return None
+    return NEVER if math.isinf(value) else float(f"{value:.5g}")
+
+
+# ---- the leaderboard ------------------------------------------------------------------------------------------------
 
 # Columns: heading, figure, decimals, factor.
 Column = tuple[str, str, int, float]
@@ -82,13 +158,12 @@ def _order(place: str) -> tuple[int, str]:
 def _sites(place: str, rows: list[Result], folder: Path) -> str:
     rows = sorted(best_raster_alone(rows), key=_merit)
     first = max(rows, key=lambda row: row.budget)
-    parts = [f"\n## {_title(first)}\n"]
     lesions = first.lesion_counts
-    parts.append(
+    organs = (
         f"{len(lesions)} organs (seeds {first.seeds[0]} to {first.seeds[1]}), {sum(lesions)} lesions, "
         f"{lesions.count(0)} organs without one; {first.budget} presses.{_reach(place, folder)}\n"
     )
-    return "\n".join([*parts, _table(rows, PLACES), "", _table(rows, MAPS)])
+    return "\n".join([f"\n## {_title(first)}\n", organs, _table(rows, PLACES), "", _table(rows, MAPS)])
 
 
 def _tasks(place: str, rows: list[Result]) -> str:
@@ -131,15 +206,8 @@ def _reach(place: str, folder: Path) -> str:
 
 def _figures(result: Result) -> dict[str, Figure]:
     """The figures, with hard limits and faults summed."""
-    figures = dict(result.figures)
-    hard, fault = figures["hard_limit_share"], figures["fault_share"]
-    figures["violations"] = Figure(
-        *(
-            (a or 0.0) + (b or 0.0)
-            for a, b in ((hard.value, fault.value), (hard.low, fault.low), (hard.high, fault.high))
-        )
-    )
-    return figures
+    both = [astuple(result.figures[name]) for name in ("hard_limit_share", "fault_share")]
+    return {**result.figures, "violations": Figure(*((a or 0.0) + (b or 0.0) for a, b in zip(*both, strict=True)))}
 
 
 def _table(rows: Sequence[Result], columns: Sequence[Column]) -> str:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.palpation.gaussian_process import contrast_process
+from surgsim_env.palpation.lesion_estimator import contrast_process
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 # Sites nearer to the chart's border than this share of its side are not pressed: half of the area that a press there

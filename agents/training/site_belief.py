@@ -1,6 +1,6 @@
 """Belief maps of SurgSim/PalpateSites-v0 as observations: expected excess and its uncertainty at the grid's sites.
 
-The maps are those of the agents gp_*.py, computed from what the observation remembers. A policy reads them as a picture
+The maps are those of the searches gp_* of agents/site_search.py. A policy reads them as a picture
 and names a site.
 """
 
@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from agents.scoring.site_agent import SiteFacts, SiteProcess
-from surgsim_env.palpation.gaussian_process import EXCESS_SPREAD
+from surgsim_env.palpation.lesion_estimator import EXCESS_SPREAD
 
 # Bound of a feature; expected excess is some 3 spreads at most.
 FEATURE_BOUND = 10.0

@@ -25,7 +25,7 @@ class SiteScores(nn.Module):
 
     Channels: expected excess, its deviation, pressed sites, the share of presses left, and the place of a site on the
     chart (x^2, y^2, and the distance from its middle). Pressed sites are not chosen again, and the outermost row is
-    excluded, as in the agents gp_*.py.
+    excluded, as in the searches gp_* of agents/site_search.py.
     """
 
     def __init__(self, site_count: int) -> None:

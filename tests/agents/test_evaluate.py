@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents import evaluate
 from agents.scoring import leaderboard
-from agents.scoring.results_files import Result, load_results
+from agents.scoring.leaderboard import Result, load_results
 from surgsim_env.palpation.scores import Figure
 
 pytestmark = pytest.mark.agents

@@ -24,16 +24,20 @@ def envs(count: int, mode: str = "Disabled", **settings) -> gym.vector.VectorEnv
 
 def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
     """Three seeds on two environments: each record is that of a single environment, to the bit; all succeed."""
-    from agents.expert_retract import RetractExpert, run_episode
-    from agents.scoring.task_episodes import play_tasks, task_figures
+    from agents.expert_retract import RetractExpert
+    from agents.scoring.episodes import play_tasks, task_figures
 
     seeds = [21, 22, 23]
     records = play_tasks(RetractExpert().act_all, envs(2), seeds)
     single = gym.make(ID)
     for seed, record in zip(seeds, records, strict=True):
-        alone = run_episode(single, RetractExpert(), seed)
-        assert (alone.pop("seed"), alone.pop("steps"), alone.pop("return")) == (seed, record.steps, record.total)
-        assert {name: record.last[name] for name in alone} == alone
+        observation, info = single.reset(seed=seed)
+        steps, total, over = 0, 0.0, False
+        while not over:
+            observation, reward, terminated, truncated, info = single.step(RetractExpert().act(observation))
+            steps, total, over = steps + 1, total + float(reward), terminated or truncated
+        assert (steps, total) == (record.steps, record.total)
+        assert {name: record.last[name] for name in info} == info
         assert record.last["success"] and not record.last["torn"] and record.last["visible"] >= 0.8
     figures = task_figures(records, 0.05, 1.0, np.random.default_rng(0))
     assert figures["success"].value == 1.0 and figures["torn"].value == figures["fault_share"].value == 0.0
@@ -73,7 +77,7 @@ def test_forces_are_those_entries_of_the_observation():
 def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypatch, capsys):
     """Two rounds of a few steps; without force the policy sees zeros there, the expert does not."""
     from agents import learn_retract
-    from agents.scoring.task_episodes import play_tasks
+    from agents.scoring.episodes import play_tasks
     from agents.training.policy_files import load_policy
 
     asked = []

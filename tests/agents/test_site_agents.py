@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents.roster import AGENTS, REFERENCES, find_agent
+from agents.evaluate import find_agent
 from agents.scoring.site_agent import SiteFacts
+from agents.site_search import AGENTS, REFERENCES
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
 pytestmark = pytest.mark.agents

@@ -1,4 +1,4 @@
-"""The learned acquisition function: it sees the belief of the agents gp_*.py and names the site that is pressed."""
+"""The learned acquisition function: it sees the belief of the searches gp_* and names the site that is pressed."""
 
 from dataclasses import asdict
 
@@ -10,12 +10,12 @@ import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
 
-from agents.roster import POLICIES
+from agents.evaluate import POLICIES
 from agents.scoring.site_agent import LENGTH_SHARE, SiteFacts, SiteProcess
 from agents.training.policy_files import PolicyDescription, load_policy, save_policy
 from agents.training.site_belief import SiteBelief
 from agents.training.site_policy import CURIOSITY, SHARPNESS, SitePolicy
-from surgsim_env.palpation.gaussian_process import (
+from surgsim_env.palpation.lesion_estimator import (
     BACKGROUND_SPREAD,
     EXCESS_LENGTH,
     EXCESS_SPREAD,

@@ -1,0 +1,185 @@
+"""The methods for SurgSim/PalpateSites-v0 by name: site searches, and the reference scores, oracle and blind guess.
+
+They use observations and the size of the chart only (`SiteFacts`). A Gaussian process on log contrast is the belief of
+the searches `gp_*`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from agents.scoring.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
+from surgsim_env.palpation.lesion_estimator import EXCESS_LEAST, EXCESS_LEAST_NOISE
+from surgsim_env.palpation.scores import MapScore
+
+# Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
+UCB_BETA = 3.0
+LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
+
+
+class RandomSites:
+    """Presses places that are uniformly distributed over the chart."""
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        self.rng = rng
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        return self.rng.uniform(-1.0, 1.0, 2).astype(np.float32)
+
+
+class RasterSites:
+    """Presses the centres of `side` x `side` equal fields in boustrophedon order.
+
+    Further presses go to the corners of the fields, `side` + 1 per side, and then through both again.
+    """
+
+    def __init__(self, side: int) -> None:
+        if side < 1:
+            raise ValueError(f"side is {side}; a raster has at least 1 place a side")
+        middles, corners = (np.arange(side) + 0.5) / side, np.arange(side + 1) / side
+        self.actions = 2.0 * np.concatenate([_there_and_back(middles), _there_and_back(corners)]) - 1.0
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        self.count = 0
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        self.count += 1
+        return self.actions[(self.count - 1) % len(self.actions)].astype(np.float32)
+
+
+def _there_and_back(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All pairs of an axis' values, each second row in reverse, shape (n n, 2)."""
+    rows = [np.column_stack([axis[:: 1 if row % 2 == 0 else -1], np.full(len(axis), y)]) for row, y in enumerate(axis)]
+    return np.concatenate(rows)
+
+
+class SobolSites:
+    """Presses a low-discrepancy sequence (Sobol 1967), scrambled anew in each episode (Owen 1998).
+
+    It covers the chart more evenly than chance does and, unlike a raster, after any number of presses.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        powers = int(np.ceil(np.log2(facts.budget)))
+        self.places = iter(qmc.Sobol(2, scramble=True, rng=rng).random_base2(powers))
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        return (2.0 * next(self.places) - 1.0).astype(np.float32)
+
+
+class GpVariance:
+    """Variance reduction: presses the site of the largest standard deviation of the Gaussian process.
+
+    The deviation does not depend on the measured contrast: the presses fill the chart evenly, a raster of any length.
+    """
+
+    # Whether the first presses are a raster (`SiteProcess.first`).
+    begins_with_raster: ClassVar[bool] = False
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        self.rng, self.process, self.count = rng, SiteProcess(facts), 0
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        first = self.process.first(self.count) if self.begins_with_raster else None
+        self.count += 1
+        if first is not None:
+            return first
+        return self.process.best(self.worth(self.process.belief(observation)), observation, self.rng)
+
+    def worth(self, belief: Belief) -> NDArray[np.float64]:
+        """The acquisition function at each site (n n,)."""
+        return belief.spread
+
+
+class GpUcb(GpVariance):
+    """GP-UCB (Srinivas et al. 2010): presses where mean + UCB_BETA x deviation of the excess is highest."""
+
+    begins_with_raster = True
+
+    def worth(self, belief: Belief) -> NDArray[np.float64]:
+        """The upper confidence bound."""
+        return belief.excess + UCB_BETA * belief.spread
+
+
+class GpLevelSet(GpVariance):
+    """Level-set search: presses where it is most uncertain whether there is a lesion.
+
+    Implicit level sets by upper confidence bounds, ILS-UCB (Garg et al. 2016, "Tumor localization using automated
+    palpation with Gaussian process adaptive sampling"; Gotovos et al. 2013): the level h is a share of the largest
+    expected excess, and the site of the largest ambiguity min(upper bound - h, h - lower bound) is pressed: outlines of
+    lesions and unexplored regions.
+    """
+
+    begins_with_raster = True
+
+    def worth(self, belief: Belief) -> NDArray[np.float64]:
+        """The ambiguity; the level is at least the least excess that the estimator reports as a lesion."""
+        excess, margin = belief.excess, LEVEL_BETA * belief.spread
+        least = EXCESS_LEAST + EXCESS_LEAST_NOISE * self.process.facts.noise
+        level = max(least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
+        return np.minimum(excess + margin - level, level - excess + margin)
+
+
+class Truth:
+    """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %.
+
+    It presses the middle of the chart, as the environment asks for presses; `estimate` and `estimate_map` are scored
+    in place of the estimator's output.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The middle of the chart."""
+        return np.zeros(2, dtype=np.float32)
+
+    def estimate(self, task: Any) -> NDArray[np.float64]:
+        """Places of the lesions on the surface [m], shape (k, 3)."""
+        return task.truth
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        """The true map: 1 over lesions, else 0, and the true outline."""
+        return replace(made, excess=made.lesion.astype(np.float64), outline=made.outline_true)
+
+
+class Middle(Truth):
+    """The blind guess: one lesion in the middle of the chart, regardless of the presses."""
+
+    def estimate(self, task: Any) -> NDArray[np.float64]:
+        """The middle of the chart on the surface [m], shape (1, 3)."""
+        return task.charted.surface(np.zeros((1, 2)))
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        """A uniform map without an outline."""
+        return replace(made, excess=np.zeros_like(made.excess), outline=np.zeros_like(made.outline))
+
+
+# Sides of the rasters tried on each scene; the leaderboard shows the best raster.
+RASTER_SIDES = (2, 3, 4, 5, 6, 7)
+
+AGENTS: dict[str, Callable[[], SiteAgent]] = {
+    "random": RandomSites,
+    **{f"raster_{side}": lambda side=side: RasterSites(side) for side in RASTER_SIDES},
+    "sobol": SobolSites,
+    "gp_variance": GpVariance,
+    "gp_ucb": GpUcb,
+    "gp_level_set": GpLevelSet,
+    "truth": Truth,
+    "middle": Middle,
+}
+
+# Methods whose estimates do not depend on what their presses feel.
+REFERENCES = ("truth", "middle")

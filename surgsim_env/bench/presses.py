@@ -14,8 +14,8 @@ from surgsim_env.palpation.press import press
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import BlockMesh, MeshSource
-from surgsim_env.validation.layer_fem import ball_force, layer
-from surgsim_env.validation.punch import DISC
+from surgsim_env.validation.elements import ball_force
+from surgsim_env.validation.punch import reference_layer
 
 SIZE = (0.06, 0.06, 0.03)  # [m] of the block, x and y around 0, bottom at z = 0
 MODULUS, POISSON, DENSITY = 5000.0, 0.45, 1060.0
@@ -80,8 +80,7 @@ def step_count(dt: float) -> int:
 @lru_cache(maxsize=4)
 def reference_force(contact: float) -> float:
     """Force of the press by axisymmetric quadratic elements, small strains [N]; ImportError without scikit-fem."""
-    body = layer(DISC, SIZE[2], lambda r, _: np.full_like(r, MODULUS), POISSON)
-    return ball_force(body, RADIUS, DEPTH, contact)
+    return ball_force(reference_layer(MODULUS, POISSON), RADIUS, DEPTH, contact)
 
 
 def organ_press(cells: Cells) -> Contender:

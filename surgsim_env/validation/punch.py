@@ -1,5 +1,9 @@
-"""A flat punch on a bonded layer: Hayes' solution, and how much a hidden sphere changes the force."""
+"""A flat punch on a bonded layer: Hayes' solution, and how much a hidden sphere changes the force.
 
+The layer consists of cells of one size, or is fine in its upper third and coarse below.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -8,8 +12,8 @@ import numpy as np
 from msdm_core.material.regions import Lesion, Material
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
-from surgsim_env.validation.layer_fem import layer, punch_stiffness
-from surgsim_env.validation.row import Curve, Outcome, Row, compare
+from surgsim_env.validation.elements import Elements, layer, punch_stiffness
+from surgsim_env.validation.row import Curve, Result, Row, compare
 from surgsim_env.validation.statics import (
     DENSITY,
     assemble_stiffness,
@@ -23,10 +27,13 @@ MODULUS = 20e3  # [Pa]
 SIZE = (0.06, 0.06, 0.03)  # [m]
 DISC = 0.03385  # [m] radius of the disc with the block's area
 RADIUS = 0.006  # [m] of the punch
-# F = 2 E a d kappa / (1 - nu^2): kappa of Hayes 1972 at a / h = 0.2, from the integral equation (facts, section 4).
-KAPPA = {0.25: 1.198, 0.45: 1.252}
+# F / d = 2 E a kappa / (1 - nu^2): kappa of Hayes 1972 at a / h = 0.2, from the integral equation (facts, section 4).
+HAYES = {nu: 2.0 * MODULUS * RADIUS * kappa / (1.0 - nu**2) for nu, kappa in ((0.25, 1.198), (0.45, 1.252))}  # [N/m]
 FORCE_TOLERANCE = 0.25
 CONTRAST_TOLERANCE = 0.15
+# A graded layer: fine cells of 2.5 mm in the upper 10 mm of 30.
+GRADED_CELLS, GRADED_DEPTH = 24, 0.010
+GRADED_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,11 @@ class Hidden:
     def name(self) -> str:
         """The sphere in the names of rows."""
         return f"{self.ratio:g} x, cover {1e3 * self.cover:g} mm, radius {1e3 * self.radius:g} mm"
+
+
+COVERS = tuple(Hidden(5.0, cover, 0.005) for cover in (0.0025, 0.004, 0.006, 0.010))
+OTHERS = (Hidden(2.0, 0.004, 0.005), Hidden(10.0, 0.004, 0.005), Hidden(5.0, 0.004, 0.0075), Hidden(5.0, 0.006, 0.010))
+COARSE = (Hidden(5.0, 0.004, 0.008), Hidden(5.0, 0.008, 0.010))
 
 
 @lru_cache(maxsize=32)
@@ -64,80 +76,85 @@ def pressed(mesh: TetMesh, nu: float, hidden: Hidden | None = None) -> float:
     return twice_energy(stiffness, solve_displacement(stiffness, held, value))
 
 
+@lru_cache(maxsize=8)
+def reference_layer(modulus: float, nu: float, hidden: Hidden | None = None, radius: float = DISC) -> Elements:
+    """The layer in axisymmetric quadratic elements, homogeneous or over a sphere, as a disc of a radius [m]."""
+
+    def field(r: FloatArray, z: FloatArray) -> FloatArray:
+        if hidden is None:
+            return np.full_like(r, modulus)
+        inside = np.hypot(r, z + hidden.cover + hidden.radius) < hidden.radius
+        return np.where(inside, hidden.ratio * modulus, modulus)
+
+    return layer(radius, SIZE[2], field, nu)
+
+
 @lru_cache(maxsize=32)
 def reference_stiffness(nu: float, hidden: Hidden | None = None) -> float:
-    """The same by axisymmetric quadratic elements [N/m]."""
-
-    def modulus(r: FloatArray, z: FloatArray) -> FloatArray:
-        if hidden is None:
-            return np.full_like(r, MODULUS)
-        inside = r**2 + (z + hidden.cover + hidden.radius) ** 2 <= hidden.radius**2
-        return np.where(inside, hidden.ratio * MODULUS, MODULUS)
-
-    return punch_stiffness(layer(DISC, SIZE[2], modulus, nu), RADIUS)
+    """Force per depth of the punch by these elements [N/m]."""
+    return punch_stiffness(reference_layer(MODULUS, nu, hidden), RADIUS)
 
 
-def wide_reference(nu: float) -> float:
-    """The punch on a disc so wide that its rim does not matter [N/m]."""
-    return punch_stiffness(layer(5.0 * SIZE[2], SIZE[2], lambda r, _: np.full_like(r, MODULUS), nu), RADIUS)
-
-
-def hayes(counts: tuple[int, ...]) -> Outcome:
+def hayes(counts: tuple[int, ...]) -> Iterator[Row]:
     """Punch of 6 mm radius on 30 mm of tissue."""
-    rows: list[Row] = []
-    for nu, kappa in KAPPA.items():
-        expected = 2.0 * MODULUS * RADIUS * kappa / (1.0 - nu**2)
+    for nu, expected in HAYES.items():
         for count in counts:
             cell = SIZE[0] / count
-            rows.append(
-                compare(
-                    f"flat punch, nu {nu:.2f}, cell {1e3 * cell:.1f} mm", "Hayes 1972, bonded layer", expected=expected,
-                    measured=block_stiffness(count, nu), tolerance=FORCE_TOLERANCE, unit="N/m",
-                    note=f"{RADIUS / cell:.1f} cells per punch radius",
-                )
+            yield compare(
+                f"flat punch, nu {nu:.2f}, cell {1e3 * cell:.1f} mm", "Hayes 1972, bonded layer", expected=expected,
+                measured=block_stiffness(count, nu), tolerance=FORCE_TOLERANCE, unit="N/m",
+                note=f"{RADIUS / cell:.1f} cells per punch radius",
             )  # fmt: skip
-    return Outcome(tuple(rows))
 
 
-def reference_check() -> Outcome:
-    """The reference elements of contrasts and ball, on a wide disc without inclusion, against Hayes."""
-    return Outcome(
-        tuple(
-            compare(
-                f"reference elements for the punch, nu {nu:.2f}", "Hayes 1972, bonded layer",
-                expected=2.0 * MODULUS * RADIUS * kappa / (1.0 - nu**2), measured=wide_reference(nu),
-                tolerance=0.02, unit="N/m", note="a check of the reference, not of the organ",
-            )
-            for nu, kappa in KAPPA.items()
-        )
-    )  # fmt: skip
+def reference_check() -> Iterator[Row]:
+    """The reference elements of contrasts and ball against Hayes, on a disc so wide that its rim does not matter."""
+    for nu, expected in HAYES.items():
+        yield compare(
+            f"reference elements for the punch, nu {nu:.2f}", "Hayes 1972, bonded layer", expected=expected,
+            measured=punch_stiffness(reference_layer(MODULUS, nu, radius=5.0 * SIZE[2]), RADIUS), tolerance=0.02,
+            unit="N/m", note="a check of the reference, not of the organ",
+        )  # fmt: skip
 
 
-def contrast(count: int, nu: float, hidden: tuple[Hidden, ...], curve: str = "") -> Outcome:
+def contrast(count: int, nu: float, hidden: tuple[Hidden, ...], curve: str = "") -> Iterator[Result]:
     """Force with the sphere over force without it, less 1; where cell <= radius / 2 and cell <= cover."""
     cell = SIZE[0] / count
     rows: list[Row] = []
     for one in hidden:
         assert cell <= one.radius / 2.0 + 1e-9 and cell <= one.cover + 1e-9
-        rows.append(
-            compare(
-                f"contrast, {one.name}, nu {nu:.2f}, cell {1e3 * cell:.1f} mm", "scikit-fem, axisymmetric",
-                expected=reference_stiffness(nu, one) / reference_stiffness(nu) - 1.0,
-                measured=block_stiffness(count, nu, one) / block_stiffness(count, nu) - 1.0,
-                tolerance=CONTRAST_TOLERANCE,
-            )
+        row = compare(
+            f"contrast, {one.name}, nu {nu:.2f}, cell {1e3 * cell:.1f} mm", "scikit-fem, axisymmetric",
+            expected=reference_stiffness(nu, one) / reference_stiffness(nu) - 1.0,
+            measured=block_stiffness(count, nu, one) / block_stiffness(count, nu) - 1.0,
+            tolerance=CONTRAST_TOLERANCE,
         )  # fmt: skip
-    if not curve:
-        return Outcome(tuple(rows))
-    x = tuple(1e3 * one.cover for one in hidden)
-    lines = (("springs", [row.measured for row in rows]), ("reference", [row.expected for row in rows]))
-    labels = (f"{{}}, nu {nu:.2f}", "cover [mm]", "contrast, k / k0 - 1")
-    return Outcome(
-        tuple(rows),
-        tuple(Curve(curve, labels[0].format(name), x, tuple(y), *labels[1:], False) for name, y in lines),
-    )
+        rows.append(row)
+    yield from rows
+    if curve:
+        covers, labels = tuple(1e3 * one.cover for one in hidden), ("cover [mm]", "contrast, k / k0 - 1", False)
+        yield Curve(curve, f"springs, nu {nu:.2f}", covers, tuple(row.measured for row in rows), *labels)
+        yield Curve(curve, f"reference, nu {nu:.2f}", covers, tuple(row.expected for row in rows), *labels)
 
 
-COVERS = tuple(Hidden(5.0, cover, 0.005) for cover in (0.0025, 0.004, 0.006, 0.010))
-OTHERS = (Hidden(2.0, 0.004, 0.005), Hidden(10.0, 0.004, 0.005), Hidden(5.0, 0.004, 0.0075), Hidden(5.0, 0.006, 0.010))
-COARSE = (Hidden(5.0, 0.004, 0.008), Hidden(5.0, 0.008, 0.010))
+def graded_punch() -> Iterator[Row]:
+    """The punch on a layer that is fine in its upper third: its force, and a hidden sphere's contrast."""
+    counts = (GRADED_CELLS, GRADED_CELLS, GRADED_CELLS // 2)
+    mesh, hidden = box_mesh(SIZE, counts, coarsening=2, fine_depth=GRADED_DEPTH), Hidden(5.0, 0.004, 0.005)
+    for nu, expected in HAYES.items():
+        force, uniform = pressed(mesh, nu), block_stiffness(GRADED_CELLS, nu)
+        name = f"nu {nu:.2f}, cells 2.5 and 5 mm"
+        yield compare(
+            f"flat punch on a graded layer, {name}", "Hayes 1972, bonded layer", expected=expected, measured=force,
+            tolerance=FORCE_TOLERANCE, unit="N/m",
+        )  # fmt: skip
+        yield compare(
+            f"flat punch, graded against uniform, {name}", "the same punch on cells of 2.5 mm alone", expected=uniform,
+            measured=force, tolerance=GRADED_TOLERANCE, unit="N/m",
+            note=f"{mesh.node_count} nodes; a comparison, not a check of either",
+        )  # fmt: skip
+        yield compare(
+            f"contrast on a graded layer, {hidden.name}, {name}", "scikit-fem, axisymmetric",
+            expected=reference_stiffness(nu, hidden) / reference_stiffness(nu) - 1.0,
+            measured=pressed(mesh, nu, hidden) / force - 1.0, tolerance=CONTRAST_TOLERANCE,
+        )  # fmt: skip

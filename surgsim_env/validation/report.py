@@ -105,24 +105,16 @@ def write_report(validation: Validation, folder: Path) -> Path:
 
 def write_plot(curves: list[Curve], path: Path) -> None:
     """Write a plot of curves."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     colour = "C0"
     for curve in curves:
         # A reference is dashed and has the colour of the line before it, which is compared with it.
         dashed = curve.label.startswith(REFERENCES)
-        (line,) = axes.plot(
-            curve.x,
-            curve.y,
-            "--" if dashed else "o-",
-            color=colour if dashed else None,
-            label=curve.label,
-            markersize=4,
-        )
+        style, chosen = ("--", colour) if dashed else ("o-", None)
+        (line,) = axes.plot(curve.x, curve.y, style, color=chosen, label=curve.label, markersize=4)
         colour = line.get_color()
     if curves[0].logarithmic:
         axes.set_xscale("log")

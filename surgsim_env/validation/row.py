@@ -1,7 +1,7 @@
 """Results of a validation case: rows of the table, curves of plots, drawings."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -61,13 +61,7 @@ class Drawing:
     draw: Callable[[Path], None]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """All results of one case."""
-
-    rows: tuple[Row, ...]
-    curves: tuple[Curve, ...] = ()
-    drawings: tuple[Drawing, ...] = ()
+Result = Row | Curve | Drawing
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,7 @@ class Case:
     """A named computation; a quick run leaves out `slow` ones; `needs_fem` ones need scikit-fem."""
 
     name: str
-    run: Callable[[], Outcome]
+    run: Callable[[], Iterable[Result]]
     slow: bool = False
     needs_fem: bool = False
 
@@ -115,30 +109,17 @@ def bounded(
     return Row(case, source, bound, measured, measured / bound - 1.0, math.inf, verdict, unit, note=text)
 
 
-def convergence_order(sizes: list[float], errors: list[float]) -> float:
-    """The p of |error| = C size^p, by least squares of the logarithms."""
-    return float(np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0])
+def with_order(name: str, sizes: list[float], rows: list[Row]) -> Iterator[Result]:
+    """Rows of meshes from coarse to fine, the curve of their errors, a row that is met if the error falls on each one.
 
-
-def falling(case: str, sizes: list[float], errors: list[float], *, note: str = "") -> Row:
-    """A row that is met if the error falls on every finer mesh; it shows the order (sizes from coarse to fine)."""
-    order = convergence_order(sizes, errors)
-    falls = bool(np.all(np.diff(np.abs(errors)) < 0.0))
-    verdict: Verdict = "met" if falls else "not met"
-    text = "verdict: the error falls on every finer mesh"
-    return Row(
-        case,
-        "springs cut at a surface: O(cell)",
-        1.0,
-        order,
-        order - 1.0,
-        math.inf,
-        verdict,
-        absolute=True,
-        note=f"{text}; {note}" if note else text,
-    )
-
-
-def skipped(case: str, source: str, reason: str) -> Row:
-    """A row of a case that cannot run here, with the reason."""
-    return Row(case, source, math.nan, math.nan, math.nan, math.nan, "skipped", note=reason)
+    That row shows the p of |error| = C size^p, by least squares of the logarithms.
+    """
+    errors = np.array([abs(row.error) for row in rows])
+    order = float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
+    verdict: Verdict = "met" if (np.diff(errors) < 0.0).all() else "not met"
+    yield from rows
+    yield Row(
+        f"{name}, order of the error", "springs cut at a surface: O(cell)", 1.0, order, order - 1.0, math.inf, verdict,
+        absolute=True, note="verdict: the error falls on every finer mesh",
+    )  # fmt: skip
+    yield Curve("convergence", name, tuple(1e3 * size for size in sizes), tuple(errors.tolist()))

@@ -119,3 +119,18 @@ def solve_displacement(
 def twice_energy(stiffness: csr_array, displacement: FloatArray) -> float:
     """The product u . K u [J]; for a unit displacement of what is held this is its stiffness."""
     return float(displacement @ (stiffness @ displacement))
+
+
+def pull_stiffness(mesh: TetMesh, stiffness: csr_array, axis: int = 2) -> float:
+    """Force per elongation along an axis of a block whose two ends slide freely [N/m]."""
+    place = mesh.points[:, axis]
+    low, high = np.flatnonzero(place < 1e-9), np.flatnonzero(place > place.max() - 1e-9)
+    held = nodal_dofs(np.concatenate([low, high]), (axis,))
+    value = np.repeat([0.0, 1.0], [len(low), len(high)])
+    return twice_energy(stiffness, solve_displacement(stiffness, held, value))
+
+
+def vector_areas(points: FloatArray, triangles: NDArray[np.int32]) -> FloatArray:
+    """Area times unit normal of each triangle [m^2], shape (n_triangle, 3)."""
+    corners = points[triangles]
+    return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

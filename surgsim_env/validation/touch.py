@@ -1,8 +1,13 @@
-"""A ball at rest on the phantom: force from site to site, over a lesion and with depth; contact never lets go."""
+"""A ball on the phantom, end to end and with prescribed motion, against axisymmetric finite elements.
+
+Indentation by the scene's own instrument; force from site to site, over a lesion and with depth; contact never lets go.
+"""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,11 +18,21 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import advance_organ, round_shapes
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.palpation.press import press
 from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.validation.ball import phantom
-from surgsim_env.validation.layer_fem import ball_force, layer
-from surgsim_env.validation.punch import DISC, SIZE, Hidden
-from surgsim_env.validation.row import Outcome, Row, compare
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import BlockMesh, MeshSource, Scene
+from surgsim_env.validation.elements import ball_force
+from surgsim_env.validation.punch import SIZE, Hidden, reference_layer
+from surgsim_env.validation.row import Curve, Result, Row, compare
+
+REFERENCE = "scikit-fem, axisymmetric, same k_p"
+# Of the instrument's press: tolerances, and sites within a cell of the middle, in cells, so that the mean is over the
+# places of a ball on the lattice.
+FORCE_TOLERANCE = 0.20
+EXPONENT_TOLERANCE = 0.1
+OFFSETS = ((0.0, 0.0), (0.5, 0.5), (0.5, 0.0), (0.25, 0.25), (0.25, 0.5))
 
 STEP = 1e-3  # [s] the haptic step
 PRESS_SPEED = 0.04  # [m/s]
@@ -35,6 +50,35 @@ CONTRASTS = (
     (18, Hidden(8.0, 0.005, 0.010)),
     (18, Hidden(8.0, 0.004, 0.008)),
 )
+# Where a ball is pressed in deeply [m].
+PLACES = {"a node": (0.03, 0.03), "an edge": (0.0325, 0.03), "a face": (0.03333, 0.03167)}
+
+
+def phantom(cells: int) -> Scene:
+    """The scene `phantom` with `cells` cells along 6 cm and as many substeps as these need."""
+    scene = make_scene("phantom")
+    mesh = MeshSource(block=BlockMesh(SIZE, (cells, cells, cells // 2)))
+    return replace(scene, mesh=mesh, timing=replace(scene.timing, substep_count=max(4, cells // 3)))
+
+
+def held_forces(scene: Scene, depths: tuple[float, ...]) -> list[float]:
+    """Mean force of presses around the middle of a block without a lesion, held at each depth [N]."""
+    assert scene.mesh.block is not None
+    cell = scene.mesh.block.size[0] / scene.mesh.block.cells[0]
+    anatomy = load_anatomy(scene)
+    organ = anatomy.organ()
+    up = np.array([0.0, 0.0, 1.0])
+    sites = [np.array([0.03 + x * cell, 0.03 + y * cell, SIZE[2]]) for x, y in OFFSETS]
+    forces: list[float] = []
+    for depth in depths:
+        pressed = replace(scene, palpation=replace(scene.palpation, press_depth=depth))
+        simulation = Simulation(replace(anatomy, scene=pressed))
+        simulation.reset(organ, sites[0] + 0.03 * up)
+        presses = [press(simulation, site, up) for site in sites]
+        if any(one.end for one in presses):
+            raise ValueError(f"a press ended early: {next(one.end for one in presses if one.end)}")
+        forces.append(float(np.mean([one.force for one in presses])))
+    return forces
 
 
 class LostError(ValueError):
@@ -99,22 +143,41 @@ def block(
 @lru_cache(maxsize=16)
 def reference_force(radius: float, depth: float, hidden: Hidden | None = None) -> float:
     """The same ball by axisymmetric elements [N], over a sphere if one is given."""
-    scene = phantom(12)
-    modulus = scene.material.youngs_modulus
-
-    def field(r: FloatArray, z: FloatArray) -> FloatArray:
-        if hidden is None:
-            return np.full_like(r, modulus)
-        inside = np.hypot(r, z + hidden.cover + hidden.radius) < hidden.radius
-        return np.where(inside, hidden.ratio * modulus, modulus)
-
-    body = layer(DISC, SIZE[2], field, scene.material.poisson_ratio)
+    scene = make_scene("phantom")
+    body = reference_layer(scene.material.youngs_modulus, scene.material.poisson_ratio, hidden)
     return ball_force(body, radius, depth, scene.contact.stiffness)
+
+
+def ball_on_layer(cells: int, depths: tuple[float, ...]) -> Iterator[Result]:
+    """Force of the instrument's ball at the scene's press depth, and how it rises with depth."""
+    scene = phantom(cells)
+    radius, cell = scene.instrument.tip_radius, SIZE[0] / cells
+    reference = [reference_force(radius, depth) for depth in depths]
+    measured = held_forces(scene, depths)
+    exponents = [float(np.polyfit(np.log(depths), np.log(force), 1)[0]) for force in (measured, reference)]
+    shares = [f"{cell / np.sqrt(radius * depth):.1f}" for depth in depths]
+    name = f"ball on the phantom, cell {1e3 * cell:.1f} mm"
+    yield compare(
+        f"{name}, force", REFERENCE, expected=reference[-1], measured=measured[-1], tolerance=FORCE_TOLERANCE, unit="N",
+        note=f"mean of {len(OFFSETS)} sites, {1e3 * depths[-1]:g} mm deep, ball of {1e3 * radius:g} mm, "
+        f"cell / contact radius {shares[-1]}; the reference has small strains",
+    )  # fmt: skip
+    yield compare(
+        f"{name}, exponent", "Hertz, F ~ d^1.5", expected=1.5, measured=exponents[0], tolerance=EXPONENT_TOLERANCE,
+        absolute=True,
+        note=f"over {1e3 * depths[0]:g} to {1e3 * depths[-1]:g} mm, cell / contact radius {shares[0]} to "
+        f"{shares[-1]}; the reference elements give {exponents[1]:.2f}",
+    )  # fmt: skip
+    millimetres, labels = tuple(1e3 * depth for depth in depths), ("depth [mm]", "force [N]", False)
+    yield Curve("ball", f"cell {1e3 * cell:.1f} mm", millimetres, tuple(measured), *labels)
+    # The reference is the same for every cell size and is drawn once.
+    if cells == 12:
+        yield Curve("ball", "reference", millimetres, tuple(reference), *labels)
 
 
 def sites(
     cells: int, radius: float, depth: float, count: int, mean: float, deviation: float | None, spread: float | None
-) -> Outcome:
+) -> Iterator[Row]:
     """Force at random sites of the homogeneous phantom: mean against elements, standard deviation, range."""
     touch = block(cells)
     places = np.random.default_rng(0).uniform(-REACH, REACH, (count, 2)) + 0.5 * np.array(SIZE[:2])
@@ -122,24 +185,19 @@ def sites(
     share = SIZE[0] / cells / math.sqrt(radius * depth)
     name = f"touch, tip {1e3 * radius:g} mm pressed {1e3 * depth:g} mm, cell / contact radius {share:.2f}"
     note = f"{count} sites, pressed at {1e3 * PRESS_SPEED:g} mm/s and held {HOLD_COUNT * STEP:g} s, damped critically"
-    rows = [
-        compare(
-            f"{name}, mean", "scikit-fem, axisymmetric, same k_p", expected=reference_force(radius, depth),
-            measured=float(force.mean()), tolerance=mean, unit="N", note=f"{note}; the reference has small strains",
-        )
-    ]  # fmt: skip
+    yield compare(
+        f"{name}, mean", REFERENCE, expected=reference_force(radius, depth), measured=float(force.mean()),
+        tolerance=mean, unit="N", note=f"{note}; the reference has small strains",
+    )  # fmt: skip
     for what, measured, tolerance in (("std", force.std(), deviation), ("max - min", np.ptp(force), spread)):
         if tolerance is not None:
-            rows.append(
-                compare(
-                    f"{name}, {what}", "homogeneous tissue", expected=0.0, measured=float(measured / force.mean()),
-                    tolerance=tolerance, absolute=True, note=f"over the mean; {note}",
-                )
+            yield compare(
+                f"{name}, {what}", "homogeneous tissue", expected=0.0, measured=float(measured / force.mean()),
+                tolerance=tolerance, absolute=True, note=f"over the mean; {note}",
             )  # fmt: skip
-    return Outcome(tuple(rows))
 
 
-def contrast(cells: int, hidden: Hidden) -> Outcome:
+def contrast(cells: int, hidden: Hidden) -> Iterator[Row]:
     """Force over a sphere over that without it, at three places on the lattice; without friction, as the reference."""
     radius, depth = 0.008, 0.004
     cell = SIZE[0] / cells
@@ -151,46 +209,36 @@ def contrast(cells: int, hidden: Hidden) -> Outcome:
         lesion = anatomy.lesion_at(centre, hidden.radius, hidden.ratio, "lesion")
         healthy.append(block(cells, friction=0.0).held(place, radius, depth))
         hard.append(block(cells, lesions=(lesion,), friction=0.0).held(place, radius, depth))
-    row = compare(
-        f"touch, contrast, {hidden.name}, cell {1e3 * cell:.1f} mm", "scikit-fem, axisymmetric, same k_p",
+    yield compare(
+        f"touch, contrast, {hidden.name}, cell {1e3 * cell:.1f} mm", REFERENCE,
         expected=reference_force(radius, depth, hidden) / reference_force(radius, depth),
         measured=sum(hard) / sum(healthy), tolerance=CONTRAST_TOLERANCE,
         note="tip 8 mm pressed 4 mm, no friction; the reference has small strains",
     )  # fmt: skip
-    return Outcome((row,))
 
 
-PLACES = {"a node": (0.03, 0.03), "an edge": (0.0325, 0.03), "a face": (0.03333, 0.03167)}
-
-
-def deep_presses(target: float = 1.2) -> Outcome:
+def deep_presses(target: float = 1.2) -> Iterator[Row]:
     """Balls of 3, 5 and 8 mm on 5 mm cells, slow and at 1 m/s, to 1.5 times the hard limit or to a named fault."""
     touch = block(12, alpha=None)
     lost, faults, falls = [], [], []
-    for radius in (0.003, 0.005, 0.008):
-        for speed in (0.02, 1.0):
-            for place, site in PLACES.items():
-                force, fault = _deep(touch, site, radius, speed, target)
-                name = f"{1e3 * radius:g} mm, {place}, {speed:g} m/s"
-                touched = force[np.argmax(force > 0.0) :]
-                if fault:
-                    faults.append(name)
-                # Contact is lost if it lets go without a fault, or if the force fell by a fifth before the fault.
-                if force[-1] < 0.8 * force.max() or not (fault or force[-1] >= target):
-                    lost.append(name)
-                if speed < 0.1 and (np.diff(touched[9::10]) <= 0.0).any():
-                    falls.append(name)
-    count = 6 * len(PLACES)
-    rows: list[Row] = []
+    for radius, speed, (place, site) in product((0.003, 0.005, 0.008), (0.02, 1.0), PLACES.items()):
+        force, fault = _deep(touch, site, radius, speed, target)
+        name = f"{1e3 * radius:g} mm, {place}, {speed:g} m/s"
+        touched = force[np.argmax(force > 0.0) :]
+        if fault:
+            faults.append(name)
+        # Contact is lost if it lets go without a fault, or if the force fell by a fifth before the fault.
+        if force[-1] < 0.8 * force.max() or not (fault or force[-1] >= target):
+            lost.append(name)
+        if speed < 0.1 and (np.diff(touched[9::10]) <= 0.0).any():
+            falls.append(name)
     for what, which in (("lost without a fault", lost), ("whose force falls with depth", falls)):
-        rows.append(
-            compare(
-                f"touch, presses to {target:g} N {what}", "contact holds", expected=0.0, measured=float(len(which)),
-                tolerance=0.0, absolute=True,
-                note=f"of {count}; {', '.join(which) or 'none'}; a tet turned inside out, said so, in {len(faults)}",
-            )
+        yield compare(
+            f"touch, presses to {target:g} N {what}", "contact holds", expected=0.0, measured=float(len(which)),
+            tolerance=0.0, absolute=True,
+            note=f"of {6 * len(PLACES)}; {', '.join(which) or 'none'}; a tet turned inside out, said so, "
+            f"in {len(faults)}",
         )  # fmt: skip
-    return Outcome(tuple(rows))
 
 
 def _deep(touch: Touch, site: ArrayLike, radius: float, speed: float, target: float) -> tuple[FloatArray, bool]:

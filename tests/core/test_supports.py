@@ -14,7 +14,7 @@ from msdm_core.organ.measure import kinetic_energy, momentum, potential_energy, 
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import advance, advance_organ
 from msdm_core.organ.support import Support, SupportLaw
-from surgsim_env.validation.resting import FLOOR, GRAVITY, crept, free_block, on_incline, run, slid
+from surgsim_env.validation.friction import FLOOR, GRAVITY, crept, free_block, on_incline, run, slid
 from tests.core import oracle
 from tests.core.test_stable_step import growth
 

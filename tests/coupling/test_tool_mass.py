@@ -15,7 +15,7 @@ from surgsim_env.instruments.tool_bodies import ToolBodies
 from surgsim_env.instruments.tool_mass import check_tool_masses, tool_masses
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
-from surgsim_env.validation.free_tool import ELASTIC, UPRIGHT, free_ball
+from surgsim_env.validation.dynamics import ELASTIC, UPRIGHT, free_ball
 from tests.core import oracle
 from tests.coupling.test_passivity import resting, static_force
 

@@ -6,11 +6,10 @@ import pytest
 from rich.console import Console
 
 from surgsim_env.validation import suite
-from surgsim_env.validation.catalogue import CASES
-from surgsim_env.validation.fem import has_fem
-from surgsim_env.validation.row import Case, Outcome, Row, bounded, compare
+from surgsim_env.validation.elements import has_fem
+from surgsim_env.validation.row import Case, Row, bounded, compare
 
-PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else []) for case in CASES]
+PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else []) for case in suite.CASES]
 
 
 @pytest.mark.parametrize("case", PARAMETERS)
@@ -47,7 +46,7 @@ def test_a_bound_holds_on_its_side():
 
 
 def test_a_run_passes_only_where_every_shortfall_is_known(monkeypatch):
-    cases = (Case("good", lambda: Outcome((row("good", 1.0),))), Case("bad", lambda: Outcome((row("bad", 2.0),))))
+    cases = (Case("good", lambda: [row("good", 1.0)]), Case("bad", lambda: [row("bad", 2.0)]))
     known = {"good": suite.Shortfall("once", 1.0)}
     monkeypatch.setattr(suite, "load_shortfalls", lambda: known)
     found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
@@ -72,6 +71,6 @@ def test_shortfalls_have_reasons(tmp_path):
 
 def test_without_scikit_fem_its_rows_are_said_to_be_skipped(monkeypatch):
     monkeypatch.setattr(suite, "has_fem", lambda: False)
-    cases = (Case("block", lambda: Outcome((row("block", 1.0),)), needs_fem=True),)
+    cases = (Case("block", lambda: [row("block", 1.0)], needs_fem=True),)
     found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
     assert found.passed and found.rows[0].verdict == "skipped" and "scikit-fem is not installed" in found.rows[0].note

@@ -4,17 +4,16 @@ import pytest
 
 from surgsim_env.cli.main import main
 from surgsim_env.validation import suite
-from surgsim_env.validation.catalogue import CASES
-from surgsim_env.validation.row import Case, Outcome, compare
+from surgsim_env.validation.row import Case, Row, compare
 
 
-def wrong() -> Outcome:
-    return Outcome((compare("a wrong one", "by hand", expected=1.0, measured=2.0, tolerance=0.1, unit="N"),))
+def wrong() -> list[Row]:
+    return [compare("a wrong one", "by hand", expected=1.0, measured=2.0, tolerance=0.1, unit="N")]
 
 
 @pytest.mark.parametrize(("spoilt", "status"), [(False, 0), (True, 1)])
 def test_validate(tmp_path, monkeypatch, capsys, spoilt, status):
-    chosen = tuple(case for case in CASES if case.name in ("Table I", "bar in tension"))
+    chosen = tuple(case for case in suite.CASES if case.name in ("Table I", "bar in tension"))
     cases = (*chosen, Case("wrong", wrong)) if spoilt else chosen
     run = suite.run_cases
     monkeypatch.setattr(suite, "run_cases", lambda **given: run(**given, cases=cases))

@@ -3,7 +3,6 @@
 import importlib
 import importlib.util
 import re
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -25,11 +24,7 @@ def hook(name: str):
     specification = importlib.util.spec_from_file_location(name, HOOKS / f"{name}.py")
     assert specification is not None and specification.loader is not None
     module = importlib.util.module_from_spec(specification)
-    sys.path.insert(0, str(HOOKS))
-    try:
-        specification.loader.exec_module(module)
-    finally:
-        sys.path.remove(str(HOOKS))
+    specification.loader.exec_module(module)
     return module
 
 
@@ -110,14 +105,14 @@ def test_every_environment_has_a_page_with_gymnasiums_headings(id):
     text = page.read_text(encoding="utf-8")
     assert text.startswith(f"# {id}\n")
     assert re.search(r"!\[[^]]+\]\(\.\./images/\w+\.webp\)", text)
-    _, told = docstring_sections(hook("environment_pages").environment_class(id).__doc__)
+    _, told = docstring_sections(hook("generated_parts").environment_class(id).__doc__)
     assert set(told) >= {"Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End"}
     assert "Arguments" in told and all(told.values())
 
 
 @pytest.mark.parametrize("id", IDS)
 def test_tables_have_every_command_channel_and_reward(id):
-    task, text = TASKS[id], hook("environment_pages").environment_text(id)
+    task, text = TASKS[id], hook("generated_parts").environment_text(id)
     _, told = docstring_sections(text)
     for heading, parts in (
         ("Action Space", task.commands), ("Observation Space", task.channels), ("Rewards", task.rewards)
@@ -128,7 +123,7 @@ def test_tables_have_every_command_channel_and_reward(id):
 
 
 def test_a_docstring_without_a_heading_is_refused(monkeypatch):
-    module = hook("environment_pages")
+    module = hook("generated_parts")
     bad = type("Env", (), {"__doc__": "One.\n\n## Description\nx"})
     monkeypatch.setattr(module, "environment_class", lambda id: bad)
     with pytest.raises(module.PluginError, match="has the headings Description; it must have Description, Action"):
@@ -136,7 +131,7 @@ def test_a_docstring_without_a_heading_is_refused(monkeypatch):
 
 
 def test_every_command_and_every_option_is_on_the_page():
-    module = hook("command_pages")
+    module = hook("generated_parts")
     text = module.command_list()
     (names,) = re.findall(r"\{([\w,]+)\}", module.said("--help"))
     assert {"palpate", "organ", "arms", "validate"} <= set(names.split(","))
@@ -150,7 +145,7 @@ def test_every_command_and_every_option_is_on_the_page():
 
 
 def test_paths_of_pages_become_links_outside_of_code():
-    module = hook("named_pages")
+    module = hook("site_pages")
 
     class One:
         def __init__(self, place: str, text: str) -> None:

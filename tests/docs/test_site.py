@@ -110,9 +110,7 @@ def test_a_fault_ends_the_build(build, tmp_path, fault):
     (docs / "index.md").write_text(f"# Home\n\n[there](arms.md#arms) {fault}\n", encoding="utf-8")
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     text = re.sub(r"^nav:\n(?:[ #].*\n|\n)*?(?=\S)", "", text, flags=re.MULTILINE)
-    text = re.sub(r"^  (logo|favicon):.*\n", "", text, flags=re.MULTILINE).replace(
-        "  - docs/hooks/outside_pages.py\n", ""
-    )
+    text = re.sub(r"^  (logo|favicon):.*\n", "", text, flags=re.MULTILINE).replace("  - docs/hooks/site_pages.py\n", "")
     text = text.replace("docs/hooks/", f"{ROOT}/docs/hooks/").replace("extra_css: [stylesheets/site.css]\n", "")
     configuration = tmp_path / "mkdocs.yml"
     configuration.write_text(text, encoding="utf-8")

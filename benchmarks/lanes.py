@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel
-from msdm_core.lanes.lane_organs import stack_organs
-from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_shapes
+from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_organs, stack_shapes
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.stepping import advance_organ, round_shapes
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy

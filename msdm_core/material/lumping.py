@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import OrganError
-from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 
-FloatArray = NDArray[np.float64]
 MassScheme = Literal["barycentric", "voronoi"]
 
 # Tets clipped at a time: keeps the pieces of one batch (up to nine per corner) within some tens of megabytes.

@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh.surface import surface_volume
-from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh
-
-FloatArray = NDArray[np.float64]
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
 
 
 @dataclass(frozen=True)

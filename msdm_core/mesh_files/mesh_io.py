@@ -1,11 +1,34 @@
-"""Reading and writing tetrahedral meshes: vtu, legacy vtk, gmsh 2.2 and 4.1, medit; surfaces are in surface_io."""
+"""Reading and writing tetrahedral meshes: vtu, legacy vtk, gmsh 2.2 and 4.1, medit; surfaces are in surface_io.
 
+Two formats are written here rather than by meshio, as text: it drops the physical tags of a gmsh 4.1 file unless every
+region owns a node of its own, and writes medit with a Python loop per line. Text with 17 significant digits gives every
+float64 back exactly.
+
+Mesh formats have no field for the length unit and most none for region names; these notes are stored so that other
+readers skip them:
+
+| format | length unit                                   | region names                                     |
+|--------|-----------------------------------------------|--------------------------------------------------|
+| vtu    | FieldData array "length_unit_m"               | FieldData arrays "region/NAME" (*), value = tag  |
+| vtk    | FIELD array "length_unit_m" after DATASET     | FIELD arrays "region/NAME" (*), value = tag      |
+| gmsh   | "surgsim length_unit_m 1.0" in a $Comments    | $PhysicalNames of dimension 3, gmsh's own field; |
+|        |                                               | tag 0: "surgsim region 0 NAME" in the $Comments  |
+| medit  | comment "# surgsim length_unit_m 1.0"         | comment "# surgsim region TAG NAME"              |
+
+(*) percent-coded, as VTK does itself in legacy files; a file that VTK or ParaView saved again keeps both.
+"""
+
+import io
+import itertools
 import re
+import struct
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +36,6 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.errors import MeshError
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.mesh_files.mesh_file import LengthUnit, check_extent, checked_file, metres_per_unit, parsed
-from msdm_core.mesh_files.mesh_notes import FileNotes, physical_names, read_notes, with_notes
-from msdm_core.mesh_files.mesh_text import gmsh41_bytes, medit_bytes
 
 # The formats that may be written under each suffix, the first by default.
 FORMATS = {".vtu": ("vtu",), ".vtk": ("vtk",), ".msh": ("gmsh", "gmsh22"), ".mesh": ("medit",)}
@@ -22,6 +43,21 @@ REGION_KEYS = ("region", "gmsh:physical", "medit:ref")
 
 _CONVERT = "convert it, for instance: meshio convert IN OUT.vtu, or gmsh IN -save -format msh22 -o OUT.msh"
 _VOLUME_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
+_GMSH_TETRA = 4
+
+RegionNames = tuple[tuple[int, str], ...]
+
+UNIT_KEY = "length_unit_m"
+_REGION_KEY = "region/"
+_HEAD_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class FileNotes:
+    """Metres per file unit, None when the file does not say, and the (tag, name) pairs of its regions."""
+
+    metres: float | None = None
+    region_names: RegionNames = ()
 
 
 def read_mesh(path: str | Path, *, length_unit: LengthUnit | None = None, region_key: str | None = None) -> TetMesh:
@@ -71,8 +107,8 @@ def write_mesh(
 ) -> None:
     """Write a mesh, its regions and their names, and the length unit, so that `read_mesh` gives it back.
 
-    Coordinates survive exactly with length_unit "m", to rounding with another. msdm_core.mesh_files.mesh_notes says
-    where each format has the unit and the names.
+    Coordinates survive exactly with length_unit "m", to rounding with another. The table at the
+    top says where each format has the unit and the names.
 
     Args:
         path: the file; its suffix decides: .vtu, .vtk, .msh (gmsh 4.1; 2.2 with file_format "gmsh22"), .mesh (medit).
@@ -261,3 +297,163 @@ def _write_gmsh22(path: str, out: Any) -> None:
     import meshio
 
     meshio.gmsh.write(path, out, fmt_version="2.2")
+
+
+def gmsh41_bytes(
+    mesh: TetMesh,
+    points: NDArray[np.float64],
+    point_data: Mapping[str, NDArray],
+    cell_data: Mapping[str, NDArray],
+) -> bytes:
+    """A gmsh 4.1 text file: one volume entity and one physical group per region; points in file units (n_node, 3)."""
+    out = io.BytesIO()
+    out.write(b"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n")
+    names = physical_names(mesh.region_names)
+    if names:
+        rows = "".join(f'3 {tag} "{name}"\n' for tag, name in names)
+        out.write(f"$PhysicalNames\n{len(names)}\n{rows}$EndPhysicalNames\n".encode())
+    tags, entity = np.unique(np.asarray(mesh.region), return_inverse=True)
+    _write_entities(out, points, tags)
+    node_count = len(points)
+    # Any one volume may own the nodes: readers look a tet's region up through the tet's entity.
+    out.write(f"$Nodes\n1 {node_count} 1 {node_count}\n3 1 0 {node_count}\n".encode())
+    np.savetxt(out, np.arange(1, node_count + 1), fmt="%d")
+    np.savetxt(out, points, fmt="%.17g")
+    out.write(b"$EndNodes\n")
+    _write_elements(out, mesh.tets, entity + 1)
+    for name, values in point_data.items():
+        _write_data(out, "NodeData", name, values)
+    for name, values in cell_data.items():
+        _write_data(out, "ElementData", name, values)
+    return out.getvalue()
+
+
+def medit_bytes(mesh: TetMesh, points: NDArray[np.float64]) -> bytes:
+    """A medit text file with each tet's region as its reference; points in file units (n_node, 3)."""
+    out = io.BytesIO()
+    out.write(f"MeshVersionFormatted 2\nDimension 3\n\nVertices\n{len(points)}\n".encode())
+    np.savetxt(out, np.column_stack([points, np.zeros(len(points))]), fmt="%.17g %.17g %.17g %d")
+    out.write(f"\nTetrahedra\n{mesh.tet_count}\n".encode())
+    np.savetxt(out, np.column_stack([mesh.tets + 1, np.asarray(mesh.region)]), fmt="%d")
+    out.write(b"\nEnd\n")
+    return out.getvalue()
+
+
+def _write_entities(out: io.BytesIO, points: NDArray[np.float64], tags: NDArray[np.int32]) -> None:
+    low, high = (" ".join(f"{value:.17g}" for value in bound) for bound in (points.min(axis=0), points.max(axis=0)))
+    rows = "".join(f"{entity} {low} {high} 1 {tag} 0\n" for entity, tag in enumerate(tags, start=1))
+    out.write(f"$Entities\n0 0 0 {len(tags)}\n{rows}$EndEntities\n".encode())
+
+
+def _write_elements(out: io.BytesIO, tets: NDArray[np.int32], entity: NDArray[np.integer]) -> None:
+    """Blocks are runs of tets of one region, not whole regions, so that the tets come back in the same order."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(entity)) + 1, [len(tets)]])
+    rows = np.column_stack([np.arange(1, len(tets) + 1), tets + 1])
+    out.write(f"$Elements\n{len(starts) - 1} {len(tets)} 1 {len(tets)}\n".encode())
+    for start, stop in itertools.pairwise(starts):
+        out.write(f"3 {entity[start]} {_GMSH_TETRA} {stop - start}\n".encode())
+        np.savetxt(out, rows[start:stop], fmt="%d")
+    out.write(b"$EndElements\n")
+
+
+def _write_data(out: io.BytesIO, section: str, name: str, values: NDArray) -> None:
+    """One named array, shape (n,) or (n, components), as a gmsh view: one text tag, one time, three integers."""
+    columns = values.reshape(len(values), -1)
+    out.write(f'${section}\n1\n"{name}"\n1\n0.0\n3\n0\n{columns.shape[1]}\n{len(columns)}\n'.encode())
+    np.savetxt(
+        out,
+        np.column_stack([np.arange(1, len(columns) + 1), columns]),
+        fmt=" ".join(["%d"] + ["%.17g"] * columns.shape[1]),
+    )
+    out.write(f"$End{section}\n".encode())
+
+
+def read_notes(file_format: str, data: bytes, field_data: Mapping[str, Any]) -> FileNotes:
+    """The notes in a file's bytes and in the field data that meshio found in it."""
+    head = data[:_HEAD_BYTES]
+    if file_format == "vtu":
+        metres = float(field_data[UNIT_KEY].flat[0]) if UNIT_KEY in field_data else None
+        regions = [(key, values) for key, values in field_data.items() if key.startswith(_REGION_KEY)]
+        names = [(values.flat[0], unquote(key[len(_REGION_KEY) :])) for key, values in regions]
+    elif file_format == "vtk":
+        metres, names = _read_vtk(head)
+    elif file_format == "gmsh":
+        metres = _read_line_unit(head, b"")
+        # meshio maps each physical name to (tag, dimension); those of surfaces name no tets.
+        names = [(value[0], name) for name, value in field_data.items() if len(value) == 2 and value[1] == 3]
+        names += _read_line_names(head, b"")
+    else:
+        metres, names = _read_line_unit(head, b"# "), _read_line_names(head, b"# ")
+    return FileNotes(metres, tuple(sorted((int(tag), name) for tag, name in names)))
+
+
+def with_notes(file_format: str, data: bytes, notes: FileNotes) -> bytes:
+    """The bytes of a mesh file with the notes at the places of the table above."""
+    if file_format == "vtu":
+        return _after(data, b"<UnstructuredGrid>", _vtu_field_data(notes))
+    if file_format == "vtk":
+        return _after(data, b"DATASET UNSTRUCTURED_GRID\n", _vtk_field_data(notes))
+    lines = [f"surgsim {UNIT_KEY} {notes.metres!r}"]
+    if file_format in ("gmsh", "gmsh22"):
+        rest = set(notes.region_names) - set(physical_names(notes.region_names))
+        lines += [f"surgsim region {tag} {name}" for tag, name in rest]
+        return _after(data, b"$EndMeshFormat\n", "\n".join(["$Comments", *lines, "$EndComments\n"]).encode())
+    lines += [f"surgsim region {tag} {name}" for tag, name in notes.region_names]
+    return _after(data, b"Dimension 3\n", "".join(f"# {line}\n" for line in lines).encode())
+
+
+def physical_names(region_names: RegionNames) -> RegionNames:
+    """The names that gmsh can hold itself, by tag: it takes tag 0 for "no tag" and gives its name to another region."""
+    return tuple(sorted((tag, name) for tag, name in region_names if tag > 0))
+
+
+def _after(data: bytes, mark: bytes, addition: bytes) -> bytes:
+    before, found, rest = data.partition(mark)
+    assert found, f"the writer left out {mark!r}"
+    return before + found + addition + rest
+
+
+def _read_line_unit(head: bytes, prefix: bytes) -> float | None:
+    found = re.search(rb"^" + prefix + rb"surgsim " + UNIT_KEY.encode() + rb" (\S+)\s*$", head, re.MULTILINE)
+    return float(found[1]) if found else None
+
+
+def _read_line_names(head: bytes, prefix: bytes) -> list[tuple[Any, str]]:
+    found = re.findall(rb"^" + prefix + rb"surgsim region (-?\d+) (.+?)\r?$", head, re.MULTILINE)
+    return [(tag, name.decode()) for tag, name in found]
+
+
+def _vtu_field_data(notes: FileNotes) -> bytes:
+    arrays = [("Float64", UNIT_KEY, repr(notes.metres))]
+    arrays += [("Int32", _REGION_KEY + quote(name, safe=" "), str(tag)) for tag, name in notes.region_names]
+    rows = [
+        f'<DataArray type="{kind}" Name="{name}" NumberOfTuples="1" format="ascii">{value}</DataArray>\n'
+        for kind, name, value in arrays
+    ]
+    return f"\n<FieldData>\n{''.join(rows)}</FieldData>".encode()
+
+
+def _vtk_field_data(notes: FileNotes) -> bytes:
+    # 64 bits: meshio takes the 4 bytes of a VTK "int" for 8.
+    arrays = [f"{UNIT_KEY} 1 1 double\n".encode() + struct.pack(">d", notes.metres)]
+    arrays += [
+        f"{_REGION_KEY}{quote(name, safe='')} 1 1 vtktypeint64\n".encode() + struct.pack(">q", tag)
+        for tag, name in notes.region_names
+    ]
+    return f"FIELD FieldData {len(arrays)}\n".encode() + b"".join(array + b"\n" for array in arrays)
+
+
+def _read_vtk(head: bytes) -> tuple[float | None, list[tuple[Any, str]]]:
+    """The field block is read from the bytes: meshio does not return what precedes POINTS."""
+    block = head.partition(b"\nPOINTS ")[0]
+    as_text = b"\nASCII" in block[:600]
+    value = rb"(\S+) *" if as_text else rb"(.{8})"
+    unit = re.search(rb"\n" + UNIT_KEY.encode() + rb" 1 1 double\n" + value + rb"(?=\n|$)", block, re.DOTALL)
+    pattern = rb"\n" + _REGION_KEY.encode() + rb"(\S+) 1 1 vtktypeint64\n" + value + rb"(?=\n|$)"
+    names = [(_number(tag, as_text, "q"), name) for name, tag in re.findall(pattern, block, re.DOTALL)]
+    metres = _number(unit[1], as_text, "d") if unit else None
+    return metres, [(tag, unquote(name.decode())) for tag, name in names]
+
+
+def _number(value: bytes, as_text: bool, kind: str) -> float:
+    return float(value) if as_text else struct.unpack(">" + kind, value)[0]

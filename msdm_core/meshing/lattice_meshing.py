@@ -1,34 +1,31 @@
 """Meshes of body-centred cubic (BCC) lattices, on which formula (6) is isotropic: blocks and filled surfaces.
 
 Both can be graded: fine where the tissue is felt, with cells 2 or 4 times as long elsewhere
-(`msdm_core.meshing.octree`). At the seams between cell sizes formula (6) is not isotropic.
+(`msdm_core.meshing.grading`). At the seams between cell sizes formula (6) is not isotropic.
 """
 
 import warnings
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.ordering import swept
-from msdm_core.mesh.surface import check_surface, surface_volume
-from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh, tet_volumes
+from msdm_core.mesh.surface import Int64Array, check_surface, surface_volume
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh, tet_volumes
 from msdm_core.meshing.grading import (
     CELLS_ACROSS_MIN,
     COARSENINGS,
+    balanced_levels,
     check_coarse_cell_size,
     checked_coarsest,
     checked_fine_triangles,
+    octree_tets,
     stuff_graded,
 )
-from msdm_core.meshing.lattice import lattice_around
-from msdm_core.meshing.octree import balanced_levels, octree_tets
-from msdm_core.meshing.stuffing import stuff
-
-FloatArray = NDArray[np.float64]
-Int64Array = NDArray[np.int64]
+from msdm_core.meshing.stuffing import lattice_around, stuff
 
 STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
 TETS_PER_CELL = 12

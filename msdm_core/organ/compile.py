@@ -1,6 +1,11 @@
-"""Compiling an organ from its specification, and its state at rest."""
+"""Compiling an organ from its specification, and its state at rest.
 
+Under gravity an organ rests on its anchors and supports: dynamic relaxation, remembered for the last organs.
+"""
+
+import hashlib
 import math
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import cast
@@ -8,9 +13,11 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msdm_core.errors import OrganError
+from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
-from msdm_core.kernels.structure_kernels import LaneModel, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneModel, OrganModel, OrganState
+from msdm_core.kernels.substep_kernels import evaluate_forces
+from msdm_core.kernels.support_kernels import add_support_forces
 from msdm_core.kernels.vector_kernels import aligned_zeros
 from msdm_core.material.lumping import MassScheme, lump_mass
 from msdm_core.material.regions import (
@@ -28,9 +35,17 @@ from msdm_core.material.stiffness import membrane_stiffness, spring_network
 from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
-from msdm_core.organ.settling import settle
 from msdm_core.organ.stability import own_step
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
+
+# How many settled organs are remembered, the most recently used.
+REMEMBERED = 32
+# Forces balance when their magnitudes sum to less than this share of the weight of the organ.
+FORCE_TOLERANCE = 1e-6
+ROUNDS, ROUND_STEPS = 4000, 10
+
+_settled: OrderedDict[bytes, tuple[FloatArray, FloatArray]] = OrderedDict()
 
 
 @dataclass(frozen=True)
@@ -120,14 +135,14 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     """A state at rest, with contact memory for `shape_count` shapes; under gravity the settled static equilibrium.
 
     The organ settles from its undeformed shape onto its supports, their friction included; the organs settled last are
-    remembered (`settling.settle`).
+    remembered.
 
     Raises:
         OrganDivergedError: gravity turns the organ inside out or it does not settle.
     """
     state = blank_state(model, shape_count=shape_count)
     if np.any(model.gravity != 0.0):
-        settle(model, state)
+        _settle(model, state)
     return state
 
 
@@ -154,6 +169,68 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         finite_sum=np.zeros(1),
         candidate_count=np.zeros(1, dtype=np.int32),
         contact_kept=np.ones(1, dtype=np.uint8),
+    )
+
+
+def _settle(model: OrganModel, state: OrganState) -> None:
+    """Bring a state from the undeformed position to rest under gravity, in place; the same organ settles only once.
+
+    Raises:
+        OrganDivergedError: gravity turns the organ inside out or it does not settle.
+    """
+    key = _content(model)
+    settled = _settled.pop(key, None)
+    if settled is None:
+        _relax(model, state)
+        settled = state.node_position.copy(), state.support_stretch.copy()
+    # Moved to the end: the least recently used organ is forgotten first.
+    _settled[key] = settled
+    if len(_settled) > REMEMBERED:
+        _settled.popitem(last=False)
+    state.node_position[:], state.support_stretch[:] = settled
+    state.node_velocity[:] = 0.0
+    state.node_force[:] = 0.0
+    # The smallest volume ratio on the way to equilibrium does not count.
+    state.volume_ratio_smallest[:] = 1.0
+
+
+def _content(model: OrganModel) -> bytes:
+    """A digest of all numbers of an organ."""
+    digest = hashlib.blake2b(digest_size=16)
+    for value in model:
+        array = np.ascontiguousarray(value)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.data)
+    return digest.digest()
+
+
+def _relax(model: OrganModel, state: OrganState) -> None:
+    """Dynamic relaxation: advance the organ, the mode that gravity excites damped critically, until forces balance.
+
+    alpha = 2 w, w^2 = -(u . f) / (u . M u) (Rayleigh's quotient of the displacement u, f the forces without gravity).
+    """
+    relaxed = model._replace(alpha=0.0, beta=0.0)
+    free = model.node_inverse_mass > 0.0
+    mass = model.node_mass[:, None]
+    weight = float(np.linalg.norm(model.gravity) * model.node_mass.sum())
+    wrench = np.zeros((0, 6))
+    dt = 0.8 * own_step(relaxed)
+    for _ in range(ROUNDS):
+        fault = advance_organ(relaxed, state, NO_SHAPES, NO_CONTACT, dt, ROUND_STEPS, wrench)
+        if fault != FAULT_NONE:
+            raise OrganDivergedError("under gravity, " + describe_fault(relaxed, state, fault))
+        evaluate_forces(relaxed, state)
+        add_support_forces(
+            relaxed, state.node_position, state.node_velocity, state.node_force, state.support_stretch, 0.0
+        )
+        if np.linalg.norm(state.node_force[free], axis=1).sum() <= FORCE_TOLERANCE * weight:
+            return
+        displacement = state.node_position - model.node_rest_position
+        held = float((displacement * (mass * model.gravity - state.node_force)).sum())
+        relaxed = relaxed._replace(alpha=2.0 * math.sqrt(max(held, 0.0) / float((mass * displacement**2).sum())))
+    raise OrganDivergedError(
+        f"the organ did not settle under gravity in {ROUNDS * ROUND_STEPS} steps: is it anchored, or does it "
+        "rest on something? Give `anchors` or `supports`, or no gravity"
     )
 
 

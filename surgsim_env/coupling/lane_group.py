@@ -8,8 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.kernels.structure_kernels import LANE_EMPTY, OrganModel
-from msdm_core.lanes.lane_organs import same_rest, set_lane, stack_organs
-from msdm_core.lanes.lanes import get_lane, lane_responses, lane_shapes, lanes_of, put_lane, stack_shapes
+from msdm_core.lanes.lanes import (
+    get_lane,
+    lane_responses,
+    lane_shapes,
+    lanes_of,
+    put_lane,
+    same_rest,
+    set_lane,
+    stack_organs,
+    stack_shapes,
+)
 from surgsim_env.coupling.exchange import step_outcome, steps_taken
 from surgsim_env.coupling.haptic_kernels import StepPlan, advance_lane_haptic_steps
 from surgsim_env.coupling.simulation import Simulation

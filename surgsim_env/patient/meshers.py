@@ -1,40 +1,152 @@
-"""An organ's mesh from a label image, or from closed surfaces of it and its regions: by the lattice or by fTetWild."""
+"""An organ's mesh with its regions, from a label image or from closed surfaces, by the lattice or by fTetWild."""
 
-from collections.abc import Sequence
+import contextlib
+import math
+import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh.surface import surface_volume
+from msdm_core.mesh.quality import dihedral_angles
+from msdm_core.mesh.surface import check_surface, surface_volume
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LengthUnit
-from msdm_core.meshing.lattice_meshing import mesh_surface
-from msdm_core.meshing.region_tags import RegionShare, label_share, tag_tets
-from msdm_core.meshing.segmentation_meshing import fill_labels
-from surgsim_env.patient.label_cleaning import clean_labels
-from surgsim_env.patient.label_image import LabelImage
-from surgsim_env.patient.label_source import CONVENTION
+from msdm_core.meshing.lattice_meshing import largest_body_mesh, mesh_surface
+from msdm_core.meshing.segmentation_meshing import (
+    RegionShare,
+    SmoothedShare,
+    fill_labels,
+    label_share,
+    smoothed_share,
+    tag_tets,
+    voxels_at,
+)
+from surgsim_env.patient.label_image import CleanLabels, LabelImage, clean_labels
+from surgsim_env.patient.label_readers import CONVENTION
 from surgsim_env.patient.materials import check_name, is_lesion
-from surgsim_env.patient.patient_mesh import PatientMesh, region_volumes, well_shaped
 from surgsim_env.patient.surface_files import (
     BrokenSurface,
     ClosedSurface,
+    bodies_of,
     checked_names,
     mended_voxels,
     read_organ_surface,
     read_region_surfaces,
     region_name,
+    voxels_inside,
 )
-from surgsim_env.patient.tetwild_mesh import mesh_labels_conforming, tetwild_mesh
-from surgsim_env.patient.voxels import voxels_inside
 
+# Cells of a default mesh, with about two nodes and twelve tets each: a palpation then takes a minute.
+CELLS_WANTED = 2000
+# Default cell sizes are multiples of CELL_STEP, and at least CELL_SMALLEST [m].
+CELL_STEP, CELL_SMALLEST = 1e-4, 1e-3
+# A default mesh with a smaller dihedral angle [degrees] is made again with cells scaled by the next share.
+DIHEDRAL_SMALLEST = 10.0
+CELL_SHARES = (1.0, 0.98, 0.96, 0.94)
 FILE_CONVENTION = "the files' own axes and origin, in metres"
 # Voxels of a region's surface along one cell.
-REGION_VOXELS = 8
+CELL_VOXELS = 8
 # At least this share of a region must lie inside the organ.
 SHARE_INSIDE = 0.5
+# Ratio of fTetWild's target edge to the lattice's cell that gives about as many tets.
+EDGE_PER_CELL = 0.9
+# Largest distance of its surface from the given one over the bounding box's diagonal: fTetWild's default.
+EPSILON = 1e-3
+# Voxels along a region's longest extent, by which its tets are found.
+REGION_VOXELS = 160
+
+
+@dataclass(frozen=True)
+class RegionVolume:
+    """Volume of one region in its source and in the mesh [m^3]."""
+
+    name: str
+    source: float
+    mesh: float
+
+    @property
+    def error(self) -> float:
+        """(mesh - source) / source."""
+        return self.mesh / self.source - 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PatientMesh:
+    """An organ's mesh and its sources.
+
+    Fields:
+        mesh: with named regions, the organ's own first; in metres
+        lesions: names of the regions that are lesions
+        volumes: of the whole organ, under its name, then of each region
+        cell_size, mesher: how it was made
+        convention: the meaning of its axes, in words
+        sources: names of the files
+        is_scan: whether the axes are the patient's (LPS)
+        smoothing, smoothing_change: width of the labels' smoothing [m] and relative change of the volume by it; None
+            for surfaces
+        notes: remarks on what was dropped, repaired or is unusual
+    """
+
+    mesh: TetMesh
+    lesions: tuple[str, ...]
+    volumes: tuple[RegionVolume, ...]
+    cell_size: float
+    mesher: str
+    convention: str
+    sources: tuple[str, ...]
+    notes: tuple[str, ...]
+    is_scan: bool
+    smoothing: float | None = None
+    smoothing_change: float | None = None
+
+    @property
+    def organ_name(self) -> str:
+        """Name of the organ."""
+        return self.volumes[0].name
+
+    @property
+    def volume_error(self) -> float:
+        """Relative volume error of the whole organ, (mesh - source) / source."""
+        return self.volumes[0].error
+
+
+def default_cell_size(volume: float) -> float:
+    """Cell edge [m] in proportion to the size of an organ of a given volume [m^3]."""
+    wanted = (volume / CELLS_WANTED) ** (1.0 / 3.0)
+    return max(math.ceil(wanted / CELL_STEP) * CELL_STEP, CELL_SMALLEST)
+
+
+def well_shaped(make: Callable[[float], PatientMesh], cell_size: float | None, volume: float) -> PatientMesh:
+    """A mesh of a given cell size [m]; by default of the default size, or a slightly smaller one for better angles.
+
+    Isosurface stuffing guarantees 9.3 degrees; slightly smaller cells are cut elsewhere, often with larger angles.
+    """
+    if cell_size is not None:
+        return make(cell_size)
+    best, largest = None, -math.inf
+    for share in CELL_SHARES:
+        mesh = make(round(share * default_cell_size(volume), 6))
+        angle = float(dihedral_angles(mesh.mesh).min())
+        if angle > largest:
+            best, largest = mesh, angle
+        if angle >= DIHEDRAL_SMALLEST or mesh.mesher != "lattice":
+            break
+    assert best is not None
+    return best
+
+
+def region_volumes(
+    mesh: TetMesh, names: Sequence[str], whole: float, sources: dict[int, float]
+) -> tuple[RegionVolume, ...]:
+    """Volumes of the whole organ and of the regions after the first; `sources` holds theirs by tag [m^3]."""
+    volumes = [RegionVolume(names[0], whole, float(mesh.volumes.sum()))]
+    for tag, name in enumerate(names[1:], start=2):
+        volumes.append(RegionVolume(name, sources[tag], float(mesh.volumes[mesh.region == tag].sum())))
+    return tuple(volumes)
 
 
 def mesh_image(image: LabelImage, source: str, *, cell_size: float | None, mesher: str, mend: bool) -> PatientMesh:
@@ -46,25 +158,27 @@ def mesh_image(image: LabelImage, source: str, *, cell_size: float | None, meshe
 def _mesh_labels(image: LabelImage, source: str, cell_size: float, mesher: str, mend: bool) -> PatientMesh:
     labels = clean_labels(image, cell_size=cell_size, mend=mend)
     if mesher == "tetwild":
-        return mesh_labels_conforming(labels, source, cell_size)
-    filled = fill_labels(
-        labels.tags, image.geometry.spacing, cell_size=cell_size, region_names=list(enumerate(labels.names, start=1))
-    )
-    placed = filled.mesh
+        placed, volumes, smoothed = _conforming(labels, cell_size)
+        whole = sum(volumes.values())
+        smoothing, change = smoothed.smoothing, smoothed.volume_above(0.5) / whole - 1.0
+    else:
+        names = list(enumerate(labels.names, start=1))
+        filled = fill_labels(labels.tags, image.geometry.spacing, cell_size=cell_size, region_names=names)
+        placed, volumes, whole = filled.mesh, filled.region_volumes, filled.label_volume
+        smoothing, change = filled.smoothing, filled.smoothing_change
     mesh = TetMesh(image.geometry.places(placed.points), placed.tets, placed.region, placed.region_names)
-    volumes = region_volumes(mesh, labels.names, filled.label_volume, filled.region_volumes)
     return PatientMesh(
         mesh=mesh,
         lesions=labels.lesions,
-        volumes=volumes,
+        volumes=region_volumes(mesh, labels.names, whole, volumes),
         cell_size=cell_size,
         mesher=mesher,
         convention=CONVENTION,
         sources=(source,),
         notes=(*image.notes, *labels.notes),
         is_scan=True,
-        smoothing=filled.smoothing,
-        smoothing_change=filled.smoothing_change,
+        smoothing=smoothing,
+        smoothing_change=change,
     )
 
 
@@ -91,27 +205,21 @@ def mesh_surfaces(
     inner = []
     for name, file in [*((region_name(file), file) for file in files[1:]), *map(_named, regions)]:
         inner += read_region_surfaces(file, length_unit, name)
-    names = [organ.name, *(one.name for one in inner)]
-    checked_names(names)
+    checked_names([organ.name, *(one.name for one in inner)])
     sources = tuple(file.name for file in files) + tuple(_named(text)[1].name for text in regions)
-    given = _Surfaces(organ, tuple(inner), sources, tuple(notes))
     volume = abs(surface_volume(organ.vertices, organ.triangles))
-    return well_shaped(lambda size: _mesh_given(given, size, mesher), cell_size, volume)
+    return well_shaped(lambda size: _mesh_given(organ, inner, sources, notes, size, mesher), cell_size, volume)
 
 
-@dataclass(frozen=True, eq=False)
-class _Surfaces:
-    """The surfaces of the organ and its regions, the files' names, and notes on what was dropped."""
-
-    organ: ClosedSurface | BrokenSurface
-    inner: tuple[ClosedSurface, ...]
-    files: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
-def _mesh_given(given: _Surfaces, cell_size: float, mesher: str) -> PatientMesh:
-    organ, inner, notes = given.organ, given.inner, list(given.notes)
-    names = [organ.name, *(one.name for one in inner)]
+def _mesh_given(
+    organ: ClosedSurface | BrokenSurface,
+    inner: Sequence[ClosedSurface],
+    sources: tuple[str, ...],
+    dropped: Sequence[str],
+    cell_size: float,
+    mesher: str,
+) -> PatientMesh:
+    names, notes = [organ.name, *(one.name for one in inner)], list(dropped)
     smoothing = change = None
     if isinstance(organ, BrokenSurface):
         tags, step, start, note = mended_voxels(organ, cell_size)
@@ -132,7 +240,7 @@ def _mesh_given(given: _Surfaces, cell_size: float, mesher: str) -> PatientMesh:
         cell_size=cell_size,
         mesher="lattice" if isinstance(organ, BrokenSurface) else mesher,
         convention=FILE_CONVENTION,
-        sources=given.files,
+        sources=sources,
         notes=tuple(notes),
         is_scan=False,
         smoothing=smoothing,
@@ -163,7 +271,7 @@ def _share_inside(mesh: TetMesh, surface: ClosedSurface, cell_size: float) -> tu
     """Share of each tet inside a surface (n_tet,), and the total volume inside it [m^3]."""
     extent = np.ptp(surface.vertices, axis=0)
     # Fine enough also for a region that is small against a cell.
-    step = min(cell_size / REGION_VOXELS, float(extent.min()) / REGION_VOXELS)
+    step = min(cell_size, float(extent.min())) / CELL_VOXELS
     inside, first = voxels_inside(surface.vertices, surface.triangles, step)
     share = label_share(mesh, inside, first, np.full(3, step))
     volume = float(share @ mesh.volumes)
@@ -173,3 +281,69 @@ def _share_inside(mesh: TetMesh, surface: ClosedSurface, cell_size: float) -> tu
             f"{SHARE_INSIDE:.0%} must: are both surfaces in the same axes and unit?"
         )
     return share, min(volume, surface.volume)
+
+
+def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh:
+    """Tets inside the first surface, which encloses the others; these are regions, tagged from 2 in their order.
+
+    fTetWild is not deterministic: the same surfaces give a different mesh each time.
+
+    Raises:
+        MeshError: fTetWild is not installed, or makes no tets.
+    """
+    try:
+        import pytetwild  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise MeshError(f"--mesher tetwild needs pytetwild ({error}): pip install 'surgsim[tetwild]'") from None
+    starts = np.cumsum([0, *(len(one.vertices) for one in surfaces)])
+    vertices = np.concatenate([one.vertices for one in surfaces])
+    triangles = np.concatenate([one.triangles + start for one, start in zip(surfaces, starts, strict=False)])
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    share = EDGE_PER_CELL * cell_size / diagonal
+    # fTetWild leaves a file, __tracked_surface.stl, in the current folder.
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        nodes, tets = pytetwild.tetrahedralize(
+            vertices, triangles.astype(np.int32), edge_length_fac=share, epsilon=EPSILON, optimize=True, quiet=True
+        )[:2]
+    if not len(tets):
+        raise MeshError(f"fTetWild made no tets of {surfaces[0].name}; use --mesher lattice")
+    nodes, tets = np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int64)
+    body = largest_body_mesh(nodes, tets, f"a cell_size below {cell_size:g} m")
+    tags = np.ones(body.tet_count, dtype=np.int32)
+    middles = body.points[body.tets].mean(axis=1)
+    for tag, one in enumerate(surfaces[1:], start=2):
+        step = float(np.ptp(one.vertices, axis=0).max()) / REGION_VOXELS
+        inside, first = voxels_inside(one.vertices, one.triangles, step)
+        tags[voxels_at(middles, inside, first, np.full(3, step))] = tag
+        if not (tags == tag).any():
+            raise MeshError(f"region {one.name!r} holds no tet: use smaller cells, or leave it out")
+    return TetMesh(body.points, body.tets, tags, tuple((n, one.name) for n, one in enumerate(surfaces, start=1)))
+
+
+def _conforming(labels: CleanLabels, cell_size: float) -> tuple[TetMesh, dict[int, float], SmoothedShare]:
+    """Tets inside level sets of the smoothed labels, the labels' volumes by tag [m^3], and the smoothed organ."""
+    tags, voxel = range(1, len(labels.names) + 1), labels.image.voxel_volume
+    volumes = {tag: float(np.count_nonzero(labels.tags == tag)) * voxel for tag in tags}
+    organ = _smoothed(labels, 1, cell_size)
+    surfaces = [ClosedSurface(labels.names[0], *_level_surface(organ, sum(volumes.values())))]
+    for tag in tags[1:]:
+        surface = _level_surface(_smoothed(labels, tag, cell_size), volumes[tag])
+        surfaces.append(ClosedSurface(labels.names[tag - 1], *surface))
+    return tetwild_mesh(surfaces, cell_size), volumes, organ
+
+
+def _smoothed(labels: CleanLabels, tag: int, cell_size: float) -> SmoothedShare:
+    """A smoothed label; for tag 1 the whole organ."""
+    mask = labels.tags > 0 if tag == 1 else labels.tags == tag
+    return smoothed_share(mask, np.zeros(3, dtype=np.int64), labels.image.geometry.spacing, cell_size)
+
+
+def _level_surface(field: SmoothedShare, volume: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """The largest closed level set of a smoothed label, at the level that encloses a volume [m^3]."""
+    try:
+        from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise MeshError("--mesher tetwild of labels needs scikit-image: pip install 'surgsim[tetwild]'") from None
+    vertices, faces = marching_cubes(field.values, field.level_of(volume))[:2]
+    points = field.start + np.asarray(vertices, dtype=np.float64) * field.step
+    return check_surface(*bodies_of(points, np.asarray(faces, dtype=np.int64))[0])

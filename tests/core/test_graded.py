@@ -15,10 +15,9 @@ from msdm_core.mesh.quality import dihedral_angles, mesh_quality
 from msdm_core.mesh.surface import check_surface, triangles_facing
 from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh
 from msdm_core.meshing import grading
-from msdm_core.meshing.lattice import lattice_around
+from msdm_core.meshing.grading import balanced_levels, octree_tets
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
-from msdm_core.meshing.octree import balanced_levels, octree_tets
-from msdm_core.meshing.stuffing import stuff
+from msdm_core.meshing.stuffing import lattice_around, stuff
 
 ROOT = Path(__file__).parents[2]
 CT_LIVER = ROOT.parent / "shared" / "data" / "anatomy" / "openhelp_liver.stl"

@@ -8,8 +8,17 @@ import pytest
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import ContactShapes, LaneModel, LaneState, OrganModel, OrganState
-from msdm_core.lanes.lane_organs import same_rest, set_lane, stack_organs
-from msdm_core.lanes.lanes import advance_lanes, get_lane, lane_shapes, put_lane, rest_lanes, stack_shapes
+from msdm_core.lanes.lanes import (
+    advance_lanes,
+    get_lane,
+    lane_shapes,
+    put_lane,
+    rest_lanes,
+    same_rest,
+    set_lane,
+    stack_organs,
+    stack_shapes,
+)
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh

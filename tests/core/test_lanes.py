@@ -24,7 +24,6 @@ from msdm_core.kernels.structure_kernels import (
     ToolResponse,
 )
 from msdm_core.kernels.substep_kernels import advance_substeps, evaluate_forces
-from msdm_core.lanes.lane_organs import set_lane, stack_organs
 from msdm_core.lanes.lanes import (
     advance_lanes,
     get_lane,
@@ -32,6 +31,8 @@ from msdm_core.lanes.lanes import (
     lane_shapes,
     put_lane,
     rest_lanes,
+    set_lane,
+    stack_organs,
     stack_shapes,
 )
 from msdm_core.material.regions import Damping

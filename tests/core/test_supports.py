@@ -6,8 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
-from msdm_core.lanes.lane_organs import stack_organs
-from msdm_core.lanes.lanes import advance_lanes, get_lane, rest_lanes, stack_shapes
+from msdm_core.lanes.lanes import advance_lanes, get_lane, rest_lanes, stack_organs, stack_shapes
 from msdm_core.organ import settling
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.measure import kinetic_energy, momentum, potential_energy, support_forces

@@ -296,7 +296,7 @@ PLANTED = [
     (gymnasium_stays_above, "surgsim_env/instruments/arm/arm.py", "def late():\n    import gymnasium"),
     (gymnasium_stays_above, "surgsim_env/haptics/loop.py", "from gymnasium.spaces import Box"),
     (patients_are_data, "surgsim_env/patient/report.py", "from surgsim_env.coupling.simulation import Simulation"),
-    (patients_are_data, "surgsim_env/patient/rim.py", "def late():\n    import mujoco"),
+    (patients_are_data, "surgsim_env/patient/retract_scene.py", "def late():\n    import mujoco"),
     (tops_stand_alone, "surgsim_env/envs/ids.py", "from surgsim_env.scripting.run import run_script"),
     (tops_stand_alone, "surgsim_env/haptics/loop.py", "from surgsim_env.live.session import Session"),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),

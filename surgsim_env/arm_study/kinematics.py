@@ -54,31 +54,20 @@ class BatchKinematics:
         self._body_rotation = [_rotation(quaternion) for quaternion in model.body_quat]
         self._tip_body = int(model.site_bodyid[arm.tip_site])
         self._tip_position = model.site_pos[arm.tip_site].copy()
-        tip_axis = np.array(arm.description.tip.direction)
-        self._tip_axis = _rotation(model.site_quat[arm.tip_site]) @ (tip_axis / np.linalg.norm(tip_axis))
-        trocar = arm.description.trocar
-        self._shaft = model.body(trocar.shaft_body).id
-        self._shaft_point = np.array(trocar.shaft_point)
-        self._shaft_axis = np.array(trocar.shaft_axis) / np.linalg.norm(trocar.shaft_axis)
-        self.trocar, self._into = np.array(arm.port.point), -arm.port.rotation[:, 2]
+        self._tip_axis = _rotation(model.site_quat[arm.tip_site]) @ arm.tip_axis
+        self.trocar, self._into = arm.trocar, -arm.port.rotation[:, 2]
         self._hinge = np.array([model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE for j in self._joint_of])
         bodies = [int(model.jnt_bodyid[joint]) for joint in self._joint_of]
         self._moves_tip = np.array([body in _ancestors(model, self._tip_body) for body in bodies])
-        self._moves_shaft = np.array([body in _ancestors(model, self._shaft) for body in bodies])
-        self._read_shapes()
-        self.effort = np.array([_effort(model, joint) for joint in self._joint_of])
-
-    def _read_shapes(self) -> None:
-        arm, model = self.arm, self.arm.model
-        geoms = [model.geom(name).id for name in arm.shape_names]
-        self._shape_body = model.geom_bodyid[geoms]
-        local = np.zeros((len(geoms), 2, 3))
-        for index, geom in enumerate(geoms):
+        self._moves_shaft = np.array([body in _ancestors(model, arm.shaft) for body in bodies])
+        self._shape_body = model.geom_bodyid[arm.shapes]
+        self._shape_local = np.zeros((len(arm.shapes), 2, 3))
+        for index, geom in enumerate(arm.shapes):
             axis = _rotation(model.geom_quat[geom]) @ arm.shape_half_axis[index]
-            local[index] = model.geom_pos[geom] - axis, model.geom_pos[geom] + axis
-        self._shape_local = local
-        self.shaft_index: IntArray = np.flatnonzero(self._shape_body == self._shaft).astype(np.int32)
-        self.distal = np.array([self._shaft in _ancestors(model, int(body)) for body in self._shape_body])
+            self._shape_local[index] = model.geom_pos[geom] - axis, model.geom_pos[geom] + axis
+        self.shaft_index: IntArray = np.flatnonzero(self._shape_body == arm.shaft).astype(np.int32)
+        self.distal = np.array([arm.shaft in _ancestors(model, int(body)) for body in self._shape_body])
+        self.effort = np.array([_effort(model, joint) for joint in self._joint_of])
 
     @property
     def joint_count(self) -> int:
@@ -90,8 +79,9 @@ class BatchKinematics:
         rotation, position, axes, anchors = self._bodies(joints)
         count = len(joints)
         tip = position[self._tip_body] + rotation[self._tip_body] @ self._tip_position
-        along = rotation[self._shaft] @ self._shaft_axis
-        start = position[self._shaft] + rotation[self._shaft] @ self._shaft_point
+        shaft = self.arm.shaft
+        along = rotation[shaft] @ self.arm.shaft_axis
+        start = position[shaft] + rotation[shaft] @ self.arm.shaft_point
         near = start + dot(self.trocar - start, along)[:, None] * along
         ends = np.zeros((count, len(self._shape_body) if shapes else 0, 2, 3))
         for index in range(ends.shape[1]):

@@ -1,21 +1,37 @@
-"""Pictures of both arms in the patient: drawn with OpenGL where there is one, and without it as capsules.
+"""Heat maps of two arms on an organ's surface, and pictures of both, with OpenGL where there is one and without it.
 
-In all of them each arm has its tip at the point that `poses` names; an arm that reaches nothing stands at home, or is
+In the pictures each arm has its tip at the point that `poses` names; an arm that reaches nothing stands at home, or is
 left out where it is drawn as capsules.
 """
 
+from __future__ import annotations
+
+import math
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.arm_study.maps import LEFT, RIGHT, camera_view
 from surgsim_env.arm_study.ports import Ports
-from surgsim_env.arm_study.results import SIDES, ArmsEvaluation, sides
+from surgsim_env.arm_study.results import (
+    DISTANCES,
+    QUANTITIES,
+    SIDES,
+    ArmsEvaluation,
+    Quantity,
+    reason_counts,
+    share_text,
+    sides,
+    spread,
+    values_of,
+    worse_of_both,
+)
 from surgsim_env.instruments.arm.arm import Arm
 from surgsim_env.palpation.surface_drawing import (
     INK,
@@ -28,9 +44,35 @@ from surgsim_env.palpation.surface_drawing import (
     tube,
 )
 from surgsim_env.rendering.cameras import Camera
-from surgsim_env.rendering.still import Capsule, draw_still
+from surgsim_env.rendering.renderer import Capsule, draw_still
 from surgsim_env.reports.html_page import Picture
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+
+# Distinct for all kinds of colour blindness: viridis, which contains no grey, and Okabe & Ito's colours.
+COLOUR_MAP = "viridis"
+LEFT, RIGHT, BOTH, APART, NEITHER = "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#bdbdbd"
+# Colour of parts where no point was tried.
+UNTRIED = "#f4e6de"
+# Further from every point than this many of their usual distances, a part of the organ was not tried.
+TRIED_WITHIN = 2.0
+# The view from behind is left out if a smaller share of the surface in it was tried.
+BEHIND_LEAST = 0.25
+PORT_MARKS = {"left": ("L", LEFT), "right": ("R", RIGHT), "endoscope": ("E", INK)}
+SPLITS = 2
+NEIGHBOURS = 4
+# Points whose normals differ by a right angle count as this much farther apart than they are, as a share of the
+# organ's size: values of one side do not show on the other side of a thin lobe.
+NORMAL_WEIGHT = 0.15
+DPI = 100
+# Share of a colour that the light does not change.
+FLATNESS = 0.6
+
+
+# Of a map: title, which points have a value, the values [SI], and a text about the other points.
+Panel = tuple[str, NDArray[np.bool_], FloatArray, str]
 SIZE = 960, 720
 TISSUE = np.array([0.70, 0.33, 0.28])
 SCOPE, PORT, WALL = "#5c6470", "#f2bf33", (0.85, 0.65, 0.55, 0.18)
@@ -48,6 +90,229 @@ PIECE = 0.02
 
 # Patches, their colours and gloss.
 Part = tuple[Patches, FloatArray, float]
+
+
+class ArmMaps:
+    """The heat maps of one evaluation; the organ's patches and their nearest points are computed once."""
+
+    def __init__(self, evaluation: ArmsEvaluation) -> None:
+        """Take an evaluation."""
+        self.evaluation = evaluation
+        self._patches = curved_patches(evaluation.surface_points, evaluation.surface_triangles, SPLITS)
+        surface = ~evaluation.inner
+        self._surface = np.flatnonzero(surface)
+        size = float(np.ptp(evaluation.surface_points, axis=0).max())
+        weight = NORMAL_WEIGHT * size
+        tree = KDTree(np.hstack([evaluation.points[surface], weight * evaluation.normals[surface]]))
+        count = min(NEIGHBOURS, len(self._surface))
+        places = np.hstack([self._patches.corners.mean(axis=1), weight * self._patches.normals])
+        distance, index = tree.query(places, k=count)
+        self._distance = np.reshape(distance, (-1, count))
+        self._nearest = self._surface[np.reshape(index, (-1, count))]
+        spacing = float(np.median(tree.query(tree.data, k=2)[0][:, -1]))
+        self._tried = self._distance[:, 0] <= TRIED_WITHIN * spacing
+        front = camera_view(evaluation)
+        back = View(-front.right, front.up, -front.towards)
+        self._views = [("from the camera", front)]
+        if self._tried[self._patches.normals @ back.towards > 0.0].mean() >= BEHIND_LEAST:
+            self._views.append(("from behind", back))
+
+    def write_all(self, folder: Path) -> list[Picture]:
+        """Write all maps into a folder: reach, each quantity, and the arms' distances."""
+        written = [self._write_reach(folder)]
+        # The two errors are checks of the method and the same everywhere: the table suffices.
+        shown = [quantity for quantity in QUANTITIES if quantity.field not in ("position_error", "trocar_error")]
+        written.extend(self._write_quantity(folder, quantity) for quantity in shown)
+        written.append(self._write_distances(folder))
+        return written
+
+    def _write_reach(self, folder: Path) -> Picture:
+        from matplotlib.colors import to_rgb
+        from matplotlib.figure import Figure
+        from matplotlib.lines import Line2D
+
+        one = self.evaluation
+        left, right = one.left.reachable, one.right.reachable
+        either = np.where(left, np.where(right, 2, 0), np.where(right, 1, 3))
+        # Each arm reaches the point alone, but the arms would come too close.
+        kind = np.where((either == 2) & ~one.both, 4, either)
+        palette = np.array([to_rgb(colour) for colour in (LEFT, RIGHT, BOTH, NEITHER, APART)])
+        names = ("left arm only", "right arm only", "both at once", "neither", "each, but not both at once")
+        figure = Figure(figsize=(10.5, 4.2), dpi=DPI, facecolor=PAPER, layout="constrained")
+        columns = figure.subplots(1, len(self._views), squeeze=False)[0]
+        for axes, (title, view) in zip(columns, self._views, strict=True):
+            self._draw(axes, view, palette[kind[self._nearest[:, 0]]], palette[kind], title)
+        shown = [index for index in (2, 0, 1, 4, 3) if (kind == index).any()]
+        labels = [f"{names[index]}: {share_text(kind[self._surface] == index)}" for index in shown]
+        handles = [
+            Line2D([], [], marker="s", ls="", ms=10, color=palette[index], label=label)
+            for index, label in zip(shown, labels, strict=True)
+        ]
+        if not self._tried.all():
+            handles.append(Line2D([], [], marker="s", ls="", ms=10, color=UNTRIED, label="no points there"))
+        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10)
+        figure.suptitle("which arm reaches which part of the organ", fontsize=12, color=INK)
+        save_png(figure, folder / "map_reach.png")
+        return Picture.of_file(folder / "map_reach.png", "Who reaches what", f"The organ's parts: {', '.join(labels)}.")
+
+    def _write_quantity(self, folder: Path, quantity: Quantity) -> Picture:
+        one = self.evaluation
+        panels = [
+            (f"{side} arm", arm.reachable, values_of(arm, quantity), _misses(reason_counts(arm)))
+            for side, arm in sides(one)
+        ]
+        close = int((one.left.reachable & one.right.reachable & ~one.both).sum())
+        missed = f"grey, points:\nnot reached by each arm: {int((~one.both).sum()) - close}\narms too close: {close}"
+        panels.append(("both at once, the worse arm", one.both, worse_of_both(one, quantity), missed))
+        name = f"map_{quantity.field}.png"
+        sense = "more is better" if quantity.more_is_better else "less is better"
+        label = f"{quantity.label}\n{sense}"
+        self._write_panels(folder / name, quantity.title, label, quantity.scale, panels)
+        text = "; ".join(
+            f"{title}: {_spread(values, quantity)} over {share_text(mask[self._surface])} of the surface's points"
+            for title, mask, values, _ in panels
+        )
+        title = quantity.title[0].upper() + quantity.title[1:]
+        return Picture.of_file(folder / name, title, f"{text}. Grey: not reached. In the colours, {sense}.")
+
+    def _write_distances(self, folder: Path) -> Picture:
+        panels = []
+        for field, title, _ in DISTANCES:
+            values = getattr(self.evaluation, field)
+            known = np.isfinite(values)
+            place = title.removeprefix("distance between the arms ")
+            panels.append((place, known, values, f"not reached by each arm: {int((~known).sum())}"))
+        name, title = "map_arm_distance.png", "distance between the arms"
+        self._write_panels(folder / name, title, "distance [mm]\nmore is better", 1e3, panels, shared=False)
+        quantity = Quantity("", title, "mm", 1e3, 1, "_m", True, "")
+        text = "; ".join(f"{panel[0]}: {_spread(panel[2], quantity)}" for panel in panels)
+        return Picture.of_file(folder / name, "Distance between the arms", f"{text}. Grey: not reached by each arm.")
+
+    def _write_panels(
+        self, path: Path, heading: str, label: str, scale: float, panels: list[Panel], shared: bool = True
+    ) -> None:
+        """A column for each panel, the camera's view above the one from behind; a colour bar for all or for each."""
+        from matplotlib import colormaps
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import to_rgb
+        from matplotlib.figure import Figure
+
+        groups = [panels] if shared else [[panel] for panel in panels]
+        norms = [_norm(group, scale) for group in groups for _ in group]
+        figure = Figure(
+            figsize=(0.6 + 3.7 * len(panels), 1.9 + 2.25 * len(self._views)),
+            dpi=DPI,
+            facecolor=PAPER,
+            layout="constrained",
+        )
+        rows = figure.subplots(len(self._views), len(panels), squeeze=False)
+        grey = np.array(to_rgb(NEITHER))
+        for column, (title, mask, values, missed) in enumerate(panels):
+            norm = norms[column]
+            tint = colormaps[COLOUR_MAP](norm(np.nan_to_num(values * scale)))[:, :3]
+            dots = np.where(mask[:, None], tint, grey)
+            colours = np.where(mask[self._nearest[:, :1]], self._painted(values * scale, mask, norm), grey)
+            for axes, (_, view) in zip(rows[:, column], self._views, strict=True):
+                self._draw(axes, view, colours, dots, title if axes is rows[0, column] else "")
+            axes = rows[-1, column]
+            axes.text(0.5, -0.02, missed, transform=axes.transAxes, ha="center", va="top", fontsize=8, color=INK)
+            if not shared:
+                figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=rows[:, column], shrink=0.6, pad=0.02, label=label)
+        for row, (side, _) in zip(rows[:, 0], self._views, strict=True):
+            row.text(-0.02, 0.5, side, transform=row.transAxes, ha="right", va="center", rotation=90, fontsize=9)
+        if shared:
+            figure.colorbar(ScalarMappable(norms[0], COLOUR_MAP), ax=rows, shrink=0.7, pad=0.02, label=label)
+        if not any(np.isfinite(values).any() for _, _, values, _ in panels):
+            heading = f"{heading}: nothing is reached"
+        figure.suptitle(heading, fontsize=12, color=INK)
+        save_png(figure, path)
+
+    def _painted(self, values: FloatArray, mask: NDArray[np.bool_], norm: Normalize) -> FloatArray:
+        """Colours of the patches: the points around each, those that are reached, weighted by nearness."""
+        from matplotlib import colormaps
+
+        weight = mask[self._nearest] / np.maximum(self._distance, 1e-6) ** 2
+        total = weight.sum(axis=1)
+        mean = (weight * np.nan_to_num(values)[self._nearest]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+        return colormaps[COLOUR_MAP](norm(mean))[:, :3]
+
+    def _draw(self, axes: Axes, view: View, colours: FloatArray, dots: FloatArray, title: str) -> None:
+        """The organ painted, its points as dots, inner targets as diamonds, and the ports where they are in front."""
+        one = self.evaluation
+        from matplotlib.colors import to_rgb
+
+        painted = np.where(self._tried[:, None], colours, to_rgb(UNTRIED))
+        # No gloss and little shading, which would look like values.
+        draw_patches(axes, [(self._patches, painted, 0.0)], view, flatness=FLATNESS)
+        facing = ~one.inner & (one.normals @ view.towards > 0.1)
+        axes.scatter(*view.flat(one.points[facing]).T, s=3.0, color=INK, alpha=0.45, linewidths=0, zorder=2)
+        if one.inner.any():
+            places = view.flat(one.points[one.inner])
+            axes.scatter(*places.T, s=26, marker="D", c=dots[one.inner], edgecolors=INK, linewidths=0.8, zorder=3)
+        if view is self._views[0][1]:
+            _mark_ports(axes, one, view)
+        _finish(axes, title)
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=10, color=INK)
+    axes.set_aspect("equal")
+    axes.margins(0.03)
+    axes.set_axis_off()
+
+
+def camera_view(evaluation: ArmsEvaluation) -> View:
+    """The view along the endoscope; without one, onto the points that are reached, else from above."""
+    port = evaluation.ports.get("endoscope")
+    if port is not None:
+        direction = np.array(port.into)
+    else:
+        seen = ~evaluation.inner & (evaluation.left.reachable | evaluation.right.reachable)
+        direction = -evaluation.normals[seen].sum(axis=0)
+        if not np.linalg.norm(direction) > 1e-6:
+            direction = np.array([0.0, 0.0, -1.0])
+    direction = direction / np.linalg.norm(direction)
+    # The patient's head is up (z); where the view is along z, the back is (y).
+    return View.along(direction, np.array([0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [0.0, 1.0, 0.0]))
+
+
+def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: View) -> None:
+    """Each port as a letter in a disc, and the way into the body from it as far as the organ's middle."""
+    from matplotlib.patheffects import withStroke
+
+    middle = evaluation.surface_points.mean(axis=0)
+    for name, port in evaluation.ports.items():
+        letter, colour = PORT_MARKS.get(name, (name[:1].upper(), INK))
+        start, into = np.array(port.point), np.array(port.into) / np.linalg.norm(port.into)
+        path = view.flat(np.stack([start, start + max(0.0, float((middle - start) @ into)) * into]))
+        halo = [withStroke(linewidth=3.2, foreground="white")]
+        axes.plot(*path.T, color=colour, lw=1.4, ls=(0, (4, 2)), zorder=4, path_effects=halo)
+        axes.plot(*path[0], "o", ms=12, color=colour, mec="white", mew=1.2, zorder=5)
+        axes.text(
+            path[0, 0], path[0, 1], letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6
+        )
+
+
+def _norm(panels: list[Panel], scale: float) -> Normalize:
+    """From the least to the greatest value of the panels."""
+    from matplotlib.colors import Normalize
+
+    known = np.concatenate([values[np.isfinite(values)] for _, _, values, _ in panels]) * scale
+    least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    return Normalize(least, most if most > least else least + 1.0)
+
+
+def _misses(counts: list[tuple[str, int]]) -> str:
+    if not counts:
+        return "every point is reached"
+    return "grey, points:\n" + "\n".join(f"{reason}: {count}" for reason, count in counts)
+
+
+def _spread(values: FloatArray, quantity: Quantity) -> str:
+    least, _, greatest = spread(values)
+    if math.isnan(least):
+        return "no value"
+    return f"{quantity.text(least, with_unit=False)} to {quantity.text(greatest)}"
 
 
 def poses(evaluation: ArmsEvaluation) -> dict[str, int]:
@@ -151,7 +416,8 @@ def write_pictures(
     places = poses(evaluation)
     if not places:
         return given
-    parts = [_organ(evaluation)]
+    organ = curved_patches(evaluation.surface_points, evaluation.surface_triangles, 2)
+    parts: list[Part] = [(organ, np.broadcast_to(TISSUE, (len(organ.corners), 3)), 0.2)]
     for (side, reach), arm, colour in zip(sides(evaluation), arms, (LEFT, RIGHT), strict=True):
         if side in places:
             ends = arm.shape_ends(reach.joints[places[side]])
@@ -182,11 +448,6 @@ def write_given_pictures(pictures: Mapping[str, NDArray[np.uint8]], folder: Path
     return written
 
 
-def _organ(evaluation: ArmsEvaluation) -> Part:
-    patches = curved_patches(evaluation.surface_points, evaluation.surface_triangles, 2)
-    return patches, np.broadcast_to(TISSUE, (len(patches.corners), 3)), 0.2
-
-
 def _capsule(ends: FloatArray, radius: float, colour: str) -> list[Part]:
     """A capsule about an axis (2, 3) [m] in short pieces."""
     from matplotlib.colors import to_rgb
@@ -209,10 +470,7 @@ def _write_views(evaluation: ArmsEvaluation, parts: list[Part], path: Path) -> N
     near = np.concatenate([evaluation.surface_points, *(np.array([port.point]) for port in evaluation.ports.values())])
     for axes, view, title in zip(figure.subplots(1, 3), (front, front, side), titles, strict=True):
         draw_patches(axes, parts, view)
-        axes.set_title(title, fontsize=10, color=INK)
-        axes.set_aspect("equal")
-        axes.margins(0.03)
-        axes.set_axis_off()
+        _finish(axes, title)
         if title == titles[0]:
             (left, low), (right, high) = view.flat(near).min(axis=0) - 15.0, view.flat(near).max(axis=0) + 15.0
             axes.set(xlim=(left, right), ylim=(low, high))

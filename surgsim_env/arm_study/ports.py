@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.arm_study.clearance import outside_ball, point_segment_distance
-from surgsim_env.arm_study.kinematics import dot
 from surgsim_env.instruments.arm.arm_instrument import inside_surface
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import fill, read_toml
@@ -123,28 +121,6 @@ class Ports:
                 f"{0.5 * apart:.3f} m, or use wall.plate = true"
             )
 
-    def wall_clearance(self, segments: FloatArray, trocar: FloatArray) -> FloatArray:
-        """Distances of segments (..., 2, 3) from the wall [m]; negative within it, inf where all lies in the hole.
-
-        With heights from h0 to h1 above the wall's middle surface and a thickness t:
-        max(h0 - t/2, -t/2 - h1): how far a segment is, or would have to be moved to be, clear of it.
-        """
-        parts, left = outside_ball(segments, trocar, self.wall.hole)
-        low, high = self._heights(parts)
-        half = 0.5 * self.wall.thickness
-        return np.where(left, np.maximum(low - half, -half - high), np.inf).min(axis=-1)
-
-    def _heights(self, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest height of segments (..., 2, 3) above the middle of the wall [m]."""
-        if self.wall.plate:
-            middle = 0.5 * (np.array(self.left.point) + np.array(self.right.point))
-            heights = (segments - middle) @ self.wall_normal
-            return heights.min(axis=-1), heights.max(axis=-1)
-        centre, radius = self.dome_centre, self.wall.radius
-        nearest = point_segment_distance(centre, segments)
-        furthest = np.sqrt(dot(segments - centre, segments - centre)).max(axis=-1)
-        return nearest - radius, furthest - radius
-
     @property
     def dome_centre(self) -> FloatArray:
         """Middle of the dome's sphere [m] (3,): both ports lie on it, below them along the wall's normal."""
@@ -181,13 +157,9 @@ class Ports:
             ValueError: names the port, its place and the organ.
         """
         mesh = anatomy.mesh
-        for name, point in (
-            ("left", self.left.point),
-            ("right", self.right.point),
-            ("endoscope", self.endoscope.point),
-        ):
-            if inside_surface(point, mesh.points, mesh.boundary_triangles):
-                place = ", ".join(f"{value * 1e3:.1f}" for value in point)
+        for name, port in self.frames.items():
+            if inside_surface(port.point, mesh.points, mesh.boundary_triangles):
+                place = ", ".join(f"{value * 1e3:.1f}" for value in port.point)
                 raise ValueError(
                     f"the {name} port at ({place}) mm lies inside the organ of scene {anatomy.scene.name!r}: "
                     "move it out through the body wall"
@@ -200,8 +172,7 @@ def read_ports(path: str | Path) -> Ports:
     Raises:
         ValueError: a file that cannot be read, or the entry that is wrong in it.
     """
-    table = read_toml(Path(path), "ports")
-    return ports_from_table(table, name=Path(path).stem)
+    return ports_from_table(read_toml(Path(path), "ports"), name=Path(path).stem)
 
 
 def ports_from_table(table: dict[str, Any], *, name: str) -> Ports:

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from surgsim_env.arm_study import dexterity
-from surgsim_env.arm_study.candidates import (
+from surgsim_env.arm_study.clearance import Surroundings, arm_distances
+from surgsim_env.arm_study.joint_search import (
     REACHED,
     Candidates,
     approach_directions,
@@ -18,8 +18,7 @@ from surgsim_env.arm_study.candidates import (
     spread_starts,
     still_open,
 )
-from surgsim_env.arm_study.collisions import Surroundings, arm_distances
-from surgsim_env.arm_study.kinematics import BatchKinematics
+from surgsim_env.arm_study.kinematics import BatchKinematics, Chain, cross, dot
 from surgsim_env.arm_study.results import ArmReach
 
 # Number of candidates whose clearance is computed at once.
@@ -28,6 +27,8 @@ CANDIDATES_AT_ONCE = 20_000
 ARM_DISTANCE = 0.005
 # Candidates of each arm that are paired where the reported joints come too close.
 WAYS = 6
+# One radian of rotation of the tip counts as this travel [m].
+CHARACTERISTIC_LENGTH = 0.1
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,13 @@ class _Search:
             more = _empty_like(found, self.directions.shape[1])
             if rows.size:
                 directions, tips = self.directions[rows], self.tips[rows]
-                part = from_directions(self.kinematics, tips, directions, _rows(found, rows), begin[rows])
+                part = from_directions(
+                    self.kinematics,
+                    tips,
+                    directions,
+                    Candidates(*(one[rows] for one in vars(found).values())),
+                    begin[rows],
+                )
                 for name in vars(more):
                     getattr(more, name)[rows] = getattr(part, name)
             clear = np.concatenate([clear, self.clear(more)], axis=2)
@@ -137,10 +144,6 @@ class _Search:
 def _every(clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which candidates pass every test, (n, k)."""
     return np.logical_and.reduce(clear, axis=0)
-
-
-def _rows(found: Candidates, rows: NDArray) -> Candidates:
-    return Candidates(*(values[rows] for values in vars(found).values()))
 
 
 def _empty_like(found: Candidates, count: int) -> Candidates:
@@ -173,12 +176,12 @@ def _reasons(search: _Search, found: Candidates, clear: NDArray[np.bool_]) -> In
 def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
     kinematics, sites, around = search.kinematics, search.sites, search.around
     rows, good = np.arange(len(reason)), reason == 0
-    worth = np.where(usable, dexterity.limit_margin(kinematics, found.joints), -np.inf)
+    worth = np.where(usable, limit_margin(kinematics, found.joints), -np.inf)
     nearest = np.argmin(found.position_error + found.trocar_error, axis=1)
     best = np.where(good, worth.argmax(axis=1), nearest)
     joints = found.joints[rows, best]
     chain = kinematics.at(joints)
-    values = dexterity.scaled_singular_values(kinematics, chain)
+    values = scaled_singular_values(kinematics, chain)
     organ = np.full(len(rows), np.nan)
     outer = np.flatnonzero(good & ~sites.inner)
     if outer.size:
@@ -193,12 +196,12 @@ def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reaso
         joints=joints,
         position_error=found.position_error[rows, best],
         approach_share=where_reached(approach_share(found.pointing, usable, search.directions)),
-        manipulability=where_reached(dexterity.manipulability(values)),
-        isotropy=where_reached(dexterity.isotropy(values)),
-        limit_margin=where_reached(dexterity.limit_margin(kinematics, joints)),
-        tip_force=where_reached(dexterity.tip_force(kinematics, chain, -sites.normals)),
-        trocar_load=where_reached(dexterity.trocar_load(kinematics, chain, -sites.normals)),
-        camera_angle=where_reached(dexterity.camera_angle(chain, sites.points, np.array(around.ports.endoscope.point))),
+        manipulability=where_reached(manipulability(values)),
+        isotropy=where_reached(isotropy(values)),
+        limit_margin=where_reached(limit_margin(kinematics, joints)),
+        tip_force=where_reached(tip_force(kinematics, chain, -sites.normals)),
+        trocar_load=where_reached(trocar_load(kinematics, chain, -sites.normals)),
+        camera_angle=where_reached(camera_angle(chain, sites.points, np.array(around.ports.endoscope.point))),
         organ_clearance=organ,
         wall_clearance=where_reached(around.wall_clearance(kinematics, chain)),
         trocar_error=where_reached(kinematics.trocar_error(chain)),
@@ -244,7 +247,7 @@ def _improve(
 def _ways(arm: Reach, rows: NDArray) -> FloatArray:
     """Joint values of usable candidates, the furthest from limits to the nearest, (len(rows), WAYS, n_joint)."""
     usable = arm.usable[rows]
-    margin = np.where(usable, dexterity.limit_margin(arm.kinematics, arm.candidates.joints[rows]), -np.inf)
+    margin = np.where(usable, limit_margin(arm.kinematics, arm.candidates.joints[rows]), -np.inf)
     order = np.argsort(-margin, axis=1, kind="stable")
     count = usable.sum(axis=1)
     rank = (np.linspace(0.0, 1.0, WAYS) * (count[:, None] - 1)).astype(np.int64)
@@ -259,3 +262,71 @@ def _distances(
         (arm.kinematics, arm.kinematics.at(joints)) for arm, joints in ((left, left_joints), (right, right_joints))
     ]
     return arm_distances(sides[0], sides[1], points)
+
+
+def scaled_singular_values(kinematics: BatchKinematics, chain: Chain) -> FloatArray:
+    """Singular values, largest first, of J = [J_v; L J_w] with L = 0.1 m, shape (n, k).
+
+    k is the smaller of 6 and the degrees of freedom that the trocar leaves: where control keeps the shaft in the
+    trocar, J acts on the n_joint - 2 motions that keep it there.
+    """
+    linear, angular = kinematics.tip_jacobian(chain)
+    jacobian = np.concatenate([linear, CHARACTERISTIC_LENGTH * angular], axis=1)
+    freedoms = kinematics.joint_count
+    if not kinematics.arm.remote_centre_fixed:
+        shaft = kinematics.shaft_jacobian(chain)
+        across = shaft - chain.along[:, :, None] * np.einsum("ni,nij->nj", chain.along, shaft)[:, None]
+        idle = np.linalg.svd(across)[2][:, 2:]
+        jacobian, freedoms = jacobian @ np.swapaxes(idle, 1, 2), freedoms - 2
+    values: FloatArray = np.asarray(np.linalg.svd(jacobian, compute_uv=False), dtype=np.float64)
+    return values[:, : min(6, freedoms)]
+
+
+def manipulability(singular_values: FloatArray) -> FloatArray:
+    """Yoshikawa's measure, the product of the singular values: sqrt(det J J^T) at full rank, (n,)."""
+    return singular_values.prod(axis=1)
+
+
+def isotropy(singular_values: FloatArray) -> FloatArray:
+    """Smallest over largest singular value: 1 moves alike in all directions, 0 is singular, (n,)."""
+    return singular_values[:, -1] / singular_values[:, 0]
+
+
+def limit_margin(kinematics: BatchKinematics, joints: FloatArray) -> FloatArray:
+    """Prod 4 (q - low)(high - q) / (high - low)^2 over joints: 1 in the middle of all limits, 0 at any, (n,)."""
+    low, high = kinematics.lower, kinematics.upper
+    return (4.0 * (joints - low) * (high - joints) / (high - low) ** 2).prod(axis=-1)
+
+
+def tip_force(kinematics: BatchKinematics, chain: Chain, directions: FloatArray) -> FloatArray:
+    """Largest static force along unit vectors (n, 3) within the joints' torques [N], (n,); inf if none is stated.
+
+    tau = J_v^T F d, so F = min over joints of tau_max / |J_v^T d|. Gravity is compensated; the trocar bears no load.
+    """
+    torque = np.abs(np.einsum("nij,ni->nj", kinematics.tip_jacobian(chain)[0], directions))
+    with np.errstate(divide="ignore"):
+        return np.where(torque > 1e-12, kinematics.effort / np.maximum(torque, 1e-300), np.inf).min(axis=1)
+
+
+def trocar_load(kinematics: BatchKinematics, chain: Chain, directions: FloatArray) -> FloatArray:
+    """Sideways force on the trocar [N] at 1 N on the tip along unit vectors (n, 3), (n,).
+
+    The shaft is a lever, supported by the trocar and held at its outer end without a moment: the case of an arm whose
+    mechanism does not fix the remote centre. Moments about the outer end o, with the shaft's direction a, the
+    tip x and the trocar t: N = |a x ((x - o) x f)| / (t - o).a; for a straight instrument and a sideways force that
+    is (outer + inner length) / outer length. NaN where no shape of the shaft reaches outside.
+    """
+    ends = chain.shape_ends[:, kinematics.shaft_index].reshape(len(chain.tip), -1, 3)
+    if ends.shape[1] == 0:
+        return np.full(len(chain.tip), np.nan)
+    along = dot(ends - chain.near[:, None], chain.along[:, None])
+    outer = np.min(along, axis=1)
+    start = chain.near + outer[:, None] * chain.along
+    moment = cross(chain.along, cross(chain.tip - start, directions))
+    return np.where(outer < -1e-3, np.linalg.norm(moment, axis=1) / np.maximum(-outer, 1e-3), np.nan)
+
+
+def camera_angle(chain: Chain, points: FloatArray, endoscope: FloatArray) -> FloatArray:
+    """Angle between the shafts and the lines of sight from the endoscope's port (3,) to points (n, 3) [rad], (n,)."""
+    sight = points - endoscope
+    return np.arctan2(np.linalg.norm(cross(chain.along, sight), axis=1), dot(chain.along, sight))

@@ -1,23 +1,35 @@
-"""Evaluation of two arms on a patient's anatomy: reach, dexterity, clearances."""
+"""Evaluation of two arms on a patient's anatomy: reach, dexterity, clearances, and their summary."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import json
+import math
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.arm_study.clearance import ClusteredSurface
-from surgsim_env.arm_study.collisions import Surroundings
+from surgsim_env.arm_study.clearance import MEETING_ZONE, TIP_ZONE, ClusteredSurface, Surroundings
+from surgsim_env.arm_study.joint_search import APPROACH_ANGLE, DIRECTION_COUNT, REACHED
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.arm_study.pictures import draw_arms
-from surgsim_env.arm_study.ports import InnerTarget, PortPlace, Ports, default_ports, read_ports
-from surgsim_env.arm_study.reach import Reach, Sites, evaluate_both, evaluate_reach, tip_ball
-from surgsim_env.arm_study.results import ArmReach, ArmsEvaluation
-from surgsim_env.arm_study.summary import plain_ports, summarise
-from surgsim_env.instruments.arm.arm import Arm, load_arm
+from surgsim_env.arm_study.ports import InnerTarget, Ports, default_ports, read_ports
+from surgsim_env.arm_study.reach import (
+    ARM_DISTANCE,
+    CHARACTERISTIC_LENGTH,
+    BothArms,
+    Sites,
+    evaluate_both,
+    evaluate_reach,
+    tip_ball,
+)
+from surgsim_env.arm_study.results import QUANTITIES, REASONS, SIDES, ArmReach, ArmsEvaluation, spread
+from surgsim_env.instruments.arm.arm import load_arm
+from surgsim_env.palpation.job import package_version
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.arm_description import ArmDescription
@@ -60,17 +72,35 @@ def evaluate_arms(
     """
     tell = progress or (lambda _what, _share: None)
     tell("reading the scene", 0.0)
-    anatomy = scene if isinstance(scene, Anatomy) else load_anatomy(_scene(scene))
-    where = _ports(ports, anatomy)
+    if not isinstance(scene, Anatomy):
+        scene = load_anatomy(scene if isinstance(scene, Scene) else make_scene(scene))
+    anatomy, mesh = scene, scene.mesh
+    if ports is None:
+        where = default_ports(anatomy)
+    else:
+        where = ports if isinstance(ports, Ports) else read_ports(ports)
     where.check_outside(anatomy)
     inner = where.targets if targets is None else tuple(targets)
-    arms = [_arm(side, place, anatomy) for side, place in ((left, where.left), (right, where.right))]
+    radius = anatomy.scene.instrument.tip_radius
+    arms = tuple(
+        load_arm(source, place.port, tip_radius=radius) for source, place in ((left, where.left), (right, where.right))
+    )
     sites = _sites(anatomy, where, inner, count, seed)
-    reaches = _reaches(anatomy, arms, sites, where, tell)
+    organ, reaches = ClusteredSurface(mesh.points, mesh.boundary_triangles), []
+    for index, arm in enumerate(arms):
+        tell(f"the {SIDES[index]} arm at {len(sites.points)} points", 0.05 + 0.4 * index)
+        kinematics = BatchKinematics(arm)
+        reaches.append(evaluate_reach(kinematics, sites, Surroundings(organ, where, tip_ball(kinematics))))
     tell("both arms at once", 0.85)
     both = evaluate_both(reaches[0], reaches[1], sites.points)
     reports = reaches[0].report, reaches[1].report
-    inputs = _inputs(anatomy, reports, where, count)
+    inputs = {
+        "scene": anatomy.scene.name,
+        **{side: report.name for side, report in zip(SIDES, reports, strict=True)},
+        # As JSON has them: lists for tuples.
+        "ports": json.loads(json.dumps(asdict(where))),
+        "count": count,
+    }
     found = ArmsEvaluation(
         points=sites.points,
         normals=sites.normals,
@@ -82,52 +112,19 @@ def evaluate_arms(
         arm_distance_outside=both.outside,
         summary=summarise(sites, *reports, both, inner, inputs, seed),
         scene=anatomy.scene.name,
-        surface_points=anatomy.mesh.points,
-        surface_triangles=anatomy.mesh.boundary_triangles,
+        surface_points=mesh.points,
+        surface_triangles=mesh.boundary_triangles,
         pictures={},
         ports=where.frames,
     )
     if pictures:
-        found = replace(found, pictures=_pictures(found, (arms[0].arm, arms[1].arm), where, tell))
+        tell("pictures", 0.95)
+        try:
+            found = replace(found, pictures=draw_arms(found, (arms[0], arms[1]), where))
+        except NoGLError as error:
+            tell(f"no pictures: {error}", 0.95)
     tell("done", 1.0)
     return found
-
-
-def _reaches(
-    anatomy: Anatomy, arms: list[BatchKinematics], sites: Sites, ports: Ports, tell: Progress
-) -> tuple[Reach, Reach]:
-    """Reach of the left and the right arm."""
-    organ = ClusteredSurface(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
-    found = []
-    for index, kinematics in enumerate(arms):
-        tell(f"the {('left', 'right')[index]} arm at {len(sites.points)} points", 0.05 + 0.4 * index)
-        found.append(evaluate_reach(kinematics, sites, Surroundings(organ, ports, tip_ball(kinematics))))
-    return found[0], found[1]
-
-
-def _inputs(anatomy: Anatomy, reports: tuple[ArmReach, ArmReach], ports: Ports, count: int) -> dict[str, Any]:
-    return {
-        "scene": anatomy.scene.name,
-        "left": reports[0].name,
-        "right": reports[1].name,
-        "ports": plain_ports(ports),
-        "count": count,
-    }
-
-
-def _scene(scene: str | Path | Scene) -> Scene:
-    return scene if isinstance(scene, Scene) else make_scene(scene)
-
-
-def _ports(ports: str | Path | Ports | None, anatomy: Anatomy) -> Ports:
-    if ports is None:
-        return default_ports(anatomy)
-    return ports if isinstance(ports, Ports) else read_ports(ports)
-
-
-def _arm(source: str | Path | ArmDescription, place: PortPlace, anatomy: Anatomy) -> BatchKinematics:
-    """An arm at its port, with the scene's tip."""
-    return BatchKinematics(load_arm(source, place.port, tip_radius=anatomy.scene.instrument.tip_radius))
 
 
 def _sites(anatomy: Anatomy, ports: Ports, targets: Sequence[InnerTarget], count: int, seed: int) -> Sites:
@@ -192,13 +189,78 @@ def _spread(points: FloatArray, count: int, first: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def _pictures(
-    evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], ports: Ports, tell: Progress
-) -> dict[str, NDArray[np.uint8]]:
-    """Pictures by caption, none where there is no OpenGL."""
-    tell("pictures", 0.95)
-    try:
-        return draw_arms(evaluation, arms, ports)
-    except NoGLError as error:
-        tell(f"no pictures: {error}", 0.95)
-        return {}
+def summarise(
+    sites: Sites,
+    left: ArmReach,
+    right: ArmReach,
+    both: BothArms,
+    targets: Sequence[InnerTarget],
+    inputs: Mapping[str, Any],
+    seed: int,
+) -> dict[str, Any]:
+    """Shares, extremes, targets, versions, seed and inputs; SI units; the same run gives the same text."""
+    outer = ~sites.inner
+    return {
+        "points": int(outer.sum()),
+        "reachable": {
+            "left": _share(left.reachable[outer]),
+            "right": _share(right.reachable[outer]),
+            "either": _share((left.reachable | right.reachable)[outer]),
+            "both": _share(both.reachable[outer]),
+        },
+        "left": _arm_summary(left, outer),
+        "right": _arm_summary(right, outer),
+        "arm_distance_inside": _extremes(both.inside[outer]),
+        "arm_distance_outside": _extremes(both.outside[outer]),
+        "targets": _targets(sites, left, right, both, targets),
+        "rules": {
+            "reached_within": REACHED,
+            "approach_directions": DIRECTION_COUNT,
+            "approach_angle": APPROACH_ANGLE,
+            "characteristic_length": CHARACTERISTIC_LENGTH,
+            "tip_zone": TIP_ZONE,
+            "meeting_zone": MEETING_ZONE,
+            "arm_distance": ARM_DISTANCE,
+        },
+        "versions": {
+            "surgsim": package_version(),
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("numpy", "scipy", "mujoco", "matplotlib")},
+        },
+        "seed": seed,
+        "inputs": dict(inputs),
+    }
+
+
+def _arm_summary(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
+    counts = {reason: int((arm.reason[outer] == index).sum()) for index, reason in enumerate(REASONS)}
+    return {
+        "arm": arm.name,
+        "reasons": counts,
+        **{one.field: _extremes(getattr(arm, one.field)[outer]) for one in QUANTITIES if one.field != "position_error"},
+    }
+
+
+def _targets(
+    sites: Sites, left: ArmReach, right: ArmReach, both: BothArms, targets: Sequence[InnerTarget]
+) -> list[dict[str, Any]]:
+    rows = np.flatnonzero(sites.inner)
+    return [
+        {
+            "name": target.name,
+            "point": list(target.point),
+            "left": REASONS[left.reason[row]],
+            "right": REASONS[right.reason[row]],
+            "both": bool(both.reachable[row]),
+        }
+        for row, target in zip(rows, targets, strict=True)
+    ]
+
+
+def _extremes(values: FloatArray) -> dict[str, float | None]:
+    """Least, median and greatest of the finite values; None where there are none."""
+    return {name: None if math.isnan(value) else value for name, value in spread(values)._asdict().items()}
+
+
+def _share(flags: np.ndarray) -> float | None:
+    return float(flags.mean()) if flags.size else None

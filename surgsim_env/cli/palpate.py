@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 from rich.console import Console
@@ -18,12 +17,21 @@ from surgsim_env.cli.values import (
     vector_of,
     writable_folder,
 )
+from surgsim_env.palpation.figures import write_stiffness_map
+from surgsim_env.palpation.job import (
+    CSV_NAME,
+    MODEL_MODULUS_ERROR,
+    PICTURE_NAME,
+    SUMMARY_NAME,
+    print_report,
+    run_palpation,
+    write_csv,
+    write_summary,
+)
+from surgsim_env.palpation.surface_scene import SurfaceOptions, load_stable_anatomy, surface_scene, with_options
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Ball, Scene, Vector
-
-if TYPE_CHECKING:
-    from surgsim_env.palpation.surface_scene import SurfaceOptions
 
 
 @dataclass(frozen=True)
@@ -73,10 +81,8 @@ class Palpate:
     """Number of threads; default: one for each core."""
 
     @property
-    def options(self) -> "SurfaceOptions":
+    def options(self) -> SurfaceOptions:
         """Options that replace values of the scene or the file."""
-        from surgsim_env.palpation.surface_scene import SurfaceOptions
-
         balls = (numbers_of("--anchors", text, "x,y,z,radius") for text in self.anchors)
         return SurfaceOptions(
             approach=vector_of("--approach", self.approach),
@@ -92,29 +98,12 @@ class Palpate:
         """The command line with these options."""
         return command_text(["surgsim", "palpate"], vars(self))
 
-    @property
-    def makes_organ(self) -> bool:
-        """Whether an organ is made from a file in proportion to its size, as `surgsim organ` makes it."""
-        return self.segmentation is not None or (self.surface is not None and self.cell_size is None)
-
     def run(self, console: Console) -> int:
         """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the lesions found.
 
         Raises:
             ValueError: options that do not go together, impossible values, files that cannot become an organ.
         """
-        from surgsim_env.palpation.figures import write_stiffness_map
-        from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, run_palpation
-        from surgsim_env.palpation.report import (
-            CSV_NAME,
-            PICTURE_NAME,
-            SUMMARY_NAME,
-            print_report,
-            write_csv,
-            write_summary,
-        )
-        from surgsim_env.palpation.surface_scene import load_stable_anatomy
-
         _check(self)
         # Checked before an organ is made, which takes a minute.
         around, asked = _around(self), _asked_lesions(self)
@@ -181,14 +170,12 @@ def _asked_lesions(command: Palpate) -> list[tuple[Vector, float, float]]:
 
 def _scene(command: Palpate, names: tuple[str, ...], console: Console) -> tuple[Scene, Path | None]:
     """The scene, and the folder where the organ was written if one was made."""
-    if command.makes_organ:
-        file = command.segmentation or command.surface
-        assert file is not None
+    # Without a cell size, an organ is made in proportion to its size, as `surgsim organ` makes it.
+    file = command.segmentation or (command.surface if command.cell_size is None else None)
+    if file is not None:
         folder = writable_folder(command.out or _free_folder(_stem(file)), names)
         return _patient_scene(command, file, folder, console), folder
     if command.surface is None:
-        from surgsim_env.palpation.surface_scene import with_options
-
         scene = load_scene(command.organ) if command.organ else make_scene(command.scene or "liver")
         return with_options(scene, command.options), None
     return _surface_scene(command, command.surface, console), None
@@ -214,8 +201,6 @@ def _patient_scene(command: Palpate, file: Path, folder: Path, console: Console)
 
 
 def _surface_scene(command: Palpate, file: Path, console: Console) -> Scene:
-    from surgsim_env.palpation.surface_scene import surface_scene
-
     unit, cell_size = unit_of(command.length_unit), command.cell_size
     assert unit is not None and cell_size is not None
     scene = surface_scene(file, length_unit=unit, cell_size=cell_size, options=command.options)

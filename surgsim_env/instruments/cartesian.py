@@ -8,8 +8,7 @@ import numpy as np
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.instruments.jaw import Jaw
-from surgsim_env.instruments.supports import add_supports
-from surgsim_env.instruments.tool_bodies import make_servo
+from surgsim_env.instruments.tool_bodies import add_supports, make_servo
 from surgsim_env.scene.load import scenes_folder
 from surgsim_env.scene.model import Scene
 

@@ -1,13 +1,17 @@
-"""Bodies of a MuJoCo model that tissue feels: contact shapes, poses, twists, and their response to wrenches."""
+"""Bodies of a MuJoCo model that tissue feels: shapes, poses, twists, response to wrenches, minimum mass; supports."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.errors import OrganError
+from msdm_core.kernels.structure_kernels import ContactLaw
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.stepping import round_shapes, unyielding
+from msdm_core.organ.support import Support
 from surgsim_env.instruments import tool_kernels
 from surgsim_env.instruments.tool_kernels import Servo, ToolViews
 
@@ -17,43 +21,26 @@ IndexArray = NDArray[np.int64]
 CONTACT_GROUP = 3
 # Prefix of a model's custom number (<numeric>) for the friction of a geom; the geom's name follows.
 ROUGHNESS = "roughness_"
+SUPPORT_PREFIX = "support_"
+# Bit of the contact masks by which supports meet the tools' contact geoms, and nothing else.
+SUPPORT_BIT = 2
+# As soft as cloth over a soft base: 1500 N/m for a tool of 0.1 kg, more for a heavier one, critically damped.
+# MuJoCo's negative solref [1/s^2, 1/s] gives a contact of impedance 1/2 a stiffness of 2 x 7500 N/m per kilogram of
+# the tool.
+SOLREF = (-7500.0, -173.0)
+SOLIMP = (0.5, 0.5, 0.001, 0.5, 2.0)
+SUPPORT_COLOUR = (0.125, 0.335, 0.375, 1.0)
+_GEOMS = {
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
 
 
 def make_servo(lower: FloatArray, upper: FloatArray, position: IndexArray, speed: IndexArray) -> Servo:
     """A servo at rest: limits of its joints [m or rad], indices of MuJoCo's position and speed controls, each (n,)."""
     return Servo(np.zeros(len(lower)), lower.copy(), upper.copy(), position, speed, np.zeros(len(lower), dtype=bool))
-
-
-@dataclass(frozen=True, eq=False)
-class _Cores:
-    """Cores of the contact geoms, each array (n_shape,): radius, axes along and across, half sizes [m], friction.
-
-    A box is rounded by its smallest half size; its core lies along the longest and spans the other.
-    """
-
-    radius: FloatArray
-    axis: IndexArray
-    half_length: FloatArray
-    across: IndexArray
-    half_width: FloatArray
-    friction: FloatArray
-
-
-def _cores(model: mujoco.MjModel, geoms: IndexArray) -> _Cores:
-    size, kind = model.geom_size[geoms], model.geom_type[geoms]
-    box = kind == mujoco.mjtGeom.mjGEOM_BOX
-    capsule = kind == mujoco.mjtGeom.mjGEOM_CAPSULE
-    # The axes of a box by size (thin, middle, long); other geoms lie along z, and their first size is the radius.
-    order = np.where(box[:, None], np.argsort(size, axis=1, kind="stable"), np.array([[0, 1, 2]]))
-    thin, middle, long = np.take_along_axis(size, order, axis=1).T
-    return _Cores(
-        radius=thin.copy(),
-        axis=order[:, 2].copy(),
-        half_length=np.where(box, long - thin, np.where(capsule, size[:, 1], 0.0)),
-        across=order[:, 1].copy(),
-        half_width=np.where(box, middle - thin, 0.0),
-        friction=np.array([_roughness(model, int(geom)) for geom in geoms]),
-    )
 
 
 def _roughness(model: mujoco.MjModel, geom: int) -> float:
@@ -97,12 +84,20 @@ class ToolBodies:
         self._geoms = np.flatnonzero(model.geom_group == CONTACT_GROUP)
         bodies = model.geom_bodyid[self._geoms]
         self._tools = np.unique(bodies)
-        self._core = _cores(model, self._geoms)
+        size, kind = model.geom_size[self._geoms], model.geom_type[self._geoms]
+        box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+        # The core of a box, which is rounded by its smallest half size, lies along its longest axis and spans the other
+        # (thin, middle, long); other geoms lie along z, and their first size is the radius.
+        order = np.where(box[:, None], np.argsort(size, axis=1, kind="stable"), np.array([[0, 1, 2]]))
+        thin, middle, long = np.take_along_axis(size, order, axis=1).T
+        self._axis, self._across = order[:, 2].copy(), order[:, 1].copy()
+        self._half_length = np.where(box, long - thin, np.where(capsule, size[:, 1], 0.0))
+        self._half_width = np.where(box, middle - thin, 0.0)
         count = len(self._tools)
         self.shapes = round_shapes(
             np.zeros((len(self._geoms), 2, 3)),
-            self._core.radius,
-            friction=self._core.friction,
+            thin.copy(),
+            friction=np.array([_roughness(model, int(geom)) for geom in self._geoms]),
             tool=np.searchsorted(self._tools, bodies),
             centre=np.zeros((count, 3)),
         )
@@ -165,10 +160,10 @@ class ToolBodies:
             data=data._address if compiled else data,
             timestep=model.opt.timestep,
             geoms=self._geoms,
-            axis=self._core.axis,
-            half_length=self._core.half_length,
-            across=self._core.across,
-            half_width=self._core.half_width,
+            axis=self._axis,
+            half_length=self._half_length,
+            across=self._across,
+            half_width=self._half_width,
             bodies=self._tools,
             joint_damping=model.dof_damping,
             implicit_damping=self._implicit_damping,
@@ -185,3 +180,142 @@ class ToolBodies:
             inertia=self._inertia,
             yielded=self._yielded,
         )
+
+
+def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support]) -> None:
+    """Add supports to a model's world as geoms `support_NAME`, in the scene's frame; its tools then meet them.
+
+    Without supports nothing changes. Call it after every geom has its group and the world its final frame.
+    """
+    if not supports:
+        return
+    # A pyramidal friction cone would make the contact 1 / mu^2 times as stiff.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    for geom in spec.geoms:
+        if geom.group == CONTACT_GROUP:
+            geom.conaffinity |= SUPPORT_BIT
+    for support in supports:
+        spec.worldbody.add_geom(
+            name=SUPPORT_PREFIX + support.name,
+            type=_GEOMS[support.kind],
+            pos=support.position,
+            quat=support.quaternion,
+            # Half sizes of 0 draw an infinite plane.
+            size=(*support.size, 0.0, 0.0, 0.0)[:3] if support.kind != "plane" else (0.0, 0.0, 0.05),
+            friction=(support.friction, 0.005, 0.0001),
+            contype=SUPPORT_BIT,
+            conaffinity=0,
+            # The contact parameters of the support apply, not those of the tool.
+            priority=1,
+            condim=3,
+            solref=SOLREF,
+            solimp=SOLIMP,
+            rgba=SUPPORT_COLOUR,
+        )
+
+
+@dataclass(frozen=True)
+class ToolMass:
+    """Effective mass of a tool at its contact shapes, and the minimum that the exchange needs.
+
+    Args:
+        name: the tool's body.
+        stiffness: its largest contact stiffness [N/m].
+        damping: its largest contact damping [N s/m].
+        mass: its least effective mass over the ends of its contact shapes and all directions [kg].
+        damped_mass: the same for M + (dt / 2) D, with the damping D of its joints [kg].
+        least_mass: minimum of `damped_mass` [kg].
+        least_damping: joint damping along the lightest direction that makes up for the mass [N s/m].
+    """
+
+    name: str
+    stiffness: float
+    damping: float
+    mass: float
+    damped_mass: float
+    least_mass: float
+    least_damping: float
+
+
+def contact_area(tools: ToolBodies, tool: int) -> float:
+    """Largest surface area that can push a tool [m^2]: the cross-sections of its shapes, pi r^2 + 2 r l + w (2 r + l).
+
+    l and w are length and width of the core, 0 for a ball, w = 0 for a capsule.
+
+    A surface pressed by k_p per area and penetration holds a shape with k_p int (e . u)^2 dA along u, e being the
+    direction of the pressure. For a ball in a flat surface up to its centre that is half of pi r^2, for one with
+    tissue wrapped around its lower half two thirds; for a capsule's side pi / 4 of 2 r l. What the turning of the
+    pressure adds is smaller by penetration / radius.
+    """
+    mine = tools.shapes.shape_tool == tool
+    radius = tools.shapes.shape_radius[mine]
+    length = np.linalg.norm(np.diff(tools.shapes.shape_ends[mine], axis=1)[:, 0], axis=1)
+    width = 2.0 * np.linalg.norm(tools.shapes.shape_span[mine], axis=1)
+    return float((np.pi * radius**2 + 2.0 * radius * (length + width) + width * length).sum())
+
+
+def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float) -> list[ToolMass]:
+    """Effective and minimum mass of each tool at the tools' current pose.
+
+    In the worst case a tool of mass m touches tissue too heavy to move within a haptic step dt: a spring k = k_p A and
+    a damper c = c_p A, where A is `contact_area`, at most the organ's whole surface; k_t replaces k_p where sticking
+    friction is stiffer. An explicit exchange takes the force at the mean place x_n + v_n dt / 2 of a twist held through
+    the step, v_(n+1) = v_n - (dt / m) (k (x_n + v_n dt / 2) + c v_n), x_(n+1) = x_n + dt v_(n+1). Its characteristic
+    polynomial leaves the unit circle at z = -1, where 4 m = 2 k dt^2 + 2 c dt:
+
+        m + b dt / 2 >= (k dt + c) dt / 2,
+
+    where b is the joints' damping, which MuJoCo takes implicitly: m > k dt^2 / 2 without damping, or else
+    b > k dt + c - 2 m / dt. (The minimum mass of Brown & Colgate 1998, "Minimum mass for haptic display simulations",
+    for this integrator; the damping is Colgate & Schenkel's b > k T / 2, moved from the device to the tool.) As tools
+    here respond within the step, the actual limit is lower, 0.25 to 0.33 k dt^2 depending on the number of substeps,
+    and the bound is safe by a factor of 1.5 to 2. The damping of servos is not counted, because servos saturate, nor is
+    their stiffness.
+
+    Args:
+        tools: of one model; the derived quantities of its `data` are updated.
+        contact: the scene's contact law.
+        surface_area: of the organ's touchable surface [m^2].
+    """
+    mujoco.mj_forward(tools.model, tools.data)
+    tools.read_shapes()
+    dt = tools.model.opt.timestep
+    stiffest = max(contact.stiffness, contact.tangential_stiffness if contact.friction > 0.0 else 0.0)
+    found: list[ToolMass] = []
+    for tool, name in enumerate(tools.tool_names):
+        area = min(contact_area(tools, tool), surface_area)
+        stiffness, damping = stiffest * area, contact.damping * area
+        mass, damped = (effective_mass(tools, tool, tools.damped_inertia(share * dt)) for share in (0.0, 0.5))
+        least = 0.5 * dt * (stiffness * dt + damping)
+        found.append(ToolMass(name, stiffness, damping, mass, damped, least, max(0.0, 2.0 * (least - mass) / dt)))
+    return found
+
+
+def effective_mass(tools: ToolBodies, tool: int, inertia: FloatArray) -> float:
+    """Least mass of a tool at the ends of its shapes' axes, 1 / max eig(J M^-1 J^T) [kg], M (nv, nv) as given."""
+    jacobian = tools.jacobian(tool)
+    mobility = 0.0
+    mine = tools.shapes.shape_tool == tool
+    ends, span = tools.shapes.shape_ends[mine], tools.shapes.shape_span[mine][:, None]
+    for end in np.concatenate([ends - span, ends + span]).reshape(-1, 3):
+        x, y, z = end - tools.shapes.tool_centre[tool]
+        # Velocity of that end: v + omega x (x, y, z).
+        there = jacobian[:3] + np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ jacobian[3:]
+        mobility = max(mobility, float(np.linalg.eigvalsh(there @ np.linalg.solve(inertia, there.T))[-1]))
+    return 1.0 / mobility if mobility > 0.0 else np.inf
+
+
+def check_tool_masses(scene: str, tools: ToolBodies, contact: ContactLaw, surface_area: float) -> None:
+    """Refuse a tool that is too light for a stable exchange.
+
+    Raises:
+        OrganError: a tool is too light (names it, its mass, the minimum mass, and the damping that would do instead).
+    """
+    for found in tool_masses(tools, contact, surface_area):
+        if found.damped_mass < found.least_mass:
+            raise OrganError(
+                f"scene {scene!r}: tool {found.name!r} weighs {found.mass * 1e3:.3g} g at its tip, too little for a "
+                f"contact as stiff as {found.stiffness:.3g} N/m at steps of {tools.model.opt.timestep * 1e3:g} ms: the "
+                f"exchange would be unstable. Give it at least {found.least_mass * 1e3:.3g} g, or joints damped with "
+                f"{found.least_damping:.3g} N s/m, or lower contact.stiffness or timing.haptic_step"
+            )

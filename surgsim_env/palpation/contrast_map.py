@@ -185,18 +185,15 @@ def _regressors(plane: FloatArray, geometry: FloatArray | None) -> FloatArray:
         return constant
     u, v = ((plane - plane.mean(axis=0)) / max(float(np.ptp(plane, axis=0).max()), 1e-9)).T
     linear = np.column_stack([constant, u, v])
-    extra = np.zeros((count, 0)) if geometry is None else _standardised(geometry)
+    extra = np.zeros((count, 0)) if geometry is None else geometry
+    spread = extra.std(axis=0)
+    varying = spread > 1e-12
+    extra = (extra[:, varying] - extra[:, varying].mean(axis=0)) / spread[varying]
     full = np.column_stack([linear, u * u, u * v, v * v, extra])
     for columns in (full, full[:, :6], linear):
         if count >= SITES_PER_COEFFICIENT * columns.shape[1]:
             return columns
     return constant
-
-
-def _standardised(columns: FloatArray) -> FloatArray:
-    spread = columns.std(axis=0)
-    varying = spread > 1e-12
-    return (columns[:, varying] - columns[:, varying].mean(axis=0)) / spread[varying]
 
 
 def _robust_fit(columns: FloatArray, values: FloatArray) -> FloatArray:
@@ -292,14 +289,8 @@ def score_map(
     for index, truth in enumerate(truths):
         over = contrast[from_lesion[index] <= truth.radius]
         column = matched.get(index)
-        scores.append(
-            LesionScore(
-                truth=truth,
-                estimate=column,
-                error=float(error[index, column]) if column is not None else np.inf,
-                contrast=float(over.max()) if len(over) else np.nan,
-            )
-        )
+        off = float(error[index, column]) if column is not None else np.inf
+        scores.append(LesionScore(truth, column, off, contrast=float(over.max()) if len(over) else np.nan))
     healthy = np.ones(len(sites), dtype=bool)
     for truth, distance in zip(truths, from_lesion, strict=True):
         healthy &= distance > truth.radius + HEALTHY_DISTANCE

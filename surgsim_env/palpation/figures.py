@@ -73,7 +73,10 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
     one = next(item for item in palpation.maps if item.name == MODEL)
     place = one.estimates[0].point if one.estimates else palpation.sites[0]
     site, normal = palpation.anatomy.face.project(place)
-    view = _oblique(palpation.anatomy.face.approach)
+    approach = palpation.anatomy.face.approach
+    right, up = tangent_axes(approach)
+    # From beside the approach, so that the probe's shaft is visible.
+    view = View.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
     organ = curved_patches(mesh.points, mesh.boundary_triangles)
     colours = np.broadcast_to(LIVER, (len(organ.corners), 3)).copy()
     glow, weight = _map_over(palpation, one, organ, everywhere=True)
@@ -84,7 +87,7 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
     colours[painted] = (1.0 - share) * colours[painted] + share * heat
     radius = scene.instrument.tip_radius
     ball = site + normal * (radius - scene.palpation.press_depth)
-    handle = -palpation.anatomy.face.approach
+    handle = -approach
     draw_patches(axes, [(organ, colours, 0.30)], view)
     _mark_sites(axes, palpation, view, colour="white", alpha=0.35)
     parts = []
@@ -211,12 +214,6 @@ def _typical_sites(palpation: PalpationResult, one: ContrastMap) -> tuple[int | 
     stiff = int(over[np.argmax(one.contrast[over])]) if len(over) else None
     usual = int(off[np.argmin(np.abs(one.contrast[off] - 1.0))]) if len(off) else None
     return stiff, usual
-
-
-def _oblique(approach: FloatArray) -> View:
-    """A view from beside the approach, so that the probe's shaft is visible."""
-    right, up = tangent_axes(approach)
-    return View.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
 
 
 def _colours(name: str, values: FloatArray) -> FloatArray:

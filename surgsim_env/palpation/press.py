@@ -252,7 +252,8 @@ def scan(
     """
     if workers is not None and workers < 1:
         raise ValueError(f"workers is {workers}; it must be at least 1, or left out for one per core")
-    count = min(workers or _core_count(), max(1, len(sites)))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = min(workers or cores, max(1, len(sites)))
     stopped = threading.Event()
     presses: list[Press | None] = [None] * len(sites)
 
@@ -277,8 +278,3 @@ def scan(
             stopped.set()
             raise
     return [one for one in presses if one is not None]
-
-
-def _core_count() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.press import scan
 from surgsim_env.scene.anatomy import Anatomy
@@ -161,14 +160,15 @@ def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Genera
         return found
 
     whole = figures(np.arange(len(records)))
-    draws = [figures(_resampled(len(records), rng)) for _ in range(RESAMPLES)]
+    draws = [figures(rng.integers(len(records), size=len(records))) for _ in range(RESAMPLES)]
     return {name: _figure(value, np.array([draw[name] for draw in draws])) for name, value in whole.items()}
 
 
 def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) -> dict[str, Figure]:
     """Means over episodes, with intervals, of one number per episode (n,), NaN where it is undefined."""
     table = np.array(list(columns.values()))
-    draws = np.array([_means(table[:, _resampled(table.shape[1], rng)]) for _ in range(RESAMPLES)])
+    count = table.shape[1]
+    draws = np.array([_means(table[:, rng.integers(count, size=count)]) for _ in range(RESAMPLES)])
     means = _means(table).tolist()
     return {name: _figure(mean, draw) for name, mean, draw in zip(columns, means, draws.T, strict=True)}
 
@@ -199,10 +199,6 @@ def presses_to_line(errors: FloatArray, percentile: float, line: float = ERROR_L
     return float(above[-1] + 2) if above[-1] + 1 < errors.shape[1] else math.inf
 
 
-def _resampled(count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    return rng.integers(count, size=count)
-
-
 def _means(values: FloatArray) -> FloatArray:
     """Means along the last axis over the entries that are not NaN; NaN where there is none."""
     defined = ~np.isnan(values)
@@ -228,23 +224,6 @@ def _matched(record: PalpationRecord) -> FloatArray:
     """Distances [m] between lesions and the last estimates that found them."""
     distance = matched_distances(record.truth, record.estimates[-1], record.cutoff)[2]
     return distance[distance <= FOUND_DISTANCE]
-
-
-def _centroid_error_mm(record: PalpationRecord) -> float:
-    return float(_means(_matched(record))) * 1000.0
-
-
-def _recall(record: PalpationRecord) -> float:
-    return len(_matched(record)) / len(record.truth) if len(record.truth) else math.nan
-
-
-def _precision(record: PalpationRecord) -> float:
-    count = len(record.estimates[-1])
-    return len(_matched(record)) / count if count else math.nan
-
-
-def _count_right(record: PalpationRecord) -> float:
-    return float(len(record.estimates[-1]) == len(record.truth))
 
 
 def _outline_iou(record: PalpationRecord) -> float:
@@ -278,10 +257,12 @@ def _average_precision(record: PalpationRecord) -> float:
 
 # One number per episode, NaN where it is undefined; a method's figure is their mean.
 EPISODE_FIGURES: Mapping[str, Callable[[PalpationRecord], float]] = {
-    "centroid_error_mm": _centroid_error_mm,
-    "recall": _recall,
-    "precision": _precision,
-    "count_right": _count_right,
+    "centroid_error_mm": lambda record: float(_means(_matched(record))) * 1000.0,
+    "recall": lambda record: len(_matched(record)) / len(record.truth) if len(record.truth) else math.nan,
+    "precision": lambda record: (
+        len(_matched(record)) / len(record.estimates[-1]) if len(record.estimates[-1]) else math.nan
+    ),
+    "count_right": lambda record: float(len(record.estimates[-1]) == len(record.truth)),
     "outline_iou": _outline_iou,
     "outline_difference_mm2": _outline_difference_mm2,
     "auroc": _auroc,
@@ -335,10 +316,6 @@ def lesion_reaches(anatomy: Anatomy, drawn: DrawnOrgan) -> list[LesionReach]:
         place, normal = anatomy.face.project(lesion.centre)  # type: ignore[arg-type]
         others = drawn.lesions[:index] + drawn.lesions[index + 1 :]
         without = replace(drawn, lesions=others).compiled(anatomy)
-        force, force_without = (_held_force(anatomy, organ, place, normal) for organ in (whole, without))
-        reaches.append(LesionReach(force, force_without, anatomy.scene.sensor.noise))
+        presses = [scan(anatomy, organ, place[None], normal[None], workers=1)[0] for organ in (whole, without)]
+        reaches.append(LesionReach(presses[0].force, presses[1].force, anatomy.scene.sensor.noise))
     return reaches
-
-
-def _held_force(anatomy: Anatomy, organ: OrganModel, place: FloatArray, normal: FloatArray) -> float:
-    return scan(anatomy, organ, place[None], normal[None], workers=1)[0].force

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.organ.stability import stable_dt
@@ -111,12 +112,24 @@ def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_fact
     """
     anatomy = load_anatomy(scene)
     organs = [anatomy.organ(lesions), anatomy.organ(modulus_factor=modulus_factor_largest)]
+    return with_substeps(anatomy, organs, least=scene.timing.substep_count)
+
+
+def with_substeps(
+    anatomy: Anatomy, organs: Sequence[OrganModel], *, least: int = 1, most: float = SUBSTEPS_MOST
+) -> Anatomy:
+    """The anatomy with the number of substeps, and at least `least`, that is stable for all of some organs in contact.
+
+    Raises:
+        ValueError: more than `most` are needed.
+    """
+    scene = anatomy.scene
     step = min(stable_dt(organ, scene.contact.law) for organ in organs)
-    count = max(substeps_needed(scene.timing.haptic_step, step), scene.timing.substep_count)
-    if count > SUBSTEPS_MOST:
+    count = max(substeps_needed(scene.timing.haptic_step, step), least)
+    if count > most:
         raise ValueError(
             f"this organ needs {count} substeps in {scene.timing.haptic_step:g} s, its stable step is {step:.3g} s; at "
-            f"most {SUBSTEPS_MOST} are allowed: is the modulus in pascals? Else use larger cells"
+            f"most {most} are allowed: are the moduli in pascals? Else use larger cells"
         )
     return replace(anatomy, scene=replace(scene, timing=replace(scene.timing, substep_count=count)))
 

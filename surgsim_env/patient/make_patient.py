@@ -1,5 +1,6 @@
 """A patient's organ from files: mesh and scene made, summary printed, mesh, scenes and report written."""
 
+import math
 import os
 import shutil
 import tempfile
@@ -21,16 +22,33 @@ from msdm_core.organ.compile import OrganSpec, compile_organ
 from surgsim_env.palpation.surface_scene import SurfaceOptions
 from surgsim_env.patient.label_image import FORM, is_image, parse_labels, read_label_image
 from surgsim_env.patient.meshers import mesh_image, mesh_surfaces
-from surgsim_env.patient.patient_mesh import PatientMesh
-from surgsim_env.patient.patient_scene import PatientScene, patient_scene
+from surgsim_env.patient.patient_scene import (
+    CELL_PER_CONTACT_RADIUS,
+    HARD_PER_PRESS,
+    SITES_MOST,
+    SOFT_PER_PRESS,
+    PatientScene,
+    patient_scene,
+)
 from surgsim_env.patient.report import MARK, report_page
-from surgsim_env.patient.retract_scene import RetractScene, find_retraction, with_retraction
-from surgsim_env.patient.scene_text import FIRST_LINE, retract_text, scene_text
+from surgsim_env.patient.retract_scene import (
+    BED_GAP,
+    BED_INSIDE,
+    MODULUS_SPREAD,
+    RetractScene,
+    find_retraction,
+    with_retraction,
+)
 from surgsim_env.scene.load import load_scene, make_scene
+from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import share_text, warn_of_coarse_cells
+from surgsim_env.scene.save import scene_toml
 
 MESHERS = ("lattice", "tetwild")
 REPORT_NAME = "report.html"
+SCENE_MARK = "Made by surgsim from a patient's organ."
+# A file with this first line was written by an earlier run and may be replaced.
+FIRST_LINE = f"# {SCENE_MARK}"
 
 
 def make_patient(
@@ -66,41 +84,24 @@ def make_patient(
     """
     if mesher not in MESHERS:
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
-    mesh = (
-        _image_mesh(files, labels, cell_size=cell_size, mesher=mesher, mend=mend)
-        if is_image(files[0])
-        else _surface_mesh(files, regions, length_unit, cell_size=cell_size, mesher=mesher, mend=mend)
-    )
-    return patient_scene(mesh, out.stem, out.parent, out.name, options=options, moduli=moduli or {})
-
-
-def _image_mesh(
-    files: Sequence[Path], labels: str | None, *, cell_size: float | None, mesher: str, mend: bool
-) -> PatientMesh:
     first = files[0]
-    if len(files) > 1:
-        raise ValueError(f"{first}: one image is taken, {len(files)} files are given")
-    if labels is None:
-        raise ValueError(f"{first}: which labels are the organ? Give {FORM}")
-    image = read_label_image(first, parse_labels(labels))
-    return mesh_image(image, first.name, cell_size=cell_size, mesher=mesher, mend=mend)
-
-
-def _surface_mesh(
-    files: Sequence[Path],
-    regions: Sequence[str],
-    length_unit: LengthUnit | None,
-    *,
-    cell_size: float | None,
-    mesher: str,
-    mend: bool,
-) -> PatientMesh:
-    wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
-    if wrong:
-        raise ValueError(f"{wrong[0]}: is no surface; beside {files[0]} only {', '.join(SURFACE_SUFFIXES)} are taken")
-    if length_unit is None:
-        raise ValueError(f'{files[0]}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none')
-    return mesh_surfaces(files, regions, length_unit, cell_size=cell_size, mesher=mesher, mend=mend)
+    if is_image(first):
+        if len(files) > 1:
+            raise ValueError(f"{first}: one image is taken, {len(files)} files are given")
+        if labels is None:
+            raise ValueError(f"{first}: which labels are the organ? Give {FORM}")
+        image = read_label_image(first, parse_labels(labels))
+        mesh = mesh_image(image, first.name, cell_size=cell_size, mesher=mesher, mend=mend)
+    else:
+        wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
+        if wrong:
+            raise ValueError(f"{wrong[0]}: is no surface; beside {first} only {', '.join(SURFACE_SUFFIXES)} are taken")
+        if length_unit is None:
+            raise ValueError(
+                f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
+            )
+        mesh = mesh_surfaces(files, regions, length_unit, cell_size=cell_size, mesher=mesher, mend=mend)
+    return patient_scene(mesh, out.stem, out.parent, out.name, options=options, moduli=moduli or {})
 
 
 def add_retraction(found: PatientScene, out: Path) -> tuple[PatientScene, RetractScene | str]:
@@ -179,18 +180,14 @@ def check_targets(out: Path) -> None:
     """Refuse, before the work, targets that cannot be written and files that no earlier run has written."""
     check_target(out)
     turned = _retract_file(out)
-    scene = turned.with_suffix(".toml")
-    if turned.exists() and not scene.exists():
-        raise ValueError(
-            f"--out {out}: {turned} is there, and not of an earlier run; choose another place or remove it"
-        )
+    scene, others = turned.with_suffix(".toml"), "choose another place or remove it"
+    foreign = [turned] if turned.exists() and not scene.exists() else []
     for path, mark in ((out.with_suffix(".toml"), FIRST_LINE), (scene, FIRST_LINE), (out.with_name(REPORT_NAME), MARK)):
         if path.is_dir():
-            raise ValueError(f"--out {out}: {path.name} is a folder there; choose another place or remove it")
-        if path.exists() and not _begins(path, mark):
-            raise ValueError(
-                f"--out {out}: {path} is there, and not of an earlier run; choose another place or remove it"
-            )
+            raise ValueError(f"--out {out}: {path.name} is a folder there; {others}")
+        foreign += [path] if path.exists() and not _begins(path, mark) else []
+    if foreign:
+        raise ValueError(f"--out {out}: {foreign[0]} is there, and not of an earlier run; {others}")
 
 
 def check_target(out: Path) -> None:
@@ -229,7 +226,9 @@ def convert_tets(
     organ = compile_organ(OrganSpec(mesh=mesh, materials=material, damping=liver.damping))
     cell = surface_cell(mesh, mesh.boundary_triangles)
     touch = (liver.instrument.tip_radius, liver.palpation.press_depth)
-    _print_organ(file.name, mesh, organ, material=material, volume_error=None, cell=cell, touch=touch, console=console)
+    _print_organ(
+        file.name, mesh, organ, material=material, volume_error=None, cell=cell, touch=touch, more={}, console=console
+    )
     if out is not None:
         write_mesh(out, mesh)
         console.print(f"written: {out}", highlight=False, soft_wrap=True)
@@ -267,20 +266,11 @@ def _print_organ(
     cell: float,
     touch: tuple[float, float],
     console: Console,
-    more: Mapping[str, str] | None = None,
+    more: Mapping[str, str],
 ) -> None:
-    """Print a table of an organ; warns if its cells would be felt.
+    """Print a table of an organ, and warn if its cells [m] would be felt by a touch (tip radius, press depth) [m].
 
-    Args:
-        title: of the table.
-        mesh: of the organ.
-        organ: compiled on it.
-        material: of its healthy tissue.
-        volume_error: of the mesh against its source; None if the source has no volume.
-        cell: edge of the cells at its surface [m].
-        touch: tip radius and press depth [m].
-        console: to print to.
-        more: further rows.
+    `volume_error` is the mesh's against its source, None if that has no volume.
     """
     quality = mesh_quality(mesh)
     fit = "no surface to compare with" if volume_error is None else f"{volume_error:+.2%}"
@@ -292,7 +282,7 @@ def _print_organ(
         "tets": f"{mesh.tet_count}, {mesh.reoriented_count} reoriented",
         "springs": f"{len(organ.spring_nodes)}",
         "volume": f"{quality.volume * 1e6:.1f} ml (error {fit})",
-        **(more or {}),
+        **more,
         "mass": f"{organ.node_mass.sum():.4f} kg at {material.density:g} kg/m^3",
         "dihedral angles": f"{quality.dihedral_smallest_deg:.1f} to {quality.dihedral_largest_deg:.1f} degrees",
         "radius ratio": f"from {quality.radius_ratio_smallest:.3f} (1 is regular)",
@@ -304,3 +294,110 @@ def _print_organ(
         table.add_row(name, value)
     console.print(table)
     warn_of_coarse_cells(title, cell, *touch)
+
+
+def scene_text(found: PatientScene) -> str:
+    """The text of a patient's palpation scene."""
+    patient, scene = found.patient, found.scene
+    instrument, depth = scene.instrument, scene.palpation.press_depth
+    share = found.anatomy.palpable_cell / math.sqrt(instrument.tip_radius * depth)
+    head = (
+        SCENE_MARK,
+        f"From {', '.join(patient.sources)}.",
+        f"Mesh: {patient.mesher}, cells of {patient.cell_size * 1e3:.4g} mm.",
+        f"Axes: {patient.convention}.",
+        "Change any number here; surgsim organ replaces this file only while its first line is unchanged.",
+        *(f"Note: {note}" for note in (*patient.notes, *found.notes)),
+    )
+    comments = {
+        "retract_scene": "used by the retraction environments",
+        "anchors.bed": "chosen: it lies on the side away from the probe; put its ligaments here",
+        "anchors.ball": "given on the command line",
+        "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
+        "contact.damping": "[N s/m^3] as in the scene liver",
+        "contact.friction": "as in the scene liver",
+        "instrument.tip_radius": f"[m] chosen for the cells: cell / contact radius {share:.2f}, wanted "
+        f"{CELL_PER_CONTACT_RADIUS}",
+        "instrument.approach": "direction of the probe, in the axes above",
+        "timing.haptic_step": "[s]",
+        "timing.substep_count": "stable with contact, with all lesions here and the stiffest drawn one",
+        "limits": f"[N] chosen: {SOFT_PER_PRESS:g} and {HARD_PER_PRESS:g} times a healthy press (Hertz)",
+        "sensor": "per axis, as in the scene liver",
+        "sensor.noise": "[N]",
+        "sensor.bias": "[N]",
+        "sensor.range": "[N]",
+        "palpation.press_depth": "[m] chosen: 7/12 of the tip's radius, as in the scene liver",
+        "palpation.face_margin": "[m]",
+        "palpation.thickness_smallest": "[m] of organ below a site",
+        "palpation.site_spacing": f"[m] {found.site_count} sites, at most {SITES_MOST} unless given",
+        "palpation.clearance": "[m]",
+        "lesion": "drawn anew in each episode, in the organ without its segmented lesions",
+        "lesion.radius": "[m] chosen in proportion to the tip, as in the scene liver",
+        "lesion.cover": "[m] tissue above its top",
+        "lesion.modulus_ratio": "HCC 51, metastases 50 in 6.6 kPa liver (doi 10.1177/8756479317733713)",
+        "lesion.rim_distance": "[m]",
+    }
+    return scene_toml(scene, head=head, comments={**_tissue_comments(found, scene), **comments})
+
+
+def retract_text(found: PatientScene, made: RetractScene) -> str:
+    """The text of a patient's retraction scene."""
+    rows = "; ".join(", ".join(f"{value:.6f}" for value in row) for row in made.frame.T)
+    place = ", ".join(f"{value:.6f}" for value in made.origin)
+    head = (
+        SCENE_MARK,
+        f"The organ of {', '.join(found.patient.sources)}, turned so that a thin edge of it can be lifted.",
+        "x runs along that edge, y out over it, z up; the bed's top is z = 0. A point p of the patient is here at",
+        "R (p - o) [m], without any change of shape:",
+        f"  o = ({place}), R = ({rows}), one row each.",
+        f"The edge is {made.rim.thickness * 1e3:.0f} mm thick where a jaw takes it. Only the flap around it moves.",
+    )
+    comments = {
+        "gravity": "a scan shows the organ under its weight: that shape is its rest here",
+        "anchors": "chosen: all but the flap is held",
+        "supports": f"chosen: it ends {BED_INSIDE * 1e3:g} mm inside the edge, so that a jaw gets around the edge",
+        "supports.position": f"[m] its top {BED_GAP * 1e3:g} mm below the lowest of the organ above it",
+        "supports.friction": "as in the scene lobe",
+        "contact": "of tools and of the bed",
+        "instrument": "the jaw points along the middle of the edge",
+        "instrument.tip_radius": "[m] chosen: of a right arm's ball, wider than its neck",
+        "port": "as in the scene lobe, at the same distance from the edge",
+        "ports": "as in the scene lobe, at the same distance from the edge",
+        "limits": "[N] as in the scene lobe: they follow from the holding force of its jaw",
+        "sensor": "[N] per axis, as in the scene lobe",
+        "palpation": "not used: the organ is pressed in its palpation scene",
+        "endoscope": "on the free side; chosen so that the target is visible once the edge is lifted",
+        "retract": "drawn anew in each episode",
+        "retract.target_distance": "[m] behind the bed's border, hidden at rest",
+        "retract.start_lower": "[m] at the same distance from the edge as in the scene lobe",
+        "retract.scale": "a patient's organ has its size",
+        "retract.youngs_modulus": f"[Pa] +-{MODULUS_SPREAD:.0%}: normal liver 6.63 +- 1.65 kPa "
+        "(doi 10.1177/8756479317733713)",
+        "retract.capsule_share": "the capsule is the organ's own, above",
+        "retract.flap": "[m] the part that is lifted",
+        "retract.camera": "[m], degrees",
+    }
+    scene = made.anatomy.scene
+    return scene_toml(scene, head=head, comments={**_tissue_comments(found, scene), **comments})
+
+
+def _tissue_comments(found: PatientScene, scene: Scene) -> dict[str, str]:
+    """Sources and units of materials, regions, capsule and damping."""
+    comments = {
+        "material": f"{found.patient.organ_name}: {found.organ.source}",
+        "regions": "tets of the mesh with a material of their own",
+        "regions.lesion": "whether palpation looks for it; healthy organs do not have it then",
+        "capsule": "on the boundary; as in the scene liver, with its sources; delete it for an organ without one",
+        "capsule.youngs_modulus": "[Pa]",
+        "capsule.thickness": "[m]; only modulus x thickness matters",
+        "damping": "as in the scene liver",
+        "damping.alpha": "[1/s]",
+        "damping.beta": "[s]",
+    }
+    for table in ("material", "regions.material"):
+        comments[f"{table}.youngs_modulus"] = "[Pa]"
+        comments[f"{table}.density"] = "[kg/m^3] a common textbook value, not checked against a source"
+        comments[f"{table}.poisson_ratio"] = "chosen: nearly incompressible"
+    for number, region in enumerate(scene.regions):
+        comments[f"regions[{number}].material"] = found.regions[region.name].source
+    return comments

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from msdm_core.errors import MeshError
 from msdm_core.material.regions import Material
@@ -38,6 +38,7 @@ LESIONS: Mapping[str, tuple[float, str]] = {
     "lesion": (8.0, "chosen: HCC 51 kPa and metastases 50 kPa in liver of 6.6 kPa (doi 10.1177/8756479317733713)"),
 }
 KIDNEY_LESION = (4.0, "chosen: strain index of renal cell carcinoma 4.04 +- 0.72 (PMID 26880174)")
+GIVEN = "given on the command line"
 # Names are written into mesh files, TOML and HTML.
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_ .-]{0,39}")
 LESION_WORD = re.compile(r"lesion|tumou?r|metastas|carcinoma|hcc|nodule|mass|cancer|adenoma|fnh", re.IGNORECASE)
@@ -65,13 +66,16 @@ def without_number(name: str) -> str:
 def organ_material(name: str, youngs_modulus: float | None = None) -> TissueMaterial:
     """Material of an organ by its name, such as "liver" or "left kidney", or with a given modulus [Pa]."""
     if youngs_modulus is not None:
-        return TissueMaterial(Material(youngs_modulus, DENSITY, POISSON_RATIO), "given on the command line")
-    for word, (modulus, source) in ORGANS.items():
-        if word in name.lower():
-            return TissueMaterial(Material(modulus, DENSITY, POISSON_RATIO), source)
-    modulus, _ = ORGANS["liver"]
-    source = f"the liver's: nothing is known of {name!r} here (--youngs-modulus)"
+        modulus, source = youngs_modulus, GIVEN
+    else:
+        unknown = ORGANS["liver"][0], f"the liver's: nothing is known of {name!r} here (--youngs-modulus)"
+        modulus, source = _known(name) or unknown
     return TissueMaterial(Material(modulus, DENSITY, POISSON_RATIO), source)
+
+
+def _known(name: str) -> tuple[float, str] | None:
+    """Modulus [Pa] and source of the first organ whose word is in a name."""
+    return next((entry for word, entry in ORGANS.items() if word in name.lower()), None)
 
 
 def region_material(name: str, organ_name: str, organ: Material, moduli: Mapping[str, float]) -> TissueMaterial:
@@ -85,18 +89,14 @@ def region_material(name: str, organ_name: str, organ: Material, moduli: Mapping
     """
     given = moduli.get(name, moduli.get(without_number(name)))
     if given is not None:
-        return TissueMaterial(Material(given, organ.density, organ.poisson_ratio), "given on the command line")
-    if not is_lesion(name):
-        for word, (modulus, source) in ORGANS.items():
-            if word in name.lower():
-                return TissueMaterial(Material(modulus, organ.density, organ.poisson_ratio), source)
-        source = f"that of the organ around it: nothing is known of {name!r} here (--modulus)"
-        return TissueMaterial(organ, source)
-    ratio, source = LESIONS["lesion"]
-    if "kidney" in organ_name.lower():
-        ratio, source = KIDNEY_LESION
-    for word, entry in LESIONS.items():
-        if word in name.lower() and word != "lesion":
-            ratio, source = entry
-    modulus = ratio * organ.youngs_modulus
-    return TissueMaterial(Material(modulus, organ.density, organ.poisson_ratio), f"{ratio:g} x the organ's; {source}")
+        modulus, source = given, GIVEN
+    elif is_lesion(name):
+        ratio, source = KIDNEY_LESION if "kidney" in organ_name.lower() else LESIONS["lesion"]
+        for word, entry in LESIONS.items():
+            if word in name.lower() and word != "lesion":
+                ratio, source = entry
+        modulus, source = ratio * organ.youngs_modulus, f"{ratio:g} x the organ's; {source}"
+    else:
+        unknown = f"that of the organ around it: nothing is known of {name!r} here (--modulus)"
+        modulus, source = _known(name) or (organ.youngs_modulus, unknown)
+    return TissueMaterial(replace(organ, youngs_modulus=modulus), source)

@@ -7,20 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Material
-from msdm_core.organ.stability import stable_dt
 from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, plan_sites
 from surgsim_env.palpation.surface_scene import (
     CONTACT_MODULI_PER_CELL,
     PATTERN,
-    SUBSTEPS_MOST,
     SurfaceOptions,
     anchors_of,
     with_options,
+    with_substeps,
 )
 from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material, without_number
-from surgsim_env.patient.patient_mesh import PatientMesh
+from surgsim_env.patient.meshers import PatientMesh
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.levels import LEVELS
 from surgsim_env.scene.load import make_scene
@@ -33,7 +31,6 @@ from surgsim_env.scene.model import (
     TetFile,
     TissueRegion,
     Vector,
-    substeps_needed,
 )
 
 # As in the scene liver, whose cells are 0.85 of the contact radius sqrt(tip radius x press depth).
@@ -134,7 +131,8 @@ def _first_scene(
 ) -> Scene:
     """The scene with all values that follow from the cells and the tissue."""
     liver, cell = make_scene(PATTERN), patient.cell_size
-    tip = options.tip_radius or _tip_radius(cell)
+    wanted = math.ceil(cell / (CELL_PER_CONTACT_RADIUS * math.sqrt(DEPTH_PER_TIP)) / TIP_STEP) * TIP_STEP
+    tip = options.tip_radius or min(max(_rounded(wanted, TIP_STEP), TIP_RANGE[0]), TIP_RANGE[1])
     depth = options.press_depth or _rounded(DEPTH_PER_TIP * tip, DEPTH_STEP)
     approach = options.approach or (APPROACH_SCAN if patient.is_scan else APPROACH_FILE)
     described = f"{patient.organ_name} of {', '.join(patient.sources)}, {patient.mesh.volumes.sum() * 1e6:.0f} ml"
@@ -169,12 +167,6 @@ def _first_scene(
         anchors=anchors_of(options, direction),
         material=material,
     )
-
-
-def _tip_radius(cell: float) -> float:
-    wanted = cell / (CELL_PER_CONTACT_RADIUS * math.sqrt(DEPTH_PER_TIP))
-    low, high = TIP_RANGE
-    return min(max(_rounded(math.ceil(wanted / TIP_STEP) * TIP_STEP, TIP_STEP), low), high)
 
 
 def _limits(material: Material, tip: float, depth: float) -> Limits:
@@ -259,23 +251,7 @@ def _substeps_of_worst(anatomy: Anatomy) -> Anatomy:
             draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[0],) * 2, modulus_ratio=(draw.modulus_ratio[1],) * 2
         )
         organs += [anatomy.organ([anatomy.random_lesion(worst, hardest)]) for _ in range(2)]
-    anatomy = with_substeps(anatomy, organs)
-    count = anatomy.scene.timing.substep_count
-    if count > SUBSTEPS_MOST:
-        step = min(stable_dt(organ, scene.contact.law) for organ in organs)
-        raise ValueError(
-            f"this organ needs {count} substeps in {scene.timing.haptic_step:g} s, its stable step is {step:.3g} s; at "
-            f"most {SUBSTEPS_MOST} are allowed: are the moduli in pascals? Else use larger cells"
-        )
-    return anatomy
-
-
-def with_substeps(anatomy: Anatomy, organs: Sequence[OrganModel]) -> Anatomy:
-    """The anatomy with the number of substeps that is stable for all of some organs in contact."""
-    scene = anatomy.scene
-    step = min(stable_dt(organ, scene.contact.law) for organ in organs)
-    count = max(substeps_needed(scene.timing.haptic_step, step), 1)
-    return replace(anatomy, scene=replace(scene, timing=replace(scene.timing, substep_count=count)))
+    return with_substeps(anatomy, organs)
 
 
 def _pair(share: tuple[float, float], length: float) -> tuple[float, float]:
@@ -289,13 +265,3 @@ def _rounded(value: float, step: float) -> float:
 
 def _digits(value: float, count: int) -> float:
     return float(f"{value:.{count}g}")
-
-
-def material_rows(found: PatientScene) -> list[tuple[str, TissueMaterial, float]]:
-    """Name, material and volume of mesh [m^3] of the healthy tissue and each region."""
-    mesh = found.patient.mesh
-    rows = []
-    for tag, name in mesh.region_names:
-        what = found.organ if tag == 1 else found.regions[name]
-        rows.append((name, what, float(mesh.volumes[mesh.region == tag].sum())))
-    return rows

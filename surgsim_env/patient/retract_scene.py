@@ -1,16 +1,21 @@
-"""The retraction scene of a patient's organ, turned so that a thin edge of it can be lifted."""
+"""The retraction scene of a patient's organ, turned so that a thin edge of it, which a jaw can grasp, can be lifted."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from msdm_core.mesh.ordering import in_sweep_order
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.support import Support
-from surgsim_env.patient.patient_scene import PatientScene, with_substeps
-from surgsim_env.patient.rim import HIDING, NoRim, Rim, find_rim
+from surgsim_env.palpation.surface_scene import with_substeps
+from surgsim_env.patient.patient_scene import PatientScene
+from surgsim_env.patient.surface_files import voxels_inside
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import (
@@ -28,6 +33,26 @@ from surgsim_env.scene.model import (
 )
 from surgsim_env.tasks.visibility import Disc, uncovered
 
+# Opening and pad width of the grasper's jaw (scenes/instruments/grasper.xml), play that is left in the opening, and
+# least depth to which an edge is grasped [m].
+JAW_OPENING, PAD_WIDTH = 0.020, 0.016
+JAW_PLAY, OVERLAP_LEAST = 0.003, 0.012
+# Edge of voxels; radii of the balls whose filled share finds edges (a half space fills 0.5) [m].
+VOXEL = 0.0015
+BALL, BALL_WIDE, FILLED_MOST = 0.015, 0.030, 0.45
+# Number of the thinnest places that are examined, on both sides.
+PLACES_TRIED = 60
+# Sampling of the thickness: positions along the edge, inward, and across [m].
+ALONG = np.linspace(-0.012, 0.012, 9)
+DEPTHS = np.arange(0.001, 0.0365, 0.001)
+HEIGHTS = np.arange(-0.03, 0.0601, 0.001)
+# Depths between which the target is hidden, and largest unevenness of the side that hides it [m].
+HIDING = (0.012, 0.030)
+UNEVEN_MOST = 0.006
+# Largest bend of an edge's border over the width of a pad [m].
+BEND_MOST = 0.004
+# A side turned further from the given upward direction is taken only if there is no other.
+TURN_MOST = math.radians(60.0)
 PATTERN = "lobe"
 # Larger cells give no edge that fills a jaw evenly, and miss a bed of 24 mm [m].
 CELL_MOST = 0.011
@@ -53,6 +78,189 @@ PLACES = tuple((aside, 0.075, up) for up in (0.045, 0.035, 0.055, 0.070) for asi
 HIDDEN_SHARE, SEEN_SHARE = 0.05, 0.95
 # Height of targets above the bed for the test of visibility [m].
 TARGET_LIFT = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Rim:
+    """An edge of an organ that a jaw can grasp.
+
+    Fields:
+        place: a point on the edge (3,) [m]
+        frame: columns are x along the edge, y outward, z up, normal to the side that hides (3, 3)
+        thickness: opening of a jaw that grasps it OVERLAP_LEAST deep [m]
+        underside: lowest and highest point of the side that hides, along z from `place` [m]
+        jaw: direction in which the jaw points, in the frame (3,)
+        stiffness: mean cubed thickness above the hidden area [m^3], to compare edges
+    """
+
+    place: FloatArray
+    frame: FloatArray
+    thickness: float
+    underside: tuple[float, float]
+    jaw: FloatArray
+    stiffness: float
+
+
+@dataclass(frozen=True)
+class NoRim:
+    """An organ without an edge to be lifted; `thickness` is the opening that its thinnest one needs [m]."""
+
+    thickness: float
+
+    @property
+    def reason(self) -> str:
+        """The reason why the organ cannot be retracted, in a sentence."""
+        jaw = f"the jaw opens {JAW_OPENING * 1e3:g} mm and needs {JAW_PLAY * 1e3:g} mm of play"
+        if self.thickness <= JAW_OPENING - JAW_PLAY:
+            return (
+                f"an edge of {self.thickness * 1e3:.0f} mm fits the jaw ({jaw}), but none has an even side of "
+                f"{np.ptp(ALONG) * 1e3:.0f} x {np.ptp(HIDING) * 1e3:.0f} mm behind it that could hide something"
+            )
+        if math.isinf(self.thickness):
+            return f"this organ has no edge that is straight over the jaw's {PAD_WIDTH * 1e3:g} mm; {jaw}"
+        return (
+            f"no edge is thin enough to be grasped {OVERLAP_LEAST * 1e3:g} mm deep: the thinnest is "
+            f"{self.thickness * 1e3:.0f} mm thick, {jaw}"
+        )
+
+
+class OrganVoxels:
+    """The voxels of edge `step` [m] inside an organ's boundary."""
+
+    def __init__(self, mesh: TetMesh, step: float) -> None:
+        """Voxelise the inside of a mesh's boundary."""
+        self.step = step
+        self._inside, self._first = voxels_inside(mesh.points, mesh.boundary_triangles.astype(np.int64), step)
+        self._centres = (np.argwhere(self._inside) + self._first) * step
+        self._tree = KDTree(self._centres)
+
+    def contains(self, places: FloatArray) -> NDArray[np.bool_]:
+        """Whether points (..., 3) [m] lie in the organ (...,)."""
+        index = np.rint(places / self.step).astype(np.int64) - self._first
+        there = np.logical_and(index >= 0, index < self._inside.shape).all(axis=-1)
+        x, y, z = np.moveaxis(np.where(np.expand_dims(there, -1), index, 0), -1, 0)
+        return np.logical_and(there, self._inside[x, y, z])
+
+    def near(self, place: FloatArray, radius: float) -> FloatArray:
+        """Vectors from a point (3,) [m] to the organ's voxels within a radius [m] (n, 3)."""
+        return self._centres[self._tree.query_ball_point(place, radius)] - place
+
+    def filled_share(self, places: FloatArray, radius: float) -> FloatArray:
+        """Share of a ball of a radius [m] around each point (n, 3) that the organ fills (n,)."""
+        count = self._tree.query_ball_point(places, radius, return_length=True)
+        return np.asarray(count) * self.step**3 / (4.0 / 3.0 * np.pi * radius**3)
+
+    def columns(
+        self, origin: FloatArray, frame: FloatArray, x: FloatArray, depth: FloatArray, height: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Bottom and top of the organ along the z lines of a frame, from its edge inward.
+
+        Args:
+            origin: on the organ's edge [m], (3,).
+            frame: columns are the axes x, y (outward) and z (3, 3).
+            x: positions along the edge [m], (n_x,).
+            depth: distances inward from the edge, against y [m], rising, (n_depth,).
+            height: positions along z that are sampled [m], evenly spaced, (n_height,).
+
+        Returns:
+            Two arrays of heights (n_x, n_depth) [m], NaN where a line misses the organ. If a line meets several pieces,
+            the one nearest to the middle of the previous piece is taken.
+        """
+        places = (
+            origin
+            + x[:, None, None, None] * frame[:, 0]
+            - depth[:, None, None] * frame[:, 1]
+            + height[:, None] * frame[:, 2]
+        )
+        inside = self.contains(places)
+        bottom = np.full(inside.shape[:2], np.nan)
+        top, half = bottom.copy(), 0.5 * float(height[1] - height[0])
+        for row in range(len(x)):
+            middle = 0.0
+            for place in range(len(depth)):
+                edges = np.flatnonzero(np.diff(inside[row, place].astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+                if not len(edges):
+                    continue
+                low, high = height[edges[:, 0]], height[edges[:, 1] - 1]
+                nearest = int(np.argmin(np.maximum(np.maximum(low - middle, middle - high), 0.0)))
+                bottom[row, place], top[row, place] = low[nearest] - half, high[nearest] + half
+                middle = 0.5 * float(low[nearest] + high[nearest])
+        return bottom, top
+
+
+def find_rim(mesh: TetMesh, up: FloatArray) -> Rim | NoRim:
+    """The most flexible edge of an organ that fits into a jaw, with z on the side of `up` (3,) if possible."""
+    voxels, thinnest, found = OrganVoxels(mesh, VOXEL), math.inf, list[Rim]()
+    for place, frame in _edges(mesh, voxels, up):
+        thickness = _thickness(voxels, place, frame)
+        thinnest = min(thinnest, thickness)
+        if thickness > JAW_OPENING - JAW_PLAY:
+            continue
+        sides = (_rim(voxels, place, side, thickness) for side in (frame, frame * [-1.0, 1.0, -1.0]))
+        found += [rim for rim in sides if rim is not None]
+    if not found:
+        return NoRim(thinnest)
+    upright = [rim for rim in found if rim.frame[:, 2] @ up >= math.cos(TURN_MOST)]
+    return min(upright or found, key=lambda rim: rim.stiffness)
+
+
+def _edges(mesh: TetMesh, voxels: OrganVoxels, up: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Points on edges with frames: y away from the organ nearby, z along its smallest extent, on the side of `up`."""
+    places = mesh.points[mesh.boundary_nodes]
+    sharp = np.flatnonzero(voxels.filled_share(places, BALL) < FILLED_MOST)
+    flexible = sharp[np.argsort(voxels.filled_share(places[sharp], BALL_WIDE), kind="stable")]
+    for place in places[flexible[:PLACES_TRIED]]:
+        near = voxels.near(place, BALL)
+        if len(near) < 10:
+            continue
+        outward = -near.mean(axis=0)
+        outward /= np.linalg.norm(outward)
+        thin = np.linalg.eigh(np.cov(near.T))[1][:, 0]
+        across = thin - (thin @ outward) * outward
+        across *= np.copysign(1.0, across @ up) / np.linalg.norm(across)
+        yield place, np.stack([np.cross(outward, across), outward, across], axis=1)
+
+
+def _thickness(voxels: OrganVoxels, place: FloatArray, frame: FloatArray) -> float:
+    """Opening of a jaw that grasps an edge OVERLAP_LEAST deep over its pads [m]; infinite where the edge bends."""
+    bottom, top = voxels.columns(place, frame, ALONG, DEPTHS, HEIGHTS)
+    held = np.abs(ALONG) <= 0.5 * PAD_WIDTH + 1e-6
+    border = DEPTHS[np.argmax(np.isfinite(bottom[held]), axis=1)]
+    if not np.isfinite(bottom[held]).any(axis=1).all() or np.ptp(border) > BEND_MOST:
+        return math.inf
+    # All tissue between the border and that depth must fit.
+    within = DEPTHS <= border.min() + OVERLAP_LEAST + 1e-6
+    return float(np.nanmax(top[held][:, within]) - np.nanmin(bottom[held][:, within]))
+
+
+def _rim(voxels: OrganVoxels, place: FloatArray, frame: FloatArray, thickness: float) -> Rim | None:
+    """The edge with its frame turned until the side below is level; None where that side is uneven or missing."""
+    hiding = (DEPTHS >= HIDING[0]) & (DEPTHS <= HIDING[1])
+    x, depth = (part.ravel() for part in np.meshgrid(ALONG, DEPTHS[hiding], indexing="ij"))
+    level = turned = frame
+    bottom, top = np.zeros(0), np.zeros(0)
+    for _ in range(4):
+        bottom, top = (side[:, hiding].ravel() for side in voxels.columns(place, turned, ALONG, DEPTHS, HEIGHTS))
+        if not np.isfinite(bottom).all():
+            return None
+        _, along, inward = np.linalg.lstsq(np.stack([np.ones_like(x), x, depth], axis=1), bottom, rcond=None)[0]
+        level, turned = turned, _levelled(turned, turned @ np.array([-along, inward, 1.0]))
+    if np.ptp(bottom) > UNEVEN_MOST:
+        return None
+    jaw = level.T @ -frame[:, 1]
+    jaw[0] = 0.0
+    # The bending stiffness of a plate grows with its thickness cubed.
+    stiffness = float(((top - bottom) ** 3).mean())
+    underside = (float(bottom.min()), float(bottom.max()))
+    return Rim(place, level, thickness, underside, jaw / np.linalg.norm(jaw), stiffness)
+
+
+def _levelled(frame: FloatArray, up: FloatArray) -> FloatArray:
+    """The frame with another z, turned by the smallest angle."""
+    up = up / np.linalg.norm(up)
+    outward = frame[:, 1] - (frame[:, 1] @ up) * up
+    outward /= np.linalg.norm(outward)
+    return np.stack([np.cross(outward, up), outward, up], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +313,10 @@ def retract_scene(found: PatientScene, rim: Rim, folder: Path, mesh_file: str) -
         )
     anatomy = replace(anatomy, scene=replace(anatomy.scene, endoscope=endoscope))
     return RetractScene(
-        with_substeps(anatomy, [anatomy.organ(modulus_factor=1.0 + MODULUS_SPREAD)]), origin, rim.frame, rim
+        with_substeps(anatomy, [anatomy.organ(modulus_factor=1.0 + MODULUS_SPREAD)], most=math.inf),
+        origin,
+        rim.frame,
+        rim,
     )
 
 
@@ -219,34 +430,22 @@ def _moved(place: Vector) -> Vector:
 
 def find_endoscope(anatomy: Anatomy, edge: Vector, fov_deg: float) -> Endoscope | None:
     """The first of PLACES before an edge (3,) [m] from which targets are hidden, and visible without the flap."""
-    table, triangles = anatomy.scene.retract, anatomy.mesh.boundary_triangles
+    table, points, triangles = anatomy.scene.retract, anatomy.mesh.points, anatomy.mesh.boundary_triangles
     assert table is not None
     held = triangles[np.isin(triangles, anatomy.anchors).all(axis=1)]
-    targets = _targets(table)
+    up, corners = np.array([0.0, 0.0, 1.0]), product(table.target_along, table.target_distance)
+    # At the corners of the range from which targets are drawn.
+    targets = [Disc(np.array([x, y, TARGET_LIFT]), up, table.target_radius) for x, y in corners]
     middle = np.mean([target.centre for target in targets], axis=0)
     for shift in PLACES:
         eye = np.array(edge) + shift
         if all(
-            _visible_share(eye, target, anatomy.mesh.points, triangles) <= HIDDEN_SHARE
-            and _visible_share(eye, target, anatomy.mesh.points, held) >= SEEN_SHARE
+            uncovered(eye, target.points(), points, triangles).mean() <= HIDDEN_SHARE
+            and uncovered(eye, target.points(), points, held).mean() >= SEEN_SHARE
             for target in targets
         ):
             return Endoscope(_vector(*eye), _vector(*middle), fov_deg)
     return None
-
-
-def _targets(table: Retraction) -> list[Disc]:
-    """Target discs at the corners of the range from which they are drawn."""
-    up = np.array([0.0, 0.0, 1.0])
-    return [
-        Disc(np.array([x, y, TARGET_LIFT]), up, table.target_radius)
-        for x in table.target_along
-        for y in table.target_distance
-    ]
-
-
-def _visible_share(eye: FloatArray, target: Disc, points: FloatArray, triangles: IntArray) -> float:
-    return float(uncovered(eye, target.points(), points, triangles).mean())
 
 
 def _vector(x: float, y: float, z: float) -> Vector:

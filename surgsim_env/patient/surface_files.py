@@ -1,4 +1,4 @@
-"""Surfaces of an organ and its regions from STL, OBJ and PLY files, one file for each."""
+"""Surfaces of an organ and its regions from STL, OBJ and PLY files, one file for each, and the voxels inside them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh.surface import check_surface, merge_vertices, surface_volume
+from msdm_core.mesh.surface import check_surface, line_hits, merge_vertices, surface_volume
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.mesh_files.mesh_file import LengthUnit
 from surgsim_env.patient.materials import check_name, is_lesion
-from surgsim_env.patient.voxels import voxels_inside
 
 Triangles = NDArray[np.int64]
 # Voxels along one cell when a surface is rebuilt.
 MENDING_VOXELS = 6
+VOXELS_MOST = 150_000_000
+# Shift of the grid [voxels], so that no line runs through a vertex or along an edge of an aligned surface.
+SHIFT = 1e-6 * np.array([np.sqrt(2) - 1, np.sqrt(3) - 1, np.sqrt(5) - 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,3 +147,55 @@ def checked_names(names: Sequence[str]) -> None:
             raise MeshError(
                 f"region {name!r} is given twice; give the files other names, or name them: --region NAME=FILE"
             )
+
+
+def voxels_inside(
+    vertices: FloatArray, triangles: NDArray[np.int64], step: float, *, vote: bool = False
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Voxels whose centres lie inside (n_x, n_y, n_z), and the grid index of the first (3,); centres are index * step.
+
+    Args:
+        vertices: [m], shape (n_vertex, 3).
+        triangles: shape (n_triangle, 3).
+        step: edge of the voxels [m].
+        vote: for surfaces with holes or self-intersections: majority of the lines along x, y and z through a voxel,
+            counting those that leave the body as often as they enter it. Otherwise lines along x alone decide.
+    """
+    first = np.floor(vertices.min(axis=0) / step).astype(np.int64) - 1
+    shape = np.ceil(vertices.max(axis=0) / step).astype(np.int64) + 2 - first
+    if np.prod(shape.astype(np.float64)) > VOXELS_MOST:
+        raise MeshError(
+            f"the surface's box has {np.prod(shape.astype(np.float64)):.3g} voxels of {step:.3g} m; at most "
+            f"{VOXELS_MOST:.3g} are made: use larger cells"
+        )
+    places = vertices / step - first + SHIFT
+    if not vote:
+        winding, _ = _winding(places, triangles, 0, shape)
+        return winding % 2 == 1, first
+    inside, voters = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=np.int8)
+    for axis in range(3):
+        winding, closed = _winding(places, triangles, axis, shape)
+        inside += (winding != 0) & closed
+        voters += closed
+    return 2 * inside > voters, first
+
+
+def _winding(
+    places: FloatArray, triangles: NDArray[np.int64], axis: int, shape: NDArray[np.int64]
+) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
+    """Entries minus exits of lines along an axis up to each voxel; whether each line ends outside (broadcastable)."""
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    a, b, c = (places[corner] for corner in triangles.T)
+    leaving = np.cross(b - a, c - a)[:, axis] > 0
+    crossed = np.zeros((shape[axis], shape[u], shape[v]), dtype=np.int16)
+    for chosen, change in ((leaving, -1), (~leaving, 1)):
+        if not chosen.any():
+            continue
+        # line_hits traces the lines at even coordinates only.
+        row, column, at = line_hits(2.0 * places[:, u], 2.0 * places[:, v], places[:, axis], triangles[chosen], 0)
+        np.add.at(crossed, (np.ceil(at).astype(np.int64), row // 2, column // 2), change)
+    winding = np.cumsum(crossed, axis=0, dtype=np.int16)
+    closed = np.broadcast_to(winding[-1:] == 0, winding.shape)
+    # (axis, u, v) is a cyclic permutation of (x, y, z).
+    back = [(0 - axis) % 3, (1 - axis) % 3, (2 - axis) % 3]
+    return winding.transpose(back), closed.transpose(back)

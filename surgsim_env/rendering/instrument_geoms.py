@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.supports import SUPPORT_PREFIX
-from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_PREFIX
 
 PREFIX = "instrument"
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)

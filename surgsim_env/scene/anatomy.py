@@ -18,7 +18,7 @@ from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 from msdm_core.organ.compile import OrganSpec, compile_organ
 from msdm_core.organ.stability import scale_mass
 from msdm_core.organ.support import SupportLaw
-from surgsim_env.scene.model import Anchor, FixedLesion, LesionDraw, Scene, SurfaceMesh, step_needed
+from surgsim_env.scene.model import Anchor, LesionDraw, Scene, step_needed
 from surgsim_env.scene.palpable_surface import PalpableFace, find_palpable_face, warn_of_coarse_cells
 
 # How exactly a drawn lesion's cover is met [m].
@@ -61,13 +61,14 @@ class Anatomy:
         """The specification that `organ` compiles, for further changes by an episode's draw."""
         scene, capsule = self.scene, self.scene.capsule
         material = _stiffer(scene.material, modulus_factor)
+        standing = [region.as_lesion for region in scene.regions if not region.lesion]
         if capsule is not None:
             capsule = replace(capsule, youngs_modulus=capsule.youngs_modulus * modulus_factor)
         return OrganSpec(
             mesh=self.mesh,
             materials=material,
             capsule=capsule,
-            lesions=(*self._standing_regions(modulus_factor), *lesions),
+            lesions=(*(replace(one, material=_stiffer(one.material, modulus_factor)) for one in standing), *lesions),
             anchors=self.anchors,
             damping=scene.damping,
             stiffness_rule=scene.stiffness_rule,
@@ -75,11 +76,6 @@ class Anatomy:
             supports=scene.supports,
             support_law=scene.support_law or SupportLaw(scene.contact.stiffness, scene.contact.damping),
         )
-
-    def _standing_regions(self, modulus_factor: float) -> list[Lesion]:
-        """The regions of every organ of the scene, their moduli multiplied by a factor."""
-        standing = [region.as_lesion for region in self.scene.regions if not region.lesion]
-        return [replace(one, material=_stiffer(one.material, modulus_factor)) for one in standing]
 
     def compiled(self, specification: OrganSpec) -> OrganModel:
         """The organ of a specification, with mass added as in `organ`."""
@@ -161,13 +157,10 @@ class Anatomy:
 
     def demonstration_lesions(self) -> list[Lesion]:
         """The lesions of the scene file: regions of its mesh, and balls."""
-        regions = [region.as_lesion for region in self.scene.regions if region.lesion]
-        return regions + [self._fixed(lesion) for lesion in self.scene.demonstration]
-
-    def _fixed(self, lesion: FixedLesion) -> Lesion:
-        return self.lesion_below(
-            np.asarray(lesion.below), lesion.radius, lesion.cover, lesion.modulus_ratio, lesion.name
-        )
+        lesions = [region.as_lesion for region in self.scene.regions if region.lesion]
+        for one in self.scene.demonstration:
+            lesions.append(self.lesion_below(np.asarray(one.below), one.radius, one.cover, one.modulus_ratio, one.name))
+        return lesions
 
 
 def _stiffer(material: Material | None, factor: float) -> Material:
@@ -215,27 +208,21 @@ def _load_mesh(scene: Scene) -> TetMesh:
     from msdm_core.mesh_files.surface_io import read_surface
 
     if source.surface is not None:
-        return _filled_surface(
-            scene,
-            source.surface,
-            *read_surface(scene.folder / source.surface.file, length_unit=source.surface.length_unit),
+        surface, palpation = source.surface, scene.palpation
+        vertices, triangles = read_surface(scene.folder / surface.file, length_unit=surface.length_unit)
+        if surface.coarse_cell_size is None:
+            return mesh_surface(vertices, triangles, cell_size=surface.cell_size)
+        # Fine at the palpable face, coarser in the rest.
+        return mesh_surface(
+            vertices,
+            triangles,
+            cell_size=surface.cell_size,
+            coarse_cell_size=surface.coarse_cell_size,
+            fine_triangles=triangles_facing(vertices, triangles, scene.instrument.approach, palpation.face_angle_deg),
+            fine_depth=surface.fine_depth,
         )
     assert source.tets is not None
     return in_sweep_order(read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit))
-
-
-def _filled_surface(scene: Scene, source: SurfaceMesh, vertices: FloatArray, triangles: NDArray) -> TetMesh:
-    """The organ's tets: of one size, or fine at the palpable face if the scene gives a coarser size for the rest."""
-    if source.coarse_cell_size is None:
-        return mesh_surface(vertices, triangles, cell_size=source.cell_size)
-    return mesh_surface(
-        vertices,
-        triangles,
-        cell_size=source.cell_size,
-        coarse_cell_size=source.coarse_cell_size,
-        fine_triangles=triangles_facing(vertices, triangles, scene.instrument.approach, scene.palpation.face_angle_deg),
-        fine_depth=source.fine_depth,
-    )
 
 
 def _anchored_nodes(mesh: TetMesh, anchors: Sequence[Anchor]) -> IntArray:

@@ -86,9 +86,9 @@ def _tuples_in(*hints: Any) -> Iterator[Any]:
         yield from _tuples_in(*get_args(hint))
 
 
-def nearest(name: str, known: list[str]) -> str:
-    """A hint at the nearest known name, or an empty string."""
-    found = get_close_matches(name, known, n=1)
+def nearest(name: str, known: list[str], likeness: float = 0.6) -> str:
+    """A hint at the nearest known name, at least so like (0 to 1), or an empty string."""
+    found = get_close_matches(name, known, n=1, cutoff=likeness)
     return f"; did you mean {found[0]!r}?" if found else ""
 
 
@@ -130,9 +130,7 @@ def make_scene(name: str | Path) -> Scene:
         return load_scene(Path(name))
     known = list_scenes()
     if name not in known:
-        close = get_close_matches(name, known, n=1, cutoff=0.4)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"scene {name!r} is unknown; the scenes are {', '.join(known)}{hint}")
+        raise ValueError(f"scene {name!r} is unknown; the scenes are {', '.join(known)}{nearest(name, known, 0.4)}")
     return load_scene(scenes_folder() / "organs" / f"{name}.toml")
 
 

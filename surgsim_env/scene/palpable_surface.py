@@ -143,14 +143,17 @@ def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: PalpationS
         np.add.at(normals, face[:, corner], area_vector[chosen])
     length = np.linalg.norm(normals, axis=1)
     normals[length > 0.0] /= length[length > 0.0, None]
+    sides = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
+    edges, counts = np.unique(sides, axis=0, return_counts=True)
     thickness = np.full(len(face), np.inf)
     if palpation.thickness_smallest > 0.0:
-        thickness = _thickness(corners[chosen].mean(axis=1), -unit[chosen], corners)
+        # Length of the chord inside the organ from the middle of each triangle.
+        nearest_hits(corners[chosen].mean(axis=1), -unit[chosen], corners, HIT_LEAST, thickness)
     return PalpableFace(
         points=mesh.points,
         normals=normals,
         triangles=face,
-        rim=_rim(face),
+        rim=edges[counts == 1],
         approach=direction,
         thickness=thickness,
         margin=palpation.face_margin,
@@ -164,12 +167,6 @@ def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     first = start - (start @ direction) * direction
     first /= np.linalg.norm(first)
     return first, np.cross(direction, first) * (-1.0)
-
-
-def _rim(face: IntArray) -> IntArray:
-    edges = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
-    unique, counts = np.unique(edges, axis=0, return_counts=True)
-    return unique[counts == 1]
 
 
 def _grid(lower: FloatArray, upper: FloatArray, spacing: float) -> FloatArray:
@@ -204,13 +201,6 @@ def _drop(plane: FloatArray, height: FloatArray, u: float, v: float) -> tuple[in
     weights = np.column_stack([wa, wb, wc])[inside]
     best = int(np.argmax((weights * height[inside]).sum(axis=1)))
     return int(inside[best]), weights[best]
-
-
-def _thickness(origins: FloatArray, directions: FloatArray, corners: FloatArray) -> FloatArray:
-    """Length of the chord inside the organ from each origin along each direction [m]."""
-    result = np.empty(len(origins))
-    nearest_hits(origins, directions, corners, HIT_LEAST, result)
-    return result
 
 
 # Largest cell over contact radius; on coarser cells the force varies more between sites than over a deep lesion.

@@ -10,7 +10,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import make_chart
-from surgsim_env.palpation.touch_memory import Indenter, TouchMemory
+from surgsim_env.palpation.touches import Indenter, TouchMemory
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import DrawnOrgan
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
@@ -67,7 +67,7 @@ class PalpateTask(Task):
 
     ## Observation Space
     `Box((10,), float32)`, all bounds finite. With `memory=True` `Box((13 + 2 n,), float32)`: what the sensor felt so
-    far (`surgsim_env.palpation.touch_memory`) on a grid of n sites over the palpable face
+    far (`surgsim_env.palpation.touches`) on a grid of n sites over the palpable face
     (`surgsim_env.palpation.chart`); n is 169 on `phantom`. `env.unwrapped.observation_slices` has the entries of each
     channel by its name.
 

@@ -16,7 +16,7 @@ from surgsim_env.palpation.healthy_map import HealthyMap, charted_face, healthy_
 from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
-from surgsim_env.palpation.site_touches import LOG_CONTRAST_BOUND, SiteTouches, Touch
+from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SiteTouches, Touch
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
 from surgsim_env.scene.load import make_scene, with_instrument

@@ -13,8 +13,7 @@ from stable_baselines3 import PPO
 from agents.evaluate import POLICIES
 from agents.scoring.site_agent import LENGTH_SHARE, SiteFacts, SiteProcess
 from agents.training.policy_files import PolicyDescription, load_policy, save_policy
-from agents.training.site_belief import SiteBelief
-from agents.training.site_policy import CURIOSITY, SHARPNESS, SitePolicy
+from agents.training.site_policy import CURIOSITY, SHARPNESS, SiteBelief, SitePolicy
 from surgsim_env.palpation.lesion_estimator import (
     BACKGROUND_SPREAD,
     EXCESS_LENGTH,

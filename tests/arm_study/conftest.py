@@ -2,11 +2,11 @@
 
 import pytest
 
-from surgsim_env.arm_study import maps
+from surgsim_env.arm_study import pictures
 
 
 @pytest.fixture
 def few_maps(monkeypatch):
     """Who reaches what, one quantity and the distances between the arms, instead of all quantities."""
-    shown = tuple(quantity for quantity in maps.QUANTITIES if quantity.field == "tip_force")
-    monkeypatch.setattr(maps, "QUANTITIES", shown)
+    shown = tuple(quantity for quantity in pictures.QUANTITIES if quantity.field == "tip_force")
+    monkeypatch.setattr(pictures, "QUANTITIES", shown)

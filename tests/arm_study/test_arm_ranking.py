@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from surgsim_env.arm_study.table import RANKING_RULE, Candidate, rank
+from surgsim_env.arm_study.results import RANKING_RULE, rank
 from tests.arm_study.made import made_evaluation
 
 
@@ -21,7 +21,7 @@ def case(name, *, both, clearance=0.010, force=3.0, left=0.8, right=0.8):
             wall_clearance=np.where(reached, clearance + 0.02, np.nan),
             tip_force=np.where(reached, force, np.nan),
         )
-    return Candidate(name, "made", replace(evaluation, both=np.arange(100) < round(100 * both), **arms))
+    return (name, "made", replace(evaluation, both=np.arange(100) < round(100 * both), **arms))
 
 
 def test_the_share_of_both_comes_first_and_the_reasons_are_in_words():
@@ -82,7 +82,7 @@ def test_the_median_is_over_both_arms_and_the_nearer_of_organ_and_wall():
         for arm in (one.left, one.right)
         for index in np.flatnonzero(arm.reachable)
     ]
-    (row,) = rank([Candidate("one", "made", one)])
+    (row,) = rank([("one", "made", one)])
     assert row.clearance == np.median(wanted) and row.worst_clearance == min(wanted)
     assert row.both == one.both[:-5].mean()
 

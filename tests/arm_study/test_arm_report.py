@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.maps import ArmMaps, camera_view
-from surgsim_env.arm_study.pictures import poses, write_pictures
-from surgsim_env.arm_study.report import write_report
-from surgsim_env.arm_study.results import QUANTITIES, REASONS, number_text, share_text, verdict, worse_of_both
-from surgsim_env.arm_study.table import columns, write_points
+from surgsim_env.arm_study.job import write_report
+from surgsim_env.arm_study.pictures import ArmMaps, camera_view, poses, write_pictures
+from surgsim_env.arm_study.results import (
+    QUANTITIES,
+    REASONS,
+    columns,
+    number_text,
+    share_text,
+    verdict,
+    worse_of_both,
+    write_points,
+)
 from surgsim_env.instruments.arm.arm import load_arm
 from tests.arm_study.made import PICTURE, PORTS, made_evaluation
 

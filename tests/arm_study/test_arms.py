@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from msdm_core.mesh.tet_mesh import TetMesh
-from surgsim_env.arm_study.collisions import TIP_ZONE
+from surgsim_env.arm_study.clearance import TIP_ZONE
 from surgsim_env.arm_study.ports import (
     CAMERA_DISTANCE,
     PORT_SPACING,

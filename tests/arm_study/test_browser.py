@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.maps import ArmMaps
-from surgsim_env.arm_study.pictures import write_given_pictures
-from surgsim_env.arm_study.report import write_report
-from surgsim_env.arm_study.table import Candidate, rank
+from surgsim_env.arm_study.job import write_report
+from surgsim_env.arm_study.pictures import ArmMaps, write_given_pictures
+from surgsim_env.arm_study.results import rank
 from surgsim_env.reports.html_page import POLICY
 from tests.arm_study.made import made_episodes, made_evaluation
 from tests.chromium import Browser
@@ -42,7 +41,7 @@ def shown(chromium):
 def report(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     evaluation = made_evaluation()
-    others = [Candidate("ports.toml", "as given", evaluation), Candidate("wide.toml", "ports", made_evaluation(seed=1))]
+    others = [("ports.toml", "as given", evaluation), ("wide.toml", "ports", made_evaluation(seed=1))]
     path = folder / "report.html"
     episodes = made_episodes(failing=True)
     write_report(

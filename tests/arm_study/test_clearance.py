@@ -11,6 +11,7 @@ from surgsim_env.arm_study.clearance import (
     point_segment_distance,
     segment_distance,
     segment_triangle_distance,
+    wall_clearance,
 )
 from surgsim_env.arm_study.ports import EndoscopePort, PortPlace, Ports, Wall
 
@@ -170,7 +171,7 @@ def test_plate_clearance():
         ]
     )
     # The third would have to go down by 15 mm; the fourth leaves the hole at 30 mm, 20 mm from the plate's faces.
-    assert where.wall_clearance(segments, trocar) == pytest.approx([0.010, 0.020, -0.015, 0.020, np.inf])
+    assert wall_clearance(where, segments, trocar) == pytest.approx([0.010, 0.020, -0.015, 0.020, np.inf])
 
 
 def test_dome_clearance():
@@ -186,4 +187,4 @@ def test_dome_clearance():
         ]
     )
     # The third: from 100 mm below to 200 mm above the middle surface; up by 110 mm or down by 210 mm frees it.
-    assert where.wall_clearance(segments, far) == pytest.approx([0.02, 0.04, -0.11])
+    assert wall_clearance(where, segments, far) == pytest.approx([0.02, 0.04, -0.11])

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from surgsim_env.arm_study import dexterity
-from surgsim_env.arm_study.candidates import DIRECTION_COUNT, approach_directions, approach_share
+from surgsim_env.arm_study import reach
+from surgsim_env.arm_study.joint_search import DIRECTION_COUNT, approach_directions, approach_share
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.scene.model import Port
 from tests.arm_study.pivot_arm import EFFORT, FAR, NEAR, OUTER, PITCH, YAW, pivot
 
-LENGTH = dexterity.CHARACTERISTIC_LENGTH
+LENGTH = reach.CHARACTERISTIC_LENGTH
 
 
 @pytest.fixture
@@ -23,11 +23,11 @@ def kinematics(tmp_path):
 def test_manipulability_and_isotropy(kinematics):
     """Columns of J at depth d and pitch b: yaw (d cos b, L), pitch (d, L), slide (1, 0), all perpendicular."""
     pitch, depth = 0.3, 0.12
-    values = dexterity.scaled_singular_values(kinematics, kinematics.at(np.array([[0.2, pitch, depth]])))
+    values = reach.scaled_singular_values(kinematics, kinematics.at(np.array([[0.2, pitch, depth]])))
     lengths = sorted([math.hypot(depth * math.cos(pitch), LENGTH), math.hypot(depth, LENGTH), 1.0], reverse=True)
     assert values[0] == pytest.approx(lengths, rel=1e-12)
-    assert dexterity.manipulability(values)[0] == pytest.approx(math.prod(lengths), rel=1e-12)
-    assert dexterity.isotropy(values)[0] == pytest.approx(lengths[-1] / lengths[0], rel=1e-12)
+    assert reach.manipulability(values)[0] == pytest.approx(math.prod(lengths), rel=1e-12)
+    assert reach.isotropy(values)[0] == pytest.approx(lengths[-1] / lengths[0], rel=1e-12)
 
 
 def test_trocar_by_control_takes_two_freedoms():
@@ -35,7 +35,7 @@ def test_trocar_by_control_takes_two_freedoms():
     arm = load_arm("six_axis", Port())
     kinematics = BatchKinematics(arm)
     chain = kinematics.at(arm.home[None])
-    values = dexterity.scaled_singular_values(kinematics, chain)
+    values = reach.scaled_singular_values(kinematics, chain)
     assert values.shape == (1, 4)
     linear, _ = kinematics.tip_jacobian(chain)
     assert np.linalg.matrix_rank(linear[0]) == 3
@@ -45,7 +45,7 @@ def test_trocar_by_control_takes_two_freedoms():
 def test_limit_margin(kinematics):
     middle, high = [0.0, 0.0, 0.5 * (NEAR + FAR)], [YAW, 0.0, 0.1]
     quarter = [0.5 * YAW, -0.5 * PITCH, 0.5 * (NEAR + FAR)]
-    margin = dexterity.limit_margin(kinematics, np.array([middle, high, quarter]))
+    margin = reach.limit_margin(kinematics, np.array([middle, high, quarter]))
     assert margin == pytest.approx([1.0, 0.0, 0.75**2], abs=1e-12)  # 4 (3/4)(1/4) = 3/4
 
 
@@ -54,7 +54,7 @@ def test_tip_force(kinematics):
     depth = 0.1
     chain = kinematics.at(np.array([[0.0, 0.0, depth]] * 4))
     across = np.array([math.sqrt(0.5), 0.0, -math.sqrt(0.5)])
-    force = dexterity.tip_force(kinematics, chain, np.array([[0.0, 0.0, -1.0], [1.0, 0, 0], [0, 1.0, 0], across]))
+    force = reach.tip_force(kinematics, chain, np.array([[0.0, 0.0, -1.0], [1.0, 0, 0], [0, 1.0, 0], across]))
     slanted = min(EFFORT[2], EFFORT[0] / depth) * math.sqrt(2.0)
     assert force == pytest.approx([EFFORT[2], EFFORT[0] / depth, EFFORT[1] / depth, slanted], rel=1e-12)
 
@@ -64,14 +64,14 @@ def test_trocar_load(kinematics):
     depth = 0.1
     outer = OUTER + 0.1 - depth
     chain = kinematics.at(np.array([[0.0, 0.0, depth]] * 3))
-    load = dexterity.trocar_load(kinematics, chain, np.array([[1.0, 0, 0], [0, 0, -1.0], [0.6, 0.0, -0.8]]))
+    load = reach.trocar_load(kinematics, chain, np.array([[1.0, 0, 0], [0, 0, -1.0], [0.6, 0.0, -0.8]]))
     assert load == pytest.approx([(depth + outer) / outer, 0.0, 0.6 * (depth + outer) / outer], abs=1e-12)
 
 
 def test_camera_angle(kinematics):
     """The shaft straight down to a point; the camera 8 cm beside the trocar, 15 cm above the point: atan(8 / 15)."""
     chain = kinematics.at(np.array([[0.0, 0.0, 0.15]]))
-    angle = dexterity.camera_angle(chain, np.array([[0.0, 0.0, -0.15]]), np.array([0.08, 0.0, 0.0]))
+    angle = reach.camera_angle(chain, np.array([[0.0, 0.0, -0.15]]), np.array([0.08, 0.0, 0.0]))
     assert angle[0] == pytest.approx(math.atan2(0.08, 0.15), abs=1e-12)
 
 

@@ -21,10 +21,10 @@ from surgsim_env.arm_study.episodes import (
     run_episodes,
     what_was_run,
 )
-from surgsim_env.arm_study.report import write_report
+from surgsim_env.arm_study.job import write_report
 from surgsim_env.cli.arms import Arms
 from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.palpation.report import plain_json
+from surgsim_env.palpation.job import plain_json
 from surgsim_env.scene.model import Port
 from surgsim_env.scripting import oracle_script, run_script
 from tests.arm_study.made import made_episodes, made_evaluation

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from surgsim_env.arm_study.candidates import REACHED
-from surgsim_env.arm_study.clearance import ClusteredSurface
-from surgsim_env.arm_study.collisions import Surroundings, arm_distances, split_at_trocar
+from surgsim_env.arm_study.clearance import ClusteredSurface, Surroundings, arm_distances, split_at_trocar
+from surgsim_env.arm_study.joint_search import REACHED
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.arm_study.ports import EndoscopePort, PortPlace, Ports, Wall
 from surgsim_env.arm_study.reach import ARM_DISTANCE, Sites, evaluate_both, evaluate_reach, tip_ball

@@ -58,7 +58,7 @@ def test_the_shaft_meets_the_remote_centre_at_any_joint_values(arm):
 def test_the_residual_is_a_distance_from_the_shafts_axis():
     """Moving the trocar by 3 mm across the shaft is missed by 3 mm, along the shaft by nothing."""
     arm = load_arm("psm_palpator")
-    arm._trocar = np.array([0.003, 0.0, 0.05])
+    arm.trocar = np.array([0.003, 0.0, 0.05])
     assert arm.trocar_residual(arm.home) == pytest.approx(0.003, abs=EXACT)
 
 

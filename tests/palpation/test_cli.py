@@ -10,8 +10,8 @@ import trimesh
 from matplotlib.image import imread
 
 from surgsim_env.cli.main import _joined, main
+from surgsim_env.palpation.job import COLUMNS
 from surgsim_env.palpation.press import scan
-from surgsim_env.palpation.report import COLUMNS
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
@@ -187,7 +187,7 @@ def test_options_that_would_do_nothing_are_refused(capsys):
         (["--spacing", "inf"], "spacing is inf; it must be finite"),
         (["--press-depth", "inf"], "press depth is inf"),
         (["--spacing", "1e-6"], "raster points"),
-        (["--youngs-modulus", "1e12"], "is the modulus in pascals"),
+        (["--youngs-modulus", "1e12"], "are the moduli in pascals"),
         (["--seed", "-1"], "--seed is -1"),
         (["--around", "0,0,0,-1"], "the radius is -1 m"),
     ],

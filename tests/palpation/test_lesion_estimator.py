@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from surgsim_env.palpation import gaussian_process as process
 from surgsim_env.palpation import lesion_estimator as module
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
@@ -44,12 +43,12 @@ def test_posterior_is_that_of_the_joint_normal() -> None:
     made, (places, values) = estimator(), scattered(25)
 
     def covariance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return process.EXCESS_SPREAD**2 * np.exp(-0.5 * squared_distances(a, b) / process.EXCESS_LENGTH**2)
+        return module.EXCESS_SPREAD**2 * np.exp(-0.5 * squared_distances(a, b) / module.EXCESS_LENGTH**2)
 
-    noise = NOISE**2 + process.MODEL_SPREAD**2
-    solved = np.linalg.solve(covariance(places, places) + process.BACKGROUND_SPREAD**2 + noise * np.eye(25), values)
+    noise = NOISE**2 + module.MODEL_SPREAD**2
+    solved = np.linalg.solve(covariance(places, places) + module.BACKGROUND_SPREAD**2 + noise * np.eye(25), values)
     background, excess = made.process.mean(places, values)
-    assert background == pytest.approx(process.BACKGROUND_SPREAD**2 * solved.sum(), abs=1e-10)
+    assert background == pytest.approx(module.BACKGROUND_SPREAD**2 * solved.sum(), abs=1e-10)
     expected = covariance(map_points(made), places) @ solved
     np.testing.assert_allclose(excess.ravel(), expected, atol=1e-10)
 
@@ -60,10 +59,10 @@ def test_posterior_is_that_of_scikit_learn() -> None:
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
     made, (places, values) = estimator(), scattered(25)
-    rbf = ConstantKernel(process.EXCESS_SPREAD**2) * RBF(process.EXCESS_LENGTH)
+    rbf = ConstantKernel(module.EXCESS_SPREAD**2) * RBF(module.EXCESS_LENGTH)
     peer = GaussianProcessRegressor(
-        ConstantKernel(process.BACKGROUND_SPREAD**2) + rbf,
-        alpha=NOISE**2 + process.MODEL_SPREAD**2,
+        ConstantKernel(module.BACKGROUND_SPREAD**2) + rbf,
+        alpha=NOISE**2 + module.MODEL_SPREAD**2,
         optimizer=None,  # pyright: ignore[reportArgumentType]  (None is documented)
     )
     expected = peer.fit(places, values).predict(map_points(made))
@@ -93,7 +92,7 @@ def test_stiffer_tissue_throughout_is_no_lesion() -> None:
     without = estimator().estimate(places, lesion)
     np.testing.assert_allclose(with_offset.points, without.points, atol=5e-4)
     # What e takes of the offset: it averages to a spread of se / sqrt(patches) over area / (2 pi l^2) = 6 patches.
-    taken = process.EXCESS_SPREAD**2 / 6.0 / (process.EXCESS_SPREAD**2 / 6.0 + process.BACKGROUND_SPREAD**2)
+    taken = module.EXCESS_SPREAD**2 / 6.0 / (module.EXCESS_SPREAD**2 / 6.0 + module.BACKGROUND_SPREAD**2)
     assert (1.0 - taken) * np.log(1.3) < with_offset.background - without.background < np.log(1.3)
 
 

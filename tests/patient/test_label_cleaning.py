@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.label_cleaning import NAMES_MOST, clean_labels
-from surgsim_env.patient.label_image import LabelImage
-from surgsim_env.patient.label_source import ImageGeometry
+from surgsim_env.patient.label_image import NAMES_MOST, LabelImage, clean_labels
+from surgsim_env.patient.label_readers import ImageGeometry
 
 
 def image_of(tags, names):

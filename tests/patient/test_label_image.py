@@ -11,7 +11,7 @@ import SimpleITK
 
 from msdm_core.errors import MeshError
 from surgsim_env.patient.label_image import parse_labels, read_label_image
-from surgsim_env.patient.label_source import RUN_VOXELS, VOXELS_MOST
+from surgsim_env.patient.label_readers import RUN_VOXELS, VOXELS_MOST
 from tests.patient.scans import affine_of, check_organ, labels_on, write_nifti
 
 BOTH = parse_labels("liver=1,lesion=2")
@@ -176,7 +176,7 @@ def test_voxels_of_several_numbers_and_too_many_bytes_for_itk(tmp_path, monkeypa
     SimpleITK.WriteImage(SimpleITK.Image([4, 4, 4], SimpleITK.sitkVectorUInt8, 3), str(tmp_path / "rgb.nrrd"))
     refused(tmp_path / "rgb.nrrd", "each voxel has 3 numbers; the rule is one label")
     SimpleITK.WriteImage(SimpleITK.Image([4, 5, 6], SimpleITK.sitkInt16), str(tmp_path / "big.nrrd"))
-    monkeypatch.setattr("surgsim_env.patient.itk_labels.BYTES_MOST", 2 * 4 * 5 * 6 - 1)
+    monkeypatch.setattr("surgsim_env.patient.label_readers.ITK_BYTES_MOST", 2 * 4 * 5 * 6 - 1)
     refused(tmp_path / "big.nrrd", r"holds 4 x 5 x 6 voxels of 2 bytes; at most .* of this format are read at once")
 
 

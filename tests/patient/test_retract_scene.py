@@ -12,10 +12,18 @@ import surgsim_env  # noqa: F401
 from msdm_core.mesh_files.mesh_io import read_mesh
 from msdm_core.meshing.lattice_meshing import mesh_surface
 from surgsim_env.cli.main import main
-from surgsim_env.patient.make_patient import check_targets
-from surgsim_env.patient.rim import JAW_OPENING, JAW_PLAY, OVERLAP_LEAST, VOXEL, NoRim, Rim, _thickness, find_rim
-from surgsim_env.patient.scene_text import FIRST_LINE
-from surgsim_env.patient.voxels import OrganVoxels
+from surgsim_env.patient.make_patient import FIRST_LINE, check_targets
+from surgsim_env.patient.retract_scene import (
+    JAW_OPENING,
+    JAW_PLAY,
+    OVERLAP_LEAST,
+    VOXEL,
+    NoRim,
+    OrganVoxels,
+    Rim,
+    _thickness,
+    find_rim,
+)
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene, make_retract_scene
 from surgsim_env.scene.model import Flap, Retraction

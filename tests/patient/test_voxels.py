@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.voxels import voxels_inside
+from surgsim_env.patient.surface_files import voxels_inside
 
 STEP = 0.01
 # Of a block along its edges; its faces lie half way between voxels' centres, the first of which are at 0.

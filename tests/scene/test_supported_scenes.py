@@ -15,8 +15,7 @@ from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.support import Support, SupportLaw
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.supports import SUPPORT_BIT
-from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_BIT
 from surgsim_env.rendering.options import render_options
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.rendering.stage import LABELS

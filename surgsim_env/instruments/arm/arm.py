@@ -39,6 +39,10 @@ class Arm:
             same length around its cross-section                                 (n_shape,)
         shape_half_axis: from the middle of each shape to its end, in its geom's frame [m]  (n_shape, 3)
         felt: whether tissue feels a shape                                       (n_shape,)
+        shapes, tip_site, shaft: indices of the shapes' geoms, the tip's site and the shaft's body in the model
+        tip_axis: unit vector out of the tip, in its site's frame                (3,)
+        shaft_point, shaft_axis: point [m] and direction of the shaft's axis, in its body's frame      (3,)
+        trocar: [m]                                                              (3,)
     """
 
     def __init__(self, description: ArmDescription, port: Port, model: mujoco.MjModel) -> None:
@@ -53,21 +57,21 @@ class Arm:
         jaw = [model.joint(name).range for name in description.jaw]
         self.jaw_range = (float(sum(low for low, _ in jaw)), float(sum(high for _, high in jaw)))
         groups = [np.flatnonzero(model.geom_group == group) for group in (CONTACT_GROUP, LINK_GROUP)]
-        self._shapes = np.concatenate(groups)
-        self.felt = np.arange(len(self._shapes)) < len(groups[0])
-        self.shape_names = [model.geom(geom).name for geom in self._shapes]
-        size, kind = model.geom_size[self._shapes], model.geom_type[self._shapes]
+        self.shapes = np.concatenate(groups)
+        self.felt = np.arange(len(self.shapes)) < len(groups[0])
+        self.shape_names = [model.geom(geom).name for geom in self.shapes]
+        size, kind = model.geom_size[self.shapes], model.geom_type[self.shapes]
         box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
         thin, middle, long = np.sort(size, axis=1).T
         self.shape_radius = np.where(box, np.hypot(thin, middle), size[:, 0])
         half_length = np.where(box, long, np.where(capsule, size[:, 1], 0.0))
         self.shape_half_axis = np.eye(3)[np.where(box, size.argmax(axis=1), 2)] * half_length[:, None]
         self.tip_site = model.site(description.tip.site or TIP_SITE).id
-        self._tip_axis = _unit(description.tip.direction)
+        self.tip_axis = _unit(description.tip.direction)
         trocar = description.trocar
-        self._shaft = model.body(trocar.shaft_body).id
-        self._shaft_point, self._shaft_axis = np.array(trocar.shaft_point), _unit(trocar.shaft_axis)
-        self._trocar = np.array(port.point)
+        self.shaft = model.body(trocar.shaft_body).id
+        self.shaft_point, self.shaft_axis = np.array(trocar.shaft_point), _unit(trocar.shaft_axis)
+        self.trocar = np.array(port.point)
         self._data = mujoco.MjData(model)
         self._jacobian = np.zeros((6, model.nv))
 
@@ -88,7 +92,7 @@ class Arm:
 
     def tip_direction(self, joints: ArrayLike) -> FloatArray:
         """Unit vector out of the tip at joint values (n,), shape (3,)."""
-        return self._at(joints).site_xmat[self.tip_site].reshape(3, 3) @ self._tip_axis
+        return self._at(joints).site_xmat[self.tip_site].reshape(3, 3) @ self.tip_axis
 
     def tip_jacobian(self, joints: ArrayLike) -> FloatArray:
         """Jacobian from joint speeds to the tip's velocity [m/s] and angular velocity [rad/s], world frame, (6, n)."""
@@ -99,28 +103,28 @@ class Arm:
     def shaft_line(self, joints: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """The point of the shaft's axis nearest to the trocar [m] and its direction to the tip, each (3,)."""
         data = self._at(joints)
-        rotation = data.xmat[self._shaft].reshape(3, 3)
-        start, along = data.xpos[self._shaft] + rotation @ self._shaft_point, rotation @ self._shaft_axis
-        return start + ((self._trocar - start) @ along) * along, along
+        rotation = data.xmat[self.shaft].reshape(3, 3)
+        start, along = data.xpos[self.shaft] + rotation @ self.shaft_point, rotation @ self.shaft_axis
+        return start + ((self.trocar - start) @ along) * along, along
 
     def trocar_residual(self, joints: ArrayLike) -> float:
         """Distance of the shaft's axis from the trocar at joint values (n,) [m]."""
-        return float(np.linalg.norm(self._trocar - self.shaft_line(joints)[0]))
+        return float(np.linalg.norm(self.trocar - self.shaft_line(joints)[0]))
 
     def trocar_task(self, joints: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Lateral distance of the trocar from the shaft's axis [m] (2,), and the Jacobian of the shaft there (2, n)."""
         near, along = self.shaft_line(joints)
         data = self._at(joints, moving=True)
-        mujoco.mj_jac(self.model, data, self._jacobian[:3], None, near, self._shaft)
+        mujoco.mj_jac(self.model, data, self._jacobian[:3], None, near, self.shaft)
         across = np.linalg.svd(along[None])[2][1:]
-        return across @ (self._trocar - near), across @ self._jacobian[:3, self.dof]
+        return across @ (self.trocar - near), across @ self._jacobian[:3, self.dof]
 
     def shape_ends(self, joints: ArrayLike, jaw: float = 0.0) -> FloatArray:
         """Ends of the outer shapes' axes at joint values (n,) and a jaw angle [rad], shape (n_shape, 2, 3) [m]."""
         data = self._at(joints, jaw)
-        rotations = data.geom_xmat[self._shapes].reshape(-1, 3, 3)
+        rotations = data.geom_xmat[self.shapes].reshape(-1, 3, 3)
         axis = np.einsum("sxy,sy->sx", rotations, self.shape_half_axis)
-        centre = data.geom_xpos[self._shapes]
+        centre = data.geom_xpos[self.shapes]
         return np.stack([centre - axis, centre + axis], axis=1)
 
     def manipulability(self, joints: ArrayLike) -> float:

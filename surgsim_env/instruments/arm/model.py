@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -10,8 +9,7 @@ import mujoco
 import numpy as np
 
 from msdm_core.organ.support import Support
-from surgsim_env.instruments.supports import add_supports
-from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription
 from surgsim_env.scene.load import nearest
 from surgsim_env.scene.model import Port, frame_into
@@ -24,11 +22,7 @@ URDF_COMPILER = {"discardvisual": "false", "fusestatic": "false", "strippath": "
 
 
 def compile_arm(
-    description: ArmDescription,
-    port: Port,
-    tip_radius: float | None,
-    timestep: float,
-    supports: Sequence[Support] = (),
+    description: ArmDescription, port: Port, tip_radius: float | None, timestep: float, supports: Sequence[Support] = ()
 ) -> mujoco.MjModel:
     """Compile the model of an arm alone with its trocar at a port; `tip_radius` [m] overrides that of the tip's ball.
 
@@ -74,7 +68,10 @@ def _read_spec(description: ArmDescription) -> mujoco.MjSpec:
             ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         spec.modelfiledir = str(path.parent)
-    _check_meshes(spec, path)
+    for mesh in spec.meshes:
+        file = path.parent / spec.meshdir / mesh.file
+        if mesh.file and not file.is_file():
+            raise ValueError(f"mesh file {file} is missing: put it there, or take the mesh out of {path.name}")
     return spec
 
 
@@ -91,13 +88,6 @@ def _check_repeated_names(root: ElementTree.Element) -> None:
         if name and (part.tag, name) in seen:
             raise ValueError(f"two parts <{part.tag}> are named {name!r}; names must differ: rename one")
         seen.add((part.tag, name or ""))
-
-
-def _check_meshes(spec: mujoco.MjSpec, path: Path) -> None:
-    for mesh in spec.meshes:
-        file = path.parent / spec.meshdir / mesh.file
-        if mesh.file and not file.is_file():
-            raise ValueError(f"mesh file {file} is missing: put it there, or take the mesh out of {path.name}")
 
 
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
@@ -158,17 +148,13 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
         body.gravcomp = 1.0
     if arm.tip.body is not None:
         spec.body(arm.tip.body).add_site(name=TIP_SITE, pos=arm.tip.offset, size=[0.001, 0.001, 0.001])
-    _check_crossing_limits(spec, arm)
-    if arm.control.mode == "servo":
-        _add_servos(spec, arm)
-    _place(spec, arm, port)
-
-
-def _check_crossing_limits(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
     for name in (*arm.joints, *arm.jaw):
         lower, upper = spec.joint(name).range
         if lower > upper or (lower == upper != 0.0):
             raise ValueError(f"the limits of joint {name!r} cross: lower {lower:g}, upper {upper:g}; swap them")
+    if arm.control.mode == "servo":
+        _add_servos(spec, arm)
+    _place(spec, arm, port)
 
 
 def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:

@@ -13,8 +13,7 @@ from surgsim_env.instruments.arm.model import LINK_GROUP, arm_spec
 from surgsim_env.instruments.arm.steering import SteeredArm, millimetres, missing, placed
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.instruments.jaw import Jaw
-from surgsim_env.instruments.supports import SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
-from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ROUGHNESS
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ROUGHNESS, SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import pair_names
 from surgsim_env.scene.model import Scene

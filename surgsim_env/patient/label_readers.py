@@ -1,0 +1,430 @@
+"""Readers of label images, NIfTI, NRRD, MetaImage and DICOM: shape, geometry in the patient, and voxels in runs."""
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh_files.mesh_file import parsed
+
+# The axes of a scan's mesh, in words.
+CONVENTION = "x to the patient's left, y to the back, z to the head (LPS, as DICOM), metres, the scanner's own origin"
+# Two axes are at right angles up to this cosine of the angle between them; headers hold 32-bit numbers.
+COSINE_LARGEST = 1e-3
+# Smallest and largest voxel spacing that is accepted [m].
+SPACING_RANGE = (1e-5, 0.05)
+AXES = (("right", "left"), ("front", "back"), ("feet", "head"))
+# Largest image [voxels]; a reader holds one byte of each.
+VOXELS_MOST = 1_000_000_000
+# Length of a run [voxels]; a reader makes a few copies of it with eight bytes a voxel.
+RUN_VOXELS = 2_000_000
+ADVICE = "export or copy it again"
+# NIfTI's axes are RAS: x to the right and y to the front.
+RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
+METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
+# Most that may precede the image's first voxel, and follow its last one [bytes].
+HEADER_BYTES = TAIL_BYTES = 1_000_000
+# SimpleITK reads whole images [bytes].
+ITK_BYTES_MOST = 4_000_000_000
+# Only so much of a library's message is quoted [characters].
+REASON_LENGTH = 200
+READERS = {".nrrd": "NrrdImageIO", ".mha": "MetaImageIO", ".dcm": "GDCMImageIO"}
+# Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
+CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
+# pydicom holds the whole file and its unpacked frames in memory [bytes].
+DICOM_BYTES_MOST = 2_000_000_000
+# Frame positions may be off the grid by this share of the slice step, or of 1 mm where slices are thinner.
+SLACK = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class ImageGeometry:
+    """Position of voxel (i, j, k) in LPS: origin + direction @ (spacing * (i, j, k)).
+
+    Fields:
+        spacing: of voxels along the image's axes [m]           (3,)
+        direction: unit vectors of these axes, as columns       (3, 3)
+        origin: centre of voxel (0, 0, 0) [m]                   (3,)
+    """
+
+    spacing: FloatArray
+    direction: FloatArray
+    origin: FloatArray
+
+    @classmethod
+    def from_matrix(cls, matrix: FloatArray, origin: FloatArray, file: Path) -> "ImageGeometry":
+        """The geometry of a header.
+
+        Args:
+            matrix: the step from voxel to voxel along each axis of the image, as columns, LPS (3, 3) [m].
+            origin: centre of the first voxel, LPS (3,) [m].
+            file: for messages.
+
+        Raises:
+            MeshError: numbers that are not finite, axes that are not at right angles, a spacing outside SPACING_RANGE.
+        """
+        if not (np.isfinite(matrix).all() and np.isfinite(origin).all()):
+            raise MeshError(f"{file}: the header's affine has numbers that are not finite: export the image again")
+        spacing = np.linalg.norm(matrix, axis=0)
+        low, high = SPACING_RANGE
+        if not ((spacing >= low) & (spacing <= high)).all():
+            shown = " x ".join(f"{one * 1e3:.4g}" for one in spacing)
+            raise MeshError(
+                f"{file}: the header's voxels are {shown} mm; the rule is {low * 1e3:g} to {high * 1e3:g} mm a side: "
+                "is the header's length unit right?"
+            )
+        direction = matrix / spacing
+        cosines = np.abs(direction.T @ direction - np.eye(3))
+        if cosines.max() > COSINE_LARGEST:
+            first, second = np.unravel_index(int(np.argmax(cosines)), (3, 3))
+            angle = np.degrees(np.arccos(np.clip(direction[:, first] @ direction[:, second], -1, 1)))
+            raise MeshError(
+                f"{file}: axes {first} and {second} of the header's affine stand at {angle:.2f} degrees; sheared "
+                "images (non-orthogonal affine, as of a tilted gantry) are refused: resample it onto right-angled axes"
+            )
+        # The nearest orthogonal matrix removes the header's rounding.
+        left, _, right = np.linalg.svd(direction)
+        return cls(spacing, left @ right, np.asarray(origin, dtype=np.float64))
+
+    def moved(self, corner: FloatArray) -> "ImageGeometry":
+        """The geometry of a part of the image that begins at voxel `corner` (3,)."""
+        return ImageGeometry(self.spacing, self.direction, self.places(np.asarray(corner) * self.spacing))
+
+    def places(self, points: FloatArray) -> FloatArray:
+        """LPS positions (..., 3) [m] of points given along the image's axes from voxel (0, 0, 0), (..., 3) [m]."""
+        return self.origin + points @ self.direction.T
+
+    def side(self, axis: int, *, high: bool) -> str:
+        """The patient's side to which an axis of the image begins or ends, such as "head"."""
+        along = self.direction[:, axis]
+        main = int(np.argmax(np.abs(along)))
+        return AXES[main][int((along[main] > 0) == high)]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelSource:
+    """An image file whose header was read.
+
+    Fields:
+        file: its path
+        shape: of the image                                     (3,)
+        geometry: spacing, directions and origin
+        runs: reads the voxels as (first voxel, values (n,)), in order, the first axis fastest
+        notes: assumptions about the header, for the report
+    """
+
+    file: Path
+    shape: tuple[int, int, int]
+    geometry: ImageGeometry
+    runs: Callable[[], Iterator[tuple[int, NDArray]]]
+    notes: tuple[str, ...] = ()
+
+
+def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
+    """The three voxel counts of a header; further axes of length 1 are dropped.
+
+    Raises:
+        MeshError: fewer or more axes, or an image that is too large.
+    """
+    counts = [int(count) for count in shape]
+    while len(counts) > 3 and counts[-1] == 1:
+        counts.pop()
+    if len(counts) != 3:
+        text = " x ".join(map(str, counts))
+        raise MeshError(
+            f"{file}: the image has {len(counts)} axes ({text}); the rule is three: export one volume of it"
+        )
+    if min(counts) < 1:
+        raise MeshError(f"{file}: the image has {' x '.join(map(str, counts))} voxels: export it again")
+    total = counts[0] * counts[1] * counts[2]
+    if total > VOXELS_MOST:
+        raise MeshError(
+            f"{file}: the image has {' x '.join(map(str, counts))} = {total:.3g} voxels; at most {VOXELS_MOST:.3g} are "
+            "read: crop it to the organ, or resample it"
+        )
+    return counts[0], counts[1], counts[2]
+
+
+def checked_kind(dtype: np.dtype, file: Path) -> None:
+    """Raise a MeshError for values such as colours or complex numbers."""
+    if dtype.kind not in "iubf":
+        raise MeshError(f"{file}: the image's values are {dtype}; labels are whole numbers: export a label map")
+
+
+def checked_whole(values: NDArray, file: Path) -> NDArray:
+    """The label values; raises a MeshError with the first that is not a whole number."""
+    checked_kind(values.dtype, file)
+    if values.dtype.kind != "f":
+        return values
+    wrong = values != np.rint(values)
+    if wrong.any():
+        raise MeshError(
+            f"{file}: the image holds {float(values[wrong][0]):g}, which is no whole number: labels are; is this the "
+            "scan itself, or resampled with interpolation? Export a label map, resampled by nearest neighbours"
+        )
+    return values
+
+
+def open_nifti(file: Path) -> LabelSource:
+    """Read the header of a NIfTI file.
+
+    Raises:
+        MeshError: a damaged file or an unsupported header.
+    """
+    _check_compression(file)
+    header = _header(file)
+    shape = checked_shape(parsed(file, lambda _: header.get_data_shape(), ADVICE), file)
+    dtype = np.dtype(parsed(file, lambda _: header.get_data_dtype(), ADVICE))
+    checked_kind(dtype, file)
+    offset = int(header.get_data_offset())
+    if not 0 <= offset <= HEADER_BYTES:
+        raise MeshError(
+            f"{file}: its header puts the first voxel at byte {offset} (vox_offset); the rule is 0 to {HEADER_BYTES}: "
+            "export it without header extensions"
+        )
+    slope, shift = parsed(file, lambda _: header.get_slope_inter(), ADVICE)
+    scaling = (1.0 if slope is None else float(slope), 0.0 if shift is None else float(shift))
+    notes = []
+    unit = str(parsed(file, lambda _: header.get_xyzt_units(), ADVICE)[0])
+    if unit not in METRES:
+        notes.append("the header states no length unit: millimetres are assumed, as NIfTI's readers do")
+    if not int(header["sform_code"]) and not int(header["qform_code"]):
+        notes.append("the header states no orientation: left and right, front and back may be swapped")
+    affine = np.asarray(parsed(file, lambda _: header.get_best_affine(), ADVICE), dtype=np.float64)
+    affine = affine * METRES.get(unit, 1e-3)
+    geometry = ImageGeometry.from_matrix(RAS_TO_LPS @ affine[:3, :3], RAS_TO_LPS @ affine[:3, 3], file)
+
+    runs = partial(_runs, file, shape, dtype, offset, scaling)
+    return LabelSource(file, shape, geometry, runs, tuple(notes))
+
+
+def _check_compression(file: Path) -> None:
+    with file.open("rb") as stream:
+        packed = stream.read(2) == b"\x1f\x8b"
+    if packed != file.name.lower().endswith(".gz"):
+        name, what = (".nii.gz", "is not") if not packed else (".nii", "is")
+        raise MeshError(f"{file}: is named {name} and {what} compressed by gzip: rename it, or {ADVICE}")
+
+
+def _header(file: Path) -> Any:
+    """The header without its extensions, whose stated sizes nibabel.load would trust."""
+    try:
+        from nibabel.nifti1 import Nifti1Header
+        from nibabel.nifti2 import Nifti2Header
+    except ImportError:
+        raise MeshError(f"{file}: reading NIfTI needs nibabel: pip install 'surgsim[patient]'") from None
+    raw = parsed(file, lambda _: _opened(file, Nifti2Header.template_dtype.itemsize), ADVICE)
+    if len(raw) < Nifti1Header.template_dtype.itemsize:
+        raise MeshError(f"{file}: is cut short: it ends within its header, after {len(raw)} bytes: {ADVICE}")
+    # Positions of the magic words in the two versions of the format.
+    for kind, magic, place in ((Nifti1Header, b"n+1\0", 344), (Nifti2Header, b"n+2\0", 4)):
+        if raw[place : place + 4] == magic:
+            size = kind.template_dtype.itemsize
+            return parsed(file, lambda _, kind=kind, size=size: kind.from_fileobj(io.BytesIO(raw[:size])), ADVICE)
+    raise MeshError(f"{file}: is no NIfTI image of one file (no n+1 or n+2 in its header): {ADVICE}")
+
+
+def _opened(file: Path, size: int) -> bytes:
+    from nibabel.openers import ImageOpener
+
+    stream: Any = ImageOpener(str(file))
+    with stream:
+        return stream.read(size)
+
+
+def _runs(
+    file: Path, shape: tuple[int, int, int], dtype: np.dtype, offset: int, scaling: tuple[float, float]
+) -> Iterator[tuple[int, NDArray]]:
+    """Runs of (first voxel, values); reads the whole file, so that gzip's checksum is verified."""
+    from nibabel.openers import ImageOpener
+
+    layer, total = shape[0] * shape[1], shape[0] * shape[1] * shape[2]
+    slope, shift = scaling
+    stream: Any = ImageOpener(str(file))
+    with stream:
+        parsed(file, lambda _: stream.seek(offset), ADVICE)
+        for first in range(0, total, RUN_VOXELS):
+            wanted = min(RUN_VOXELS, total - first) * dtype.itemsize
+            raw = parsed(file, lambda _, size=wanted: stream.read(size), ADVICE)
+            if len(raw) < wanted:
+                raise MeshError(
+                    f"{file}: is cut short: its header promises {' x '.join(map(str, shape))} voxels, the data end "
+                    f"within slice {(first + len(raw) // dtype.itemsize) // layer} of {shape[2]}: {ADVICE}"
+                )
+            values = np.frombuffer(raw, dtype=dtype)
+            yield first, values if scaling == (1.0, 0.0) else values * slope + shift
+        if len(parsed(file, lambda _: stream.read(TAIL_BYTES), ADVICE)) >= TAIL_BYTES:
+            raise MeshError(f"{file}: goes on far beyond the image that its header describes: {ADVICE}")
+
+
+def open_itk(file: Path) -> LabelSource:
+    """Read the header of an NRRD, MHA or DICOM file.
+
+    Raises:
+        MeshError: a damaged file, an unsupported header, or a file that SimpleITK cannot parse.
+    """
+    try:
+        import SimpleITK
+    except ImportError:
+        raise MeshError(f"{file}: reading {file.suffix} needs SimpleITK: pip install 'surgsim[patient]'") from None
+    SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
+    reader: Any = SimpleITK.ImageFileReader()
+    reader.SetImageIO(READERS[file.suffix.lower()])
+    reader.SetFileName(str(file))
+    _asked(file, reader.ReadImageInformation)
+    shape = checked_shape(reader.GetSize(), file)
+    components = reader.GetNumberOfComponents()
+    if components != 1:
+        raise MeshError(f"{file}: each voxel has {components} numbers; the rule is one label: export one layer of it")
+    pixel = SimpleITK.GetPixelIDValueAsString(reader.GetPixelID())
+    width = next((size for name, size in (("8-bit", 1), ("16-bit", 2), ("32-bit", 4)) if name in pixel), 8)
+    if np.prod(np.array(shape, dtype=np.float64)) * width > ITK_BYTES_MOST:
+        raise MeshError(
+            f"{file}: holds {' x '.join(map(str, shape))} voxels of {width} bytes; at most {ITK_BYTES_MOST / 1e9:g} GB "
+            "of this format are read at once: crop it, or save it as NIfTI of 8 bits"
+        )
+    dimension = reader.GetDimension()
+    direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
+    matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
+    geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * 1e-3, file)
+    notes = _stated_space(file)
+
+    def runs() -> Iterator[tuple[int, NDArray]]:
+        image = _asked(file, reader.Execute)
+        # SimpleITK's arrays have the axes reversed, so that the image's first axis is the fastest.
+        values = SimpleITK.GetArrayViewFromImage(image).reshape(-1)
+        for first in range(0, len(values), RUN_VOXELS):
+            yield first, values[first : first + RUN_VOXELS]
+
+    return LabelSource(file, shape, geometry, runs, notes)
+
+
+def _asked(file: Path, question: Callable[[], Any]) -> Any:
+    """The result of a call to SimpleITK; its error messages without the positions in its own sources."""
+    try:
+        return parsed(file, lambda _: question(), ADVICE)
+    except MeshError as error:
+        lines = [line.strip() for line in str(error.__cause__).splitlines() if line.strip()]
+        raise MeshError(f"{file}: cannot be parsed: {' '.join(lines)[-REASON_LENGTH:]}: {ADVICE}") from None
+
+
+def _stated_space(file: Path) -> tuple[str, ...]:
+    """A note if an NRRD header names no anatomical space: ITK then assumes LPS."""
+    if file.suffix.lower() != ".nrrd":
+        return ()
+    with file.open("rb") as stream:
+        head = stream.read(20_000).partition(b"\n\n")[0].decode("ascii", errors="replace").lower()
+    if "\nspace:" in head:
+        return ()
+    return ("the header names no anatomical space: left, back and up (LPS) are assumed",)
+
+
+def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
+    """Read the header of a DICOM file; None if it is no segmentation object.
+
+    Args:
+        file: the file.
+        wanted: segment numbers; where segments overlap, the later one in this list applies.
+
+    Raises:
+        MeshError: a damaged or unsupported file; a wanted segment that is not there (lists those that are).
+    """
+    try:
+        import pydicom
+    except ImportError:
+        raise MeshError(f"{file}: reading DICOM needs pydicom: pip install 'surgsim[patient]'") from None
+    if file.stat().st_size > DICOM_BYTES_MOST:
+        raise MeshError(f"{file}: has more than {DICOM_BYTES_MOST / 1e9:g} GB: crop it to the organ")
+    data: Any = parsed(file, pydicom.dcmread, ADVICE)
+    if str(data.get("SOPClassUID", "")) not in CLASSES:
+        return None
+    try:
+        return _source(file, data, wanted)
+    except (AttributeError, KeyError, IndexError, TypeError) as error:
+        reason = " ".join(str(error).split())[:REASON_LENGTH]
+        raise MeshError(f"{file}: is no complete DICOM segmentation ({reason}): {ADVICE}") from None
+
+
+def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
+    kind = str(data.SegmentationType)
+    if kind not in ("BINARY", "LABELMAP"):
+        raise MeshError(f"{file}: its segments are {kind}; the rule is BINARY or LABELMAP: export it so")
+    segments = {int(one.SegmentNumber): str(one.SegmentLabel) for one in data.SegmentSequence}
+    missing = [number for number in wanted if number not in segments]
+    if missing:
+        there = ", ".join(f"{number} ({name!r})" for number, name in sorted(segments.items())[:20])
+        raise MeshError(f"{file}: segment {missing[0]} is nowhere in it; there are {there}: correct --labels")
+    frames = list(data.PerFrameFunctionalGroupsSequence)
+    rows, columns = int(data.Rows), int(data.Columns)
+    checked_shape((columns, rows, len(frames)), file)
+    geometry, slices = _geometry(file, data, frames)
+    shape = checked_shape((columns, rows, int(slices.max()) + 1), file)
+    identified = frames if kind == "BINARY" else []
+    numbers = [int(_group(data, one, "SegmentIdentificationSequence").ReferencedSegmentNumber) for one in identified]
+
+    def runs() -> Iterator[tuple[int, NDArray]]:
+        pixels = parsed(file, lambda _: np.atleast_3d(data.pixel_array), ADVICE).reshape(len(frames), rows, columns)
+        for place in range(shape[2]):
+            layer = np.zeros((columns, rows, 1), dtype=np.int64)
+            here = np.flatnonzero(slices == place)
+            if kind == "LABELMAP":
+                for frame in here:
+                    layer[..., 0] = pixels[frame].T
+            else:
+                for number in wanted:
+                    for frame in here:
+                        if numbers[frame] == number:
+                            layer[pixels[frame].T > 0] = number
+            yield place * rows * columns, layer.ravel(order="F")
+
+    return LabelSource(file, shape, geometry, runs)
+
+
+def _group(data: Any, frame: Any, name: str) -> Any:
+    """The first item of a functional group: the frame's own, else the one shared by all frames."""
+    return (frame if name in frame else data.SharedFunctionalGroupsSequence[0])[name][0]
+
+
+def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeometry, NDArray[np.int64]]:
+    """The geometry of the stack and the slice of each frame (n_frame,)."""
+    turns = {tuple(map(float, _group(data, one, "PlaneOrientationSequence").ImageOrientationPatient)) for one in frames}
+    measures = _group(data, frames[0], "PixelMeasuresSequence")
+    if len(turns) != 1:
+        raise MeshError(
+            f"{file}: its frames have {len(turns)} orientations; the rule is one stack of parallel slices: resample it"
+        )
+    turn = np.array(turns.pop()).reshape(2, 3)
+    normal = np.cross(turn[0], turn[1])
+    places = np.array([_group(data, one, "PlanePositionSequence").ImagePositionPatient for one in frames], dtype=float)
+    along = places @ normal
+    step = _slice_step(file, along, measures)
+    slices = np.rint((along - along.min()) / step).astype(np.int64)
+    first = places[int(np.argmin(along))]
+    off = np.linalg.norm(places - first - slices[:, None] * step * normal, axis=1)
+    if off.max() > SLACK * max(step, 1.0):
+        raise MeshError(
+            f"{file}: a frame lies {off.max():.3g} mm off an even stack of {step:.4g} mm slices: sheared or uneven "
+            "stacks are refused: resample it onto right-angled axes"
+        )
+    row_spacing, column_spacing = map(float, measures.PixelSpacing)
+    matrix: FloatArray = np.column_stack([turn[0] * column_spacing, turn[1] * row_spacing, normal * step]) * 1e-3
+    return ImageGeometry.from_matrix(matrix, first * 1e-3, file), slices
+
+
+def _slice_step(file: Path, along: FloatArray, measures: Any) -> float:
+    """Distance between slices [mm], from the frames' positions along the normal [mm]; for one slice the stated one."""
+    apart = np.diff(np.unique(np.round(along, 3)))
+    if len(apart):
+        # Averaged over the whole stack, so that rounded positions do not add up to an error.
+        return float(np.ptp(along) / max(round(np.ptp(along) / apart.min()), 1))
+    stated = measures.get("SpacingBetweenSlices") or measures.get("SliceThickness")
+    if stated is None:
+        raise MeshError(f"{file}: has one slice and states no thickness: export it with SliceThickness")
+    return float(stated)

@@ -44,7 +44,7 @@ def _right(simulation: Simulation) -> Any:
 
 
 class BimanualRetractTask(RetractTask):
-    """Lift a lobe with one arm and touch with the other what lay under it.
+    """Lift a lobe with one arm and touch the target under it with the other.
 
     ## Description
     The lobe of `SurgSim/Retract-v0` hides a disc on its bed. The left of two robot arms grasps the lobe and folds it
@@ -60,8 +60,8 @@ class BimanualRetractTask(RetractTask):
     the right one. `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
     ## Rewards
-    `info["reward_<term>"]` shows what each term paid. What is reached pays by its changes. An episode that ends in
-    failure pays less than any that runs its time.
+    `info["reward_<term>"]` shows what each term paid. Four terms pay the change of their value, so that they cannot be
+    earned twice. An episode that ends in failure pays less than any that is truncated.
 
     ## Starting State
     That of `SurgSim/Retract-v0`, and the right tip at a random place on the free side.
@@ -70,9 +70,9 @@ class BimanualRetractTask(RetractTask):
     Terminated: for 0.5 s, at the end of each control step, the left jaw held tissue, the organ left at least 80 % of
     the target uncovered as seen from the endoscope (instruments do not count, as the right tip itself stands before the
     target), and the right ball, its centre above the disc, pressed what lies under it with 0.3 to 1.0 N (success); in a
-    haptic step the contact force on the tissue exceeded the hard limit, or the jaw's pull the strength of the tissue;
-    at the end of a control step the right arm pressed the bed with more than the hard limit, or the left arm with more
-    than 2 N; the simulation faulted. Truncated: 600 control steps (30 s).
+    haptic step the contact force on the tissue exceeded the hard limit, or the jaw's pull exceeded the strength of the
+    tissue; at the end of a control step the force between right arm and bed exceeded the hard limit, or the force
+    between the arms exceeded 2 N; the simulation faulted. Truncated: 600 control steps (30 s).
 
     ## Info
     That of `SurgSim/Retract-v0`, and `collided`, `touches` (bool), `uncovered` (share), `touch_force`,
@@ -145,7 +145,7 @@ class BimanualRetractTask(RetractTask):
             lambda task, step: task.nearness(step.simulation),
         ),
         Reward(
-            "touched", 1.0, "change", "1 while the right tip touches the target as it should",
+            "touched", 1.0, "change", "1 while the right tip presses the target with 0.3 to 1.0 N",
             lambda task, step: task.touches(step.simulation),
         ),
         Reward("success", 10.0, "success", "touched, while exposed, for long enough"),

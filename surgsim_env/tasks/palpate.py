@@ -73,7 +73,8 @@ class PalpateTask(Task):
 
     ## Rewards
     `info["reward_<term>"]` shows what each term paid. A failure (a wrong declaration, the hard limit, a fault) also
-    costs as much as the most expensive control step for each one left, so that it never pays more than searching on.
+    costs as much as the most expensive control step for each control step left, so that continuing the search never
+    pays less.
 
     ## Starting State
     Radius, cover and modulus ratio of the lesion, its place on the palpable face, the sensor's bias and the tip's place

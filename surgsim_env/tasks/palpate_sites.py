@@ -69,24 +69,26 @@ class PalpateSitesTask(Task):
     map that is made once for each scene and kept on disk (`surgsim_env.palpation.healthy_map`).
 
     ## Rewards
-    `info["reward_<term>"]` shows what each term paid. Each press costs in proportion to the error of the estimate after
-    it; lesions found pay once. An episode that ends in failure pays less than any that makes all its presses.
+    `info["reward_<term>"]` shows what each term paid. A control step is one press. Each press costs in
+    proportion to the error of the estimate after it; lesions found pay once. An episode that ends in failure pays less
+    than any that makes all its presses.
 
     ## Starting State
-    As the level says (`surgsim_env.scene.levels`): number, places, sizes, covers and modulus ratios of the lesions, the
-    modulus of the tissue around them, a capsule, the sensor's bias.
+    Drawn from the ranges of the level (`surgsim_env.scene.levels`): number, places, sizes, covers and modulus ratios of
+    the lesions, the modulus of the tissue around them, a capsule, the sensor's bias. The organ is at rest.
 
     ## Episode End
-    Terminated: the presses of the budget are made (success where the error is at most 5 mm under a tip of 8 mm); the
-    contact force exceeded the hard limit; the simulation faulted. Never truncated: the budget is the task's.
+    Terminated: the presses of the budget are made (success if the error is at most 5 mm; distances are for a tip of
+    8 mm radius and scale with it); the contact force exceeded the hard limit; the simulation faulted. Never truncated:
+    the budget of presses belongs to the task.
 
     ## Info
     Fixed keys and types. Of the press: `sim_fault` (str), `sensor_saturated`, `workspace_limited`, `hard_limit`,
     `stopped_by_force`, `contrast_cut` (bool), `force`, `force_peak` [N], `depth` [m], `stiffness` [N/m], `contrast`,
     `moved_mm`, `cost` (force over the soft limit, 1 at the hard one: a constraint for safe learning),
     `trocar_error_mm`, `added_mass` [kg], one `reward_<term>` each. Of the episode so far: `seconds`, `path_length` [m],
-    `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm under a tip of 8 mm),
-    `found` (share of lesions with an estimate within 10 mm, likewise; without lesions 1 where none is claimed),
+    `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm), `found`
+    (share of lesions with an estimate within 10 mm; on an organ without lesions 1 if the estimate has none),
     `lesion_count_estimated`, `success`.
 
     ## Arguments
@@ -120,7 +122,7 @@ class PalpateSitesTask(Task):
             lambda task, instrument: -_force_bound(task), lambda task, instrument: _force_bound(task),
             read=lambda task, simulation: task.felt.last.force / task.limits.hard_force, felt=True,
             meaning="its force along the normal, through the sensor model, over the hard limit",
-            bounds_text="+-sqrt(3) range",
+            bounds_text="+-sqrt(3) range / hard limit",
         ),
         Channel(
             "last_depth", 1, "", -DEPTH_BOUND, DEPTH_BOUND,

@@ -114,7 +114,7 @@ MAPS: tuple[Column, ...] = (
 )
 TASKS: tuple[Column, ...] = (
     ("success [%]", "success", 0, 100.0),
-    ("time to it [s]", "seconds", 1, 1.0),
+    ("time to success [s]", "seconds", 1, 1.0),
     ("error [mm]", "error_mm", 1, 1.0),
     ("peak force [N]", "force_peak", 2, 1.0),
     ("under soft limit [%]", "under_soft_force", 0, 100.0),
@@ -246,4 +246,4 @@ def _number(value: float | None, decimals: int, factor: float) -> str:
 def _commands(results: Sequence[Result]) -> str:
     lines = ["\n## Commands\n", _line(["command", "wall time [s]", "date"]), _line(["---"] * 3)]
     lines += [_line([f"`{row.command}`", f"{row.wall_time:.0f}", row.date]) for row in results]
-    return "\n".join([*lines, "", "Wall times are of a 2-core machine that did other work beside.", ""])
+    return "\n".join([*lines, "", "Wall times were measured on a 2-core machine under other load.", ""])

@@ -63,7 +63,7 @@ class OrganSpec:
         stiffness_rule: "lloyd" (eq. 6), "fitted" (eq. 6 times factors fitted to the mesh) or "van_gelder".
         gravity: [m/s^2]; off by default, because a scanned shape is the equilibrium.
         supports: fixed solids that it rests on.
-        support_law: how they hold it off.
+        support_law: their contact law.
     """
 
     mesh: TetMesh

@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env.base_vec_env import (  # pyright: ignore[r
 class VectorEnvForStableBaselines(VecEnv):
     """Environments that are stepped together, behind the interface of stable-baselines3.
 
-    Both reset an environment in the step in which its episode ends; what the last step observed is
-    `info["terminal_observation"]` here and `info["final_obs"]` there.
+    Both interfaces reset an environment in the step in which its episode ends; the last observation of the episode is
+    `info["terminal_observation"]` in stable-baselines3 and `info["final_obs"]` in Gymnasium.
     """
 
     def __init__(self, envs: VectorEnv) -> None:
@@ -85,7 +85,7 @@ class VectorEnvForStableBaselines(VecEnv):
         return [env.get_wrapper_attr(method_name)(*method_args, **method_kwargs) for env in self._chosen(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Whether some environments have a wrapper of that class: none of them has any."""
+        """False for each of some environments: they have no wrappers."""
         return [False for _ in self._chosen(indices)]
 
     def _chosen(self, indices: VecEnvIndices) -> Sequence[gym.Env]:

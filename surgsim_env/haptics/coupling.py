@@ -14,7 +14,7 @@ STIFFNESS_FREE = 500.0
 
 @dataclass(frozen=True)
 class VirtualCoupling:
-    """F = K e + B de/dt on the tip and -F on the device, with e from the tip to the device.
+    """The force F = K e + B de/dt on the tip and -F on the device, with e from the tip to the device.
 
     (Virtual coupling: Colgate, Stanley & Brown 1995, "Issues in the haptic display of tool use".) de/dt is the
     difference quotient of two haptic steps.

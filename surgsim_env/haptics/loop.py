@@ -425,7 +425,7 @@ class HapticLoop:
         self._contacts = self._contact_forces()
 
     def step(self) -> HapticTelemetry:
-        """Advance by one haptic step, or let go of everything after a fault."""
+        """Advance by one haptic step; after a fault all forces are zero."""
         simulation = self.simulation
         if not self.fault:
             for held, contact in zip(self.held, self._contacts, strict=True):

@@ -36,7 +36,7 @@ class Hand:
 
 
 class SimulatedDevice:
-    """m dv/dt = F + push - b v - k_h (x - x_h) - b_h (v - dx_h/dt), solved exactly for a constant force in each step.
+    """Simulates m dv/dt = F + push - b v - k_h (x - x_h) - b_h (v - dx_h/dt), exactly for a force constant in a step.
 
     `advance` advances it by one haptic step. Poses and forces may be delayed, and positions rounded by an encoder.
     """

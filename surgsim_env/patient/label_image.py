@@ -94,7 +94,7 @@ class LabelImage:
 
     @property
     def voxel_volume(self) -> float:
-        """[m^3]."""
+        """Volume of a voxel [m^3]."""
         return float(np.prod(self.geometry.spacing))
 
 

@@ -208,7 +208,7 @@ class Port:
     Args:
         point: the trocar [m], world frame.
         into: direction into the body, any length.
-        roll: turn of the frame about its z axis [rad]; 0 has x as near to world x (else y) as can be.
+        roll: rotation of the frame about its z axis [rad]; at 0, x is as close to world x (else y) as possible.
     """
 
     point: Vector = (0.0, 0.0, 0.0)

@@ -4,18 +4,17 @@ import hashlib
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 
+from surgsim_env.arm_study.ports import Ports, default_ports, read_ports
+from surgsim_env.arm_study.study import POINTS_NAME, REPORT_NAME, SUMMARY_NAME, ArmSetup, StudyPlan, run_study
 from surgsim_env.cli.values import writable_folder
+from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.arm_description import ArmDescription, read_description
 from surgsim_env.scene.load import make_scene, read_toml
-
-if TYPE_CHECKING:
-    from surgsim_env.arm_study.job import ArmSetup
-    from surgsim_env.arm_study.ports import Ports
 
 FEWEST_POINTS = 10
 # A file of --compare with one of these tables is a ports file, any other an arm.
@@ -67,13 +66,11 @@ class Arms:
         Raises:
             ValueError: one line about an option that is not possible.
         """
-        from surgsim_env.arm_study.job import POINTS_NAME, REPORT_NAME, SUMMARY_NAME, StudyPlan, run_study
-
         for name, least in (("points", FEWEST_POINTS), ("episodes", 0), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
         anatomy = load_anatomy(make_scene(self.scene))
-        setups = [_setup(self, anatomy), *(_compared(one, self, anatomy) for one in self.compare)]
+        setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
         # Checked before the work, which takes minutes.
         folder = writable_folder(self.out, (REPORT_NAME, POINTS_NAME, SUMMARY_NAME))
         plan = StudyPlan(
@@ -83,37 +80,25 @@ class Arms:
         return 0
 
 
-def _setup(command: Arms, anatomy: Anatomy) -> "ArmSetup":
-    ports = _checked_ports(command.ports, anatomy)
-    left, right = _read("--left", command.left), _read("--right", command.right)
-    return _placed(_ports_name(command), f"{left.name} left, {right.name} right, as given", left, right, ports, anatomy)
-
-
-def _compared(source: str, command: Arms, anatomy: Anatomy) -> "ArmSetup":
-    """The setup of a file of --compare: other ports for the same arms, or an arm on both sides at the same ports."""
-    path = Path(source)
-    if _is_ports_file(source):
-        left, right = _read("--left", command.left), _read("--right", command.right)
-        ports = _checked_ports(path, anatomy)
-        return _placed(path.name, f"ports, with {left.name} left, {right.name} right", left, right, ports, anatomy)
-    arm = _read("--compare", source)
-    ports = _checked_ports(command.ports, anatomy)
-    return _placed(path.name, f"arm on both sides, at the ports of {_ports_name(command)}", arm, arm, ports, anatomy)
+def _setup(command: Arms, anatomy: Anatomy, compared: str | None) -> ArmSetup:
+    """The arms at their ports as given, or with a file of --compare: at its ports, or its arm on both sides."""
+    given = "default ports" if command.ports is None else command.ports.name
+    left, right, ports = _read("--left", command.left), _read("--right", command.right), command.ports
+    if compared is None:
+        name, what = given, f"{left.name} left, {right.name} right, as given"
+    elif _is_ports_file(compared):
+        name, what = Path(compared).name, f"ports, with {left.name} left, {right.name} right"
+        ports = Path(compared)
+    else:
+        name, what = Path(compared).name, f"arm on both sides, at the ports of {given}"
+        left = right = _read("--compare", compared)
+    placed, radius = _checked_ports(ports, anatomy), anatomy.scene.instrument.tip_radius
+    left_arm = load_arm(left, placed.left.port, tip_radius=radius)
+    return ArmSetup(name, what, left_arm, load_arm(right, placed.right.port, tip_radius=radius), placed)
 
 
 def _is_ports_file(source: str) -> bool:
     return source.endswith(".toml") and bool(PORT_TABLES & read_toml(Path(source), "--compare").keys())
-
-
-def _placed(
-    name: str, what: str, left: ArmDescription, right: ArmDescription, ports: "Ports", anatomy: Anatomy
-) -> "ArmSetup":
-    from surgsim_env.arm_study.job import ArmSetup
-    from surgsim_env.instruments.arm.arm import load_arm
-
-    radius = anatomy.scene.instrument.tip_radius
-    left_arm = load_arm(left, ports.left.port, tip_radius=radius)
-    return ArmSetup(name, what, left_arm, load_arm(right, ports.right.port, tip_radius=radius), ports)
 
 
 def _read(option: str, source: str) -> ArmDescription:
@@ -123,13 +108,7 @@ def _read(option: str, source: str) -> ArmDescription:
         raise ValueError(f"{option}: {error}") from None
 
 
-def _ports_name(command: Arms) -> str:
-    return "default ports" if command.ports is None else command.ports.name
-
-
-def _checked_ports(path: Path | None, anatomy: Anatomy) -> "Ports":
-    from surgsim_env.arm_study.ports import default_ports, read_ports
-
+def _checked_ports(path: Path | None, anatomy: Anatomy) -> Ports:
     if path is None:
         return default_ports(anatomy)
     ports = read_ports(path)

@@ -8,21 +8,22 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.console import Console
 
 from surgsim_env.cli.values import writable_folder
-from surgsim_env.haptics.udp import PORT
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.haptics.coupling import VirtualCoupling
+from surgsim_env.haptics.device import DeviceDynamics
+from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
+from surgsim_env.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
+from surgsim_env.haptics.settings import ForceLimits, HapticSettings
+from surgsim_env.haptics.trajectory import TrajectoryDevice
+from surgsim_env.haptics.udp import PORT, UdpDevice
+from surgsim_env.instruments.arm.arm_instrument import parked_place
+from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, pair_names
-from surgsim_env.scene.model import Scene
-
-if TYPE_CHECKING:
-    from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
-    from surgsim_env.haptics.pacing import Pacer
-    from surgsim_env.haptics.settings import HapticSettings
-    from surgsim_env.haptics.trajectory import TrajectoryDevice
-    from surgsim_env.haptics.udp import UdpDevice
 
 TELEMETRY_NAME = "telemetry.csv"
 VECTORS = ("target", "tip", "coupling_force", "force", "contact_force")
@@ -69,19 +70,11 @@ class Haptics:
             ValueError: an unknown scene, a bad trajectory, a coupling that is unstable with the device, two arms.
             OSError: the port is taken, or a file cannot be read.
         """
-        import numpy as np
-
-        from surgsim_env.coupling.simulation import Simulation
-        from surgsim_env.haptics.loop import HapticLoop
-        from surgsim_env.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
-        from surgsim_env.haptics.trajectory import TrajectoryDevice
-        from surgsim_env.haptics.udp import UdpDevice
-        from surgsim_env.instruments.arm.arm_instrument import parked_place
-        from surgsim_env.scene.anatomy import load_anatomy
-
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
             raise ValueError(f"--seconds is {self.seconds:g}; it must be finite and above 0")
-        scene = _scene(self.scene)
+        scene = make_scene(self.scene)
+        if pair_names(scene.instrument.model) is not None:
+            raise ValueError(f"scene {scene.name!r} has two arms; one device holds one tip: choose a scene with one")
         simulation = Simulation(load_anatomy(scene))
         anatomy = simulation.anatomy
         simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
@@ -119,16 +112,13 @@ class Haptics:
 
 def _hold(
     command: Haptics,
-    loop: "HapticLoop",
-    device: "UdpDevice | TrajectoryDevice",
-    pacer: "Pacer",
-    note: Callable[["HapticTelemetry"], object],
+    loop: HapticLoop,
+    device: UdpDevice | TrajectoryDevice,
+    pacer: Pacer,
+    note: Callable[[HapticTelemetry], object],
     console: Console,
 ) -> None:
     """Step the loop at its pace, note each step, print one line a second."""
-    from surgsim_env.haptics.trajectory import TrajectoryDevice
-    from surgsim_env.instruments.arm.arm_instrument import parked_place
-
     every = round(1.0 / loop.simulation.haptic_dt)
     count = None if command.seconds is None else round(command.seconds / loop.simulation.haptic_dt)
     step = 0
@@ -149,20 +139,9 @@ def _hold(
             break
 
 
-def _scene(name: str) -> Scene:
-    scene = make_scene(name)
-    if pair_names(scene.instrument.model) is not None:
-        raise ValueError(f"scene {scene.name!r} has two arms; one device holds one tip: choose a scene with one")
-    return scene
-
-
 @contextmanager
-def _device(command: Haptics, haptic_step: float) -> Iterator["UdpDevice | TrajectoryDevice"]:
+def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | TrajectoryDevice]:
     """The device that the options choose, closed at the end."""
-    from surgsim_env.haptics.device import DeviceDynamics
-    from surgsim_env.haptics.trajectory import TrajectoryDevice
-    from surgsim_env.haptics.udp import UdpDevice
-
     if command.trajectory is not None:
         yield TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
         return
@@ -173,10 +152,7 @@ def _device(command: Haptics, haptic_step: float) -> Iterator["UdpDevice | Traje
         yield device
 
 
-def _settings(command: Haptics) -> "HapticSettings":
-    from surgsim_env.haptics.coupling import VirtualCoupling
-    from surgsim_env.haptics.settings import ForceLimits, HapticSettings
-
+def _settings(command: Haptics) -> HapticSettings:
     coupling = None
     if command.stiffness is not None:
         coupling = VirtualCoupling(command.stiffness, command.damping or 0.0)
@@ -186,7 +162,7 @@ def _settings(command: Haptics) -> "HapticSettings":
 
 
 @contextmanager
-def _telemetry(folder: Path | None) -> Iterator[Callable[["HapticTelemetry"], object]]:
+def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
     """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing."""
     if folder is None:
         yield lambda told: None
@@ -197,12 +173,8 @@ def _telemetry(folder: Path | None) -> Iterator[Callable[["HapticTelemetry"], ob
         yield lambda told: writer.writerow(_row(told))
 
 
-def _row(told: "HapticTelemetry") -> list[float | int]:
+def _row(told: HapticTelemetry) -> list[float | int]:
     tip = told.tip
     vectors = [value for name in VECTORS for value in getattr(tip, name).tolist()]
-    return [
-        told.time,
-        *vectors,
-        *(getattr(tip, name) for name in NUMBERS),
-        *(int(getattr(tip, name)) for name in FLAGS),
-    ]
+    numbers = [getattr(tip, name) for name in NUMBERS]
+    return [told.time, *vectors, *numbers, *(int(getattr(tip, name)) for name in FLAGS)]

@@ -6,7 +6,6 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -19,22 +18,12 @@ from surgsim_env.cli.palpate import Palpate
 from surgsim_env.cli.retract import Retract
 from surgsim_env.cli.scenes import Scenes
 from surgsim_env.cli.validate import Validate
-from surgsim_env.cli.view import LiveView
+from surgsim_env.cli.view import View
 
 # Options whose value is a list of numbers, which may begin with a minus.
 NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around")
 
-Command = (
-    Annotated[Palpate, tyro.conf.subcommand("palpate")]
-    | Annotated[Retract, tyro.conf.subcommand("retract")]
-    | Annotated[Organ, tyro.conf.subcommand("organ")]
-    | Annotated[Scenes, tyro.conf.subcommand("scenes")]
-    | Annotated[Arms, tyro.conf.subcommand("arms")]
-    | Annotated[Validate, tyro.conf.subcommand("validate")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Haptics, tyro.conf.subcommand("haptics")]
-    | Annotated[LiveView, tyro.conf.subcommand("view")]
-)
+Command = Palpate | Retract | Organ | Scenes | Arms | Validate | Bench | Haptics | View
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -3,18 +3,19 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
 from surgsim_env.cli.values import MaybeText, writable_folder
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
-    from surgsim_env.scripting.trace import Trace
+from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.rendering.gl import NoGLError
+from surgsim_env.scripting.oracle import oracle_script
+from surgsim_env.scripting.run import ScriptError, run_script
+from surgsim_env.scripting.trace import Trace
 
 TRACE_NAME, PLOT_NAME, PICTURE_NAME, SUMMARY_NAME = "trace.csv", "forces.png", "retraction.png", "summary.json"
 # Cameras of the picture.
@@ -46,11 +47,6 @@ class Retract:
         Raises:
             ValueError: one line about an option that is not possible.
         """
-        import gymnasium as gym
-
-        from surgsim_env.scripting.oracle import oracle_script
-        from surgsim_env.scripting.run import ScriptError, run_script
-
         if self.seed < 0:
             raise ValueError(f"--seed is {self.seed}; it must be a whole number of at least 0")
         if self.bimanual and self.instrument is not None:
@@ -80,11 +76,8 @@ class Retract:
         return 0 if success else 1
 
 
-def _pictures(env: "gym.Env", console: Console) -> NDArray[np.uint8] | None:
+def _pictures(env: gym.Env, console: Console) -> NDArray[np.uint8] | None:
     """The views side by side; None, with a message, where OpenGL is missing."""
-    from surgsim_env.envs.surgical_env import SurgicalEnv
-    from surgsim_env.rendering.gl import NoGLError
-
     inner = env.unwrapped
     assert isinstance(inner, SurgicalEnv)
     try:
@@ -101,7 +94,7 @@ def _write_picture(path: Path, before: NDArray[np.uint8], after: NDArray[np.uint
     Image.fromarray(np.concatenate(rows, axis=0)).save(path)
 
 
-def _summary(trace: "Trace") -> dict[str, Any]:
+def _summary(trace: Trace) -> dict[str, Any]:
     """The episode's duration, return and steps, and the last info, as JSON holds them."""
     return {
         "duration": trace.duration,
@@ -112,7 +105,7 @@ def _summary(trace: "Trace") -> dict[str, Any]:
     }
 
 
-def _verdict(trace: "Trace", success: bool) -> str:
+def _verdict(trace: Trace, success: bool) -> str:
     info = trace.info
     if not success:
         return f"not retracted: {trace.failure or 'the episode ran out of time'}"

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from surgsim_env.haptics.pacing import Timeliness, timeliness
 from surgsim_env.scene.load import make_scene, with_instrument
 
 if TYPE_CHECKING:
-    from surgsim_env.haptics.pacing import Timeliness
     from surgsim_env.live.page import Page
 
 # The scene that has ports for two arms, and the two that work there.
@@ -24,7 +24,7 @@ RATE_SHARE, LATENESS_MOST, UPDATES_LEAST = 0.995, 0.002, 20.0
 
 
 @dataclass(frozen=True)
-class LiveView:
+class View:
     """Serve a scene live to a browser: press the organ with mouse, keys or gamepad, a thousand steps a second.
 
     Prints the address to open. Other machines can connect with --allow-remote only. See docs/live.md.
@@ -150,7 +150,6 @@ class Measurement:
 
     def report(self, console: Console) -> int:
         """Print `name value unit` lines and what is amiss; 1 where anything is, see `missed_targets`."""
-        from surgsim_env.haptics.pacing import timeliness
         from surgsim_env.live.exchange_records import Phase
 
         session, after = self._page.session, self._page.session.timing()
@@ -174,7 +173,7 @@ class Measurement:
         return 1 if missed else 0
 
 
-def missed_targets(kept: "Timeliness", period: float, updates: float, force: float) -> list[str]:
+def missed_targets(kept: Timeliness, period: float, updates: float, force: float) -> list[str]:
     """What a measured stretch fell short of, in words.
 
     Args:
@@ -195,7 +194,7 @@ def missed_targets(kept: "Timeliness", period: float, updates: float, force: flo
     return missed
 
 
-def report_lines(kept: "Timeliness", wall: float) -> list[str]:
+def report_lines(kept: Timeliness, wall: float) -> list[str]:
     """How steps kept time, as `name value unit` lines."""
     return [
         f"measured {wall:.1f} s",

@@ -16,7 +16,7 @@ from websockets.asyncio import server as websocket_server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from surgsim_env.live.errors import LiveError
+from surgsim_env.live.exchange_records import LiveError
 from surgsim_env.live.gate import Gate, asks_for_socket, listening_socket, names_of, refuse
 from surgsim_env.live.messages import HAND_PATH, InvalidMessageError, MessageFilter, RateLimit
 

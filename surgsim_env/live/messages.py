@@ -223,13 +223,3 @@ def read_report(message: object) -> DrawingReport | None:
     if not 0.0 <= rate <= FRAME_RATE_MOST or counted > 1 or software > 1:
         raise InvalidMessageError(f"{rate} frames a second, counted {counted}, software {software}")
     return DrawingReport(rate if counted else None, bool(software))
-
-
-def write_report(report: DrawingReport) -> bytes:
-    """The packet of a report."""
-    return _DRAWING.pack(report.rate or 0.0, report.rate is not None, report.software)
-
-
-def write_hand(motion: HandMotion) -> bytes:
-    """The packet of a motion."""
-    return _HAND.pack(*motion.axes, motion.arm, motion.turns_jaw)

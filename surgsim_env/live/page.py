@@ -1,32 +1,110 @@
 """The page: shows frames of the physics and passes requests of the panel to the session, thirty times a second."""
 
+import asyncio
 import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.pacing import timeliness
-from surgsim_env.live.errors import LiveError
-from surgsim_env.live.exchange_records import Change, Pause, Phase, Record, Replay, Reset
-from surgsim_env.live.felt_map import FeltMap
+from surgsim_env.live.exchange_records import Change, LiveError, Pause, Phase, Record, Replay, Reset
 from surgsim_env.live.guarded_server import GuardedServer
-from surgsim_env.live.instrument_view import SCALE, InstrumentView
-from surgsim_env.live.messages import MessageFilter
+from surgsim_env.live.messages import InvalidMessageError, MessageFilter, read_hand, read_report
 from surgsim_env.live.organ_choice import chosen_lesions
-from surgsim_env.live.organ_view import OrganView
-from surgsim_env.live.panel import Panel, headline, status_rows
+from surgsim_env.live.organ_view import FeltMap, OrganView
+from surgsim_env.live.panel import Panel, status_rows
 from surgsim_env.live.recording import write_recording
 from surgsim_env.live.session import Session
-from surgsim_env.live.stage import ForceArrow, Surroundings, add_handle
-from surgsim_env.live.tabs import HandSockets
+from surgsim_env.live.stage import SCALE, ForceArrow, InstrumentView, Surroundings, add_handle
 
 # Between updates of the plots, and of the status text [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
 # Longest wait for the physics to end a recording [s].
 END_TIMEOUT = 2.0
+# Largest and smallest picture rate [1/s].
+RATE_MOST, RATE_LEAST = 30.0, 6.0
+# Frames that a browser should draw per picture; factors by which a report changes the rate.
+HEADROOM, SLOWER, QUICKER = 1.15, 0.85, 1.08
+# Older reports are ignored: the tab is in the background [s].
+REPORT_AGE_MOST = 5.0
+
+
+class PictureRate:
+    """Adapts the picture rate to the slowest browser; without a report it is RATE_MOST.
+
+    A browser that cannot keep up would draw ever older pictures, and on a machine with two processors take time from
+    the physics.
+
+    Fields:
+        rate: pictures to send now [1/s]
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin with the largest rate."""
+        self.rate = RATE_MOST
+        self._clock = clock
+        self._reports: dict[int, tuple[float, float]] = {}
+
+    @property
+    def slowest(self) -> float | None:
+        """Frame rate of the slowest browser [1/s]; None without reports."""
+        now = self._clock()
+        recent = [rate for rate, heard in self._reports.values() if now - heard < REPORT_AGE_MOST]
+        return min(recent, default=None)
+
+    def report(self, tab: int, rate: float) -> None:
+        """Process a tab's frame rate [1/s]."""
+        self._reports[tab] = (rate, self._clock())
+        slowest = self.slowest
+        assert slowest is not None
+        if rate <= slowest:
+            factor = QUICKER if rate >= HEADROOM * self.rate else SLOWER
+            self.rate = min(RATE_MOST, max(RATE_LEAST, factor * self.rate))
+
+    def forget(self, tab: int) -> None:
+        """Remove a closed tab."""
+        self._reports.pop(tab, None)
+        if self.slowest is None:
+            self.rate = RATE_MOST
+
+
+class HandSockets:
+    """The sockets that `hand.js` opens, one per tab.
+
+    Fields:
+        rate: the picture rate
+        software: whether a tab without a graphics card was opened
+    """
+
+    def __init__(self, session: Session, message_filter: MessageFilter) -> None:
+        """Push a session's hands; the filter counts disconnected clients."""
+        self._session, self._message_filter = session, message_filter
+        self.rate = PictureRate()
+        self.software = False
+
+    async def serve(self, connection: ServerConnection) -> None:
+        """Serve one tab until it is closed or sends an invalid message."""
+        tab = id(connection)
+        with contextlib.suppress(ConnectionClosed, asyncio.CancelledError):
+            while True:
+                message = await connection.recv()
+                try:
+                    report = read_report(message)
+                    if report is None:
+                        self._session.push(read_hand(message, arm_count=max(2, self._session.arm_count)))
+                        continue
+                    self.software = self.software or report.software
+                    if report.rate is not None:
+                        self.rate.report(tab, report.rate)
+                except InvalidMessageError as error:
+                    self._message_filter.dropped += 1
+                    await connection.close(1008, str(error)[:100])
+        self.rate.forget(tab)
 
 
 class Page:
@@ -105,7 +183,7 @@ class Page:
             "record": lambda: session.ask(Record(not session.frame()["recording"])),
             "replay": lambda: session.ask(Replay(not session.frame()["replaying"])),
             "show_lesions": self._show_lesions,
-            "paint": self._show_paint,
+            "paint": self._organ.show_paint,
             "clear_map": self.felt.clear,
             "close_jaw": session.close_jaw,
             "plain": self.show_plain,
@@ -190,9 +268,6 @@ class Page:
         with self.server.viser.atomic():
             self._organ.show_lesions(chosen_lesions(self.session.anatomy, self.session.choice) if on else [])
 
-    def _show_paint(self, on: bool) -> None:
-        self._organ.show_paint(on)
-
     def _attend(self, frame: np.ndarray) -> None:
         """Do what does not depend on open tabs: update the stiffness map, apply the sliders, write recordings."""
         session = self.session
@@ -251,15 +326,9 @@ class Page:
         rows = status_rows(
             frame, kept, skipped=int(now[0]["skipped"]), fps=fps, drawn=self._tabs.rate.slowest, said=self._said
         )
-        self._panel.show_status(headline(frame), rows)
+        self._panel.show_status(frame, rows)
         self._show_phase(frame)
 
     def _show_phase(self, frame: np.ndarray) -> None:
-        self._panel.show_phase(
-            paused=frame["phase"] == Phase.PAUSED,
-            recording=bool(frame["recording"]),
-            replaying=bool(frame["replaying"]),
-            recorded=self.session.exchange.recorded.count,
-            step=self.session.scene.timing.haptic_step,
-            jaw_closed=self.session.jaw_closed,
-        )
+        recorded = self.session.exchange.recorded.count * self.session.scene.timing.haptic_step
+        self._panel.show_phase(frame, recorded, self.session.jaw_closed)

@@ -75,19 +75,17 @@ class Panel:
         self._changed: float | None = None
         self._status = gui.add_html(_status_html("starting", []))
         self._add_buttons()
-        self._jaw = gui.add_checkbox("Close the jaw", initial_value=False, visible=has_jaw)
-        self._allow(self._jaw, bool)
-        self._jaw.on_update(lambda _: calls["close_jaw"](self._jaw.value))
+        self._jaw = self._checkbox("Close the jaw", "close_jaw", visible=has_jaw)
         with gui.add_folder("Force and depth"):
             self._force = _plot(gui, "N", arm_count)
             self._depth = _plot(gui, "mm", arm_count)
         with gui.add_folder("Tissue"):
             self._add_tissue()
         with gui.add_folder("Stiffness map"):
-            self._add_map()
-        self._plain = gui.add_checkbox("Plain light", initial_value=False, hint="faster without a graphics card")
-        self._allow(self._plain, bool)
-        self._plain.on_update(lambda _: calls["plain"](self._plain.value))
+            gui.add_html(_legend_html())
+            self._checkbox("Paint it on the organ", "paint", initial_value=True)
+            self._button("Clear", "clear the stiffness map", calls["clear_map"])
+        self._plain = self._checkbox("Plain light", "plain", hint="faster without a graphics card")
         with gui.add_folder("How to steer", expand_by_default=False):
             second = "\n| X, or a shoulder button | the other arm |" if arm_count > 1 else ""
             jaw = "\n| G, or the first button | close or open the jaw |" if has_jaw else ""
@@ -100,27 +98,22 @@ class Panel:
         self._changed = None
         return self.choice
 
-    def show_status(self, headline: str, rows: list[tuple[str, str]]) -> None:
-        """Show a headline, and names with values."""
-        self._status.content = _status_html(headline, rows)
+    def show_status(self, frame: NDArray[Any], rows: list[tuple[str, str]]) -> None:
+        """Show the state of the physics in a frame, and names with values."""
+        self._status.content = _status_html(headline(frame), rows)
 
-    def show_phase(
-        self, *, paused: bool, recording: bool, replaying: bool, recorded: int, step: float, jaw_closed: bool
-    ) -> None:
-        """Label the buttons with what a click will do."""
-        if self._jaw.value != jaw_closed:
-            self._jaw.value = jaw_closed
-        self._name(self._pause, "Continue" if paused else "Pause")
-        self._name(self._record, f"End recording ({recorded * step:.0f} s)" if recording else "Record")
-        self._name(self._replay, "End replay" if replaying else f"Replay ({recorded * step:.1f} s)")
-        disabled = recorded == 0 or recording
-        if self._replay.disabled != disabled:
-            self._replay.disabled = disabled
+    def show_phase(self, frame: NDArray[Any], recorded: float, jaw_closed: bool) -> None:
+        """Label the buttons with what a click will do; `recorded` is the length of the recording [s]."""
+        recording = bool(frame["recording"])
+        _set(self._jaw, "value", jaw_closed)
+        _set(self._pause, "label", "Continue" if frame["phase"] == Phase.PAUSED else "Pause")
+        _set(self._record, "label", f"End recording ({recorded:.0f} s)" if recording else "Record")
+        _set(self._replay, "label", "End replay" if frame["replaying"] else f"Replay ({recorded:.1f} s)")
+        _set(self._replay, "disabled", recorded == 0.0 or recording)
 
     def show_plain(self, on: bool) -> None:
         """Set its check box."""
-        if self._plain.value != on:
-            self._plain.value = on
+        _set(self._plain, "value", on)
 
     def plot(self, trace: np.ndarray) -> None:
         """Show a trace's rows: time [s], force [N] and depth [m] of each arm."""
@@ -141,14 +134,11 @@ class Panel:
 
     def _add_buttons(self) -> None:
         calls = self._calls
-        self._pause = self._button("Pause", "pause the physics, or continue")
-        self._pause.on_click(lambda _: calls["pause"]())
-        reset = self._button("Reset", "the same organ at rest, tips parked")
-        reset.on_click(lambda _: calls["reset"]())
-        self._record = self._button("Record", "record hands, tips and forces at 1 kHz to a CSV file")
-        self._record.on_click(lambda _: calls["record"]())
-        self._replay = self._button("Replay", "repeat the recorded motion from the recording's initial state")
-        self._replay.on_click(lambda _: calls["replay"]())
+        self._pause = self._button("Pause", "pause the physics, or continue", calls["pause"])
+        self._button("Reset", "the same organ at rest, tips parked", calls["reset"])
+        self._record = self._button("Record", "record hands, tips and forces at 1 kHz to a CSV file", calls["record"])
+        hint = "repeat the recorded motion from the recording's initial state"
+        self._replay = self._button("Replay", hint, calls["replay"])
         self._replay.disabled = True
 
     def _add_tissue(self) -> None:
@@ -164,22 +154,11 @@ class Panel:
         )
         self._ratio = self._slider("Lesions' modulus / tissue's", 1.0, 12.0, 0.5, min(float(ratio), 12.0))
         self._size = self._slider("Lesions' size", 0.5, 1.3, 0.05, 1.0)
-        hide = self._button("Hide another lesion", "draw one from the scene's ranges")
+        hide = self._button("Hide another lesion", "draw one from the scene's ranges", self._hide)
         hide.visible = HIDDEN in kinds
         for one in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
             one.on_update(lambda _: self._choose())
-        hide.on_click(lambda _: self._hide())
-        show = gui.add_checkbox("Show lesions", initial_value=False)
-        self._allow(show, bool)
-        show.on_update(lambda _: self._calls["show_lesions"](show.value))
-
-    def _add_map(self) -> None:
-        gui = self._gui
-        gui.add_html(_legend_html())
-        paint = gui.add_checkbox("Paint it on the organ", initial_value=True)
-        self._allow(paint, bool)
-        paint.on_update(lambda _: self._calls["paint"](paint.value))
-        self._button("Clear", "clear the stiffness map").on_click(lambda _: self._calls["clear_map"]())
+        self._checkbox("Show lesions", "show_lesions")
 
     def _choose(self, **changes: Any) -> None:
         scene = self._scene
@@ -205,18 +184,27 @@ class Panel:
         self._allow(slider, Annotated[float, msgspec.Meta(ge=values[0] - 1e-9, le=values[1] + 1e-9)])
         return slider
 
-    def _button(self, label: str, hint: str) -> Any:
+    def _button(self, label: str, hint: str, clicked: Callable[..., None]) -> Any:
         button = self._gui.add_button(label, hint=hint, color=BUTTON_COLOUR)
         self._allow(button, bool)
+        button.on_click(lambda _: clicked())
         return button
+
+    def _checkbox(self, label: str, name: str, *, initial_value: bool = False, **given: Any) -> Any:
+        """A check box that calls the callback of some name with its value."""
+        box = self._gui.add_checkbox(label, initial_value=initial_value, **given)
+        self._allow(box, bool)
+        box.on_update(lambda _: self._calls[name](box.value))
+        return box
 
     def _allow(self, handle: Any, values: Any) -> None:
         self._message_filter.values[handle._impl.uuid] = values
 
-    @staticmethod
-    def _name(button: Any, label: str) -> None:
-        if button.label != label:
-            button.label = label
+
+def _set(handle: Any, name: str, value: object) -> None:
+    """Set an attribute of an element if it differs: viser sends each one that is set."""
+    if getattr(handle, name) != value:
+        setattr(handle, name, value)
 
 
 def _scales(top: float) -> dict[str, Any]:

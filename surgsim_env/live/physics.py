@@ -1,24 +1,30 @@
-"""The physics of a live session: haptic steps in real time, and the page's requests between them."""
+"""The physics of a live session: haptic steps in real time that follow the page's hands, requests between them."""
 
 import contextlib
 import ctypes
 import gc
+import math
 import os
 import signal
 import sys
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.haptics.device import DevicePose
 from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_env.haptics.pacing import Pacer, PaceSettings
 from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.live.browser_device import BrowserDevice, Hands, RecordedHand
+from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
+from surgsim_env.instruments.arm.pair import Pair
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
 from surgsim_env.live.exchange_records import (
     TRACE_LENGTH,
     TRACE_STEPS,
@@ -33,10 +39,9 @@ from surgsim_env.live.exchange_records import (
     Reset,
     encoded,
 )
-from surgsim_env.live.home import home_of
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
 from surgsim_env.rendering.instrument_geoms import shown_geoms
-from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.model import Scene
 
 # Steps between frames for the page, and between checks of the parent process and of requests.
@@ -45,45 +50,127 @@ FRAME_STEPS, LOOK_STEPS = 16, 8
 REQUESTS_MOST = 4
 # Largest speeds at which a tip follows its hand, in general and on the way to the organ [m/s].
 SPEED_LARGEST, APPROACH_SPEED = 0.25, 0.05
+# Initial distance of a tip on slides from the organ, and smallest distance of any contact shape [m].
+HOME_GAP, SHAPE_GAP = 0.015, 0.004
+# Time constant of the smoothing [s]: a mouse reports 20 to 60 positions a second.
+SMOOTHING = 0.030
+# Steps without a beat (of 100 a second) after which the page's process counts as dead.
+SILENT_STEPS_MOST = 20
 
 
-@dataclass(frozen=True)
-class Setup:
-    """Arguments of the physics' process.
+def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
+    """Initial tip positions [m], (3,) or (2, 3): over the middle of the palpable face, or where an arm parks.
 
-    Args:
-        scene: of the session.
-        choice: its first organ.
-        pace: of the steps.
+    Farther away if an open jaw, which reaches beyond its tip, would touch. `instrument` is parked and is not moved.
+    """
+    face = anatomy.face
+    if isinstance(instrument, ArmInstrument | Pair):
+        place = instrument.parked
+    else:
+        corners = face.points[face.triangles]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        point, normal = face.project(np.average(corners.mean(axis=1), axis=0, weights=area))
+        place = point + normal * (anatomy.scene.instrument.tip_radius + HOME_GAP)
+    missing = SHAPE_GAP - _clearance(anatomy, instrument, (place - instrument.parked).reshape(-1, 3)[0])
+    return np.clip(place - max(0.0, missing) * face.approach, instrument.lower, instrument.upper)
+
+
+def _clearance(anatomy: Anatomy, instrument: Instrument, shift: FloatArray) -> float:
+    """Smallest distance [m] of a parked instrument, shifted by [m] (3,), from the organ along the approach."""
+    model, data, face = instrument.model, instrument.data, anatomy.face
+    out, gaps = -face.approach, []
+    for geom in np.flatnonzero((model.geom_group == CONTACT_GROUP) & (model.geom_bodyid != 0)):
+        turn = data.geom_xmat[geom].reshape(3, 3)
+        centre = data.geom_xpos[geom] + turn @ model.geom_aabb[geom, :3] + shift
+        half = float(np.abs(out @ turn) @ model.geom_aabb[geom, 3:])
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
+            half = float(model.geom_size[geom, 0])
+        gaps.append(float((centre - face.project(centre)[0]) @ out) - half)
+    return min(gaps)
+
+
+class BrowserDevice:
+    """A `HapticDevice` whose pose a web page sets, or a recording during a replay; it exerts no force.
+
+    While the page's process is alive every step has a pose, since a hand at rest sends no messages. After 20 steps
+    without a beat there is none, and the loop's watchdog fades the force.
+
+    Fields:
+        pose: of the last step; None without one
+        replayed: number of steps of the recording that were replayed; None while the page sets the pose
     """
 
-    scene: Scene
-    choice: OrganChoice
-    pace: PaceSettings
+    dynamics = None
+
+    def __init__(self, exchange: Exchange, arm: int, step: float, place: FloatArray) -> None:
+        """Follow one arm's target in steps [s], from where its tip is [m], (3,)."""
+        self._hand, self._recorded, self._arm, self._step_time = exchange.hand, exchange.recorded, arm, step
+        self._share = 1.0 - math.exp(-step / SMOOTHING)
+        self._beat, self._buttons = -1, 0
+        self.pose: DevicePose | None = None
+        self.replayed: int | None = None
+        self.restart(place)
+
+    def restart(self, place: FloatArray) -> None:
+        """Restart at a position [m], (3,)."""
+        self._place = place.copy()
+        self._steps, self._silent = 0, SILENT_STEPS_MOST
+
+    def read(self) -> DevicePose | None:
+        """The smoothed pose, None when the page's process is dead; in a replay the recorded one."""
+        self.pose = self._page_pose() if self.replayed is None else self._recorded_pose(self.replayed)
+        return self.pose
+
+    def write(self, force: FloatArray) -> None:
+        """Nothing to do: the page displays the forces of frames."""
+
+    def _page_pose(self) -> DevicePose | None:
+        self._steps += 1
+        record = self._hand.glance()
+        if record is None or int(record["beat"]) == self._beat:
+            self._silent += 1
+        else:
+            self._beat, self._silent = int(record["beat"]), 0
+            self._target, self._buttons = record["target"][self._arm].copy(), int(record["buttons"][self._arm])
+        if self._silent >= SILENT_STEPS_MOST:
+            return None
+        self._place = self._place + self._share * (self._target - self._place)
+        return DevicePose(self._place, self._steps * self._step_time, self._buttons)
+
+    def _recorded_pose(self, index: int) -> DevicePose | None:
+        """The pose of a recorded step; None where the recording has none, and after its end."""
+        if index >= self._recorded.count:
+            return None
+        self.replayed = index + 1
+        step = self._recorded.steps[index]
+        place = step["hand"][self._arm].copy()
+        buttons = int(step["buttons"][self._arm])
+        return DevicePose(place, float(step["time"]), buttons) if np.isfinite(place).all() else None
 
 
 class Physics:
     """Steps a simulation whose tips follow the page's hands, writes frames, and handles requests between steps."""
 
-    def __init__(self, setup: Setup, exchange: Exchange, requests: Connection) -> None:
-        """Load the scene, compile the organ, and couple the hands."""
+    def __init__(
+        self, scene: Scene, choice: OrganChoice, pace: PaceSettings, exchange: Exchange, requests: Connection
+    ) -> None:
+        """Load the scene, compile the first organ, and couple the hands."""
         self._exchange, self._requests = exchange, requests
-        self._anatomy = load_anatomy(setup.scene)
+        self._anatomy = load_anatomy(scene)
         self._simulation = Simulation(self._anatomy)
-        self._organ: OrganModel = chosen_organ(self._anatomy, setup.choice)
+        self._organ: OrganModel = chosen_organ(self._anatomy, choice)
         self._organ_number = 1
         instrument = self._simulation.instrument
         self._home = home_of(self._anatomy, instrument)
         self._simulation.reset(self._organ, self._home)
         dt = self._simulation.haptic_dt
-        places = np.atleast_2d(self._home)
-        self._hands = [Hands(BrowserDevice(exchange.hand, arm, dt, place)) for arm, place in enumerate(places)]
+        self._hands = [BrowserDevice(exchange, arm, dt, place) for arm, place in enumerate(np.atleast_2d(self._home))]
         settings = HapticSettings(approach_speed=APPROACH_SPEED, speed_largest=SPEED_LARGEST)
         self._loop = HapticLoop(self._simulation, self._hands, settings)
         self._geoms = np.array(shown_geoms(instrument.model), dtype=np.int64)
-        self._pacer = Pacer(setup.pace, exchange.timing.peek)
+        self._pacer = Pacer(pace, exchange.timing.peek)
         self._phase, self._said = Phase.RUNNING, ""
-        self._recording, self._replaying = False, False
+        self._recording = False
         self._start_state: dict[str, np.ndarray] | None = None
         self._peak = np.zeros(len(self._hands))
         # Number of requests handled; earlier ones wait in the pipe.
@@ -94,7 +181,7 @@ class Physics:
 
     def run(self, parent_lives: Any) -> None:
         """Step until an End request or the end of the parent process."""
-        count, frame_steps = 0, FRAME_STEPS
+        count = 0
         self._pacer.start()
         while True:
             self._pacer.wait()
@@ -103,7 +190,7 @@ class Physics:
                 self._record_step(self._last)
                 self._pacer.done(self._simulation.haptic_dt)
             count += 1
-            if count % frame_steps == 0:
+            if count % FRAME_STEPS == 0:
                 self._write_frame()
             if count % LOOK_STEPS == 0 and not self._handle_requests(parent_lives):
                 break
@@ -152,9 +239,8 @@ class Physics:
         self._write_frame()
 
     def _rest(self, organ: OrganModel | None = None) -> None:
-        self._recording = self._replaying = False
-        for hand in self._hands:
-            hand.recorded = None
+        self._recording = False
+        self._replay_from(None)
         self._loop.reset(organ, self._home)
         self._restart()
 
@@ -162,7 +248,7 @@ class Physics:
         """After the tips were moved: restart the hands from there, and the trace."""
         self._phase = Phase.RUNNING
         for hand, held in zip(self._hands, self._loop.held, strict=True):
-            hand.browser.restart(held.drive.tool.tip_position)
+            hand.restart(held.drive.tool.tip_position)
         with self._exchange.trace.writing() as trace:
             trace["organ"], trace["count"] = self._organ_number, 0
         self._peak[:] = 0.0
@@ -196,9 +282,7 @@ class Physics:
     def _replay(self, request: Replay) -> None:
         self._recording = False
         if not request.on or self._exchange.recorded.count == 0:
-            self._replaying = False
-            for hand in self._hands:
-                hand.recorded = None
+            self._replay_from(None)
             return
         if request.given or self._start_state is None:
             self._loop.reset(None, self._home)
@@ -208,9 +292,16 @@ class Physics:
             for held in self._loop.held:
                 held.restart()
         self._restart()
-        for arm, hand in enumerate(self._hands):
-            hand.recorded = RecordedHand(self._exchange.recorded, arm)
-        self._replaying = True
+        self._replay_from(0)
+
+    @property
+    def _replaying(self) -> bool:
+        return self._hands[0].replayed is not None
+
+    def _replay_from(self, step: int | None) -> None:
+        """Replay the recording from a step on, or with None return the hands to the page."""
+        for hand in self._hands:
+            hand.replayed = step
 
     def _record_step(self, told: HapticTelemetry) -> None:
         """Add a step to the trace and the recording, and react to the end of a replay and to faults."""
@@ -239,11 +330,10 @@ class Physics:
                 exchange.recorded.append(
                     told.time, places, buttons, tips, np.array([tip.contact_force for tip in told.tips])
                 )
-        if self._replaying and all(hand.recorded is None or hand.recorded.done for hand in self._hands):
-            self._replaying = False
+        if self._hands[0].replayed == exchange.recorded.count:
+            self._replay_from(None)
             for hand, held in zip(self._hands, self._loop.held, strict=True):
-                hand.recorded = None
-                hand.browser.restart(held.drive.tool.tip_position)
+                hand.restart(held.drive.tool.tip_position)
         if told.fault:
             self._phase, self._said, self._recording = Phase.FAULT, told.fault, False
             self._write_frame()
@@ -270,7 +360,9 @@ class Physics:
 NICENESS = -10
 
 
-def run_physics(setup: Setup, exchange: Exchange, requests: Connection, parent: int) -> None:
+def run_physics(
+    scene: Scene, choice: OrganChoice, pace: PaceSettings, exchange: Exchange, requests: Connection, parent: int
+) -> None:
     """Run the child process; it ends on request, or when the process with the id `parent` has ended.
 
     An error at the start is sent through `requests` as a text, and the process ends with status 1.
@@ -280,7 +372,7 @@ def run_physics(setup: Setup, exchange: Exchange, requests: Connection, parent: 
     _set_timer_slack()
     _raise_priority()
     try:
-        physics = Physics(setup, exchange, requests)
+        physics = Physics(scene, choice, pace, exchange, requests)
     except (ValueError, OSError) as error:
         with contextlib.suppress(OSError):
             requests.send(str(error))

@@ -14,12 +14,19 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.pacing import PaceSettings
-from surgsim_env.live.errors import LiveError
-from surgsim_env.live.exchange_records import TRACE_LENGTH, Change, End, Exchange, Phase, Request, new_exchange
-from surgsim_env.live.home import home_of
+from surgsim_env.live.exchange_records import (
+    TRACE_LENGTH,
+    Change,
+    End,
+    Exchange,
+    LiveError,
+    Phase,
+    Request,
+    new_exchange,
+)
 from surgsim_env.live.messages import HandMotion
 from surgsim_env.live.organ_choice import OrganChoice, lesion_kinds, live_scene
-from surgsim_env.live.physics import Setup, run_physics
+from surgsim_env.live.physics import home_of, run_physics
 from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.model import Scene
@@ -74,9 +81,12 @@ class Session:
         self._requests = 0
         spawn = multiprocessing.get_context("spawn")
         self._pipe, child = spawn.Pipe()
-        setup = Setup(self.scene, self.choice, pace or PaceSettings(period=self.scene.timing.haptic_step))
+        pace = pace or PaceSettings(period=self.scene.timing.haptic_step)
         self._process = spawn.Process(
-            target=run_physics, args=(setup, self.exchange, child, os.getpid()), name="surgsim physics", daemon=True
+            target=run_physics,
+            args=(self.scene, self.choice, pace, self.exchange, child, os.getpid()),
+            name="surgsim physics",
+            daemon=True,
         )
         self._process.start()
         child.close()

@@ -1,11 +1,9 @@
 """OpenGL, loaded with the first picture: one context for all pictures of this process."""
 
-import atexit
-import contextlib
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any
 
 # MuJoCo's variable, its values that switch OpenGL off, and the module of each kind of context.
@@ -15,9 +13,6 @@ MODULES = {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw"
 
 # Variables of the environment that name a display for windows.
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
-
-_context: Any = None
-_owner = 0
 
 
 class NoGLError(RuntimeError):
@@ -50,32 +45,19 @@ def context() -> Any:
     Raises:
         NoGLError: it cannot be made; names the packages that are missing.
     """
-    global _context, _owner
-    if _context is None:
-        _context = _make_context(_kind())
-        _owner = os.getpid()
-    elif _owner != os.getpid():
+    made, owner = _first_context()
+    if owner != os.getpid():
         raise NoGLError(
             "this process was forked from one that had already drawn, and OpenGL does not survive a fork: start "
             'workers with AsyncVectorEnv(..., context="forkserver"), or draw nothing before they start'
         )
-    return _context
+    return made
 
 
-@contextlib.contextmanager
-def current(gl_context: Any) -> Iterator[None]:
-    """Make a context current; that of a window is released afterwards."""
-    if hasattr(gl_context, "as_current"):
-        with gl_context.as_current():
-            yield
-    else:
-        gl_context.make_current()
-        yield
-
-
-def at_exit(close: Callable[[], None]) -> None:
-    """Call `close` when the interpreter exits, while OpenGL is still loaded."""
-    atexit.register(close)
+@cache
+def _first_context() -> tuple[Any, int]:
+    """The context, and the id of the process that made it."""
+    return _make_context(_kind()), os.getpid()
 
 
 def _kind() -> str:

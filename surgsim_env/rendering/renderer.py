@@ -1,10 +1,12 @@
-"""The renderer of a simulation, used by the environments' `render` and for use by itself."""
+"""The renderer of a simulation, for the environments' `render` and by itself; pictures of arms on an organ at rest."""
 
 import contextlib
 import weakref
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,16 +15,19 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, scene_cameras
-from surgsim_env.rendering.canvas import LOCK
-from surgsim_env.rendering.drawn_mesh import Shape
 from surgsim_env.rendering.force_arrow import draw_forces
+from surgsim_env.rendering.instrument_geoms import add_instrument, find_instrument
 from surgsim_env.rendering.options import RenderOptions, check_camera
-from surgsim_env.rendering.stage import Instant, Stage, borrow_stage, give_back_stage
+from surgsim_env.rendering.scene_model import add_lights, add_tissue, compile_scene, empty_scene
+from surgsim_env.rendering.stage import LOCK, Canvas, Stage, borrow_stage, give_back_stage
+from surgsim_env.rendering.surface import Shape, drawn_surface
 from surgsim_env.rendering.tissue import Tissue
 from surgsim_env.tasks.visibility import Disc
 
 # How far above the drape the shadow lies [m].
 SHADOW_GAP = 0.0002
+# Of pictures without a simulation: background, and far clipping plane [m], which shows the whole length of an arm.
+STILL_BACKGROUND, STILL_FAR = (0.93, 0.95, 0.96), 10.0
 
 
 class OrganRenderer:
@@ -101,7 +106,8 @@ class OrganRenderer:
     def present(self, frame: NDArray[np.uint8]) -> None:
         """Show a picture in the window whose context this renderer uses."""
         canvas = self._ready_stage().canvas
-        with LOCK, gl.current(canvas.gl_context):
+        with LOCK:
+            canvas.gl_context.make_current()
             canvas.present(frame)
 
     @contextlib.contextmanager
@@ -109,9 +115,9 @@ class OrganRenderer:
         """The stage, showing the simulation as it is now to a camera, with its graphics context current."""
         with LOCK:
             stage = self._ready_stage()
-            with gl.current(stage.canvas.gl_context):
-                stage.show(self._instant(stage), camera)
-                yield stage
+            stage.canvas.gl_context.make_current()
+            self._show(stage, camera)
+            yield stage
 
     def _camera(self, camera: str | Camera | None) -> Camera:
         if isinstance(camera, Camera):
@@ -128,7 +134,7 @@ class OrganRenderer:
             self._finalizer = weakref.finalize(self, give_back_stage, self._stage)
         return self._stage
 
-    def _instant(self, stage: Stage) -> Instant:
+    def _show(self, stage: Stage, camera: Camera) -> None:
         simulation, options = self._simulation, self.options
         shown = self.lesions if options.show_lesion or options.cut_away else ()
         if self._tissue is None or shown != self._tissue_lesions:
@@ -140,12 +146,8 @@ class OrganRenderer:
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
             shapes["shadow"] = ground_shadow(nodes, stage.surface.triangles, scene.light, scene.ground, up)
-        return Instant(
-            shapes=shapes,
-            lesions=list(zip(tissue.lesion_centres(nodes), axes)) if options.show_lesion else [],
-            instrument=simulation.instrument.data,
-            target=self.target,
-        )
+        lesions = list(zip(tissue.lesion_centres(nodes), axes)) if options.show_lesion else []
+        stage.show(camera, shapes, simulation.instrument.data, lesions, self.target)
 
 
 def ground_shadow(
@@ -157,3 +159,66 @@ def ground_shadow(
     corners = flat[triangles]
     lit = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ up > 0.0
     return Shape(flat, np.tile(up, (len(flat), 1)), triangles[lit])
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """A capsule, or a ball where both ends are the same.
+
+    Fields:
+        ends: of its axis [m]                                                       (2, 3)
+        radius: [m]                                                                 scalar
+        colour: red, green, blue, opacity                                           (4,)
+    """
+
+    ends: FloatArray
+    radius: float
+    colour: tuple[float, float, float, float]
+
+
+def draw_still(
+    surface: tuple[FloatArray, IntArray],
+    arms: Sequence[tuple[mujoco.MjModel, mujoco.MjData]],
+    capsules: Sequence[Capsule],
+    cameras: Sequence[Camera],
+    size: tuple[int, int],
+) -> list[NDArray[np.uint8]]:
+    """A picture (height, width, 3) from each camera.
+
+    Args:
+        surface: points [m] (n_node, 3) and outward triangles (n_triangle, 3) of the organ.
+        arms: models and data, their kinematics computed; drawn as they are posed.
+        capsules: whatever else is there.
+        cameras: the first one's `up` is up in the scene.
+        size: width and height [pixels].
+
+    Raises:
+        NoGLError: there is no OpenGL; names the packages that are missing.
+    """
+    context = gl.context()
+    organ = drawn_surface(*surface)
+    spec = empty_scene(*size, STILL_BACKGROUND, far=STILL_FAR)
+    add_lights(spec, -cameras[0].up)
+    add_tissue(spec, "organ", organ.vertex_count, len(organ.faces))
+    for number, (model, _) in enumerate(arms):
+        add_instrument(spec, model, f"arm_{number}")
+    for capsule in capsules:
+        geom = spec.worldbody.add_geom(rgba=capsule.colour, contype=0, conaffinity=0, size=[capsule.radius, 0.0, 0.0])
+        if np.array_equal(*capsule.ends):
+            geom.type, geom.pos = mujoco.mjtGeom.mjGEOM_SPHERE, capsule.ends[0]
+        else:
+            geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, capsule.ends.ravel()
+    model, data, meshes = compile_scene(spec, ["organ"])
+    for number, (arm, posed) in enumerate(arms):
+        find_instrument(model, arm, f"arm_{number}").pose(posed, data)
+    with LOCK:
+        context.make_current()
+        canvas = Canvas(model, data, context)
+        canvas.select()
+        meshes["organ"].upload(Shape(*organ.follow(surface[0]), organ.faces), canvas.context)
+        frames = []
+        for camera in cameras:
+            canvas.look(camera)
+            frames.append(canvas.colour())
+        canvas.close()
+    return frames

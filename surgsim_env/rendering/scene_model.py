@@ -8,11 +8,10 @@ import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering.cameras import cut_direction
-from surgsim_env.rendering.cutting import SECTION_SPLITS, most_tets_cut
-from surgsim_env.rendering.drawn_mesh import DrawnMesh, add_mesh
 from surgsim_env.rendering.instrument_geoms import InstrumentGeoms, add_instrument, find_instrument
 from surgsim_env.rendering.options import RenderOptions
-from surgsim_env.rendering.surface import DrawnSurface
+from surgsim_env.rendering.surface import DrawnSurface, Shape
+from surgsim_env.rendering.tissue import SECTION_SPLITS, most_tets_cut
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.palpable_surface import tangent_axes
 
@@ -48,6 +47,45 @@ DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
 # Clipping planes of the cameras [m].
 NEAR, FAR = 0.005, 5.0
+# MuJoCo accepts no empty or flat mesh: until the first picture a mesh consists of copies of this tetrahedron.
+_TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.01]])
+_TETRAHEDRON_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
+
+
+class DrawnMesh:
+    """One mesh of a compiled model, which can be changed and uploaded."""
+
+    def __init__(self, model: mujoco.MjModel, name: str) -> None:
+        self._model = model
+        self.mesh = model.mesh(name).id
+        self.geom = model.geom(name).id
+        self._room = int(model.mesh_vertnum[self.mesh]), int(model.mesh_facenum[self.mesh])
+        self._face_count = self._room[1]
+        assert model.mesh_normalnum[self.mesh] == self._room[0]
+
+    def holds(self, shape: Shape) -> bool:
+        """Whether a shape fits into the mesh."""
+        return len(shape.vertices) <= self._room[0] and len(shape.faces) <= self._room[1]
+
+    def upload(self, shape: Shape, context: mujoco.MjrContext) -> None:
+        """Replace the shape of the mesh; the geom's frame is the world's."""
+        assert self.holds(shape)
+        model, mesh, count = self._model, self.mesh, len(shape.vertices)
+        for array, address, values in (
+            (model.mesh_vert, model.mesh_vertadr, shape.vertices),
+            (model.mesh_normal, model.mesh_normaladr, shape.normals),
+        ):
+            array[address[mesh] : address[mesh] + count] = values
+        first = model.mesh_faceadr[mesh]
+        for array in (model.mesh_face, model.mesh_facenormal):
+            array[first : first + len(shape.faces)] = shape.faces
+        self._face_count = len(shape.faces)
+        self.show(True, context)
+
+    def show(self, shown: bool, context: mujoco.MjrContext) -> None:
+        """Hide the mesh from the next picture, or show it again."""
+        self._model.mesh_facenum[self.mesh] = self._face_count if shown else 0
+        mujoco.mjr_uploadMesh(self._model, context, self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +145,17 @@ def add_tissue(spec: mujoco.MjSpec, name: str, vertex_count: int, face_count: in
     material = spec.add_material(name=name, specular=look.specular, shininess=look.shininess)
     material.rgba = [*look.colour, opacity]
     material.emission = look.emission
-    add_mesh(spec, name, name, vertex_count, face_count)
+    corner = np.resize(np.arange(4), max(vertex_count, 4))
+    faces = np.resize(_TETRAHEDRON_FACES.ravel(), 3 * max(face_count, 4))
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = _TETRAHEDRON[corner].ravel()
+    mesh.usernormal = np.resize([0.0, 0.0, 1.0], 3 * len(corner))
+    mesh.userface = faces
+    mesh.userfacenormal = faces
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    spec.worldbody.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, contype=0, conaffinity=0
+    )
 
 
 def compile_scene(

@@ -1,8 +1,13 @@
-"""A scene loaded into a graphics context: uploads what moves, draws colour, depth and labels; shared by its users."""
+"""A scene loaded into a graphics context: uploads what moves, draws colour, depth and labels; shared by its users.
 
+Its MuJoCo model is not simulated.
+"""
+
+import atexit
 import contextlib
+import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -13,15 +18,16 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera
-from surgsim_env.rendering.canvas import LOCK, Canvas
-from surgsim_env.rendering.drawn_mesh import Shape
 from surgsim_env.rendering.instrument_geoms import PREFIX
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, TARGET_COLOUR, build_scene
-from surgsim_env.rendering.surface import DrawnSurface, drawn_surface
+from surgsim_env.rendering.surface import DrawnSurface, Shape, drawn_surface
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
 
+# One thread draws at a time.
+LOCK = threading.RLock()
+SHADOW_MAP = 2048
 # Labels of pixels.
 LABELS = {"background": 0, "organ": 1, "instrument": 2, "lesion": 3, "target": 4}
 # Labels of the scene's meshes.
@@ -34,21 +40,97 @@ TARGET_THICKNESS = 2e-4
 _stages: dict[tuple, "Stage"] = {}
 
 
-@dataclass(frozen=True, eq=False)
-class Instant:
-    """The contents of a picture.
+class Canvas:
+    """A model in a graphics context, seen by its only camera.
 
     Fields:
-        shapes: surface and cut faces by their names in the scene
-        lesions: centre [m] (3,), half axes [m] (3,) of each solid lesion
-        instrument: the instrument's data, which is read
-        target: a disc to be drawn, None for none
+        context: MuJoCo's, with the model's meshes
+        drawn: the geoms of the current picture
     """
 
-    shapes: dict[str, Shape]
-    lesions: Sequence[tuple[FloatArray, FloatArray]]
-    instrument: mujoco.MjData
-    target: Disc | None = None
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, gl_context: Any, *, more_geoms: int = 0, shadows: bool = False
+    ) -> None:
+        """Load a model; pictures are as large as its off-screen buffer and may have `more_geoms` than it.
+
+        Raises:
+            NoGLError: MuJoCo cannot draw with this context.
+        """
+        self.gl_context = gl_context
+        self._model, self._data = model, data
+        model.vis.quality.shadowsize = SHADOW_MAP if shadows else 0
+        gl_context.make_current()
+        try:
+            self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except mujoco.FatalError as error:
+            raise gl.NoGLError(f"OpenGL is there, but MuJoCo cannot draw with it: {error}") from error
+        self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self.drawn = mujoco.MjvScene(model, model.ngeom + more_geoms)
+        self.drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self.drawn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._camera = mujoco.MjvCamera()
+        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        self._visible = mujoco.MjvOption()
+        self._visible.geomgroup[:] = 1
+        size = model.vis.global_
+        self._rect = mujoco.MjrRect(0, 0, size.offwidth, size.offheight)
+
+    def select(self) -> None:
+        """Draw off screen from now on; to be called before meshes are uploaded."""
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
+
+    def look(self, camera: Camera, *, sky: bool = True) -> None:
+        """Take the geoms as they are now, seen by a camera; without the sky a picture is quicker to draw."""
+        data = self._data
+        data.cam_xpos[0], data.cam_xmat[0] = camera.position, camera.rotation.ravel()
+        self._model.cam_fovy[0] = camera.fov
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._visible, None, self._camera, everything, self.drawn)
+        self.drawn.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
+
+    def colour(self) -> NDArray[np.uint8]:
+        """The picture, shape (height, width, 3), its first row on top."""
+        frame = np.empty((self._rect.height, self._rect.width, 3), dtype=np.uint8)
+        mujoco.mjr_render(self._rect, self.drawn, self.context)
+        mujoco.mjr_readPixels(frame, None, self._rect, self.context)
+        return np.ascontiguousarray(frame[::-1])
+
+    def numbers(self) -> NDArray[np.int32]:
+        """The number of the geom (its `segid`) that each pixel shows, plus 1, 0 for none, shape (height, width)."""
+        with self._numbered():
+            frame = self.colour()
+        return frame.astype(np.int32) @ np.array([1, 256, 65536], dtype=np.int32)
+
+    def depth(self) -> NDArray[np.float32]:
+        """Reversed depth of each pixel: 1 at the near plane, 0 at the far one and beyond, shape (height, width)."""
+        depth = np.empty((self._rect.height, self._rect.width), dtype=np.float32)
+        with self._numbered():
+            mujoco.mjr_render(self._rect, self.drawn, self.context)
+        mujoco.mjr_readPixels(None, depth, self._rect, self.context)
+        return depth[::-1]
+
+    def present(self, frame: NDArray[np.uint8]) -> None:
+        """Copy a picture to the window that the context belongs to."""
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_WINDOW.value, self.context)
+        mujoco.mjr_drawPixels(np.ascontiguousarray(frame[::-1]).ravel(), None, self._rect, self.context)
+
+    def close(self) -> None:
+        """Free what the graphics context holds."""
+        self.gl_context.make_current()
+        self.context.free()
+
+    @contextlib.contextmanager
+    def _numbered(self) -> Iterator[None]:
+        """Draw geoms in the colour of their number within this block."""
+        self._number_colours(True)
+        try:
+            yield
+        finally:
+            self._number_colours(False)
+
+    def _number_colours(self, on: bool) -> None:
+        self.drawn.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = on
+        self.drawn.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = on
 
 
 class Stage:
@@ -65,18 +147,35 @@ class Stage:
         # Labels of geoms that a picture has beyond those of the model, by their places in it.
         self._added: dict[int, int] = {}
 
-    def show(self, instant: Instant, camera: Camera) -> None:
-        """Upload the shapes and poses of a picture and look at them through a camera."""
-        self.scene.instrument.pose(instant.instrument, self.scene.data)
+    def show(
+        self,
+        camera: Camera,
+        shapes: dict[str, Shape],
+        instrument: mujoco.MjData,
+        lesions: Sequence[tuple[FloatArray, FloatArray]],
+        target: Disc | None,
+    ) -> None:
+        """Upload the shapes and poses of a picture and look at them through a camera.
+
+        Args:
+            camera: of the picture.
+            shapes: surface and cut faces by their names in the scene.
+            instrument: the instrument's data, which is read.
+            lesions: centre [m] (3,), half axes [m] (3,) of each solid lesion.
+            target: a disc to be drawn, None for none.
+        """
+        self.scene.instrument.pose(instrument, self.scene.data)
         self.canvas.select()
-        for name, shape in instant.shapes.items():
+        for name, shape in shapes.items():
             self.scene.meshes[name].upload(shape, self.canvas.context)
         self.canvas.look(camera, sky=camera.sees_above_level())
         self._added.clear()
-        for centre, half_axes in instant.lesions[:LESIONS_MOST]:
-            self._add_lesion(centre, half_axes)
-        if instant.target is not None:
-            self._add_target(instant.target)
+        for centre, half_axes in lesions[:LESIONS_MOST]:
+            self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, half_axes, centre, np.eye(3), LESION_COLOUR, "lesion")
+        if target is not None:
+            size = np.array([target.radius, 0.5 * TARGET_THICKNESS, 0.0])
+            centre = target.centre - 0.5 * TARGET_THICKNESS * target.normal
+            self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, target.rotation, TARGET_COLOUR, "target")
 
     def depth(self) -> NDArray[np.float32]:
         """Distance from the camera's plane [m], infinite where there is nothing, shape (height, width)."""
@@ -88,7 +187,7 @@ class Stage:
     def labels(self) -> NDArray[np.uint8]:
         """Label of each pixel, by LABELS; solid lesions are labelled also through the organ, shape (height, width)."""
         shown = self._labels()
-        if self._lesions_solid():
+        if LABELS["lesion"] in self._added.values():
             with self._without_organ():
                 inside = self._labels()
             shown[(shown == LABELS["organ"]) & (inside == LABELS["lesion"])] = LABELS["lesion"]
@@ -108,9 +207,6 @@ class Stage:
         name = self.scene.model.geom(geom.objid).name
         return LABELS["instrument"] if name.startswith(PREFIX) else MESH_LABELS.get(name, LABELS["background"])
 
-    def _lesions_solid(self) -> bool:
-        return LABELS["lesion"] in self._added.values()
-
     @contextlib.contextmanager
     def _without_organ(self) -> Iterator[None]:
         """Hide the organ's meshes within this block."""
@@ -120,14 +216,6 @@ class Stage:
         yield
         for mesh in hidden:
             mesh.show(True, self.canvas.context)
-
-    def _add_lesion(self, centre: FloatArray, half_axes: FloatArray) -> None:
-        self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, half_axes, centre, np.eye(3), LESION_COLOUR, "lesion")
-
-    def _add_target(self, disc: Disc) -> None:
-        size = np.array([disc.radius, 0.5 * TARGET_THICKNESS, 0.0])
-        centre = disc.centre - 0.5 * TARGET_THICKNESS * disc.normal
-        self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, disc.rotation, TARGET_COLOUR, "target")
 
     def _add(
         self, kind: mujoco.mjtGeom, size: FloatArray, centre: FloatArray, rotation: FloatArray,
@@ -147,7 +235,8 @@ class Stage:
 
 def borrow_stage(anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> Stage:
     """The stage that all simulations of one anatomy share, for pictures of one size and kind; return it when done."""
-    key = _key(anatomy, instrument, options, gl_context)
+    drawn = replace(options, camera="overview", show_force=True, force_mm_per_newton=1.0)
+    key = anatomy, int(instrument.signature), drawn, id(gl_context)
     with LOCK:
         _close_all_at_exit()
         if key not in _stages:
@@ -166,14 +255,10 @@ def give_back_stage(stage: Stage) -> None:
                 stage.canvas.close()
 
 
-def _key(anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> tuple:
-    drawn = replace(options, camera="overview", show_force=True, force_mm_per_newton=1.0)
-    return anatomy, int(instrument.signature), drawn, id(gl_context)
-
-
 @cache
 def _close_all_at_exit() -> None:
-    gl.at_exit(_close_all)
+    """Registered with the first stage, so that it runs while OpenGL is still loaded."""
+    atexit.register(_close_all)
 
 
 def _close_all() -> None:

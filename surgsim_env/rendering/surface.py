@@ -21,6 +21,21 @@ BEND_MOST = 0.0008
 
 
 @dataclass(frozen=True, eq=False)
+class Shape:
+    """The shape of a mesh in one picture, in the world's axes.
+
+    Fields:
+        vertices: [m]                                                               (n_vertex, 3)
+        normals: unit, outward                                                      (n_vertex, 3)
+        faces: vertices of the triangles, outward                                   (n_face, 3)
+    """
+
+    vertices: FloatArray
+    normals: FloatArray
+    faces: IntArray
+
+
+@dataclass(frozen=True, eq=False)
 class DrawnSurface:
     """Small triangles over a closed surface, whose vertices and normals follow the nodes.
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.cli.main import main
-from surgsim_env.haptics import pacing, udp_client
+from surgsim_env.haptics import udp_client
 from surgsim_env.haptics.pacing import SPIN, Pacer
 from surgsim_env.haptics.trajectory import save_trajectory
 from surgsim_env.scene.load import scenes_folder
@@ -55,7 +55,7 @@ def test_bridge_feels_the_organ(monkeypatch, capsys):
             clients[0].start()
 
     monkeypatch.setattr(udp_client, "time", shared)
-    monkeypatch.setattr(pacing, "Pacer", Paced)
+    monkeypatch.setattr("surgsim_env.cli.haptics.Pacer", Paced)
     assert main(["haptics", "--scene", "phantom_small", "--port", str(port), "--seconds", "2.0"]) == 0
     shared.leave()
     clients[0].join()

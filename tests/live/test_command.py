@@ -13,7 +13,7 @@ import pytest
 from surgsim_env.cli import main as cli
 from surgsim_env.cli.view import missed_targets
 from surgsim_env.haptics.pacing import Timeliness
-from surgsim_env.live.errors import LiveError
+from surgsim_env.live.exchange_records import LiveError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 KEPT = Timeliness(
@@ -86,7 +86,7 @@ def test_a_session_that_fails_is_said_in_one_line(monkeypatch, capsys):
     def fail(*_):
         raise LiveError("the physics' process died: why")
 
-    monkeypatch.setattr("surgsim_env.cli.view.LiveView.run", fail)
+    monkeypatch.setattr("surgsim_env.cli.view.View.run", fail)
     assert cli.main(["view"]) == 2
     assert capsys.readouterr().err == "surgsim: error: the physics' process died: why\n"
 

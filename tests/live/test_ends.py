@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from surgsim_env.live.errors import LiveError
+from surgsim_env.live.exchange_records import LiveError
 from surgsim_env.live.organ_choice import HIDDEN, OrganChoice
 from surgsim_env.live.page import Page
 from surgsim_env.live.session import Session

@@ -12,7 +12,7 @@ from viser import _messages
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from surgsim_env.live.errors import LiveError
+from surgsim_env.live.exchange_records import LiveError
 from surgsim_env.live.guarded_server import MESSAGE_SIZE_MOST, SOCKETS_MOST, GuardedServer
 from surgsim_env.live.messages import MessageFilter
 from surgsim_env.live.protocol_client import CAMERA

@@ -17,9 +17,9 @@ from surgsim_env.live.messages import (
     MessageFilter,
     RateLimit,
     read_hand,
-    write_hand,
 )
 from surgsim_env.live.protocol_client import CAMERA, hand_message
+from tests.live.packets import write_hand
 
 SLIDER, BOX, LIST = "slider-1", "box-1", "list-1"
 DRAG = {

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from surgsim_env.live.messages import HandMotion, write_hand
+from surgsim_env.live.messages import HandMotion
 from surgsim_env.live.protocol_client import CAMERA, ProtocolClient, hand_message, press_path
 from surgsim_env.live.session import HAND_SPEED, HELD
+from tests.live.packets import write_hand
 from tests.live.served import SECONDS, wait_until
 
 pytestmark = pytest.mark.usefixtures("fresh")

@@ -5,8 +5,9 @@ import asyncio
 import pytest
 
 from surgsim_env.live.exchange_records import Pause, Phase, Record, Reset
-from surgsim_env.live.messages import DrawingReport, HandMotion, write_hand, write_report
+from surgsim_env.live.messages import DrawingReport, HandMotion
 from surgsim_env.live.protocol_client import ProtocolClient, press_path
+from tests.live.packets import write_hand, write_report
 from tests.live.served import send, setting, wait_until
 
 pytestmark = pytest.mark.usefixtures("fresh")
@@ -32,7 +33,7 @@ def test_a_click_means_what_the_physics_is_doing(served, monkeypatch, tmp_path):
     """Whatever the button's name says: names are never renewed here."""
     panel, session = served.page._panel, served.session
     monkeypatch.setattr(served.page, "_out", tmp_path)
-    monkeypatch.setattr(panel, "_name", lambda *_: None)
+    monkeypatch.setattr("surgsim_env.live.panel._set", lambda *_: None)
     for phase in (Phase.PAUSED, Phase.RUNNING):
         clicked = setting(panel._pause, True)
         asyncio.run(send(served, clicked, until=lambda phase=phase: session.frame()["phase"] == phase))

@@ -18,7 +18,6 @@ from surgsim_env.live.exchange_records import (
     Reset,
     new_exchange,
 )
-from surgsim_env.live.felt_map import FeltMap
 from surgsim_env.live.organ_choice import (
     HIDDEN,
     NONE,
@@ -28,8 +27,8 @@ from surgsim_env.live.organ_choice import (
     lesion_kinds,
     live_scene,
 )
-from surgsim_env.live.organ_view import COLOURS, colour_levels
-from surgsim_env.live.physics import REQUESTS_MOST, Physics, Setup
+from surgsim_env.live.organ_view import COLOURS, FeltMap, colour_levels
+from surgsim_env.live.physics import REQUESTS_MOST, Physics
 from surgsim_env.live.recording import read_recording
 from surgsim_env.rendering.instrument_geoms import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
@@ -48,7 +47,7 @@ class Bench:
         self.exchange = new_exchange(1, self.anatomy.mesh.node_count, len(geoms))
         self.pipe, child = multiprocessing.Pipe()
         self.kind = lesion_kinds(self.scene)[0]
-        self.physics = Physics(Setup(self.scene, OrganChoice(lesions=self.kind), PaceSettings()), self.exchange, child)
+        self.physics = Physics(self.scene, OrganChoice(lesions=self.kind), PaceSettings(), self.exchange, child)
         point, self.normal = self.anatomy.face.project(self.anatomy.mesh.points.mean(axis=0) + UP)
         self.above = point + self.normal * (self.scene.instrument.tip_radius + 0.004)
         self.pressed = point + self.normal * (self.scene.instrument.tip_radius - 0.004)

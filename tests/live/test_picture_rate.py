@@ -4,8 +4,9 @@ import struct
 
 import pytest
 
-from surgsim_env.live.messages import DrawingReport, InvalidMessageError, read_report, write_report
-from surgsim_env.live.tabs import RATE_LEAST, RATE_MOST, REPORT_AGE_MOST, PictureRate
+from surgsim_env.live.messages import DrawingReport, InvalidMessageError, read_report
+from surgsim_env.live.page import RATE_LEAST, RATE_MOST, REPORT_AGE_MOST, PictureRate
+from tests.live.packets import write_report
 
 
 def test_the_slowest_browser_sets_the_rate_and_its_closing_frees_it():

@@ -9,9 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from surgsim_env.haptics.pacing import CLASS_WIDTH, TIMING, Pacer, PaceSettings, quantile, timeliness
-from surgsim_env.live.errors import LiveError
-from surgsim_env.live.exchange_records import RecordedSteps, encoded
-from surgsim_env.live.shared_record import SharedRecord
+from surgsim_env.live.exchange_records import LiveError, RecordedSteps, SharedRecord, encoded
 
 PAIR = np.dtype([("one", "f8", (500,)), ("other", "f8", (500,))])
 

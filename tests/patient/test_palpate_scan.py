@@ -39,7 +39,7 @@ def test_the_report_shows_the_command_that_was_given(tmp_path, monkeypatch):
     arguments = ["palpate", "--segmentation", str(file), *LABELS, "--cell-size", "0.009", *given]
     arguments += ["--around=-0.06,0.0,0.13,0.01", "--out", str(tmp_path / "out"), "--workers", "1"]
     pressed = []
-    monkeypatch.setattr("surgsim_env.palpation.job.run_palpation", lambda *_, **__: pressed.append(1) or 1 / 0)
+    monkeypatch.setattr("surgsim_env.cli.palpate.run_palpation", lambda *_, **__: pressed.append(1) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(arguments)
     assert pressed

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from surgsim_env.rendering.cameras import Camera, scene_cameras
+from surgsim_env.rendering.episode_view import orbited
 from surgsim_env.rendering.options import CAMERAS
-from surgsim_env.rendering.window import orbited
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, scene_from_table
 

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from surgsim_env.rendering.cutting import clip_triangles, cut_tets, most_tets_cut
 from surgsim_env.rendering.surface import drawn_surface
-from surgsim_env.rendering.tissue import Tissue, cut_plane
+from surgsim_env.rendering.tissue import Tissue, clip_triangles, cut_plane, cut_tets, most_tets_cut
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from tests.rendering.test_surface import area_vectors, bent

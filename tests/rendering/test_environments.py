@@ -181,8 +181,7 @@ def test_works_in_other_processes():
 
 
 def test_forked_process_is_told(monkeypatch):
-    monkeypatch.setattr(gl, "_context", object())
-    monkeypatch.setattr(gl, "_owner", -1)
+    monkeypatch.setattr(gl, "_first_context", lambda: (object(), -1))
     with pytest.raises(gl.NoGLError, match=r"forked .*forkserver"):
         gl.context()
 

@@ -7,7 +7,7 @@ import pytest
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.rendering import gl
-from surgsim_env.rendering.window import WindowContext
+from surgsim_env.rendering.episode_view import WindowContext
 
 STILL = np.zeros(4, dtype=np.float32)
 
@@ -26,15 +26,15 @@ def env():
 def test_window_shows_the_picture_of_each_step(env):
     env.reset(seed=0)
     assert env.render() is None
-    window = env.unwrapped._view._window
+    window = env.unwrapped._view.window
     env.step(STILL)
     renderer = env.unwrapped.renderer
     frame = renderer.rgb()
     assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 50
     renderer.present(frame)
     shown = np.zeros_like(frame)
-    with window._context.as_current():
-        mujoco.mjr_readPixels(shown, None, mujoco.MjrRect(0, 0, 640, 480), renderer._stage.canvas.context)
+    window._context.make_current()
+    mujoco.mjr_readPixels(shown, None, mujoco.MjrRect(0, 0, 640, 480), renderer._stage.canvas.context)
     np.testing.assert_array_equal(shown[::-1], frame)
 
 
@@ -42,7 +42,7 @@ def test_keys_and_wheel_and_a_closed_window_that_stays_closed(env):
     import glfw
 
     env.reset(seed=0)
-    window = env.unwrapped._view._window
+    window = env.unwrapped._view.window
     before = window._camera()
     window._wheel(1.0)
     assert np.linalg.norm(window._camera().position - before.target) < np.linalg.norm(before.position - before.target)
@@ -54,4 +54,4 @@ def test_keys_and_wheel_and_a_closed_window_that_stays_closed(env):
     assert window.closed and window.held_keys() == ""
     env.step(STILL)
     env.reset(seed=1)
-    assert env.unwrapped._view._window is window
+    assert env.unwrapped._view.window is window

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
 from msdm_core.lanes.lanes import advance_lanes, get_lane, rest_lanes, stack_organs, stack_shapes
-from msdm_core.organ import settling
+from msdm_core.organ import compile as organ_compile
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.measure import kinetic_energy, momentum, potential_energy, support_forces
 from msdm_core.organ.stability import stable_dt
@@ -203,10 +203,10 @@ def test_the_stable_step_counts_supports_and_contact_together():
 
 def test_the_same_organ_settles_once(monkeypatch):
     calls = []
-    relax = settling._relax
-    monkeypatch.setattr(settling, "_settled", type(settling._settled)())
-    monkeypatch.setattr(settling, "REMEMBERED", 2)
-    monkeypatch.setattr(settling, "_relax", lambda *given: (calls.append(1), relax(*given)))
+    relax = organ_compile._relax
+    monkeypatch.setattr(organ_compile, "_settled", type(organ_compile._settled)())
+    monkeypatch.setattr(organ_compile, "REMEMBERED", 2)
+    monkeypatch.setattr(organ_compile, "_relax", lambda *given: (calls.append(1), relax(*given)))
     first = rest_state(free_block(FLOOR))
     again = rest_state(free_block(FLOOR))
     assert len(calls) == 1
@@ -218,7 +218,7 @@ def test_the_same_organ_settles_once(monkeypatch):
     assert rest_state(free_block(FLOOR)).node_position.tobytes() == first.node_position.tobytes()
     rest_state(free_block(FLOOR, modulus=6000.0))
     rest_state(free_block(Support("floor", "plane", friction=0.2)))
-    assert len(calls) == 3 and len(settling._settled) == 2
+    assert len(calls) == 3 and len(organ_compile._settled) == 2
     rest_state(free_block(FLOOR))
     assert len(calls) == 4
 

@@ -14,9 +14,9 @@ SPEED = 0.04  # [m/s]
 # Haptic steps held at depth after each press.
 HOLD_COUNT = 100
 METHOD = """Wall clock of each haptic step (instrument, contact, substeps, exchange) in contact, while the scene's tip
-presses the scene's organ with its lesions at random places, to the scene's depth, and rests there. The worst shows
-other activity of the system as much as this program's; `processor` is the time of the processor alone, which
-other processes on the machine hardly change. Real time is the scene's haptic step of 1000 us."""
+presses the scene's organ with its lesions at random places, to the scene's depth, and rests there. The worst step
+includes interruptions by other processes; `processor` is processor time, which other processes hardly change. Real
+time is the scene's haptic step of 1000 us."""
 
 
 def measure(effort: Effort) -> Section:

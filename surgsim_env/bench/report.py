@@ -14,8 +14,8 @@ REPORT_NAME = "benchmarks.md"
 NOTES_NAME = "benchmarks_notes.md"
 INTRODUCTION = """# Benchmarks
 
-Written by `surgsim bench{quick}`; text after the figures, if any, is `{notes}`, kept by hand. Times are of this
-machine and this run; what counts are the ratios within it. No test asserts any of them.
+Written by `surgsim bench{quick}`; text after the figures, if any, is from `{notes}`, written by hand. Times hold for
+this machine and this run; compare the ratios. No test asserts any of them.
 """
 
 

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.arm_study.study import Progress
+from surgsim_env.arm_study.results import Tell
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.instruments.arm.arm import Arm
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
@@ -124,10 +124,6 @@ class Measure(NamedTuple):
         shown = f"{value * self.scale:.{self.digits}f}"
         return f"≥{shown}" if self.field == "arm_distance" and value >= DISTANCE_MOST else shown
 
-    def text_of(self, episode: Episode) -> str:
-        """An episode's value as the table shows it."""
-        return self.text(getattr(episode, self.field))
-
 
 MEASURES = (
     Measure("success_time", "time to success [s]", 1.0, 2,
@@ -216,7 +212,7 @@ def plain_episodes(episodes: Episodes | None) -> dict[str, Any]:
     return {"episodes": rows, "episodes_of": ran}
 
 
-def run_episodes(sources: tuple[str, str], arms: tuple[Arm, Arm], seeds: range, tell: Progress) -> Episodes:
+def run_episodes(sources: tuple[str, str], arms: tuple[Arm, Arm], seeds: range, tell: Tell) -> Episodes:
     """Run an episode for each seed with both arms; a PSM replaces an arm that cannot do the task.
 
     Args:
@@ -245,7 +241,13 @@ def run_episodes(sources: tuple[str, str], arms: tuple[Arm, Arm], seeds: range, 
         runs.append(run_episode(env, seed))
         if number == 0:
             how = "in success" if runs[0].success else "without success"
-            pictures = _picture(env, f"How the episode of seed {seed} ended: {how}", tell)
+            inner = env.unwrapped
+            assert isinstance(inner, SurgicalEnv)
+            try:
+                views = np.concatenate([inner.renderer.rgb(view) for view in VIEWS], axis=1)
+                pictures = {f"How the episode of seed {seed} ended: {how}": views}
+            except NoGLError as error:
+                tell(f"no picture of an episode: {error}", 0.0)
     env.close()
     tell("episodes done", 1.0)
     return replace(ran, runs=tuple(runs), pictures=pictures)
@@ -291,14 +293,3 @@ def has_pads(arm: Arm) -> bool:
     bodies = [int(model.jnt_bodyid[model.joint(name).id]) for name in arm.description.jaw]
     box = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)) & (model.geom_group == CONTACT_GROUP)
     return len(bodies) == 2 and all(bool(box[model.geom_bodyid == body].any()) for body in bodies)
-
-
-def _picture(env: gym.Env, caption: str, tell: Progress) -> dict[str, NDArray[np.uint8]]:
-    """The current views side by side by their caption; empty without OpenGL."""
-    inner = env.unwrapped
-    assert isinstance(inner, SurgicalEnv)
-    try:
-        return {caption: np.concatenate([inner.renderer.rgb(view) for view in VIEWS], axis=1)}
-    except NoGLError as error:
-        tell(f"no picture of an episode: {error}", 0.0)
-        return {}

@@ -83,11 +83,9 @@ class Wanted:
 def search_joints(kinematics: BatchKinematics, wanted: Wanted, start: FloatArray) -> Candidates:
     """Joint values that bring the tip as near to the targets as possible, from starts (n, n_joint) [rad or m]."""
     joints = np.clip(start, kinematics.lower, kinematics.upper) if wanted.limits else start.copy()
+    _iterate(kinematics, wanted, joints, ITERATIONS)
     if wanted.direction is not None:
-        _iterate(kinematics, wanted, joints, ITERATIONS)
         _iterate(kinematics, wanted.only(np.arange(len(joints)), direction=False), joints, POLISHING)
-    else:
-        _iterate(kinematics, wanted, joints, ITERATIONS)
     chain = kinematics.at(joints, shapes=False)
     missed = np.linalg.norm(wanted.position - chain.tip, axis=1)
     return Candidates(joints, missed, kinematics.trocar_error(chain), chain.direction)
@@ -179,7 +177,7 @@ def from_starts(
 ) -> Candidates:
     """Candidates for positions of the tip (n, 3) [m] from starts (k, n_joint), or of each (n, k, n_joint)."""
     count, each = len(tips), starts.shape[-2]
-    begin = np.broadcast_to(starts, (count, each, kinematics.joint_count)).reshape(-1, kinematics.joint_count)
+    begin = np.broadcast_to(starts, (count, each, kinematics.arm.joint_count)).reshape(-1, kinematics.arm.joint_count)
     wanted = Wanted(np.repeat(tips, each, axis=0), limits=limits, trocar=trocar)
     return _search(kinematics, wanted, begin, (count, each))
 
@@ -210,7 +208,7 @@ def from_directions(
     cosine = np.where(usable[:, None], cosine, -np.inf)
     best = cosine.argmax(axis=2)
     rows = np.arange(len(tips))[:, None]
-    begin = found.joints[rows, best].reshape(-1, kinematics.joint_count)
+    begin = found.joints[rows, best].reshape(-1, kinematics.arm.joint_count)
     wanted = Wanted(np.repeat(tips, DIRECTION_COUNT, axis=0), -directions.reshape(-1, 3))
     return _search(kinematics, wanted, begin, (len(tips), DIRECTION_COUNT))
 

@@ -69,11 +69,6 @@ class BatchKinematics:
         self.distal = np.array([arm.shaft in _ancestors(model, int(body)) for body in self._shape_body])
         self.effort = np.array([_effort(model, joint) for joint in self._joint_of])
 
-    @property
-    def joint_count(self) -> int:
-        """Number of driven joints."""
-        return len(self.lower)
-
     def at(self, joints: FloatArray, *, shapes: bool = True) -> Chain:
         """Tip, shaft, joint axes and (unless left out) shapes at joint values (n, n_joint)."""
         rotation, position, axes, anchors = self._bodies(joints)
@@ -94,7 +89,7 @@ class BatchKinematics:
         model, count = self.arm.model, len(joints)
         rotation = [np.broadcast_to(np.eye(3), (count, 3, 3))]
         position = [np.zeros((count, 3))]
-        axes, anchors = np.zeros((count, self.joint_count, 3)), np.zeros((count, self.joint_count, 3))
+        axes, anchors = np.zeros((2, count, self.arm.joint_count, 3))
         for body in range(1, model.nbody):
             parent = model.body_parentid[body]
             place = position[parent] + rotation[parent] @ model.body_pos[body]

@@ -359,18 +359,13 @@ def draw_arms(evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], ports: Ports) -
         # The right arm comes from the right.
         "Through the endoscope": Camera.looking(point + SCOPE_TIP * ahead, target, np.cross(line, ahead), SCOPE_FOV),
     }
-    posed = [_posed(arm, values) for arm, values in zip(arms, joints, strict=True)]
+    posed = [(arm.model, mujoco.MjData(arm.model)) for arm in arms]
+    for arm, (model, data), values in zip(arms, posed, joints, strict=True):
+        arm.write(data, values)
+        mujoco.mj_kinematics(model, data)
     surface = evaluation.surface_points, evaluation.surface_triangles
     frames = draw_still(surface, posed, capsules, list(cameras.values()), SIZE)
     return dict(zip(cameras, frames, strict=True))
-
-
-def _posed(arm: Arm, joints: FloatArray) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """An arm's model, and data with its kinematics at joint values."""
-    data = mujoco.MjData(arm.model)
-    arm.write(data, joints)
-    mujoco.mj_kinematics(arm.model, data)
-    return arm.model, data
 
 
 def _beside(

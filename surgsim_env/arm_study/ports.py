@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.arm.arm_instrument import inside_surface
+from surgsim_env.instruments.arm.arm_instrument import check_port_outside
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import fill, read_toml
 from surgsim_env.scene.model import Port
@@ -157,13 +157,9 @@ class Ports:
             ValueError: names the port, its place and the organ.
         """
         mesh = anatomy.mesh
+        organ = f"scene {anatomy.scene.name!r}", mesh.points, mesh.boundary_triangles
         for name, port in self.frames.items():
-            if inside_surface(port.point, mesh.points, mesh.boundary_triangles):
-                place = ", ".join(f"{value * 1e3:.1f}" for value in port.point)
-                raise ValueError(
-                    f"the {name} port at ({place}) mm lies inside the organ of scene {anatomy.scene.name!r}: "
-                    "move it out through the body wall"
-                )
+            check_port_outside(port, *organ, what=f"the {name} port")
 
 
 def read_ports(path: str | Path) -> Ports:

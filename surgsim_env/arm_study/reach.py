@@ -1,6 +1,7 @@
 """Points that an arm reaches, reasons for the others, and its dexterity there; points that both arms reach at once."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,9 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Surroundin
         np.array(ports.right.point) - np.array(ports.left.point),
     )
     search = _Search(kinematics, sites, around, sites.tips(around.ball), directions)
-    found, clear = search.all_around(*search.from_starts())
+    found = from_starts(kinematics, search.tips, spread_starts(kinematics))
+    found = from_neighbours(kinematics, search.tips, found)
+    found, clear = search.all_around(found, search.clear(found))
     usable = _every(clear)
     report = _report(search, found, usable, _reasons(search, found, clear))
     return Reach(report, kinematics, found, usable)
@@ -95,12 +98,6 @@ class _Search:
     around: Surroundings
     tips: FloatArray
     directions: FloatArray
-
-    def from_starts(self) -> tuple[Candidates, NDArray[np.bool_]]:
-        """Candidates from spread starts and from neighbours, and what they clear (3, n, k)."""
-        starts = spread_starts(self.kinematics)
-        found = from_neighbours(self.kinematics, self.tips, from_starts(self.kinematics, self.tips, starts))
-        return found, self.clear(found)
 
     def all_around(self, found: Candidates, clear: NDArray[np.bool_]) -> tuple[Candidates, NDArray[np.bool_]]:
         """More candidates, from every direction, twice: begun at any that meets the point, then at the usable ones."""
@@ -227,21 +224,14 @@ def evaluate_both(left: Reach, right: Reach, points: FloatArray) -> BothArms:
         )
     close = rows[np.minimum(inside[rows], outside[rows]) < ARM_DISTANCE]
     if close.size:
-        _improve(left, right, points, close, inside, outside)
+        # The widest of the pairs of candidates there.
+        ways = [_ways(arm, close) for arm in (left, right)]
+        for first, second in product(range(WAYS), repeat=2):
+            near, far = _distances(left, right, ways[0][:, first], ways[1][:, second], points[close])
+            wider = np.minimum(near, far) > np.minimum(inside[close], outside[close])
+            inside[close[wider]], outside[close[wider]] = near[wider], far[wider]
     with np.errstate(invalid="ignore"):
         return BothArms(np.minimum(inside, outside) >= ARM_DISTANCE, inside, outside)
-
-
-def _improve(
-    left: Reach, right: Reach, points: FloatArray, rows: NDArray, inside: FloatArray, outside: FloatArray
-) -> None:
-    """Put the distances of the widest pair of candidates at rows into inside and outside."""
-    ways = [_ways(arm, rows) for arm in (left, right)]
-    for first in range(WAYS):
-        for second in range(WAYS):
-            near, far = _distances(left, right, ways[0][:, first], ways[1][:, second], points[rows])
-            wider = np.minimum(near, far) > np.minimum(inside[rows], outside[rows])
-            inside[rows[wider]], outside[rows[wider]] = near[wider], far[wider]
 
 
 def _ways(arm: Reach, rows: NDArray) -> FloatArray:
@@ -272,7 +262,7 @@ def scaled_singular_values(kinematics: BatchKinematics, chain: Chain) -> FloatAr
     """
     linear, angular = kinematics.tip_jacobian(chain)
     jacobian = np.concatenate([linear, CHARACTERISTIC_LENGTH * angular], axis=1)
-    freedoms = kinematics.joint_count
+    freedoms = kinematics.arm.joint_count
     if not kinematics.arm.remote_centre_fixed:
         shaft = kinematics.shaft_jacobian(chain)
         across = shaft - chain.along[:, :, None] * np.einsum("ni,nij->nj", chain.along, shaft)[:, None]

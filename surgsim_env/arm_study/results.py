@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +14,8 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.scene.model import Port
 
 SIDES = ("left", "right")
+# Called with the current work in words and the share of the whole that is done.
+Tell = Callable[[str, float], None]
 # Reasons why an arm does not reach a point, in the order of the tests; 0 is reachable.
 REASONS = ("reachable", "no joints put the tip there", "a joint limit", "the shaft misses its trocar",
            "the arm touches the organ", "the arm touches the wall")  # fmt: skip
@@ -283,14 +285,6 @@ def clearances(evaluation: ArmsEvaluation) -> FloatArray:
     return np.concatenate(parts)
 
 
-def surface_shares(evaluation: ArmsEvaluation) -> tuple[float, float, float]:
-    """Shares of the points of the surface that the left arm, the right arm and both at once reach, 0 to 1."""
-    outer = ~evaluation.inner
-    masks = (evaluation.left.reachable, evaluation.right.reachable, evaluation.both)
-    left, right, both = (float(mask[outer].mean()) if outer.any() else 0.0 for mask in masks)
-    return left, right, both
-
-
 def verdict(evaluation: ArmsEvaluation) -> str:
     """The first paragraph of a report: shares, worst clearance, smallest tip force, most frequent obstacles."""
     inner, outer = evaluation.inner, ~evaluation.inner
@@ -418,8 +412,9 @@ def rank(candidates: Sequence[tuple[str, str, ArmsEvaluation]]) -> list[Ranked]:
 
 
 def _row(name: str, what: str, evaluation: ArmsEvaluation) -> Ranked:
-    left, right, both = surface_shares(evaluation)
-    either = float((evaluation.left.reachable | evaluation.right.reachable)[~evaluation.inner].mean())
+    outer, by_left, by_right = ~evaluation.inner, evaluation.left.reachable, evaluation.right.reachable
+    masks = (by_left, by_right, evaluation.both, by_left | by_right)
+    left, right, both, either = (float(mask[outer].mean()) if outer.any() else 0.0 for mask in masks)
     usual, (worst, _) = spread(clearances(evaluation)).median, worst_clearance(evaluation)
     force = extreme(evaluation, "tip_force").value
     return Ranked(0, name, what, left, right, both, either, usual, worst.value, force, "")

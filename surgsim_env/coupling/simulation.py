@@ -16,8 +16,7 @@ from msdm_core.organ.compile import blank_state, rest_state
 from msdm_core.organ.stability import stable_dt
 from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
 from surgsim_env.coupling.mujoco_library import runs_compiled
-from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.instruments.jaw import Grasp, read_grasp
+from surgsim_env.instruments.instrument import Grasp, Instrument, read_grasp
 from surgsim_env.instruments.make import make_instrument
 from surgsim_env.instruments.tool_bodies import check_tool_masses
 from surgsim_env.scene.anatomy import Anatomy

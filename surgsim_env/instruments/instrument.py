@@ -1,11 +1,181 @@
-"""What a simulation and a task ask of any instrument in MuJoCo: place and steer its tip, read it, save its state."""
+"""What a simulation and a task ask of any instrument in MuJoCo: steer its tip and jaw, read it, save its state."""
+
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.jaw import Jaw
-from surgsim_env.instruments.tool_bodies import ToolBodies
+from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
+
+# From open to closed [s].
+STROKE_TIME = 0.5
+# The pads of a jaw at rest face each other along UP as closely as possible; along UP_ELSE if the jaw points along UP.
+UP, UP_ELSE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+
+
+class Jaw:
+    """Two fingers of an instrument, each a tool of its own, commanded by a target from -1 (closed) to 1 (open).
+
+    The servo moves the fingers' position targets at a speed that takes 0.5 s from closed to open. The force (or torque)
+    range of the fingers' joints in the model limits how hard they press.
+
+    Fields:
+        tools: the two fingers, as tools of the instrument                       (2,)
+        shapes: their pads, as contact shapes of the instrument                  (2,)
+        has_pads: whether these are flat (boxes), made to hold tissue
+        closed, opened: values of the fingers' joints at -1 and at 1 [rad or m]  (2,)
+    """
+
+    def __init__(self, instrument: ToolBodies, joints: tuple[str, ...], places: NDArray[np.int64]) -> None:
+        """Take the two fingers' joints of an instrument, which open upwards, and their places in its servo (2,).
+
+        Raises:
+            ValueError: not two fingers, or a finger without a contact geom.
+        """
+        model = instrument.model
+        if len(joints) != 2:
+            raise ValueError(f"a jaw has two fingers, each with a joint; not {len(joints)} ({', '.join(joints)})")
+        index = np.array([model.joint(name).id for name in joints])
+        bodies = model.jnt_bodyid[index]
+        for body in bodies:
+            if model.body(body).name not in instrument.tool_names:
+                raise ValueError(f"finger {model.body(body).name!r} has no contact geom: tissue would not feel it")
+        self._instrument, self._places = instrument, places
+        self.tools = np.array([instrument.tool_names.index(model.body(body).name) for body in bodies], dtype=np.int32)
+        self.shapes = np.array([np.flatnonzero(instrument.shapes.shape_tool == tool)[0] for tool in self.tools])
+        self._pads = np.flatnonzero(model.geom_group == CONTACT_GROUP)[self.shapes]
+        self._qpos = model.jnt_qposadr[index]
+        self.closed, self.opened = model.jnt_range[index].T.copy()
+        self.has_pads = bool((model.geom_type[self._pads] == int(mujoco.mjtGeom.mjGEOM_BOX)).all())
+        # A box is thinnest across its pad; the first size of a ball or capsule is its radius.
+        across = np.argmin(model.geom_size[self._pads], axis=1) if self.has_pads else np.zeros(2, dtype=np.int64)
+        self._half_thickness = model.geom_size[self._pads, across]
+        self._inward = self._inner_sides(across)
+
+    @property
+    def target(self) -> float:
+        """Current position target of the fingers, from -1 (closed) to 1 (open)."""
+        now = self._instrument.data.ctrl[self._controls[0]]
+        return float(2.0 * (now - self.closed[0]) / (self.opened[0] - self.closed[0]) - 1.0)
+
+    @property
+    def friction(self) -> FloatArray:
+        """Coulomb coefficient of each pad relative to the contact law's, (2,)."""
+        return self._instrument.shapes.shape_friction[self.shapes]
+
+    @property
+    def normals(self) -> FloatArray:
+        """Unit vectors out of the pads, towards each other, (2, 3); without pads, from one finger to the other."""
+        data = self._instrument.data
+        if self.has_pads:
+            return np.einsum("pxy,py->px", data.geom_xmat[self._pads].reshape(2, 3, 3), self._inward)
+        gap = data.geom_xpos[self._pads[1]] - data.geom_xpos[self._pads[0]]
+        return np.stack([gap, -gap]) / np.linalg.norm(gap)
+
+    @property
+    def opening(self) -> float:
+        """Gap between the pads at their middles, along their mean normal [m]."""
+        first, second = self._instrument.data.geom_xpos[self._pads]
+        normals = self.normals
+        mean = normals[0] - normals[1]
+        return float((second - first) @ mean / np.linalg.norm(mean) - self._half_thickness.sum())
+
+    def command(self, target: float) -> None:
+        """Command the fingers to a target from -1 (closed) to 1 (open), which they hold.
+
+        Raises:
+            ValueError: a target outside that range.
+        """
+        if not -1.0 <= target <= 1.0:
+            raise ValueError(f"jaw target {target:g} is out of range: it goes from -1 (closed) to 1 (open)")
+        servo, span = self._instrument.servo, self.opened - self.closed
+        goal = self.closed + 0.5 * (target + 1.0) * span
+        now = self._instrument.data.ctrl[self._controls]
+        servo.command[self._places] = np.sign(goal - now) * span / STROKE_TIME
+        # The servo stops at the goal as at any other limit.
+        servo.lower[self._places] = np.where(goal < now, goal, self.closed)
+        servo.upper[self._places] = np.where(goal > now, goal, self.opened)
+
+    def rest(self) -> None:
+        """Drop any command: a jaw with pads is open, another one stays as MuJoCo's data have it.
+
+        The caller brings MuJoCo's positions up to date.
+        """
+        servo, data = self._instrument.servo, self._instrument.data
+        servo.command[self._places] = 0.0
+        servo.lower[self._places], servo.upper[self._places] = self.closed, self.opened
+        if self.has_pads:
+            data.qpos[self._qpos] = data.ctrl[self._controls] = self.opened
+
+    @property
+    def _controls(self) -> NDArray[np.int64]:
+        return self._instrument.servo.position[self._places]
+
+    def _inner_sides(self, across: NDArray[np.int64]) -> FloatArray:
+        """Normals of the open jaw's pads towards each other, each in its geom's own frame, (2, 3)."""
+        model = self._instrument.model
+        data = mujoco.MjData(model)
+        data.qpos[self._qpos] = self.opened
+        mujoco.mj_kinematics(model, data)
+        gap = data.geom_xpos[self._pads[1]] - data.geom_xpos[self._pads[0]]
+        axes = np.eye(3)[across]
+        outward = np.einsum("pxy,py->px", data.geom_xmat[self._pads].reshape(2, 3, 3), axes)
+        return axes * np.sign(outward @ gap * np.array([1.0, -1.0]))[:, None]
+
+
+def frame_along(direction: FloatArray) -> FloatArray:
+    """Right-handed frame with -z along a direction and y as close to up as possible, as columns (3, 3)."""
+    z = -direction / np.linalg.norm(direction)
+    up = UP if abs(z @ UP) < 0.9 else UP_ELSE
+    y = up - (up @ z) * z
+    y /= np.linalg.norm(y)
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A jaw's hold on tissue, computed from the contact forces of one haptic step.
+
+    Args:
+        opening: gap between the pads at their middles [m].
+        grip_force: the smaller of the tissue's two forces along the pads' own normals [N].
+        pull_force: size of the sum of the tissue's forces on both fingers [N].
+        friction_left: friction in reserve, mu (N1 + N2) - (T1 + T2) [N], where N and T are each pad's normal and
+            tangential force; at 0 or below the tissue slips.
+        holds: whether tissue presses both pads.
+    """
+
+    opening: float
+    grip_force: float
+    pull_force: float
+    friction_left: float
+    holds: bool
+
+
+def read_grasp(jaw: Jaw | None, wrench: FloatArray, friction: float) -> Grasp | None:
+    """The grasp of a jaw at the current poses of its instrument; None without a jaw.
+
+    Args:
+        jaw: of an instrument.
+        wrench: the tissue's force [N] and torque [N m] on each tool, (n_tool, 6).
+        friction: Coulomb coefficient of the scene's contact law; the pads' relative coefficients multiply it.
+    """
+    if jaw is None:
+        return None
+    forces, normals = wrench[jaw.tools, :3], jaw.normals
+    # Tissue pushes a pad back, against its normal.
+    along = (forces * normals).sum(axis=1)
+    pressing = np.maximum(-along, 0.0)
+    tangential = np.linalg.norm(forces - along[:, None] * normals, axis=1)
+    return Grasp(
+        opening=jaw.opening,
+        grip_force=float(pressing.min()),
+        pull_force=float(np.linalg.norm(forces.sum(axis=0))),
+        friction_left=float((friction * jaw.friction * pressing - tangential).sum()),
+        holds=bool((pressing > 0.0).all()),
+    )
 
 
 class Instrument(ToolBodies):

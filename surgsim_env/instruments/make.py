@@ -1,12 +1,188 @@
-"""Makes the instrument that a scene names: a Cartesian probe or grasper, one arm or two."""
+"""Instruments that a scene names: one arm, two, or a Cartesian tip on slides, a ball (probe) or a jaw (grasper)."""
+
+import math
+
+import mujoco
+import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm_instrument import ArmInstrument, is_arm
 from surgsim_env.instruments.arm.pair import Pair
-from surgsim_env.instruments.cartesian import Grasper, Probe, read_model
-from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
+from surgsim_env.instruments.tool_bodies import add_supports, make_servo
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.load import pair_names
+from surgsim_env.scene.load import pair_names, scenes_folder
+from surgsim_env.scene.model import Scene
+
+SLIDES = ("x", "y", "z")
+FINGERS = ("finger_upper", "finger_lower")
+
+
+class Probe(Instrument):
+    """A Cartesian probe of a scene, placed in the world frame: slide coordinates are the tip's position."""
+
+    def __init__(self, scene: Scene, lower: FloatArray, upper: FloatArray) -> None:
+        """Load the scene's model; the tip moves in the box from lower to upper [m] and is parked at `upper`."""
+        model = _compile_probe(scene, lower, upper)
+        super().__init__(model, lower, upper, model.site("tip").id)
+        self.parked = upper
+        self.servo = make_servo(lower, upper, np.arange(3), np.arange(3, 6))
+
+    def place(self, position: FloatArray) -> None:
+        """Place the tip at rest at a position [m]; all else is as when loaded."""
+        self._rest()
+        self.data.qpos[:3] = position
+        self.data.ctrl[:3] = position
+        mujoco.mj_forward(self.model, self.data)
+
+    def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
+        """Command the tip's velocity [m/s], shape (3,); a probe does not turn."""
+        self.turning_of(turning)
+        self.servo.command[:] = velocity
+
+
+class Grasper(Instrument):
+    """A jaw on a shaft along the scene's approach, turned by a wrist hinge and carried by three slides.
+
+    The hinge is behind the tip. Once per control step `command_velocity` computes the slide positions that bring the
+    tip to its target at the end of the step, with the hinge turned, and commands the constant speeds that lead there.
+    """
+
+    turning_size = 1
+
+    def __init__(self, scene: Scene, lower: FloatArray, upper: FloatArray) -> None:
+        """Load the scene's model; the tip moves in the box from lower to upper [m] and is parked at `upper`.
+
+        Raises:
+            ValueError: the scene's tip_direction needs the hinge beyond its range.
+        """
+        approach = np.asarray(scene.instrument.approach)
+        self._rotation = frame_along(approach)
+        model = _compile_grasper(scene, self._rotation)
+        super().__init__(model, lower, upper, model.site("tip").id)
+        # From the hinge to the tip at pitch 0, in the wrist's frame.
+        self._reach = model.site("tip").pos.copy()
+        self._start_pitch = self._pitch_towards(scene.instrument.tip_direction or scene.instrument.approach)
+        self._control_step = scene.timing.control_step
+        self.parked = upper
+        limits = self.model.jnt_range.T
+        self.servo = make_servo(limits[0], limits[1], np.arange(6), np.arange(6, 12))
+        self._set_jaw(Jaw(self, FINGERS, np.array([4, 5])))
+        self._short = False
+
+    @property
+    def workspace_limited(self) -> bool:
+        """Whether the box or the hinge's range stopped the commanded motion of the tip."""
+        return self._short or super().workspace_limited
+
+    @property
+    def pitch(self) -> float:
+        """Angle of the wrist hinge [rad]; above 0 the jaw's tip is lifted."""
+        return float(self.data.qpos[3])
+
+    def place(self, position: FloatArray) -> None:
+        """Place the tip at rest at a position [m], with the jaw open along the scene's tip direction."""
+        self._rest()
+        self._short = False
+        joints = np.append(position - self._tip_from_hinge(self._start_pitch), self._start_pitch)
+        self.data.qpos[:4] = joints
+        self.data.ctrl[:4] = joints
+        assert self.jaw is not None
+        self.jaw.rest()
+        mujoco.mj_forward(self.model, self.data)
+
+    def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
+        """Command the velocity of the tip [m/s] (3,) and of the hinge [rad/s] (1,); above 0 it lifts the jaw's tip.
+
+        Valid for one control step; after it the joints continue at the same speeds.
+        """
+        duration, joints = self._control_step, self.data.ctrl[:4]
+        low, high = self.servo.lower[3], self.servo.upper[3]
+        turned = joints[3] + float(self.turning_of(turning)[0]) * duration
+        pitch = min(max(turned, low), high)
+        wanted = joints[:3] + self._tip_from_hinge(joints[3]) + np.asarray(velocity, dtype=np.float64) * duration
+        held = np.clip(wanted, self.lower, self.upper)
+        self._short = bool(pitch != turned or (held != wanted).any())
+        self.servo.command[:3] = (held - self._tip_from_hinge(pitch) - joints[:3]) / duration
+        self.servo.command[3] = (pitch - joints[3]) / duration
+
+    def get_state(self) -> FloatArray:
+        """The whole state of the instrument, command included, as one vector."""
+        return np.append(super().get_state(), float(self._short))
+
+    def set_state(self, state: FloatArray) -> None:
+        """Restore a state from `get_state`, to the bit."""
+        super().set_state(state[:-1])
+        self._short = bool(state[-1])
+
+    def _tip_from_hinge(self, pitch: float) -> FloatArray:
+        """Vector from the hinge to the tip at an angle of the hinge [rad], world frame, (3,) [m]."""
+        _, y, z = self._reach
+        c, s = math.cos(pitch), math.sin(pitch)
+        return self._rotation @ np.array([0.0, c * y - s * z, s * y + c * z])
+
+    def _pitch_towards(self, direction: tuple[float, float, float]) -> float:
+        """Angle of the hinge at which the jaw points along a direction as closely as possible [rad]."""
+        _, y, z = self._rotation.T @ np.asarray(direction)
+        pitch = math.atan2(y, -z)
+        low, high = self.model.joint("pitch").range
+        if not low <= pitch <= high:
+            raise ValueError(
+                f"instrument.tip_direction {direction} needs the grasper's wrist at {math.degrees(pitch):.0f} degrees "
+                f"from instrument.approach; its range is {math.degrees(low):.0f} to {math.degrees(high):.0f}"
+            )
+        return pitch
+
+
+def read_model(name: str) -> mujoco.MjSpec:
+    """Read the model of a Cartesian instrument, an MJCF file in scenes/instruments.
+
+    Raises:
+        ValueError: no such file (lists those there are).
+    """
+    path = scenes_folder() / "instruments" / name
+    if not path.is_file():
+        known = ", ".join(sorted(item.name for item in path.parent.glob("*.xml")))
+        raise ValueError(f"instrument {name!r} is unknown; the instruments are {known}")
+    return mujoco.MjSpec.from_file(str(path))
+
+
+def _compile_probe(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco.MjModel:
+    spec = read_model(scene.instrument.model)
+    spec.option.timestep = scene.timing.haptic_step
+    ball, shaft, tip = spec.geom("tip_ball"), spec.geom("tip_shaft"), spec.body("tip")
+    radius = scene.instrument.tip_radius
+    ball.size = [radius, 0.0, 0.0]
+    start = radius + float(shaft.size[0])
+    shaft.fromto = [0.0, 0.0, start, 0.0, 0.0, start + 0.1]
+    tip.quat = _rotation_from_down(np.asarray(scene.instrument.approach))
+    for axis, name in enumerate(SLIDES):
+        spec.joint(f"slide_{name}").range = [lower[axis], upper[axis]]
+    add_supports(spec, scene.supports)
+    return spec.compile()
+
+
+def _rotation_from_down(direction: FloatArray) -> FloatArray:
+    """Quaternion (w, x, y, z) of the smallest rotation from -z to a direction."""
+    unit = direction / np.linalg.norm(direction)
+    down = np.array([0.0, 0.0, -1.0])
+    quaternion = np.concatenate([[1.0 + down @ unit], np.cross(down, unit)])
+    if np.linalg.norm(quaternion) < 1e-9:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    return quaternion / np.linalg.norm(quaternion)
+
+
+def _compile_grasper(scene: Scene, rotation: FloatArray) -> mujoco.MjModel:
+    spec = read_model(scene.instrument.model)
+    spec.option.timestep = scene.timing.haptic_step
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    spec.body("wrist").quat = quaternion
+    for name in SLIDES:
+        # The box limits the tip; the slides' positions depend on the hinge too.
+        spec.joint(f"slide_{name}").range = [-10.0, 10.0]
+    add_supports(spec, scene.supports)
+    return spec.compile()
 
 
 def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> Instrument:

@@ -107,9 +107,6 @@ class ContrastMap:
         return sum(score.felt for score in self.scores)
 
 
-# ---- baselines -------------------------------------------------------------------------------------------------------
-
-
 def healthy_majority(values: FloatArray) -> tuple[float, float]:
     """Middle and spread of the shortest half of the values (Rousseeuw 1984), the spread as a standard deviation.
 
@@ -216,9 +213,6 @@ def _robust_fit(columns: FloatArray, values: FloatArray) -> FloatArray:
         else:
             weight = np.maximum(1.0 - (scaled / TUKEY_LIMIT) ** 2, 0.0) ** 2
     return fitted
-
-
-# ---- lesions felt on a map -------------------------------------------------------------------------------------------
 
 
 def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> list[Estimate]:

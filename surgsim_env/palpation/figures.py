@@ -135,18 +135,15 @@ def _map_over(
 ) -> tuple[FloatArray, FloatArray]:
     """The map's value on each patch and its weight: 0 off the palpable face unless `everywhere`."""
     anatomy = palpation.anatomy
-    on_face = everywhere | _rows_in(anatomy.mesh.boundary_triangles, anatomy.face.triangles)[patches.origin]
+    palpable = set(map(frozenset, anatomy.face.triangles.tolist()))
+    chosen = np.array([frozenset(row) in palpable for row in anatomy.mesh.boundary_triangles.tolist()])
+    on_face = everywhere | chosen[patches.origin]
     centres = patches.corners[on_face].mean(axis=1)
     sites = palpation.sites[palpation.used]
     field, weight = np.ones(len(on_face)), np.zeros(len(on_face))
     field[on_face] = interpolated(sites, one.contrast, centres)
     weight[on_face] = nearness(sites, centres, anatomy.scene.palpation.site_spacing, RUN_OUT if everywhere else FADE_TO)
     return field, weight
-
-
-def _rows_in(rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    wanted = {tuple(sorted(row)) for row in chosen.tolist()}
-    return np.array([tuple(sorted(row)) in wanted for row in rows.tolist()])
 
 
 def _mark_sites(axes: Axes, palpation: PalpationResult, view: View, *, colour: str, alpha: float) -> None:

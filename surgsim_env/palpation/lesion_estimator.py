@@ -150,13 +150,11 @@ class LesionEstimator:
         self.tip_radius, self.noise = tip_radius, noise
         self.scale = tip_radius / REFERENCE_TIP_RADIUS
         self.excess_least = EXCESS_LEAST + EXCESS_LEAST_NOISE * noise
-        self.axes = (self._axis(0), self._axis(1))
+        # Coordinates of the map's points along each axis [m], from edge to edge.
+        spacing = MAP_SPACING * self.scale
+        first, second = (np.linspace(0.0, side, max(2, round(side / spacing) + 1)) for side in self.extent)
+        self.axes = (first, second)
         self.process = contrast_process(self.axes, tip_radius=tip_radius, noise=noise)
-
-    def _axis(self, index: int) -> FloatArray:
-        """Coordinates of the map's points along an axis [m], from edge to edge."""
-        count = max(2, round(self.extent[index] / (MAP_SPACING * self.scale)) + 1)
-        return np.linspace(0.0, self.extent[index], count)
 
     def estimate(self, places: ArrayLike, log_contrast: ArrayLike) -> LesionEstimate:
         """The lesions that presses indicate; without a press there are none.

@@ -30,9 +30,6 @@ INTERVAL = (2.5, 97.5)
 NOISES_LEAST = 2.0
 
 
-# ---- distance between true and estimated places ----------------------------------------------------------------------
-
-
 def ospa_cutoff(tip_radius: float) -> float:
     """The benchmark's cutoff for a tip's radius [m]."""
     return CUTOFF * tip_radius / CUTOFF_TIP_RADIUS
@@ -67,9 +64,6 @@ def matched_distances(
     distance = np.sqrt(((np.asarray(truth)[:, None] - np.asarray(estimate)) ** 2).sum(axis=2))
     rows, columns = linear_sum_assignment(np.minimum(distance, cutoff))
     return rows, columns, distance[rows, columns]
-
-
-# ---- records of episodes ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +123,6 @@ class Figure:
     value: float | None
     low: float | None
     high: float | None
-
-
-# ---- figures of a method ---------------------------------------------------------------------------------------------
 
 
 def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Generator) -> dict[str, Figure]:
@@ -217,9 +208,6 @@ def _figure(value: float, draws: FloatArray) -> Figure:
     return Figure(value, low, high)
 
 
-# ---- figures of an episode -------------------------------------------------------------------------------------------
-
-
 def _matched(record: PalpationRecord) -> FloatArray:
     """Distances [m] between lesions and the last estimates that found them."""
     distance = matched_distances(record.truth, record.estimates[-1], record.cutoff)[2]
@@ -277,9 +265,6 @@ EPISODE_FIGURES: Mapping[str, Callable[[PalpationRecord], float]] = {
     "hard_limit_share": lambda record: float(record.hard_limit),
     "fault_share": lambda record: float(bool(record.fault)),
 }
-
-
-# ---- the sensor's reach ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -126,10 +126,8 @@ def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray,
     latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)
     angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     around = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
-    points = []
-    for value in latitude:
-        centre = start if value < 0.0 else end
-        points.append(centre + radius * (np.cos(value) * around + np.sin(value) * axis))
+    balls = [(start if value < 0.0 else end, value) for value in latitude]
+    points = [centre + radius * (np.cos(value) * around + np.sin(value) * axis) for centre, value in balls]
     grid = np.arange(rings * count).reshape(rings, count)
     a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
     c, d = np.roll(grid[1:], -1, axis=1), grid[1:]
@@ -175,7 +173,4 @@ def draw_patches(
 
 def save_png(figure: Figure, path: Path, facecolor: str = PAPER) -> None:
     """Write a figure without GL or display; the same bytes for the same figure."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
     figure.savefig(path, format="png", facecolor=facecolor)

@@ -8,8 +8,7 @@ import numpy as np
 
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.chart import Chart, ChartedFace, Site
-from surgsim_env.palpation.healthy_map import HealthyMap
+from surgsim_env.palpation.chart import Chart, ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.scene.model import PalpationSettings
 

@@ -178,7 +178,11 @@ def open_nifti(file: Path) -> LabelSource:
     Raises:
         MeshError: a damaged file or an unsupported header.
     """
-    _check_compression(file)
+    with file.open("rb") as stream:
+        packed = stream.read(2) == b"\x1f\x8b"
+    if packed != file.name.lower().endswith(".gz"):
+        name, what = (".nii.gz", "is not") if not packed else (".nii", "is")
+        raise MeshError(f"{file}: is named {name} and {what} compressed by gzip: rename it, or {ADVICE}")
     header = _header(file)
     shape = checked_shape(parsed(file, lambda _: header.get_data_shape(), ADVICE), file)
     dtype = np.dtype(parsed(file, lambda _: header.get_data_dtype(), ADVICE))
@@ -203,14 +207,6 @@ def open_nifti(file: Path) -> LabelSource:
 
     runs = partial(_runs, file, shape, dtype, offset, scaling)
     return LabelSource(file, shape, geometry, runs, tuple(notes))
-
-
-def _check_compression(file: Path) -> None:
-    with file.open("rb") as stream:
-        packed = stream.read(2) == b"\x1f\x8b"
-    if packed != file.name.lower().endswith(".gz"):
-        name, what = (".nii.gz", "is not") if not packed else (".nii", "is")
-        raise MeshError(f"{file}: is named {name} and {what} compressed by gzip: rename it, or {ADVICE}")
 
 
 def _header(file: Path) -> Any:

@@ -31,14 +31,7 @@ from surgsim_env.patient.patient_scene import (
     patient_scene,
 )
 from surgsim_env.patient.report import MARK, report_page
-from surgsim_env.patient.retract_scene import (
-    BED_GAP,
-    BED_INSIDE,
-    MODULUS_SPREAD,
-    RetractScene,
-    find_retraction,
-    with_retraction,
-)
+from surgsim_env.patient.retract_scene import BED_GAP, BED_INSIDE, MODULUS_SPREAD, RetractScene, find_retraction
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import share_text, warn_of_coarse_cells
@@ -101,14 +94,15 @@ def make_patient(
                 f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
             )
         mesh = mesh_surfaces(files, regions, length_unit, cell_size=cell_size, mesher=mesher, mend=mend)
-    return patient_scene(mesh, out.stem, out.parent, out.name, options=options, moduli=moduli or {})
+    return patient_scene(mesh, out, options=options, moduli=moduli or {})
 
 
 def add_retraction(found: PatientScene, out: Path) -> tuple[PatientScene, RetractScene | str]:
     """The organ with a reference to its retraction scene, and that scene; or the reason why there is none in both."""
     turned = _retract_file(out)
-    retraction = find_retraction(found, out.parent, turned.name)
-    return with_retraction(found, retraction, turned.with_suffix(".toml").name), retraction
+    made = find_retraction(found, turned)
+    said = {"retract_refusal": made} if isinstance(made, str) else {"retract_scene": turned.with_suffix(".toml").name}
+    return replace(found, anatomy=replace(found.anatomy, scene=replace(found.scene, **said))), made
 
 
 def write_patient(
@@ -342,7 +336,7 @@ def scene_text(found: PatientScene) -> str:
 
 def retract_text(found: PatientScene, made: RetractScene) -> str:
     """The text of a patient's retraction scene."""
-    rows = "; ".join(", ".join(f"{value:.6f}" for value in row) for row in made.frame.T)
+    rows = "; ".join(", ".join(f"{value:.6f}" for value in row) for row in made.rim.frame.T)
     place = ", ".join(f"{value:.6f}" for value in made.origin)
     head = (
         SCENE_MARK,

@@ -32,7 +32,6 @@ from surgsim_env.patient.surface_files import (
     BrokenSurface,
     ClosedSurface,
     bodies_of,
-    checked_names,
     mended_voxels,
     read_organ_surface,
     read_region_surfaces,
@@ -114,22 +113,17 @@ class PatientMesh:
         return self.volumes[0].error
 
 
-def default_cell_size(volume: float) -> float:
-    """Cell edge [m] in proportion to the size of an organ of a given volume [m^3]."""
-    wanted = (volume / CELLS_WANTED) ** (1.0 / 3.0)
-    return max(math.ceil(wanted / CELL_STEP) * CELL_STEP, CELL_SMALLEST)
-
-
 def well_shaped(make: Callable[[float], PatientMesh], cell_size: float | None, volume: float) -> PatientMesh:
-    """A mesh of a given cell size [m]; by default of the default size, or a slightly smaller one for better angles.
+    """A mesh of a given cell size [m]; by default in proportion to a volume [m^3], slightly smaller for better angles.
 
     Isosurface stuffing guarantees 9.3 degrees; slightly smaller cells are cut elsewhere, often with larger angles.
     """
     if cell_size is not None:
         return make(cell_size)
     best, largest = None, -math.inf
+    usual = max(math.ceil((volume / CELLS_WANTED) ** (1.0 / 3.0) / CELL_STEP) * CELL_STEP, CELL_SMALLEST)
     for share in CELL_SHARES:
-        mesh = make(round(share * default_cell_size(volume), 6))
+        mesh = make(round(share * usual, 6))
         angle = float(dihedral_angles(mesh.mesh).min())
         if angle > largest:
             best, largest = mesh, angle
@@ -201,51 +195,49 @@ def mesh_surfaces(
         mesher: "lattice" or "tetwild".
         mend: whether an organ's surface that is open or crosses itself may be rebuilt from voxels.
     """
-    organ, notes = read_organ_surface(files[0], length_unit, mend=mend)
+    organ, dropped = read_organ_surface(files[0], length_unit, mend=mend)
     inner = []
     for name, file in [*((region_name(file), file) for file in files[1:]), *map(_named, regions)]:
         inner += read_region_surfaces(file, length_unit, name)
-    checked_names([organ.name, *(one.name for one in inner)])
+    names = [organ.name, *(one.name for one in inner)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise MeshError(
+            f"region {twice!r} is given twice; give the files other names, or name them: --region NAME=FILE"
+        )
     sources = tuple(file.name for file in files) + tuple(_named(text)[1].name for text in regions)
     volume = abs(surface_volume(organ.vertices, organ.triangles))
-    return well_shaped(lambda size: _mesh_given(organ, inner, sources, notes, size, mesher), cell_size, volume)
 
+    def make(cell_size: float) -> PatientMesh:
+        notes = list(dropped)
+        smoothing = change = None
+        if isinstance(organ, BrokenSurface):
+            tags, step, start, note = mended_voxels(organ, cell_size)
+            notes.append(note)
+            filled = fill_labels(tags, step, cell_size=cell_size, region_names={1: organ.name})
+            notes += [f"{len(filled.dropped)} part(s) apart from the largest were left out"] if filled.dropped else []
+            plain = TetMesh(filled.mesh.points + start, filled.mesh.tets)
+            volume, smoothing, change = filled.label_volume, filled.smoothing, filled.smoothing_change
+        elif mesher == "tetwild":
+            plain, volume = tetwild_mesh([organ, *inner], cell_size), organ.volume
+        else:
+            plain, volume = mesh_surface(organ.vertices, organ.triangles, cell_size=cell_size), organ.volume
+        mesh, tagged = _with_regions(plain, names[0], inner, cell_size)
+        return PatientMesh(
+            mesh=mesh,
+            lesions=tuple(name for name in names[1:] if is_lesion(name)),
+            volumes=region_volumes(mesh, names, volume, tagged),
+            cell_size=cell_size,
+            mesher="lattice" if isinstance(organ, BrokenSurface) else mesher,
+            convention=FILE_CONVENTION,
+            sources=sources,
+            notes=tuple(notes),
+            is_scan=False,
+            smoothing=smoothing,
+            smoothing_change=change,
+        )
 
-def _mesh_given(
-    organ: ClosedSurface | BrokenSurface,
-    inner: Sequence[ClosedSurface],
-    sources: tuple[str, ...],
-    dropped: Sequence[str],
-    cell_size: float,
-    mesher: str,
-) -> PatientMesh:
-    names, notes = [organ.name, *(one.name for one in inner)], list(dropped)
-    smoothing = change = None
-    if isinstance(organ, BrokenSurface):
-        tags, step, start, note = mended_voxels(organ, cell_size)
-        notes.append(note)
-        filled = fill_labels(tags, step, cell_size=cell_size, region_names={1: organ.name})
-        notes += [f"{len(filled.dropped)} part(s) apart from the largest were left out"] if filled.dropped else []
-        plain = TetMesh(filled.mesh.points + start, filled.mesh.tets)
-        volume, smoothing, change = filled.label_volume, filled.smoothing, filled.smoothing_change
-    elif mesher == "tetwild":
-        plain, volume = tetwild_mesh([organ, *inner], cell_size), organ.volume
-    else:
-        plain, volume = mesh_surface(organ.vertices, organ.triangles, cell_size=cell_size), organ.volume
-    mesh, tagged = _with_regions(plain, names[0], inner, cell_size)
-    return PatientMesh(
-        mesh=mesh,
-        lesions=tuple(name for name in names[1:] if is_lesion(name)),
-        volumes=region_volumes(mesh, names, volume, tagged),
-        cell_size=cell_size,
-        mesher="lattice" if isinstance(organ, BrokenSurface) else mesher,
-        convention=FILE_CONVENTION,
-        sources=sources,
-        notes=tuple(notes),
-        is_scan=False,
-        smoothing=smoothing,
-        smoothing_change=change,
-    )
+    return well_shaped(make, cell_size, volume)
 
 
 def _named(text: str) -> tuple[str, Path]:

@@ -81,21 +81,13 @@ class PatientScene:
 
 
 def patient_scene(
-    patient: PatientMesh,
-    name: str,
-    folder: Path,
-    mesh_file: str,
-    *,
-    options: SurfaceOptions,
-    moduli: Mapping[str, float],
+    patient: PatientMesh, out: Path, *, options: SurfaceOptions, moduli: Mapping[str, float]
 ) -> PatientScene:
     """Make the palpation scene of a patient's organ.
 
     Args:
         patient: the organ.
-        name: of the scene.
-        folder: of the scene file and its mesh.
-        mesh_file: name of the mesh file.
+        out: path of the mesh file, beside which the scene file is; its stem names the scene.
         options: touch, anchors and healthy tissue.
         moduli: of regions by name [Pa].
 
@@ -107,7 +99,7 @@ def patient_scene(
         one.name: region_material(one.name, patient.organ_name, organ.material, moduli) for one in patient.volumes[1:]
     }
     _check_moduli(moduli, list(regions))
-    scene = _first_scene(patient, name, folder, mesh_file, organ.material, regions, options)
+    scene = _first_scene(patient, out, organ.material, regions, options)
     notes: list[str] = []
     anatomy, sites = _with_sites(scene, patient, options, notes)
     anatomy = _with_lesions(anatomy, notes)
@@ -121,13 +113,7 @@ def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
 
 
 def _first_scene(
-    patient: PatientMesh,
-    name: str,
-    folder: Path,
-    mesh_file: str,
-    material: Material,
-    regions: Mapping[str, TissueMaterial],
-    options: SurfaceOptions,
+    patient: PatientMesh, out: Path, material: Material, regions: Mapping[str, TissueMaterial], options: SurfaceOptions
 ) -> Scene:
     """The scene with all values that follow from the cells and the tissue."""
     liver, cell = make_scene(PATTERN), patient.cell_size
@@ -140,10 +126,10 @@ def _first_scene(
         described += f", {len(patient.lesions)} segmented lesion(s)"
     scene = replace(
         liver,
-        name=name,
+        name=out.stem,
         description=described,
-        folder=folder,
-        mesh=MeshSource(tets=TetFile(mesh_file, "m")),
+        folder=out.parent,
+        mesh=MeshSource(tets=TetFile(out.name, "m")),
         material=material,
         contact=replace(liver.contact, stiffness=_digits(CONTACT_MODULI_PER_CELL * material.youngs_modulus / cell, 3)),
         limits=_limits(material, tip, depth),

@@ -306,9 +306,6 @@ def _legend(figure: Figure, found: PatientScene) -> None:
 
 
 def _png(figure: Figure) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
     stream = io.BytesIO()
     figure.savefig(stream, format="png", facecolor=PAPER, metadata={"Software": None})
     return stream.getvalue()

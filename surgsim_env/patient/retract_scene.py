@@ -269,18 +269,17 @@ class RetractScene:
 
     Fields:
         anatomy: the scene on the turned mesh
-        origin, frame: a point p of the patient's mesh is at (p - origin) @ frame here [m], (3,) and (3, 3)
+        origin: a point p of the patient's mesh is at (p - origin) @ rim.frame here [m], (3,)
         rim: the edge to be lifted
     """
 
     anatomy: Anatomy
     origin: FloatArray
-    frame: FloatArray
     rim: Rim
 
 
-def find_retraction(found: PatientScene, folder: Path, mesh_file: str) -> RetractScene | str:
-    """The retraction scene of an organ, with its mesh as `mesh_file` in `folder`; or the reason why there is none."""
+def find_retraction(found: PatientScene, out: Path) -> RetractScene | str:
+    """The retraction scene of an organ, with its mesh to be written to `out`; or the reason why there is none."""
     cell = found.patient.cell_size
     if cell > CELL_MOST:
         return (
@@ -288,10 +287,10 @@ def find_retraction(found: PatientScene, folder: Path, mesh_file: str) -> Retrac
             f"use --cell-size {CELL_MOST:g} or less"
         )
     rim = find_rim(found.patient.mesh, -np.array(found.scene.instrument.approach))
-    return rim.reason if isinstance(rim, NoRim) else retract_scene(found, rim, folder, mesh_file)
+    return rim.reason if isinstance(rim, NoRim) else retract_scene(found, rim, out)
 
 
-def retract_scene(found: PatientScene, rim: Rim, folder: Path, mesh_file: str) -> RetractScene | str:
+def retract_scene(found: PatientScene, rim: Rim, out: Path) -> RetractScene | str:
     """The scene in which a given edge is lifted; or the reason why it cannot be lifted."""
     bed_top = rim.underside[0] - BED_GAP
     origin = rim.place - rim.frame @ np.array([0.5 * FLAP_WIDTH, FLAP_DEPTH, -bed_top])
@@ -302,7 +301,7 @@ def retract_scene(found: PatientScene, rim: Rim, folder: Path, mesh_file: str) -
             f"the organ ends {(FLAP_DEPTH - turned.points[:, 1].min()) * 1e3:.0f} mm behind its thin edge: nothing "
             f"would hold it where {FLAP_DEPTH * 1e3:g} mm are lifted"
         )
-    anatomy = anatomy_of(_scene(found, rim, turned, folder, mesh_file), turned)
+    anatomy = anatomy_of(_scene(found, rim, turned, out), turned)
     first = anatomy.scene.endoscope
     assert first is not None
     endoscope = find_endoscope(anatomy, (0.5 * FLAP_WIDTH, FLAP_DEPTH, 0.0), first.fov_deg)
@@ -312,12 +311,8 @@ def retract_scene(found: PatientScene, rim: Rim, folder: Path, mesh_file: str) -
             "under it without lifting it, or the rest of the organ stands before it"
         )
     anatomy = replace(anatomy, scene=replace(anatomy.scene, endoscope=endoscope))
-    return RetractScene(
-        with_substeps(anatomy, [anatomy.organ(modulus_factor=1.0 + MODULUS_SPREAD)], most=math.inf),
-        origin,
-        rim.frame,
-        rim,
-    )
+    stiffest = anatomy.organ(modulus_factor=1.0 + MODULUS_SPREAD)
+    return RetractScene(with_substeps(anatomy, [stiffest], most=math.inf), origin, rim)
 
 
 def told(made: RetractScene | str) -> str:
@@ -332,29 +327,31 @@ def told(made: RetractScene | str) -> str:
     )
 
 
-def with_retraction(found: PatientScene, made: RetractScene | str, scene_file: str) -> PatientScene:
-    """The organ with a palpation scene that names its retraction scene, or the reason why there is none."""
-    said = {"retract_refusal": made} if isinstance(made, str) else {"retract_scene": scene_file}
-    return replace(found, anatomy=replace(found.anatomy, scene=replace(found.scene, **said)))
-
-
-def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, folder: Path, mesh_file: str) -> Scene:
+def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
     lobe, patient = make_scene(PATTERN), found.scene
     tilt = math.atan2(rim.jaw[2], -rim.jaw[1])
-    bed_end = FLAP_DEPTH - BED_INSIDE
+    bed_end, half = FLAP_DEPTH - BED_INSIDE, 0.5 * (HIDING[1] - HIDING[0]) + 0.003
     return replace(
         lobe,
-        name=Path(mesh_file).stem,
+        name=out.stem,
         description=f"{patient.description}: a thin edge, its underside level, to be lifted",
-        folder=folder,
-        mesh=MeshSource(tets=TetFile(mesh_file, "m")),
+        folder=out.parent,
+        mesh=MeshSource(tets=TetFile(out.name, "m")),
         material=patient.material,
         capsule=patient.capsule,
         damping=patient.damping,
         # A scan shows the organ under its weight: that is its rest, and lifting works against stiffness alone.
         gravity=(0.0, 0.0, 0.0),
         anchors=_anchors(mesh),
-        supports=(_bed(bed_end),),
+        supports=(
+            Support(
+                "bed",
+                "box",
+                _vector(0.5 * FLAP_WIDTH, bed_end - half, -0.5 * BED_THICKNESS),
+                size=_vector(0.5 * BED_WIDTH, half, 0.5 * BED_THICKNESS),
+                friction=0.2,
+            ),
+        ),
         contact=replace(lobe.contact, stiffness=patient.contact.stiffness),
         instrument=replace(
             lobe.instrument,
@@ -386,17 +383,6 @@ def _anchors(mesh: TetMesh) -> tuple[Anchor, ...]:
             if ((mesh.points >= lower) & (mesh.points <= upper)).all(axis=1).any():
                 anchors.append(Anchor(name, box=Box(_vector(*lower), _vector(*upper))))
     return tuple(anchors)
-
-
-def _bed(end: float) -> Support:
-    half = 0.5 * (HIDING[1] - HIDING[0]) + 0.003
-    return Support(
-        "bed",
-        "box",
-        _vector(0.5 * FLAP_WIDTH, end - half, -0.5 * BED_THICKNESS),
-        size=_vector(0.5 * BED_WIDTH, half, 0.5 * BED_THICKNESS),
-        friction=0.2,
-    )
 
 
 def _retract(found: PatientScene, bed_end: float) -> Retraction:

@@ -1,6 +1,5 @@
 """Surfaces of an organ and its regions from STL, OBJ and PLY files, one file for each, and the voxels inside them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -138,15 +137,6 @@ def bodies_of(vertices: FloatArray, triangles: Triangles) -> list[tuple[FloatArr
     owner = part[triangles[:, 0]]
     bodies = [merge_vertices(vertices, triangles[owner == one]) for one in np.unique(owner)]
     return sorted(bodies, key=lambda body: -abs(surface_volume(*body)))
-
-
-def checked_names(names: Sequence[str]) -> None:
-    """Raise a MeshError for two regions of one name."""
-    for name in names:
-        if list(names).count(name) > 1:
-            raise MeshError(
-                f"region {name!r} is given twice; give the files other names, or name them: --region NAME=FILE"
-            )
 
 
 def voxels_inside(

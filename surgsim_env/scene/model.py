@@ -170,8 +170,6 @@ class Contact:
 
 # Instruments carried by slides; their models are NAME.xml in scenes/instruments.
 CARTESIAN = ("probe", "grasper")
-
-
 # Instruments of two arms, left and right. "LEFT+RIGHT" makes a pair of any two arms, see `load.pair_names`.
 PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
 

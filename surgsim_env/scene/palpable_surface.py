@@ -113,13 +113,9 @@ class PalpableFace:
         """
         plane = self._plane[0]
         lower, upper = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
-        points, normals = [], []
-        for u, v in _grid(lower, upper, spacing):
-            site = self.site(u, v)
-            if site is not None:
-                points.append(site[0])
-                normals.append(site[1])
-        return np.array(points).reshape(-1, 3), np.array(normals).reshape(-1, 3)
+        sites = [site for u, v in _grid(lower, upper, spacing) if (site := self.site(u, v)) is not None]
+        points, normals = np.moveaxis(np.array(sites).reshape(-1, 2, 3), 1, 0)
+        return np.ascontiguousarray(points), np.ascontiguousarray(normals)
 
 
 def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: PalpationSettings) -> PalpableFace:

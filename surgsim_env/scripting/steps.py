@@ -1,18 +1,18 @@
-"""The steps of a script: motions of the tip, presses, the jaw, controllers, and steps that wrap others."""
+"""The steps of a script: motions of the tip, presses, the jaw, controllers, steps that wrap others; what they see."""
 
 import math
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.scripting.view import Action, View
+from surgsim_env.instruments.instrument import Grasp
+from surgsim_env.tasks.task import Task
 
-Plan = Generator[Action, View, None]
-Predicate = Callable[[View], bool]
+Action = NDArray[np.floating]
 
 # Share of the remaining distance that a step commands for one control step: the tip lags behind its command.
 APPROACH_GAIN = 0.6
@@ -24,6 +24,106 @@ TRAVEL_READ = 1e-4
 GAIN = 0.006
 # Rate at which a press on a support returns to its place across the press [1/s].
 HOMING = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A moment of a run, as the steps of its script and their predicates see it.
+
+    Fields:
+        time: since the episode's reset [s]
+        step_time: since the present step of the script began [s]
+        control_step: duration of a control step [s]
+        observation: as the environment, with its wrappers, gave it
+        tip_position, tip_velocity: centre of the tip ball [m], [m/s]                       (3,)
+        true_force: of the tissue on the tools, mean of the last haptic step [N]            (3,)
+        sensed_force: the same through the sensor model, as observed [N]                    (3,)
+        contact_position: the tip at the first contact since the step began [m]; None before it  (3,)
+        approach: unit vector along which the instrument comes                              (3,)
+        grasp: what the jaw holds and how; None without a jaw
+        task: how actions are laid out
+        support_force: of the tool on the organ's supports [N]; for the arms of a pair
+        arm: the arm of a pair whose view this is; "" for both or the only one
+        arms: views of each of several arms, by name
+    """
+
+    time: float
+    step_time: float
+    control_step: float
+    observation: NDArray[np.floating]
+    tip_position: FloatArray
+    tip_velocity: FloatArray
+    true_force: FloatArray
+    sensed_force: FloatArray
+    contact_position: FloatArray | None
+    approach: FloatArray
+    grasp: Grasp | None
+    task: Task
+    support_force: float = 0.0
+    arm: str = ""
+    arms: Mapping[str, "View"] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+    def action(self, velocity: FloatArray, **commands: Any) -> Action:
+        """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`).
+
+        A jaw stays as it was last told (`jaw=-1.0` closes it); of several arms the others stay where they are.
+        """
+        if self.arm == "right":
+            own = {"right": velocity, **{f"right_{name}": value for name, value in commands.items()}}
+            return self.task.action(np.zeros(3), **own)
+        return self.task.action(velocity, **commands)
+
+    def still(self, **commands: Any) -> Action:
+        """The action that keeps the tip where it is."""
+        return self.action(np.zeros(3), **commands)
+
+    def grasped(self, step: object) -> Grasp:
+        """What the jaw holds, for a step that needs one.
+
+        Raises:
+            TypeError: the instrument has no jaw.
+        """
+        if self.grasp is None:
+            raise TypeError(
+                f"{type(step).__name__} needs an instrument with a jaw; this one has none: choose a grasper"
+            )
+        return self.grasp
+
+    def of(self, arm: str) -> "View":
+        """The view of one of several arms.
+
+        Raises:
+            ValueError: there is no such arm (says which there are).
+        """
+        if arm not in self.arms:
+            known = ", ".join(self.arms) or "none: the instrument is one alone"
+            raise ValueError(f"arm {arm!r} is not there; the arms are {known}")
+        return self.arms[arm]
+
+    def pressing_force(self, direction: FloatArray, *, sensed: bool = False) -> float:
+        """The force with which the tissue pushes back against a unit direction [N], true or sensed."""
+        return -float((self.sensed_force if sensed else self.true_force) @ direction)
+
+    def depth(self, direction: FloatArray) -> float:
+        """How far the tip went along a unit direction since the step's first contact [m]; 0 before it."""
+        if self.contact_position is None:
+            return 0.0
+        return float((self.tip_position - self.contact_position) @ direction)
+
+    def reached(self) -> str:
+        """Where the tip is and what it feels, in words."""
+        place = ", ".join(f"{value * 1e3:.2f}" for value in self.tip_position)
+        force = float(np.linalg.norm(self.true_force))
+        return f"tip at ({place}) mm, contact force {force:.3f} N, {self.step_time:.2f} s after the step began"
+
+
+Plan = Generator[Action, View, None]
+Predicate = Callable[[View], bool]
 
 
 class StepFailed(Exception):
@@ -62,7 +162,28 @@ Script = Sequence[Step]
 
 
 @dataclass(frozen=True)
-class MoveTo:
+class _Checked:
+    """A step that does not move the tip and does not end the episode, unless a subclass says otherwise.
+
+    Its numbers are finite and above 0; its point and its direction are checked too.
+    """
+
+    ends_episode = False
+    speed = 0.0
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if one.type is float:
+                above_zero(self, one.name, value)
+            elif one.name == "point":
+                object.__setattr__(self, "point", point_of(self, "point", value))
+            elif one.name == "direction" and value is not None:
+                object.__setattr__(self, "direction", unit_vector(self, "direction", value))
+
+
+@dataclass(frozen=True)
+class MoveTo(_Checked):
     """Move the tip straight to a point [m], until it is within `tolerance` [m] of it, at `speed` [m/s] or slower.
 
     `turn` is how far the wrist turns on the way, evenly, in the instrument's own terms: an angle [rad] about its hinge,
@@ -75,11 +196,6 @@ class MoveTo:
     turn: float | tuple[float, ...] = 0.0
     timeout: float = 10.0
     name: str = ""
-    ends_episode: bool = field(default=False, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "point", point_of(self, "point", self.point))
-        above_zero(self, "speed", "tolerance", "timeout")
 
     def actions(self, view: View) -> Plan:
         """Towards the point, slower on the last millimetre."""
@@ -95,7 +211,7 @@ class MoveTo:
 
 
 @dataclass(frozen=True)
-class PressUntil:
+class PressUntil(_Checked):
     """Press until the tissue pushes back with `force` [N], less `tolerance`, at most `max_depth` [m] past contact.
 
     It slows down as the force comes near, by the stiffness that it feels. Depth counts from where the tip first touched
@@ -110,12 +226,9 @@ class PressUntil:
     tolerance: float = 0.01
     timeout: float = 10.0
     name: str = ""
-    ends_episode: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        above_zero(self, "force", "max_depth", "speed", "tolerance", "timeout")
-        if self.direction is not None:
-            object.__setattr__(self, "direction", unit_vector(self, "direction", self.direction))
+        super().__post_init__()
         if self.tolerance >= self.force:
             raise ValueError(
                 f"PressUntil: tolerance is {self.tolerance:g} N with a force of {self.force:g} N; "
@@ -141,17 +254,12 @@ class PressUntil:
 
 
 @dataclass(frozen=True)
-class Hold:
+class Hold(_Checked):
     """Keep the tip still for `duration` [s]; it ends with the first control step that is not shorter."""
 
     duration: float
     name: str = ""
-    timeout: float = field(default=np.inf, init=False, repr=False)  # it ends by itself
-    ends_episode: bool = field(default=False, init=False, repr=False)
-    speed: float = field(default=0.0, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        above_zero(self, "duration")
+    timeout = math.inf  # it ends by itself
 
     def actions(self, view: View) -> Plan:
         """No motion."""
@@ -160,7 +268,7 @@ class Hold:
 
 
 @dataclass(frozen=True)
-class Lift:
+class Lift(_Checked):
     """Lift the tip by `height` [m], against the scene's approach or along a direction of your own."""
 
     height: float
@@ -168,12 +276,6 @@ class Lift:
     direction: tuple[float, float, float] | None = None
     timeout: float = 10.0
     name: str = ""
-    ends_episode: bool = field(default=False, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        above_zero(self, "height", "speed", "timeout")
-        if self.direction is not None:
-            object.__setattr__(self, "direction", unit_vector(self, "direction", self.direction))
 
     def actions(self, view: View) -> Plan:
         """Away from the tissue."""
@@ -185,18 +287,16 @@ class Lift:
 
 
 @dataclass(frozen=True)
-class WaitUntil:
+class WaitUntil(_Checked):
     """Keep the tip still until `predicate(view)` is true; fails after `timeout` [s]."""
 
     predicate: Predicate = field(repr=False)
     timeout: float
     name: str = ""
-    ends_episode: bool = field(default=False, init=False, repr=False)
-    speed: float = field(default=0.0, init=False, repr=False)
 
     def __post_init__(self) -> None:
         callable_for(self, "predicate", "a function of the view")
-        above_zero(self, "timeout")
+        super().__post_init__()
 
     def actions(self, view: View) -> Plan:
         """No motion."""
@@ -205,16 +305,12 @@ class WaitUntil:
 
 
 @dataclass(frozen=True)
-class Declare:
+class Declare(_Checked):
     """Say "the lesion is here", the tip still, until the episode ends; it counts only while the tip touches tissue."""
 
     timeout: float = 0.5
     name: str = ""
-    ends_episode: bool = field(default=True, init=False, repr=False)
-    speed: float = field(default=0.0, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        above_zero(self, "timeout")
+    ends_episode = True
 
     def actions(self, view: View) -> Plan:
         """Declare in every control step: the episode's end ends it."""
@@ -223,16 +319,12 @@ class Declare:
 
 
 @dataclass(frozen=True)
-class AwaitEnd:
+class AwaitEnd(_Checked):
     """Keep the tip still until the episode ends by itself, such as by success; fails after `timeout` [s]."""
 
     timeout: float
     name: str = ""
-    ends_episode: bool = field(default=True, init=False, repr=False)
-    speed: float = field(default=0.0, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        above_zero(self, "timeout")
+    ends_episode = True
 
     def actions(self, view: View) -> Plan:
         """No motion: the episode's end ends it."""
@@ -241,7 +333,7 @@ class AwaitEnd:
 
 
 @dataclass(frozen=True)
-class Control:
+class Control(_Checked):
     """Let a controller of your own act, until `until(view)` is true or the episode ends; fails after `timeout` [s].
 
     The controller is called with each observation and returns the action; if it has a `reset`, that is called first.
@@ -252,14 +344,13 @@ class Control:
     timeout: float
     until: Predicate | None = field(default=None, repr=False)
     name: str = ""
-    ends_episode: bool = field(default=True, init=False, repr=False)
-    speed: float = field(default=0.0, init=False, repr=False)
+    ends_episode = True
 
     def __post_init__(self) -> None:
         callable_for(self, "controller", "called with an observation, gives an action")
         if self.until is not None:
             callable_for(self, "until", "a function of the view")
-        above_zero(self, "timeout")
+        super().__post_init__()
 
     def actions(self, view: View) -> Plan:
         """The controller's actions."""
@@ -282,17 +373,12 @@ def _towards(gap: FloatArray, speed: float, control_step: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class CloseJaw:
+class CloseJaw(_Checked):
     """Close the jaw, the tip still, until it grips tissue with `force` [N]; its target stays closed afterwards."""
 
     force: float
     timeout: float = 3.0
     name: str = ""
-    ends_episode: bool = field(default=False, init=False, repr=False)
-    speed: float = field(default=0.0, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        above_zero(self, "force", "timeout")
 
     def actions(self, view: View) -> Plan:
         """Close."""
@@ -301,17 +387,12 @@ class CloseJaw:
 
 
 @dataclass(frozen=True)
-class OpenJaw:
+class OpenJaw(_Checked):
     """Open the jaw, the tip still, until its pads are `gap` [m] apart and hold nothing."""
 
     gap: float
     timeout: float = 3.0
     name: str = ""
-    ends_episode: bool = field(default=False, init=False, repr=False)
-    speed: float = field(default=0.0, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        above_zero(self, "gap", "timeout")
 
     def actions(self, view: View) -> Plan:
         """Open."""
@@ -320,7 +401,7 @@ class OpenJaw:
 
 
 @dataclass(frozen=True)
-class PressSupport:
+class PressSupport(_Checked):
     """Press on a support at a point [m] with `force` [N] until the episode ends; fails after `timeout` [s].
 
     The tip's speed is proportional to the error of the force.
@@ -332,11 +413,7 @@ class PressSupport:
     speed: float = 0.005
     timeout: float = 5.0
     name: str = ""
-    ends_episode: bool = field(default=True, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        above_zero(self, "force", "speed", "timeout")
-        object.__setattr__(self, "direction", unit_vector(self, "direction", self.direction))
+    ends_episode = True
 
     def actions(self, view: View) -> Plan:
         """Towards the support, or away from it where the force is too large."""
@@ -433,19 +510,17 @@ class Until(_Wrapped):
 # ---- checks of the fields -------------------------------------------------------------------------------------------
 
 
-def above_zero(step: Any, *fields: str) -> None:
-    """Each field is a finite number above 0.
+def above_zero(step: Any, field: str, value: object) -> None:
+    """The field is a finite number above 0.
 
     Raises:
         ValueError: names the step, the field and the value.
     """
-    for name in fields:
-        value = getattr(step, name)
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value < math.inf:
-            raise ValueError(
-                f"{type(step).__name__}: {name} is {value!r}; it must be a finite number above 0, in SI units "
-                "(metres, newtons, seconds)"
-            )
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value < math.inf:
+        raise ValueError(
+            f"{type(step).__name__}: {field} is {value!r}; it must be a finite number above 0, in SI units "
+            "(metres, newtons, seconds)"
+        )
 
 
 def point_of(step: Any, field: str, value: ArrayLike) -> tuple[float, float, float]:

@@ -11,8 +11,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.palpation.chart import Site
-from surgsim_env.palpation.healthy_map import HealthyMap, charted_face, healthy_map
+from surgsim_env.palpation.chart import HealthyMap, Site, charted_face, healthy_map
 from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
@@ -66,7 +65,7 @@ class PalpateSitesTask(Task):
     `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
     Contrast is stiffness (force over depth) over that of the scene's healthy organ of nominal modulus at this place, a
-    map that is made once for each scene and kept on disk (`surgsim_env.palpation.healthy_map`).
+    map that is made once for each scene and kept on disk (`surgsim_env.palpation.chart`).
 
     ## Rewards
     `info["reward_<term>"]` shows what each term paid. A control step is one press. Each press costs in

@@ -14,11 +14,10 @@ from msdm_core.material.regions import Capsule, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.pair import Pair
-from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.instruments.jaw import Grasp
+from surgsim_env.instruments.instrument import Grasp, Instrument
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_retract_scene, with_instrument
-from surgsim_env.scene.model import Endoscope, Range, Retraction, RetractionCamera
+from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import (
     SPEED_FULL_SCALE,
@@ -235,11 +234,6 @@ class RetractTask(Task):
         return simulation, cls(anatomy, simulation.instrument, **settings)
 
     @property
-    def lesions(self) -> tuple[Lesion, ...]:
-        """A lobe has none."""
-        return ()
-
-    @property
     def pull_limit(self) -> float:
         """Pull of the jaw at which tissue tears [N]."""
         return self.limits.tear_force
@@ -292,7 +286,7 @@ class RetractTask(Task):
         self.record = RetractionRecord()
         self.step_count = self.goal_count = 0
         self.jaw_target = 1.0
-        return Start(drawn_organ(self.anatomy, self.drawn), np.array(self.drawn.start))
+        return Start(self.drawn.compiled(self.anatomy), np.array(self.drawn.start))
 
     def accepts(self, simulation: Simulation) -> bool:
         """Whether the lobe hides the target: at most HIDDEN_SHARE of it is visible."""
@@ -301,13 +295,14 @@ class RetractTask(Task):
 
     def look(self, simulation: Simulation) -> None:
         """Read what the jaw holds and how much of the target is visible."""
-        self.grasp = self._grasp(simulation)
+        self.grasp = simulation.grasp
         self.visible_share = self._look(simulation)
 
     def update(self, step: ControlStep) -> None:
         """Add a control step to the record."""
         simulation = step.simulation
-        self.grasp = self._grasp(simulation)
+        self.grasp = simulation.grasp
+        assert self.grasp is not None
         box = lifted_box(self.table, simulation.organ_model.node_rest_position)
         strain = region_strains(simulation.organ_model, simulation.organ_state.node_position, box)
         tip = simulation.instrument.tip_position
@@ -361,11 +356,6 @@ class RetractTask(Task):
         )
         return float(seen.mean())
 
-    def _grasp(self, simulation: Simulation) -> Grasp:
-        grasp = simulation.grasp
-        assert grasp is not None
-        return grasp
-
     # ---- saved states ------------------------------------------------------------------------------------------
 
     def get_state(self) -> str:
@@ -373,8 +363,8 @@ class RetractTask(Task):
         assert self.drawn is not None
         return json.dumps(
             {
-                "drawn": self.drawn.to_json(),
-                "record": self.record.to_json(),
+                "drawn": asdict(self.drawn),
+                "record": asdict(self.record),
                 "bias": [self.sensors[name].bias.tolist() for name in ("contact_force", "contact_torque")],
                 "counts": [self.step_count, self.goal_count],
                 "jaw_target": self.jaw_target,
@@ -386,14 +376,14 @@ class RetractTask(Task):
     def set_state(self, text: str) -> OrganModel:
         """Restore what `get_state` gave; returns the lobe of that episode."""
         table = json.loads(text)
-        self.drawn = RetractionDraw.from_json(table["drawn"])
-        self.record = RetractionRecord.from_json(table["record"])
+        self.drawn = RetractionDraw.from_table(table["drawn"])
+        self.record = RetractionRecord(**table["record"])
         for name, bias in zip(("contact_force", "contact_torque"), table["bias"], strict=True):
             self.sensors[name].bias = np.array(bias)
         self.step_count, self.goal_count = table["counts"]
         self.jaw_target = table["jaw_target"]
         self.visible_share, self._reached = table["visible"], table["reached"]
-        return drawn_organ(self.anatomy, self.drawn)
+        return self.drawn.compiled(self.anatomy)
 
 
 def jaw_wrench(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
@@ -466,15 +456,28 @@ class RetractionDraw:
     eye: Vector
     looks_at: Vector
     start: Vector
+    # A lobe has none.
+    lesions: ClassVar[tuple[Lesion, ...]] = ()
 
-    def to_json(self) -> str:
-        """All of it, exact (numbers are written in full)."""
-        return json.dumps(asdict(self))
+    def compiled(self, anatomy: Anatomy) -> OrganModel:
+        """The scene's lobe as the episode has it."""
+        plain = anatomy.specification()
+        mesh = anatomy.mesh
+        capsule = plain.capsule
+        if self.capsule_stiffness > 0.0:
+            capsule = Capsule(self.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
+        specification = replace(
+            plain,
+            mesh=TetMesh(mesh.points * self.scale, mesh.tets, mesh.region, mesh.region_names),
+            materials=replace(anatomy.scene.material, youngs_modulus=self.youngs_modulus),
+            capsule=capsule,
+            anchors=held_nodes(mesh.points, anatomy.anchors, self.held_share),
+        )
+        return anatomy.compiled(specification)
 
     @classmethod
-    def from_json(cls, text: str) -> "RetractionDraw":
-        """What `to_json` wrote."""
-        table: dict[str, Any] = json.loads(text)
+    def from_table(cls, table: dict[str, Any]) -> "RetractionDraw":
+        """The draw whose fields JSON gave back."""
         vectors: dict[str, Any] = {name: tuple(value) for name, value in table.items() if isinstance(value, list)}
         return cls(**table | vectors)
 
@@ -484,27 +487,11 @@ def draw_retraction(table: Retraction, endoscope: Endoscope, rng: np.random.Gene
     scale, modulus = float(rng.uniform(*table.scale)), float(rng.uniform(*table.youngs_modulus))
     capsule = float(rng.uniform(*table.capsule_stiffness)) if rng.uniform() < table.capsule_share else 0.0
     held = float(rng.uniform(*table.held_share))
-    target = (_even(table.target_along, rng), _even(table.target_distance, rng), TARGET_LIFT)
+    along, distance = float(rng.uniform(*table.target_along)), float(rng.uniform(*table.target_distance))
     eye, looks_at = _moved(endoscope, table.camera, rng)
     start = rng.uniform(table.start_lower, table.start_upper)
+    target = (along, distance, TARGET_LIFT)
     return RetractionDraw(scale, modulus, capsule, held, target, _vector(eye), _vector(looks_at), _vector(start))
-
-
-def drawn_organ(anatomy: Anatomy, drawn: RetractionDraw) -> OrganModel:
-    """The scene's lobe as an episode has it."""
-    plain = anatomy.specification()
-    mesh = anatomy.mesh
-    capsule = plain.capsule
-    if drawn.capsule_stiffness > 0.0:
-        capsule = Capsule(drawn.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
-    specification = replace(
-        plain,
-        mesh=TetMesh(mesh.points * drawn.scale, mesh.tets, mesh.region, mesh.region_names),
-        materials=replace(anatomy.scene.material, youngs_modulus=drawn.youngs_modulus),
-        capsule=capsule,
-        anchors=held_nodes(mesh.points, anatomy.anchors, drawn.held_share),
-    )
-    return anatomy.compiled(specification)
 
 
 def lifted_box(table: Retraction, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -534,10 +521,6 @@ def _moved(endoscope: Endoscope, camera: RetractionCamera, rng: np.random.Genera
     turned = view * math.cos(angle) + np.cross(across, view) * math.sin(angle)
     eye = np.asarray(endoscope.position) + shift
     return eye, eye + turned
-
-
-def _even(bounds: Range, rng: np.random.Generator) -> float:
-    return float(rng.uniform(*bounds))
 
 
 def _vector(values: FloatArray) -> Vector:
@@ -625,15 +608,6 @@ class RetractionRecord:
             "path_length": self.path,
             **{f"strain_{region}": value for region, value in zip(REGIONS, self.strain)},
         }
-
-    def to_json(self) -> str:
-        """All of it, exact."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> "RetractionRecord":
-        """What `to_json` wrote."""
-        return cls(**json.loads(text))
 
 
 def region_strains(model: OrganModel, node_position: FloatArray, box: tuple[FloatArray, FloatArray]) -> list[float]:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.job import write_report
 from surgsim_env.arm_study.pictures import ArmMaps, camera_view, poses, write_pictures
 from surgsim_env.arm_study.results import (
     QUANTITIES,
@@ -21,6 +20,7 @@ from surgsim_env.arm_study.results import (
     worse_of_both,
     write_points,
 )
+from surgsim_env.arm_study.study import write_report
 from surgsim_env.instruments.arm.arm import load_arm
 from tests.arm_study.made import PICTURE, PORTS, made_evaluation
 

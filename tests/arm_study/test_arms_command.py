@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from surgsim_env.arm_study import job
+from surgsim_env.arm_study import study
 from surgsim_env.arm_study.ports import default_ports
 from surgsim_env.cli.main import main
 from surgsim_env.scene.anatomy import load_anatomy
@@ -49,7 +49,7 @@ def made(monkeypatch):
         reach = {"wide.toml": 0.6, "six_axis": 0.1}.get(setup.name, 0.3)
         return made_evaluation(count=plan.points, seed=plan.seed, left_to=reach, right_to=reach)
 
-    monkeypatch.setattr(job, "evaluate", evaluate)
+    monkeypatch.setattr(study, "evaluate", evaluate)
     return asked
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.job import write_report
 from surgsim_env.arm_study.pictures import ArmMaps, write_given_pictures
 from surgsim_env.arm_study.results import rank
+from surgsim_env.arm_study.study import write_report
 from surgsim_env.reports.html_page import POLICY
 from tests.arm_study.made import made_episodes, made_evaluation
 from tests.chromium import Browser

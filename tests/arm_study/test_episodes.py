@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from surgsim_env.arm_study import episodes, job
+from surgsim_env.arm_study import episodes, study
 from surgsim_env.arm_study.episodes import (
     MEASURES,
     Episode,
@@ -21,7 +21,7 @@ from surgsim_env.arm_study.episodes import (
     run_episodes,
     what_was_run,
 )
-from surgsim_env.arm_study.job import write_report
+from surgsim_env.arm_study.study import write_report
 from surgsim_env.cli.arms import Arms
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.palpation.job import plain_json
@@ -48,7 +48,7 @@ def page_of(run, folder, organ="liver"):
 @pytest.mark.usefixtures("few_maps")
 def test_a_real_episode_in_the_report_and_its_json(tmp_path, monkeypatch):
     """One episode through the command; its figures against a run of the same script by hand."""
-    monkeypatch.setattr(job, "evaluate", lambda *_, **__: replace(made_evaluation(pictures=False), scene="x"))
+    monkeypatch.setattr(study, "evaluate", lambda *_, **__: replace(made_evaluation(pictures=False), scene="x"))
     given = {"points": 10, "episodes": 1, "seed": 1, "out": tmp_path / "out"}
     assert Arms("psm_grasper", "psm_palpator", scene="phantom", **given).run(Console(quiet=True)) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from surgsim_env.arm_study import job
+from surgsim_env.arm_study import study
 from surgsim_env.arm_study.ports import default_ports, ports_from_table
 from surgsim_env.cli.main import main
 from surgsim_env.scene.anatomy import load_anatomy
@@ -37,8 +37,8 @@ def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     for name in ("ports.toml", "wide.toml"):
         Path(name).write_text(text)
-    monkeypatch.setattr(job, "evaluate", lambda *_, **__: made_evaluation(pictures=False))
-    monkeypatch.setattr(job, "scripted_episodes", lambda *_: made_episodes())
+    monkeypatch.setattr(study, "evaluate", lambda *_, **__: made_evaluation(pictures=False))
+    monkeypatch.setattr(study, "scripted_episodes", lambda *_: made_episodes())
     # The made evaluation's arms stand anywhere: enough to be drawn.
     assert main(command.split()) == 0
     listed = re.findall(r"^\| `([\w.*]+)` \|", DOCS, flags=re.M)

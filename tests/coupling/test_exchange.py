@@ -17,7 +17,7 @@ from surgsim_env.coupling import haptic_kernels
 from surgsim_env.coupling.exchange import haptic_steps
 from surgsim_env.coupling.haptic_kernels import FORCE_CAP
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.cartesian import Probe
+from surgsim_env.instruments.make import Probe
 from surgsim_env.instruments.tool_bodies import ToolBodies
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene

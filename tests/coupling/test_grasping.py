@@ -7,7 +7,7 @@ import pytest
 
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.jaw import read_grasp
+from surgsim_env.instruments.instrument import read_grasp
 from tests.coupling.slab import HOLD, slab
 
 JAWS = ["grasper.xml", "psm_retractor"]

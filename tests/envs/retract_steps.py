@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from surgsim_env.instruments.jaw import Grasp
+from surgsim_env.instruments.instrument import Grasp
 
 STEP = 0.05
 HELD = Grasp(opening=0.01, grip_force=0.4, pull_force=0.1, friction_left=0.2, holds=True)

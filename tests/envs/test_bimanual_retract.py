@@ -9,7 +9,7 @@ import surgsim_env  # noqa: F401
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.envs.ids import BimanualRetractEnv
 from surgsim_env.instruments.arm.pair import Pair
-from surgsim_env.instruments.jaw import Grasp
+from surgsim_env.instruments.instrument import Grasp
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, pair_names, with_instrument
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask

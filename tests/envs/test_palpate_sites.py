@@ -9,9 +9,8 @@ import pytest
 
 import surgsim_env  # noqa: F401
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation import healthy_map as healthy_module
-from surgsim_env.palpation.chart import ChartedFace, interpolated, make_chart
-from surgsim_env.palpation.healthy_map import charted_face, healthy_map
+from surgsim_env.palpation import chart as healthy_module
+from surgsim_env.palpation.chart import ChartedFace, charted_face, healthy_map, interpolated, make_chart
 from surgsim_env.palpation.press import SitePress, press, press_alone, press_phases, stop_force
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import LEVELS, DrawnOrgan

@@ -11,8 +11,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.instruments.arm.model import position_actuator, speed_actuator
 from surgsim_env.instruments.arm.steering import SteeredArm, millimetres, missing, placed
-from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.instruments.jaw import Jaw
+from surgsim_env.instruments.instrument import Instrument, Jaw
 from surgsim_env.instruments.tool_bodies import make_servo
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import Port, Scene
@@ -28,7 +27,40 @@ PARKED_GAP = 0.010
 PLACES_TRIED = 24
 
 
-class ArmInstrument(Instrument):
+class SteeredArms(Instrument):
+    """An instrument of one arm or two.
+
+    Fields:
+        arms: control of each arm, by its side; an arm alone has the side ""
+    """
+
+    turning_size = 3
+    arms: dict[str, SteeredArm]
+
+    @property
+    def workspace_limited(self) -> bool:
+        """Whether the box, a joint's limit or its speed limit stopped the commanded motion of a tip."""
+        return any(one.limited for one in self.arms.values())
+
+    @property
+    def trocar_residual(self) -> float:
+        """Distance of the shaft's axis from the trocar at the current joint values [m], the larger one of two arms."""
+        return max(one.trocar_residual for one in self.arms.values())
+
+    def get_state(self) -> FloatArray:
+        """All of the instrument's state, commands and wanted directions included, as one vector."""
+        return np.concatenate([super().get_state(), *(one.get_state() for one in self.arms.values())])
+
+    def set_state(self, state: FloatArray) -> None:
+        """Restore what `get_state` gave, to the bit; contact forces are updated by the next haptic step."""
+        sizes = [len(one.get_state()) for one in self.arms.values()]
+        own, *parts = np.split(state, np.cumsum([len(state) - sum(sizes), *sizes])[:-1])
+        super().set_state(own)
+        for one, part in zip(self.arms.values(), parts, strict=True):
+            one.set_state(part)
+
+
+class ArmInstrument(SteeredArms):
     """An arm at a scene's port, steered by its tip's velocity through inverse kinematics.
 
     Fields:
@@ -36,8 +68,6 @@ class ArmInstrument(Instrument):
         steered: its control
         wrist: its force sensor, None if the model has none
     """
-
-    turning_size = 3
 
     def __init__(self, anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> None:
         """Place the scene's arm at its port; the tip may move in the box from lower to upper [m].
@@ -62,15 +92,11 @@ class ArmInstrument(Instrument):
             control_step=scene.timing.control_step,
             jaw=self.jaw,
         )
+        self.arms = {"": self.steered}
         self.wrist = WristSensor.of(model)
         self.parked = parked_place(anatomy)
         self._check_reach(anatomy)
         self.place(self.parked)
-
-    @property
-    def workspace_limited(self) -> bool:
-        """Whether the box, a joint's limit or its speed limit stopped the commanded motion of the tip."""
-        return self.steered.limited
 
     @property
     def direction(self) -> FloatArray:
@@ -82,11 +108,6 @@ class ArmInstrument(Instrument):
     def joint_positions(self) -> FloatArray:
         """Values of the driven joints [rad or m], (n,)."""
         return self.steered.joint_positions
-
-    @property
-    def trocar_residual(self) -> float:
-        """Distance of the shaft's axis from the trocar at the current joint values [m]."""
-        return self.steered.trocar_residual
 
     def place(self, position: FloatArray) -> None:
         """Place the tip at rest at a position [m], in the start direction as far as the joints allow.
@@ -114,16 +135,6 @@ class ArmInstrument(Instrument):
             ValueError: no jaw, or a target outside that range.
         """
         self.steered.command_jaw(target)
-
-    def get_state(self) -> FloatArray:
-        """All of the instrument's state, command and wanted direction included, as one vector."""
-        return np.concatenate([super().get_state(), self.steered.get_state()])
-
-    def set_state(self, state: FloatArray) -> None:
-        """Restore what `get_state` gave, to the bit."""
-        size = len(self.steered.get_state())
-        super().set_state(state[:-size])
-        self.steered.set_state(state[-size:])
 
     def _where(self) -> str:
         return self.steered.where
@@ -185,7 +196,9 @@ def inside_surface(point: ArrayLike, points: FloatArray, triangles: IntArray) ->
     return bool(abs(2.0 * np.arctan2(triple, rest).sum()) > 2.0 * math.pi)
 
 
-def check_port_outside(port: Port, name: str, points: FloatArray, triangles: IntArray) -> None:
+def check_port_outside(
+    port: Port, name: str, points: FloatArray, triangles: IntArray, *, what: str = "the port"
+) -> None:
     """Refuse a port inside an organ, whose closed surface has points (n, 3) [m] and triangles (m, 3).
 
     Raises:
@@ -193,7 +206,7 @@ def check_port_outside(port: Port, name: str, points: FloatArray, triangles: Int
     """
     if inside_surface(port.point, points, triangles):
         place = millimetres(np.array(port.point))
-        raise ValueError(f"the port at {place} lies inside the organ of {name}: move it out through the body wall")
+        raise ValueError(f"{what} at {place} lies inside the organ of {name}: move it out through the body wall")
 
 
 def start_direction(scene: Scene) -> FloatArray:

@@ -8,11 +8,16 @@ import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.instruments.arm.arm import Arm
-from surgsim_env.instruments.arm.arm_instrument import joint_servo, load_scene_arm, parked_place, start_direction
+from surgsim_env.instruments.arm.arm_instrument import (
+    SteeredArms,
+    joint_servo,
+    load_scene_arm,
+    parked_place,
+    start_direction,
+)
 from surgsim_env.instruments.arm.model import LINK_GROUP, arm_spec
 from surgsim_env.instruments.arm.steering import SteeredArm, millimetres, missing, placed
-from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.instruments.jaw import Jaw
+from surgsim_env.instruments.instrument import Jaw
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ROUGHNESS, SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import pair_names
@@ -24,7 +29,7 @@ ARM_BITS = {"left": 4, "right": 8}
 # Contact between arms is soft: critically damped, with a time constant of five haptic steps [s].
 CONTACT_SOFTNESS = (0.005, 1.0)
 # The right arm on a support: 1240 N/m at its ball, so that 0.1 N is 0.08 mm, more than one control step moves it. As
-# MuJoCo's contact stiffness is proportional to the tool's mass (`supports.SOLREF`), this is 1 / 6.5 of that of others.
+# MuJoCo's contact stiffness is proportional to the tool's mass (`tool_bodies.SOLREF`), this is 1 / 6.5 of that of others.
 TOUCH_SOFTNESS = (SOLREF[0] / 6.5, SOLREF[1] / math.sqrt(6.5))
 # Half the distance between the tips before the first reset [m].
 PARKED_ASIDE = 0.025
@@ -32,7 +37,7 @@ PARKED_ASIDE = 0.025
 DISTANCE_MOST = 0.05
 
 
-class Pair(Instrument):
+class Pair(SteeredArms):
     """Two arms at two ports, each controlled like an `ArmInstrument`.
 
     The tip and the jaw of the instrument are the left arm's; `place` and `command_velocity` take one row per arm.
@@ -41,8 +46,6 @@ class Pair(Instrument):
         arms: control of the arms, by "left" and "right"
         parked: positions of the tips before the first reset [m]                 (2, 3)
     """
-
-    turning_size = 3
 
     def __init__(self, anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> None:
         """Place the scene's arms at its two ports; both tips may move in the box from lower to upper [m].
@@ -98,16 +101,6 @@ class Pair(Instrument):
         self.place(self.parked)
 
     @property
-    def workspace_limited(self) -> bool:
-        """Whether a limit stopped the commanded motion of a tip."""
-        return any(one.limited for one in self.arms.values())
-
-    @property
-    def trocar_residual(self) -> float:
-        """The larger distance of a shaft's axis from its trocar [m]."""
-        return max(one.trocar_residual for one in self.arms.values())
-
-    @property
     def distance(self) -> float:
         """Smallest distance between the arms' outer shapes, at most DISTANCE_MOST [m]; negative when they press."""
         least, ends = DISTANCE_MOST, np.zeros(6)
@@ -154,19 +147,6 @@ class Pair(Instrument):
     def touch_force(self, side: str, support: str) -> float:
         """Size of the force between an arm and one of the scene's supports in the last haptic step [N]."""
         return self._contact_force(self._geoms_of[side], np.array([self.model.geom(SUPPORT_PREFIX + support).id]))
-
-    def get_state(self) -> FloatArray:
-        """The whole state of both arms, commands and wanted directions included, as one vector."""
-        return np.concatenate([super().get_state(), *(one.get_state() for one in self.arms.values())])
-
-    def set_state(self, state: FloatArray) -> None:
-        """Restore a state from `get_state`, to the bit; contact forces are updated by the next haptic step."""
-        sizes = [len(one.get_state()) for one in self.arms.values()]
-        first = len(state) - sum(sizes)
-        super().set_state(state[:first])
-        for one, size in zip(self.arms.values(), sizes, strict=True):
-            one.set_state(state[first : first + size])
-            first += size
 
     def _contact_force(self, some: IntArray, others: IntArray) -> float:
         """Size of the sum of MuJoCo's contact forces between two sets of geoms [N]."""

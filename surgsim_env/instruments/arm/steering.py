@@ -14,9 +14,7 @@ from surgsim_env.instruments.arm.inverse_kinematics import (
     turn_matrix,
     turn_towards,
 )
-from surgsim_env.instruments.cartesian import frame_along
-from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.instruments.jaw import Jaw
+from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
 
 # The tip has reached a place within this distance [m]; its direction is as the joints allow.
 PLACE_TOLERANCE = 1e-6
@@ -195,7 +193,10 @@ class SteeredArm:
             left, _, right = np.linalg.svd(turn_matrix(turn) @ near)
             self.wanted = left @ right
         else:
-            self.wanted = _rotated(self.wanted, turn)
+            quaternion, turned, angle = np.zeros(4), np.zeros(3), float(np.linalg.norm(turn))
+            mujoco.mju_axisAngle2Quat(quaternion, turn / angle, angle)
+            mujoco.mju_rotVecQuat(turned, self.wanted, quaternion)
+            self.wanted = turned / np.linalg.norm(turned)
 
     def _points_well(self, joints: FloatArray, rotation: FloatArray) -> bool:
         if self.wanted.ndim == 2:
@@ -208,15 +209,12 @@ class SteeredArm:
         for start in self._starts:
             given = {"rotation": start} if start.ndim == 2 else {"direction": start}
             found.append((reach_pose(self.arm, position, starts=2, **given), start.copy()))
-        best = min(found, key=lambda one: (round(one[0].angle_error, 6), _turned_far(self.arm, one[0])))
+        # Of equal angles the joints nearest to home, as shares of their ranges.
+        home, span = self.arm.home, self.arm.upper - self.arm.lower
+        best = min(found, key=lambda one: (round(one[0].angle_error, 6), (np.abs(one[0].joints - home) / span).sum()))
         if placed(best[0]):
             return best
         return reach_pose(self.arm, position, starts=4), best[1]
-
-
-def _turned_far(arm: Arm, found: PoseSolution) -> float:
-    """Distance of the joints from home, as shares of their ranges, summed."""
-    return float((np.abs(found.joints - arm.home) / (arm.upper - arm.lower)).sum())
 
 
 def _jaw_frame(arm: Arm) -> FloatArray:
@@ -247,11 +245,3 @@ def missing(found: PoseSolution) -> str:
 def millimetres(point: FloatArray) -> str:
     """A position in millimetres, for a message."""
     return "(" + ", ".join(f"{value * 1e3:.1f}" for value in point) + ") mm"
-
-
-def _rotated(direction: FloatArray, turn: FloatArray) -> FloatArray:
-    quaternion, result = np.zeros(4), np.zeros(3)
-    angle = float(np.linalg.norm(turn))
-    mujoco.mju_axisAngle2Quat(quaternion, turn / angle, angle)
-    mujoco.mju_rotVecQuat(result, direction, quaternion)
-    return result / np.linalg.norm(result)

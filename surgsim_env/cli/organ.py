@@ -108,11 +108,9 @@ def _refuse(command: Organ, names: Sequence[str], what: str) -> None:
 def _moduli(texts: Sequence[str]) -> Mapping[str, float]:
     moduli = {}
     for text in texts:
-        name, found, value = text.partition("=")
+        name, _, value = text.partition("=")
         try:
             moduli[name.strip()] = float(value)
         except ValueError:
-            found = ""
-        if not found:
-            raise ValueError(f"--modulus is {text!r}; the form is NAME=PASCAL, such as lesion=40000")
+            raise ValueError(f"--modulus is {text!r}; the form is NAME=PASCAL, such as lesion=40000") from None
     return moduli

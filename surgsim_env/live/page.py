@@ -16,11 +16,10 @@ from surgsim_env.live.exchange_records import Change, LiveError, Pause, Phase, R
 from surgsim_env.live.guarded_server import GuardedServer
 from surgsim_env.live.messages import InvalidMessageError, MessageFilter, read_hand, read_report
 from surgsim_env.live.organ_choice import chosen_lesions
-from surgsim_env.live.organ_view import FeltMap, OrganView
 from surgsim_env.live.panel import Panel, status_rows
 from surgsim_env.live.recording import write_recording
 from surgsim_env.live.session import Session
-from surgsim_env.live.stage import SCALE, ForceArrow, InstrumentView, Surroundings, add_handle
+from surgsim_env.live.stage import SCALE, FeltMap, ForceArrow, InstrumentView, OrganView, Surroundings, add_handle
 
 # Between updates of the plots, and of the status text [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5

@@ -13,7 +13,7 @@ from surgsim_env.haptics.pacing import Timeliness
 from surgsim_env.live.exchange_records import Phase
 from surgsim_env.live.messages import MessageFilter
 from surgsim_env.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
-from surgsim_env.live.organ_view import COLOURS, CONTRASTS
+from surgsim_env.live.stage import COLOURS, CONTRASTS
 from surgsim_env.scene.model import Scene
 
 # Time span of the plots [s], and their number of points.

@@ -40,7 +40,7 @@ from surgsim_env.live.exchange_records import (
     encoded,
 )
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
-from surgsim_env.rendering.instrument_geoms import shown_geoms
+from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.model import Scene
 

@@ -27,7 +27,7 @@ from surgsim_env.live.exchange_records import (
 from surgsim_env.live.messages import HandMotion
 from surgsim_env.live.organ_choice import OrganChoice, lesion_kinds, live_scene
 from surgsim_env.live.physics import home_of, run_physics
-from surgsim_env.rendering.instrument_geoms import shown_geoms
+from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.model import Scene
 

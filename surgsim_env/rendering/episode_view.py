@@ -29,7 +29,6 @@ TURN, ZOOM = 0.008, 0.9
 POLE = 0.05
 # Keys that a task may read; GLFW's code of a key is that of its letter.
 PLAYING_KEYS = "ADEFQRSW "
-KEYS = "drag: turn, wheel: zoom, C: next camera, Esc: close"
 
 
 def require_display() -> None:

@@ -16,9 +16,15 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, scene_cameras
 from surgsim_env.rendering.force_arrow import draw_forces
-from surgsim_env.rendering.instrument_geoms import add_instrument, find_instrument
 from surgsim_env.rendering.options import RenderOptions, check_camera
-from surgsim_env.rendering.scene_model import add_lights, add_tissue, compile_scene, empty_scene
+from surgsim_env.rendering.scene_model import (
+    add_instrument,
+    add_lights,
+    add_tissue,
+    compile_scene,
+    empty_scene,
+    find_instrument,
+)
 from surgsim_env.rendering.stage import LOCK, Canvas, Stage, borrow_stage, give_back_stage
 from surgsim_env.rendering.surface import Shape, drawn_surface
 from surgsim_env.rendering.tissue import Tissue

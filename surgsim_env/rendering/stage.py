@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera
-from surgsim_env.rendering.instrument_geoms import PREFIX
 from surgsim_env.rendering.options import RenderOptions
-from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, TARGET_COLOUR, build_scene
+from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, PREFIX, TARGET_COLOUR, build_scene
 from surgsim_env.rendering.surface import DrawnSurface, Shape, drawn_surface
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
@@ -188,8 +187,12 @@ class Stage:
         """Label of each pixel, by LABELS; solid lesions are labelled also through the organ, shape (height, width)."""
         shown = self._labels()
         if LABELS["lesion"] in self._added.values():
-            with self._without_organ():
-                inside = self._labels()
+            organ = [self.scene.meshes[name] for name in ("organ", "held")]
+            for mesh in organ:
+                mesh.show(False, self.canvas.context)
+            inside = self._labels()
+            for mesh in organ:
+                mesh.show(True, self.canvas.context)
             shown[(shown == LABELS["organ"]) & (inside == LABELS["lesion"])] = LABELS["lesion"]
         return shown
 
@@ -206,16 +209,6 @@ class Stage:
             return self._added[geom.segid]
         name = self.scene.model.geom(geom.objid).name
         return LABELS["instrument"] if name.startswith(PREFIX) else MESH_LABELS.get(name, LABELS["background"])
-
-    @contextlib.contextmanager
-    def _without_organ(self) -> Iterator[None]:
-        """Hide the organ's meshes within this block."""
-        hidden = [self.scene.meshes[name] for name in ("organ", "held")]
-        for mesh in hidden:
-            mesh.show(False, self.canvas.context)
-        yield
-        for mesh in hidden:
-            mesh.show(True, self.canvas.context)
 
     def _add(
         self, kind: mujoco.mjtGeom, size: FloatArray, centre: FloatArray, rotation: FloatArray,

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from websockets import Headers
 from websockets.http11 import Request, Response
 
-from surgsim_env.live.gate import Gate, listening_socket, names_of
+from surgsim_env.live.guarded_server import Gate, listening_socket, names_of
 
 TOKEN = "a-token-of-this-run"
 # What a header may hold.

@@ -27,10 +27,10 @@ from surgsim_env.live.organ_choice import (
     lesion_kinds,
     live_scene,
 )
-from surgsim_env.live.organ_view import COLOURS, FeltMap, colour_levels
 from surgsim_env.live.physics import REQUESTS_MOST, Physics
 from surgsim_env.live.recording import read_recording
-from surgsim_env.rendering.instrument_geoms import shown_geoms
+from surgsim_env.live.stage import COLOURS, FeltMap, colour_levels
+from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 

@@ -7,7 +7,7 @@ import trimesh
 
 from surgsim_env import Port, load_arm
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
-from surgsim_env.rendering.instrument_geoms import add_instrument, find_instrument, shown_geoms
+from surgsim_env.rendering.scene_model import add_instrument, find_instrument, shown_geoms
 
 
 @pytest.fixture

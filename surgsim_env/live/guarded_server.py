@@ -178,7 +178,7 @@ class GuardedServer:
         self.address = f"http://{shown}:{bound_port}/?token={self.gate.token}"
 
     def stop(self) -> None:
-        """Close every socket and the door."""
+        """Close all sockets and the port."""
         self.viser.stop()
         self._listening.close()
 

@@ -463,7 +463,7 @@ class MayEnd(_Wrapped):
 
     @property
     def ends_episode(self) -> bool:
-        """It may."""
+        """True: the episode may end in this step."""
         return True
 
 

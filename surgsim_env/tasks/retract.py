@@ -78,8 +78,8 @@ class RetractTask(Task):
     endoscope's picture instead: `Box(0, 255, (84, 84, 3), uint8)`.
 
     ## Rewards
-    `info["reward_<term>"]` shows what each term paid. What is visible and what is grasped pay by their changes, so that
-    neither can be earned twice. An episode that ends in failure pays less than any that runs its time.
+    `info["reward_<term>"]` shows what each term paid. `visible` and `grasped` pay the change of their value, so that
+    neither can be earned twice. An episode that ends in failure pays less than any that is truncated.
 
     ## Starting State
     The lobe's size and stiffness, its capsule, the held share of its edge, the target's place, the endoscope's pose,
@@ -87,9 +87,9 @@ class RetractTask(Task):
     settled on its bed, the jaw is open, and at most 10 % of the target is visible: other draws are repeated.
 
     ## Episode End
-    Terminated: 80 % of the target were visible for 0.5 s (success); in a haptic step the contact force exceeded the
-    hard limit, or the jaw's pull the strength of the tissue; the simulation faulted (`info["sim_fault"]` says how, the
-    observation is the last finite one). Truncated: 600 control steps (30 s).
+    Terminated: 80 % of the target was visible for 0.5 s (success); in a haptic step the contact force exceeded the hard
+    limit, or the jaw's pull exceeded the strength of the tissue; the simulation faulted (`info["sim_fault"]` says how,
+    the observation is the last finite one). Truncated: 600 control steps (30 s).
 
     ## Info
     Fixed keys and types. Of the step: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`,

@@ -67,7 +67,7 @@ def haptic_steps(
     the shapes that the organ saw by delta = (dt^2 / m) int_0^1 s F(s dt) ds, where F is the total force on the tool.
     This displacement takes the energy F(dt) . delta: at frequency w its mean is
     |F|^2 dt^2 / (2 m) (1 - cos w dt) / (w dt)^2, never negative. The exchange therefore dissipates, except for
-    k delta^2 / 2, which the minimum mass of `tool_bodies.tool_masses` keeps small. With a constant twist delta would be dt^2 / m
+    k delta^2 / 2, which the minimum mass in `tool_bodies` keeps small. With a constant twist delta would be dt^2 / m
     times the mean force, out of phase with F(dt): tissue vibrating above about 370 Hz under the tool would gain energy
     until damping balances it.
 

@@ -29,7 +29,7 @@ ARM_BITS = {"left": 4, "right": 8}
 # Contact between arms is soft: critically damped, with a time constant of five haptic steps [s].
 CONTACT_SOFTNESS = (0.005, 1.0)
 # The right arm on a support: 1240 N/m at its ball, so that 0.1 N is 0.08 mm, more than one control step moves it. As
-# MuJoCo's contact stiffness is proportional to the tool's mass (`tool_bodies.SOLREF`), this is 1 / 6.5 of that of others.
+# MuJoCo's contact stiffness is proportional to the tool's mass (`SOLREF`), this is 1 / 6.5 of that of others.
 TOUCH_SOFTNESS = (SOLREF[0] / 6.5, SOLREF[1] / math.sqrt(6.5))
 # Half the distance between the tips before the first reset [m].
 PARKED_ASIDE = 0.025

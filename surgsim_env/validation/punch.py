@@ -83,7 +83,7 @@ def reference_layer(modulus: float, nu: float, hidden: Hidden | None = None, rad
     def field(r: FloatArray, z: FloatArray) -> FloatArray:
         if hidden is None:
             return np.full_like(r, modulus)
-        inside = np.hypot(r, z + hidden.cover + hidden.radius) < hidden.radius
+        inside = r**2 + (z + hidden.cover + hidden.radius) ** 2 <= hidden.radius**2
         return np.where(inside, hidden.ratio * modulus, modulus)
 
     return layer(radius, SIZE[2], field, nu)

@@ -96,8 +96,24 @@ class Haptics:
             timing = np.zeros((), dtype=TIMING)
             begin = time.perf_counter()
             pacer = Pacer(PaceSettings(simulation.haptic_dt), timing)
+            step, a_second = 0, round(1.0 / simulation.haptic_dt)
+            count = None if self.seconds is None else round(self.seconds / simulation.haptic_dt)
             try:
-                _hold(self, loop, device, pacer, note, console)
+                while count is None or step < count:
+                    pacer.wait()
+                    told = loop.step()
+                    note(told)
+                    step += 1
+                    if step % a_second == 0:
+                        tip = told.tip
+                        size = float((tip.contact_force @ tip.contact_force) ** 0.5)
+                        console.print(f"{told.time:6.1f} s  force {size:.3f} N  depth {tip.depth * 1e3:.2f} mm")
+                    if told.fault:
+                        console.print(f"the organ diverged and is reset: {told.fault}")
+                        loop.reset(tip_position=parked_place(anatomy))
+                    pacer.done(simulation.haptic_dt)
+                    if count is None and isinstance(device, TrajectoryDevice) and device.over:
+                        break
             finally:
                 kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
                 console.print(
@@ -108,35 +124,6 @@ class Haptics:
                 if isinstance(device, UdpDevice):
                     console.print(f"packets: {device.counts}")
         return 0
-
-
-def _hold(
-    command: Haptics,
-    loop: HapticLoop,
-    device: UdpDevice | TrajectoryDevice,
-    pacer: Pacer,
-    note: Callable[[HapticTelemetry], object],
-    console: Console,
-) -> None:
-    """Step the loop at its pace, note each step, print one line a second."""
-    every = round(1.0 / loop.simulation.haptic_dt)
-    count = None if command.seconds is None else round(command.seconds / loop.simulation.haptic_dt)
-    step = 0
-    while count is None or step < count:
-        pacer.wait()
-        told = loop.step()
-        note(told)
-        step += 1
-        if step % every == 0:
-            tip = told.tip
-            size = float((tip.contact_force @ tip.contact_force) ** 0.5)
-            console.print(f"{told.time:6.1f} s  force {size:.3f} N  depth {tip.depth * 1e3:.2f} mm")
-        if told.fault:
-            console.print(f"the organ diverged and is reset: {told.fault}")
-            loop.reset(tip_position=parked_place(loop.simulation.anatomy))
-        pacer.done(loop.simulation.haptic_dt)
-        if count is None and isinstance(device, TrajectoryDevice) and device.over:
-            break
 
 
 @contextmanager

@@ -47,6 +47,8 @@ class Retract:
         Raises:
             ValueError: one line about an option that is not possible.
         """
+        from PIL import Image
+
         if self.seed < 0:
             raise ValueError(f"--seed is {self.seed}; it must be a whole number of at least 0")
         if self.bimanual and self.instrument is not None:
@@ -64,7 +66,9 @@ class Retract:
         written = [path.name for path in trace.to_csv(folder / TRACE_NAME)] + [PLOT_NAME, SUMMARY_NAME]
         trace.plot(folder / PLOT_NAME)
         if before is not None:
-            _write_picture(folder / PICTURE_NAME, before, _pictures(env, console))
+            after = _pictures(env, console)
+            rows = [before] if after is None else [before, after]
+            Image.fromarray(np.concatenate(rows, axis=0)).save(folder / PICTURE_NAME)
             written.append(PICTURE_NAME)
         ran = {"environment": env_id, "scene": self.scene, "instrument": self.instrument, "seed": self.seed}
         summary = {**ran, **_summary(trace)}
@@ -85,13 +89,6 @@ def _pictures(env: gym.Env, console: Console) -> NDArray[np.uint8] | None:
     except NoGLError as error:
         console.print(f"no pictures: {error}", highlight=False)
         return None
-
-
-def _write_picture(path: Path, before: NDArray[np.uint8], after: NDArray[np.uint8] | None) -> None:
-    from PIL import Image
-
-    rows = [before] if after is None else [before, after]
-    Image.fromarray(np.concatenate(rows, axis=0)).save(path)
 
 
 def _summary(trace: Trace) -> dict[str, Any]:

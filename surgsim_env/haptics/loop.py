@@ -106,8 +106,12 @@ class PressDepth:
     def of(self, tip: FloatArray) -> float:
         """Depth of a tip at a position [m], (3,)."""
         simulation = self._simulation
-        if simulation.organ_model is not self._model:
-            self._look_at(simulation.organ_model)
+        if (model := simulation.organ_model) is not self._model:
+            self._model = model
+            corners = simulation.rest_position[model.surface_triangles]
+            self._centres = corners.mean(axis=1)
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         engaged = simulation.organ_state.contact_engaged
         # Engaged with any shape, along the last axis. The view as bool makes this a hundred times as fast.
         touched = np.flatnonzero(engaged.view(np.bool_)) % engaged.shape[1] // QUADRATURE_COUNT
@@ -116,13 +120,6 @@ class PressDepth:
         across = tip - self._centres[touched]
         nearest = int(np.einsum("tx,tx->t", across, across).argmin())
         return self._radius - float(self._normals[touched[nearest]] @ across[nearest])
-
-    def _look_at(self, model: OrganModel) -> None:
-        self._model = model
-        corners = self._simulation.rest_position[model.surface_triangles]
-        self._centres = corners.mean(axis=1)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 class Follower:

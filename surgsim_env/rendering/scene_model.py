@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_PREFIX
+from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.surface import DrawnSurface, Shape
 from surgsim_env.rendering.tissue import SECTION_SPLITS, most_tets_cut

@@ -8,9 +8,8 @@ import pytest
 
 from msdm_core.mesh.geodesic import nearest_triangle
 from surgsim_env.rendering import stage
-from surgsim_env.rendering.force_arrow import COLOUR, contact_point
 from surgsim_env.rendering.options import CAMERAS, RenderOptions
-from surgsim_env.rendering.renderer import OrganRenderer
+from surgsim_env.rendering.renderer import ARROW_COLOUR, OrganRenderer, contact_point
 from surgsim_env.rendering.stage import LABELS
 
 pytestmark = pytest.mark.usefixtures("opengl")
@@ -181,7 +180,7 @@ def test_same_state_same_bytes(press, draw):
         twin.close()
 
 
-def coloured(frame, colour=COLOUR[:3]):
+def coloured(frame, colour=ARROW_COLOUR[:3]):
     return (np.abs(frame.astype(int) - colour).max(axis=2) < 3).sum()
 
 
@@ -203,8 +202,8 @@ def test_force_arrow_comes_with_a_force_and_points_along_it(press, draw):
     places = start + share[:, None] * force * 0.06
     (near, far, beyond), _ = renderer.cameras["overview"].project(places, 640, 480)
     for place in (near, far):
-        assert np.abs(frame[int(place[1]), int(place[0])].astype(int) - COLOUR[:3]).max() < 12
-    assert np.abs(frame[int(beyond[1]), int(beyond[0])].astype(int) - COLOUR[:3]).max() > 12
+        assert np.abs(frame[int(place[1]), int(place[0])].astype(int) - ARROW_COLOUR[:3]).max() < 12
+    assert np.abs(frame[int(beyond[1]), int(beyond[0])].astype(int) - ARROW_COLOUR[:3]).max() > 12
     longer = draw(press, force_mm_per_newton=120.0).rgb()
     assert coloured(longer) > 1.3 * coloured(frame)
 

@@ -3,14 +3,15 @@
 import time
 from collections.abc import Callable
 from functools import partial
+from statistics import median
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.bench.measurement import Effort, median, spread
-from surgsim_env.bench.report import AbsentError, Figure, Section, absent, core_count
+from surgsim_env.bench.measurement import Effort, interleaved, spread
+from surgsim_env.bench.report import Figure, Section, core_count
 
 SCENE = "phantom"
 ENV_ID = "SurgSim/Palpate-v0"
@@ -47,62 +48,24 @@ def stroke(observation: NDArray[Any], force: slice, step: int) -> NDArray[np.flo
     return action
 
 
-class One:
-    """A single environment, stepped and reset as a vector environment would be."""
-
-    num_envs = 1
-
-    def __init__(self) -> None:
-        self.env = make_env()
-
-    def reset(self, *, seed: int) -> tuple[Any, Any]:
-        """Begin an episode."""
-        return self.env.reset(seed=seed)
-
-    def step(self, action: NDArray[np.float32]) -> tuple[Any, ...]:
-        """One control step; a reset where the episode is over."""
-        result = self.env.step(action)
-        return (self.env.reset()[0], *result[1:]) if result[2] or result[3] else result
-
-    def close(self) -> None:
-        """Close the environment."""
-        self.env.close()
-
-
-def in_turn(count: int) -> Any:
-    """Gymnasium's SyncVectorEnv."""
-    return gym.vector.SyncVectorEnv([make_env] * count)
-
-
-def processes(count: int) -> Any:
-    """Gymnasium's AsyncVectorEnv."""
-    return gym.vector.AsyncVectorEnv([make_env] * count)
-
-
-def abreast(count: int, dtype: Literal["float64", "float32"] = "float64") -> Any:
+def abreast(count: int, dtype: Literal["float64", "float32"]) -> Any:
     """Environments side by side in vector registers, one process, a thread for each group of organs."""
     return gym.make_vec(ENV_ID, count, vectorization_mode="vector_entry_point", scene=SCENE, dtype=dtype)
 
 
-def one(count: int) -> Any:
-    """A single environment without a vector environment around it."""
-    assert count == 1
-    return One()
-
-
-# One row each; a way that this version lacks raises AbsentError.
+# One row each.
 WAYS: dict[str, Callable[[int], Any]] = {
-    "single": one,
-    "in turn": in_turn,
-    "processes": processes,
-    "abreast": abreast,
+    "single": lambda count: gym.wrappers.Autoreset(make_env()),
+    "in turn": lambda count: gym.vector.SyncVectorEnv([make_env] * count),
+    "processes": lambda count: gym.vector.AsyncVectorEnv([make_env] * count),
+    "abreast": partial(abreast, dtype="float64"),
     "abreast, float32": partial(abreast, dtype="float32"),
 }
 
 
-def rate(make: Callable[[], Any], steps: int) -> float:
-    """Control steps a second, all environments together."""
-    envs, force = make(), contact_force()
+def rate(way: str, count: int, steps: int) -> float:
+    """Control steps a second, `count` environments together."""
+    envs, force = WAYS[way](count), contact_force()
     try:
         observation = envs.reset(seed=0)[0]
         for step in range(WARM_UP):
@@ -110,7 +73,7 @@ def rate(make: Callable[[], Any], steps: int) -> float:
         begin = time.perf_counter()
         for step in range(steps):
             observation = envs.step(stroke(observation, force, step))[0]
-        return envs.num_envs * steps / (time.perf_counter() - begin)
+        return count * steps / (time.perf_counter() - begin)
     finally:
         envs.close()
 
@@ -121,15 +84,7 @@ def measure(effort: Effort) -> Section:
     for count in effort.env_counts:
         steps = max(2, effort.control_steps // count)
         quantity = f"{count} envs" if count > 1 else "1 env"
-        ways = {way: partial(make, count) for way, make in WAYS.items() if count == 1 or way != "single"}
-        rates: dict[str, list[float]] = {}
-        for _ in range(effort.control_rounds):
-            for way, make in list(ways.items()):
-                try:
-                    rates.setdefault(way, []).append(rate(make, steps))
-                except AbsentError as why:
-                    section.figures.append(absent(way, quantity, "1/s", why))
-                    del ways[way], rates[way]
-        for way, values in rates.items():
+        runs = {way: partial(rate, way, count, steps) for way in WAYS if count == 1 or way != "single"}
+        for way, values in interleaved(runs, effort.control_rounds).items():
             section.figures.append(Figure(way, quantity, median(values), "1/s", f"{quantity}: {spread(values)}"))
     return section

@@ -63,15 +63,9 @@ QUICK = Effort(
 SHORTEST_TIMING = 0.01
 
 
-def median(values: Sequence[float]) -> float:
-    """The middle value; of an even number of values, the mean of the two middle ones."""
-    return float(np.median(values))
-
-
 def quantile(values: Sequence[float], share: float) -> float:
     """The smallest value that at least this share of all values do not exceed: one that was measured."""
-    ordered = sorted(values)
-    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+    return float(np.quantile(values, share, method="inverted_cdf"))
 
 
 def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:

@@ -1,14 +1,14 @@
 """The same press in this project, in MuJoCo's flex and in Newton: time for a simulated second, and the force."""
 
-import importlib.util
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from statistics import median
 
-from surgsim_env.bench.flex import Flex, fastest_within, longest_explicit
-from surgsim_env.bench.measurement import Effort, median, spread
-from surgsim_env.bench.newton_peer import Newton
-from surgsim_env.bench.presses import PLACES, Contender, DivergedError, organ_press, reference_force
+from surgsim_env.bench.measurement import Cells, Effort, spread
+from surgsim_env.bench.peers import EXPLICIT_DAMPING, EXPLICIT_STEPS, Flex, Newton, fastest_within, longest_stable
+from surgsim_env.bench.presses import PLACES, RIGID, Contender, DivergedError, organ_press, reference_force
 from surgsim_env.bench.report import AbsentError, Figure, Section, absent
+from surgsim_env.validation.elements import has_fem
 
 # Flex at its own fastest step stays within this share of its force at 1 ms.
 SHARE = 0.02
@@ -62,10 +62,12 @@ class Tally:
 def measure(effort: Effort) -> Section:
     """All contenders that are installed, round by round; the others are listed with the reason."""
     references = "scikit-fem is absent, no error is given"
-    if importlib.util.find_spec("skfem") is not None:
+    if has_fem():
         references = f"{reference_force(organ_press(effort.organ_cells).contact):.4f} N with this project's contact "
-        references += f"stiffness, {reference_force(2e9):.4f} N with a rigid one, for the peers"
-    section = Section("side_by_side", "Beside MuJoCo flex and Newton", METHOD.format(references=references))
+        references += f"stiffness, {reference_force(RIGID):.4f} N with a rigid one, for the peers"
+    section = Section(
+        "side_by_side", "Beside MuJoCo flex and Newton", METHOD.format(references=references), closing=LIMITS
+    )
     tallies = [Tally(organ_press(effort.organ_cells))]
     for name, make in peers(effort):
         try:
@@ -76,56 +78,30 @@ def measure(effort: Effort) -> Section:
         for tally in tallies:
             tally.press()
     section.figures[:0] = [figure for tally in tallies for figure in _figures(tally, tallies[0])]
-    return Section(section.key, section.heading, section.method, section.figures, LIMITS)
+    return section
 
 
 def peers(effort: Effort) -> Iterator[tuple[str, Callable[[], Contender]]]:
     """Name and maker of each peer at each setting; a maker may search for the setting, or find the peer absent."""
     grid = effort.grid
-    yield "MuJoCo flex full, discrete 1 ms", lambda: _compiled(Flex(grid))
+    yield "MuJoCo flex full, discrete 1 ms", Flex(grid).contender
     yield "MuJoCo flex full, discrete, fastest step", lambda: _fastest(grid, effort)
-    yield "MuJoCo flex full, Euler", lambda: _compiled(longest_explicit(grid))
+    explicit = (Flex(grid, "Euler", dt, EXPLICIT_DAMPING) for dt in EXPLICIT_STEPS)
+    yield "MuJoCo flex full, Euler", lambda: longest_stable(explicit)
     for cells in ((1, 1, 1), (4, 4, 2), (6, 6, 3)):
-        name = "MuJoCo flex trilinear " + "x".join(map(str, cells))
-        yield name, lambda cells=cells: _compiled(Flex(grid, trilinear=cells))
-    yield "Newton explicit", lambda: _newton_explicit(grid)
-    yield "Newton vbd", lambda: Newton(grid, "vbd", 1e-3, damping=0.001).contender()
+        yield "MuJoCo flex trilinear " + "x".join(map(str, cells)), Flex(grid, trilinear=cells).contender
+    yield "Newton explicit", lambda: longest_stable(Newton(grid, "explicit", dt) for dt in NEWTON_STEPS)
+    yield "Newton vbd", Newton(grid, "vbd", 1e-3, damping=0.001).contender
 
 
-def _compiled(flex: Flex) -> Contender:
-    try:
-        return flex.contender()
-    except ValueError as refused:
-        raise AbsentError(f"this MuJoCo refuses the model: {refused}") from None
-
-
-def _fastest(grid: tuple[int, int, int], effort: Effort) -> Contender:
+def _fastest(grid: Cells, effort: Effort) -> Contender:
     """Flex at the fastest step whose force stays near that at 1 ms."""
     base = Flex(grid)
-    force = _compiled(base).press(0.0).force
-    best, tried = fastest_within(base, force, effort.longer_steps, SHARE)
+    best, tried = fastest_within(base, base.contender().press(0.0).force, effort.longer_steps, SHARE)
     if best is None:
         raise AbsentError(f"no longer step stays within {100 * SHARE:g} %: {'; '.join(tried)}")
-    found = best.contender()
-    setting = f"{found.setting}; against 1 ms: {', '.join(tried)}"
-    return Contender(
-        f"MuJoCo flex full, discrete, fastest step, {1e3 * best.dt:g} ms", setting, found.mesh, found.press
-    )
-
-
-def _newton_explicit(grid: tuple[int, int, int]) -> Contender:
-    """Newton's explicit solver at the longest step that is stable in the press."""
-    tried = []
-    for dt in NEWTON_STEPS:
-        contender = Newton(grid, "explicit", dt).contender()
-        try:
-            contender.press(0.0)
-        except DivergedError as fault:
-            tried.append(str(fault))
-            continue
-        setting = "; ".join([contender.setting, *tried])
-        return Contender(contender.name, setting, contender.mesh, contender.press)
-    raise DivergedError("diverged: " + "; ".join(tried))
+    found, name = best.contender(), f"MuJoCo flex full, discrete, fastest step, {1e3 * best.dt:g} ms"
+    return replace(found, name=name, setting=f"{found.setting}; against 1 ms: {', '.join(tried)}")
 
 
 def _figures(tally: Tally, own: Tally) -> list[Figure]:
@@ -143,7 +119,7 @@ def _figures(tally: Tally, own: Tally) -> list[Figure]:
     ]
     if own.processors:
         figures.append(Figure(contender.name, RATIO[0], processor / median(own.processors), RATIO[1]))
-    if importlib.util.find_spec("skfem") is not None:
+    if has_fem():
         error = 100.0 * (force / reference_force(contender.contact) - 1.0)
         figures.append(Figure(contender.name, ERROR[0], error, ERROR[1]))
     return figures

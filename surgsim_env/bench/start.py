@@ -1,26 +1,36 @@
-"""Time from a fresh interpreter to the first step, cold and warm; memory of a further environment."""
+"""Time from a fresh interpreter to the first step, cold and warm; time of a reset; memory of a further environment."""
 
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from statistics import median
 
-from surgsim_env.bench.measurement import Effort, median, spread
+from surgsim_env.bench.measurement import Effort, spread
 from surgsim_env.bench.report import AbsentError, Figure, Section, absent
 
 SCENE = "phantom"
 # A process that hangs is stopped after this time [s].
 LIMIT = 600.0
 METHOD = f"""A fresh interpreter from its first import to the end of the first `step` of `SurgSim/Palpate-v0` on
-`{SCENE}`; cold is with an empty numba cache, warm with a full one. Memory is the growth of the process (resident set)
-per environment made and reset after the first two, each with its own lesion."""
+`{SCENE}`; cold is with an empty numba cache, warm with a full one; reset is the median of seven, each with another
+lesion. Memory is the growth of the process (resident set) per environment made and reset after the first two."""
 START = f"""
 import time; begin = time.perf_counter()
 import gymnasium as gym
 env = gym.make("surgsim_env:SurgSim/Palpate-v0", scene="{SCENE}")
 env.reset(seed=0); env.step(env.action_space.sample())
 print(time.perf_counter() - begin)
+"""
+RESET = f"""
+import statistics, time
+import gymnasium as gym
+env = gym.make("surgsim_env:SurgSim/Palpate-v0", scene="{SCENE}")
+def seconds(seed):
+    begin = time.perf_counter(); env.reset(seed=seed)
+    return time.perf_counter() - begin
+print(statistics.median([seconds(seed) for seed in range(8)][1:]))
 """
 GROWTH = f"""
 import gc, os
@@ -54,7 +64,7 @@ def printed_number(code: str, environment: dict[str, str] | None = None) -> floa
 
 
 def measure(effort: Effort) -> Section:
-    """Cold and warm start, memory per environment."""
+    """Cold and warm start, reset, memory per environment."""
     section = Section("start", "Start and memory", METHOD)
     try:
         with tempfile.TemporaryDirectory() as cache:
@@ -62,6 +72,7 @@ def measure(effort: Effort) -> Section:
             section.figures.append(Figure("start", "cold", printed_number(START, environment), "s"))
             warm = [printed_number(START, environment) for _ in range(effort.starts)]
         section.figures.append(Figure("start", "warm", median(warm), "s", f"warm: {spread(warm)}"))
+        section.figures.append(Figure("start", "reset", printed_number(RESET), "s"))
     except AbsentError as why:
         section.figures.append(absent("start", "cold", "s", why))
     section.figures.append(_memory(effort.memory_envs))

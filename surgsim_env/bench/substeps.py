@@ -2,19 +2,19 @@
 
 from collections.abc import Callable
 from functools import partial
+from statistics import median
 
 import numpy as np
 
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel
 from msdm_core.kernels.vector_kernels import lane_counts
-from msdm_core.lanes.lane_organs import stack_organs
-from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_shapes
+from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Material
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
-from surgsim_env.bench.measurement import Cells, Effort, exponent, interleaved, median, seconds_per_call, spread
-from surgsim_env.bench.report import AbsentError, Figure, Section, absent
+from surgsim_env.bench.measurement import Cells, Effort, exponent, interleaved, seconds_per_call, spread
+from surgsim_env.bench.report import Figure, Section
 
 CELL = 0.005  # [m]
 # The exponent is that of blocks with at least this number of nodes: in smaller ones calls and start-up dominate.
@@ -64,7 +64,7 @@ def abreast(model: OrganModel, dtype: type = np.float64) -> Substep:
     return lambda: seconds_per_call(advance) / lanes
 
 
-# Ways of stepping, one column each. A way that this version or machine lacks raises AbsentError.
+# Ways of stepping, one column each.
 WAYS: dict[str, Callable[[OrganModel], Substep]] = {
     "single": single,
     "8 abreast": abreast,
@@ -76,24 +76,13 @@ def measure(effort: Effort) -> Section:
     """The cost of a substep for every block and way, and its growth with the number of nodes."""
     section = Section("substep", "Substep cost against node count", METHOD)
     models = {f"{len(model.node_mass)} nodes": model for model in map(block, effort.blocks)}
-    runs: dict[str, Substep] = {}
-    lacking: dict[str, str] = {}
-    for way, make in WAYS.items():
-        for name, model in models.items():
-            try:
-                runs[f"{way} {name}"] = make(model)
-            except AbsentError as why:
-                lacking[way] = f"{way}: {why}"
+    runs = {f"{way} {name}": make(model) for way, make in WAYS.items() for name, model in models.items()}
     times = interleaved(runs, effort.substep_rounds)
     for way in WAYS:
         for name, model in models.items():
-            if way in lacking:
-                section.figures.append(absent(name, way, "us", lacking[way]))
-            else:
-                section.figures.extend(_figures(way, name, model, times[f"{way} {name}"]))
-        if way not in lacking:
-            costs = {len(model.node_mass): median(times[f"{way} {name}"]) for name, model in models.items()}
-            section.figures.extend(_growth(way, costs))
+            section.figures.extend(_figures(way, name, model, times[f"{way} {name}"]))
+        costs = {len(model.node_mass): median(times[f"{way} {name}"]) for name, model in models.items()}
+        section.figures.extend(_growth(way, costs))
     return section
 
 

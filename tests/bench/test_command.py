@@ -5,7 +5,7 @@ import re
 import pytest
 
 from surgsim_env.bench import measurement as effort
-from surgsim_env.bench import newton_peer, side_by_side, start
+from surgsim_env.bench import peers, side_by_side, start
 from surgsim_env.bench.measurement import Effort
 from surgsim_env.bench.report import AbsentError
 from surgsim_env.cli.main import main
@@ -23,7 +23,7 @@ def test_bench(tmp_path, monkeypatch, capsys):
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(effort, "QUICK", TINY)
-    monkeypatch.setattr(newton_peer, "import_module", missing)
+    monkeypatch.setattr(peers, "import_module", missing)
     monkeypatch.setattr(side_by_side, "reference_force", lambda contact: 0.2)
     # Starts from an empty cache take half a minute.
     monkeypatch.setattr(start, "printed_number", lambda code, environment=None: 1.5)

@@ -6,9 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from surgsim_env.bench import newton_peer, side_by_side
-from surgsim_env.bench.flex import Flex, contact_force, fastest_within
-from surgsim_env.bench.newton_peer import Newton
+from surgsim_env.bench import peers, side_by_side
+from surgsim_env.bench.peers import Flex, Newton, contact_force, fastest_within
 from surgsim_env.bench.presses import DEPTH, Contender, DivergedError, Pressed, ball_height, step_count
 from surgsim_env.bench.report import AbsentError
 
@@ -72,7 +71,7 @@ def test_newton_that_is_not_installed_is_absent(monkeypatch):
     def missing(name: str):
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr(newton_peer, "import_module", missing)
+    monkeypatch.setattr(peers, "import_module", missing)
     with pytest.raises(AbsentError, match=r"not installed.*surgsim\[bench\]"):
         Newton((5, 5, 3), "vbd", 1e-3).contender()
 
@@ -102,6 +101,6 @@ def test_a_peer_that_diverges_is_named_with_its_setting(monkeypatch):
 
 def test_a_tet_inside_out_is_a_fault():
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    assert newton_peer._fault(points, np.array([[0, 1, 2, 3]])) == ""
-    assert newton_peer._fault(points, np.array([[0, 1, 2, 3], [0, 2, 1, 3]])) == "1 tets inside out"
-    assert newton_peer._fault(points * np.nan, np.array([[0, 1, 2, 3]])) == "positions are not finite"
+    assert peers._fault(points, np.array([[0, 1, 2, 3]])) == ""
+    assert peers._fault(points, np.array([[0, 1, 2, 3], [0, 2, 1, 3]])) == "1 tets inside out"
+    assert peers._fault(points * np.nan, np.array([[0, 1, 2, 3]])) == "positions are not finite"

@@ -10,19 +10,15 @@ RecurrentPPO of stable-baselines3 with its normalisation; reinforcement learning
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
 import minari
 import numpy as np
-from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
+from gymnasium.vector import SyncVectorEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import surgsim_env  # noqa: F401  (registers the ids)
-from agents.training.algorithms import algorithm_class
-from agents.training.cloning import CloningCurve, CloningOptions, clone, normalise_by, pad
-from agents.training.policy_files import PolicyDescription, TrainedPolicy, describe, save_policy
+from agents.scoring.episodes import play_tasks
+from agents.training.imitation import CloningCurve, CloningOptions, clone, normalise_by, pad
+from agents.training.policy_files import TrainedPolicy, algorithm_class, describe, save_policy
 
 # Episodes are scored on seeds from here on; demonstrations come from lower ones.
 FIRST_SEED = 500_000
@@ -44,41 +40,17 @@ def clone_dataset(
     actions = [np.asarray(episode.actions) for episode in episodes]
     normalisation = VecNormalize(DummyVecEnv([dataset.recover_environment]), norm_reward=False)
     normalise_by(normalisation, np.concatenate(observations))
-    model = _new_model(normalisation, recurrent, width)
+    kind, policy, network = "PPO", "MlpPolicy", {"net_arch": [width, width]}
+    if recurrent:
+        kind, policy, network = "RecurrentPPO", "MlpLstmPolicy", {"lstm_hidden_size": width, "net_arch": []}
+    model = algorithm_class(kind)(policy, normalisation, policy_kwargs=network, seed=0, device="cpu")
     seen, taken, weight = np.concatenate(observations), np.concatenate(actions), 1.0
     if recurrent:
         (seen, weight), (taken, _) = pad(observations), pad(actions)
     curve = clone(model, seen, taken, sample_weight=weight, normalisation=normalisation, options=options)
-    return TrainedPolicy(model, _description(model, normalisation, dataset)), curve
-
-
-def _new_model(normalisation: VecNormalize, recurrent: bool, width: int) -> BaseAlgorithm:
-    kind, policy, network = "PPO", "MlpPolicy", {"net_arch": [width, width]}
-    if recurrent:
-        kind, policy, network = "RecurrentPPO", "MlpLstmPolicy", {"lstm_hidden_size": width, "net_arch": []}
-    return algorithm_class(kind)(policy, normalisation, policy_kwargs=network, seed=0, device="cpu")
-
-
-def _description(model: BaseAlgorithm, normalisation: VecNormalize, dataset: minari.MinariDataset) -> PolicyDescription:
     spec = dataset.spec.env_spec
     assert spec is not None
-    return describe(model, normalisation, env_id=spec.id, env_kwargs=dict(spec.kwargs))
-
-
-def play(env: gym.Env, policy: TrainedPolicy, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """The last info of an episode for each seed, with its return and its steps added."""
-    records = []
-    for seed in seeds:
-        observation, info = env.reset(seed=seed)
-        policy.reset(1)
-        begun: NDArray[np.bool_] = np.ones(1, dtype=np.bool_)
-        total, steps, over = 0.0, 0, False
-        while not over:
-            observation, reward, terminated, truncated, info = env.step(policy.act(observation[None], begun)[0])
-            begun = np.zeros(1, dtype=np.bool_)
-            total, steps, over = total + float(reward), steps + 1, terminated or truncated
-        records.append({**info, "return": total, "steps": steps})
-    return records
+    return TrainedPolicy(model, describe(model, normalisation, env_id=spec.id, env_kwargs=dict(spec.kwargs))), curve
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -104,10 +76,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps; "
         f"mean squared error {held:.4f} on held-out ones, after {len(curve.validation)} epochs; {given.out}"
     )
-    records = play(dataset.recover_environment(), policy, range(FIRST_SEED, FIRST_SEED + given.episodes))
-    for record in records:
-        print(f"success {record['success']}, return {record['return']:.2f}, {record['steps']} steps")
-    won, returns = [record["success"] for record in records], [record["return"] for record in records]
+    envs = SyncVectorEnv([dataset.recover_environment], autoreset_mode="Disabled")
+    for record in (records := play_tasks(policy.act, envs, range(FIRST_SEED, FIRST_SEED + given.episodes))):
+        print(f"success {record.last['success']}, return {record.total:.2f}, {record.steps} steps")
+    won, returns = [record.last["success"] for record in records], [record.total for record in records]
     print(f"success {np.mean(won):.0%} of {len(won)} episodes, mean return {np.mean(returns):.2f}")
 
 

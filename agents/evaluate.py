@@ -13,7 +13,6 @@ policy is a zip of pickles: load only files that you trust.
 import argparse
 import datetime
 import json
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.expert_palpate import PalpateExpert
@@ -32,8 +32,8 @@ from agents.scoring.site_agent import SiteAgent
 from agents.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score
 
-# Seed of the bootstrap.
-BOOTSTRAP_SEED = 0
+# Seed of the bootstrap; time between two messages of progress [s].
+BOOTSTRAP_SEED, PROGRESS_EVERY = 0, 60.0
 POLICIES = Path(__file__).resolve().parent / "policies"
 
 
@@ -172,10 +172,10 @@ def _evaluate(
     count = min(options.envs, options.episodes)
     envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
-    start, progress = time.perf_counter(), _Progress(name)
+    start, bar = time.perf_counter(), tqdm(desc=name, unit=" steps", mininterval=PROGRESS_EVERY)
     scored: dict[str, Any]
     if env_id == SITES:
-        presses, budget = play_sites(actor, envs, seeds, progress), first.task.budget
+        presses, budget = play_sites(actor, envs, seeds, bar.update), first.task.budget
         scored = {
             "budget": budget,
             "figures": score(presses, budget, rng),
@@ -184,12 +184,13 @@ def _evaluate(
         }
     else:
         control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
-        records = play_tasks(actor, envs, seeds, progress)
+        records = play_tasks(actor, envs, seeds, bar.update)
         scored = {
             "budget": gym.spec(env_id).max_episode_steps or 0,
             "figures": task_figures(records, control_step, soft_force, rng),
         }
     taken = time.perf_counter() - start
+    bar.close()
     envs.close()
     result = Result(
         method=name,
@@ -215,11 +216,10 @@ def write_reach(options: argparse.Namespace) -> None:
 
     kwargs = {"scene": options.scene, "level": options.level}
     env = gym.make(SITES, **kwargs).unwrapped
-    reaches, progress = [], _Progress("reach")
-    for seed in EVALUATION_SEEDS[: options.episodes]:
+    reaches = []
+    for seed in tqdm(EVALUATION_SEEDS[: options.episodes], desc="reach", mininterval=PROGRESS_EVERY):
         env.reset(seed=seed)
         reaches += lesion_reaches(env.task.anatomy, env.task.drawn)  # type: ignore[attr-defined]
-        progress()
     table = {
         **kwargs,
         "lesions": len(reaches),
@@ -231,21 +231,6 @@ def write_reach(options: argparse.Namespace) -> None:
     path = options.results / f"reach_PalpateSites_{options.scene}_{options.level}.json"
     path.write_text(json.dumps(table) + "\n", encoding="utf-8")
     print(f"{table['below']} of {table['lesions']} lesions below reach -> {path}")
-
-
-class _Progress:
-    """Prints the number of steps about once a minute."""
-
-    def __init__(self, name: str, every: float = 60.0) -> None:
-        self.name, self.every, self.count = name, every, 0
-        self.start = self.last = time.perf_counter()
-
-    def __call__(self) -> None:
-        self.count += 1
-        now = time.perf_counter()
-        if now - self.last > self.every:
-            self.last = now
-            print(f"{self.name}: {self.count} steps in {now - self.start:.0f} s", file=sys.stderr, flush=True)
 
 
 def _with_options(command: str, options: argparse.Namespace) -> str:

@@ -17,11 +17,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.expert_palpate import PalpateExpert
-from agents.training.cloning import CloningOptions, clone, normalise_by
+from agents.training.environments import blinded
 from agents.training.extractors import MemorySummary
+from agents.training.imitation import CloningOptions, clone, normalise_by
 from agents.training.palpate_surrogate import PalpateSurrogate
 from agents.training.policy_files import TrainedPolicy, describe, save_policy
-from agents.training.wrappers import blinded
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}

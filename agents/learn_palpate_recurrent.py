@@ -19,8 +19,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.expert_palpate import PalpateExpert
 from agents.learn_palpate import ERROR, ERROR_KEPT
-from agents.training.cloning import CloningOptions, clone, normalise_by, pad
 from agents.training.extractors import WITHOUT_MEMORY, PlaceAndForce
+from agents.training.imitation import CloningOptions, clone, normalise_by, pad
 from agents.training.palpate_surrogate import PalpateSurrogate
 from agents.training.policy_files import TrainedPolicy, describe, save_policy
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines

@@ -10,24 +10,22 @@ channels. The result is a policy of stable-baselines3's PPO, from which `agents.
 import argparse
 import json
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import VectorEnv
+from gymnasium.wrappers.vector import TransformObservation
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.expert_retract import RetractExpert
-from agents.training.cloning import CloningOptions
-from agents.training.dagger import dagger
+from agents.training.environments import blinded
+from agents.training.imitation import CloningOptions, dagger
 from agents.training.policy_files import describe, save_policy
-from agents.training.wrappers import blinded
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 ID = "SurgSim/Retract-v0"
@@ -35,18 +33,6 @@ ID = "SurgSim/Retract-v0"
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh}
 # Training seeds; scores use seeds from 1,000,000, periodic evaluations from 500,000.
 FIRST_SEED = 2_000_000
-
-
-def make_envs(count: int, dtype: str, threads: int) -> VectorEnv:
-    """Environments side by side that reset in the same step, as DAgger requires."""
-    return gym.make_vec(
-        ID,
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        autoreset_mode="SameStep",
-        dtype=dtype,
-        threads=threads,
-    )
 
 
 class SeeingExpert:
@@ -61,28 +47,12 @@ class SeeingExpert:
         return np.array([self._expert.act(one.task_observation) for one in self._singles])
 
 
-class Blind(VectorWrapper):
-    """Environments with some entries of their observations set to 0; `final_obs` is not changed."""
-
-    def __init__(self, envs: VectorEnv, entries: Sequence[int]) -> None:
-        super().__init__(envs)
-        self._entries = list(entries)
-
-    def reset(self, **kwargs: Any) -> tuple[NDArray, dict[str, Any]]:
-        """Start an episode everywhere."""
-        observations, info = self.env.reset(**kwargs)
-        return blinded(observations, self._entries), info
-
-    def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
-        """One control step of all."""
-        observations, *rest = self.env.step(actions)
-        return (blinded(observations, self._entries), *rest)  # type: ignore[return-value]
-
-
 def learn(arguments: argparse.Namespace) -> None:
     """Run DAgger; save the policy and print a line of figures after each round."""
     torch.set_num_threads(1)
-    envs = make_envs(arguments.envs, arguments.dtype, arguments.threads)
+    # DAgger requires environments that reset in the same step.
+    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep", "dtype": arguments.dtype}
+    envs = gym.make_vec(ID, num_envs=arguments.envs, threads=arguments.threads, **lanes)
     expert = SeeingExpert(envs)
     entries = list(envs.unwrapped.envs[0].unwrapped.task.force_entries) if arguments.without_force else []  # type: ignore[attr-defined]
     normalisation = VecNormalize(VectorEnvForStableBaselines(envs), norm_reward=False)
@@ -90,7 +60,7 @@ def learn(arguments: argparse.Namespace) -> None:
     options = CloningOptions(epochs=arguments.epochs, patience=15, std=0.05, seed=arguments.seed)
     began, rounds = time.time(), []
     for done in dagger(
-        Blind(envs, entries) if entries else envs,
+        TransformObservation(envs, lambda observations: blinded(observations, entries)),
         expert,
         model,
         rounds=arguments.rounds,

@@ -18,7 +18,6 @@ from agents.scoring.leaderboard import SITES, Result, best_raster_alone, load_re
 from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
 from agents.scoring.site_agent import site_facts
 from agents.site_search import REFERENCES
-from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.scores import ERROR_LINE
 
 matplotlib.use("Agg")
@@ -43,8 +42,20 @@ def draw_errors(results: list[Result], path: Path) -> None:
     for axes, place in zip(panels, places, strict=False):
         shown = best_raster_alone([row for row in rows if row.place == place])
         for method in {family(row.method) for row in shown}:
-            medians = np.array([median_errors(row) for row in shown if family(row.method) == method])
-            draw_medians(axes, medians, method, LINE_COLOURS[methods.index(method) % len(LINE_COLOURS)])
+            # Over the organs with lesions after each press, one row for each seed; their mean as a line, all as a band.
+            medians = np.array(
+                [
+                    np.median(np.array(row.errors_mm)[np.array(row.lesion_counts) > 0], axis=0)
+                    for row in shown
+                    if family(row.method) == method
+                ]
+            )
+            presses = np.arange(1, medians.shape[1] + 1)
+            colour = LINE_COLOURS[methods.index(method) % len(LINE_COLOURS)]
+            axes.plot(presses, medians.mean(axis=0), label=method, color=colour, linewidth=1.6)
+            if len(medians) > 1:
+                band = {"color": colour, "alpha": 0.25, "linewidth": 0.0}
+                axes.fill_between(presses, medians.min(axis=0), medians.max(axis=0), **band)
         axes.axhline(1000.0 * ERROR_LINE, color="black", linewidth=0.8, linestyle="--")
         scene, _, level = place.removeprefix("PalpateSites_").rpartition("_")
         axes.set_title(f"{scene}, {level}")
@@ -65,19 +76,6 @@ def family(method: str) -> str:
     if method.startswith("raster_"):
         return "best raster"
     return re.sub(r"_seed\d+$", "", method)
-
-
-def median_errors(row: Result) -> FloatArray:
-    """Median over the organs with lesions after each press [mm], (n_press,)."""
-    return np.median(np.array(row.errors_mm)[np.array(row.lesion_counts) > 0], axis=0)
-
-
-def draw_medians(axes: Any, medians: FloatArray, name: str, colour: str) -> None:
-    """The mean of the seeds' medians (n_seed, n_press) [mm] as a line, from the lowest to the highest as a band."""
-    presses = np.arange(1, medians.shape[1] + 1)
-    axes.plot(presses, medians.mean(axis=0), label=name, color=colour, linewidth=1.6)
-    if len(medians) > 1:
-        axes.fill_between(presses, medians.min(axis=0), medians.max(axis=0), color=colour, alpha=0.25, linewidth=0.0)
 
 
 def draw_search(path: Path) -> None:

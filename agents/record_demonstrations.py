@@ -21,6 +21,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -31,10 +32,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
-# Seeds reserved for scores (surgsim_env.palpation.scores).
-SEEDS_FOR_SCORES = range(1_000_000, 1_000_100)
 CODE = "agents/record_demonstrations.py of surgsim"
 
 # Plays one episode in an environment, reset with a seed.
@@ -127,7 +127,8 @@ def player(by: str, env: gym.Env) -> Player:
         from agents.training.policy_files import load_policy
 
         policy = load_policy(Path(by))
-        return lambda env, seed: play_agent(env, seed, _PolicyAgent(policy))
+        alone = SimpleNamespace(reset=lambda: policy.reset(1), act=lambda seen: policy.act(seen[None])[0])
+        return lambda env, seed: play_agent(env, seed, alone)
     module, _, name = by.partition(":")
     if not name:
         raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.zip or MODULE:CLASS")
@@ -145,32 +146,15 @@ def play_agent(env: gym.Env, seed: int, agent: Any) -> None:
         over = terminated or truncated
 
 
-class _PolicyAgent:
-    """A trained policy in one environment."""
-
-    def __init__(self, policy: Any) -> None:
-        self._policy = policy
-        self.reset()
-
-    def reset(self) -> None:
-        self._policy.reset(1)
-        self._begun = np.ones(1, dtype=np.bool_)
-
-    def act(self, observation: NDArray) -> NDArray:
-        action = self._policy.act(observation[None], self._begun)[0]
-        self._begun = np.zeros(1, dtype=np.bool_)
-        return action
-
-
 def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[Episode]:
     """Play an episode for each seed; returns those that succeeded, or all.
 
     Raises:
         ValueError: seeds that are reserved for scores.
     """
-    kept = next((seed for seed in seeds if seed in SEEDS_FOR_SCORES), None)
+    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
     if kept is not None:
-        raise ValueError(f"seed {kept} is reserved for scores, as all in {SEEDS_FOR_SCORES}: record other seeds")
+        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
     recorder = Recorder(env)
     progress = tqdm(seeds, unit="episode")
     for seed in progress:

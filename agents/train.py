@@ -13,11 +13,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from stable_baselines3.common.callbacks import CallbackList
-
-from agents.training.callbacks import BetweenRollouts, CriticFirst
 from agents.training.config import TrainingConfig, read_config
-from agents.training.run import Run
+from agents.training.run import BetweenRollouts, Run
 
 
 def train(config: TrainingConfig, folder: Path, *, progress: bool = False) -> int:
@@ -28,12 +25,10 @@ def train(config: TrainingConfig, folder: Path, *, progress: bool = False) -> in
         print(f"resuming from {run.resumed_from} ({start} of {config.total_steps} steps)", flush=True)
     if start >= config.total_steps:
         return start
-    between = BetweenRollouts(run)
-    callbacks = CallbackList([between, CriticFirst(config.critic_first)])
     # A resumed run trains for the remaining steps.
-    model.learn(config.total_steps - start, callbacks, reset_num_timesteps=start == 0, progress_bar=progress)
-    between.finish()
-    run.bare.close()
+    left = config.total_steps - start
+    model.learn(left, BetweenRollouts(run), reset_num_timesteps=start == 0, progress_bar=progress)
+    run.finish()
     return model.num_timesteps
 
 

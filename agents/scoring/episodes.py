@@ -44,7 +44,7 @@ def play(
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
     begin: Callable[[int, int], R],
-    progress: Callable[[], None] = lambda: None,
+    progress: Callable[[], object] = lambda: None,
 ) -> list[R]:
     """Play an episode of each seed and return its record; where one ends the next seed begins.
 
@@ -105,7 +105,7 @@ class TaskRecord:
 
 
 def play_tasks(
-    actor: Actor, envs: gym.vector.VectorEnv, seeds: Sequence[int], progress: Callable[[], None] = lambda: None
+    actor: Actor, envs: gym.vector.VectorEnv, seeds: Sequence[int], progress: Callable[[], object] = lambda: None
 ) -> list[TaskRecord]:
     """`play` for the records of these environments."""
     return play(actor, envs, seeds, lambda env, seed: TaskRecord(), progress)
@@ -183,7 +183,7 @@ def play_sites(
     actor: Actor | SiteActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
-    progress: Callable[[], None] = lambda: None,
+    progress: Callable[[], object] = lambda: None,
 ) -> list[PalpationRecord]:
     """`play` for baselines, or for one policy in all environments.
 

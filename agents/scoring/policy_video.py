@@ -13,6 +13,7 @@ import surgsim_env  # noqa: F401  (registers the ids)
 from agents.scoring.leaderboard import SITES
 
 matplotlib.use("Agg")
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 PICTURE_SIZE = 480
@@ -44,13 +45,13 @@ def episode_frames(policy: Any, env: gym.Env, seed: int) -> list[NDArray[np.uint
     presses = policy.description.env_id == SITES
     observation, _ = env.reset(seed=int(seed))
     policy.reset(1)
-    begins, over, steps = np.ones(1, dtype=bool), False, 0
+    over, steps = False, 0
     forces: list[float] = []
     tips: list[NDArray[np.float64]] = []
     frames: list[NDArray[np.uint8]] = []
     while not over:
-        observation, _, terminated, truncated, info = env.step(policy.act(observation[None], begins)[0])
-        begins, over, steps = np.zeros(1, dtype=bool), terminated or truncated, steps + 1
+        observation, _, terminated, truncated, info = env.step(policy.act(observation[None])[0])
+        over, steps = terminated or truncated, steps + 1
         forces.append(float(info["force_peak"]))
         tips.append(env.unwrapped.simulation.instrument.tip_position.copy())  # type: ignore[attr-defined]
         if presses or over or steps % STEPS_A_PICTURE == 0:
@@ -74,7 +75,9 @@ def _panel(
     else:
         _draw_way(below, env, tips)
         below.set_title(f"{len(forces) * env.scene.timing.control_step:.1f} s", fontsize=9)
-    return _pixels(figure)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _draw_forces(axes: Any, env: Any, forces: Sequence[float], presses: bool) -> None:
@@ -131,11 +134,3 @@ def _draw_way(axes: Any, env: Any, tips: Sequence[NDArray[np.float64]]) -> None:
     axes.set_aspect("equal")
     axes.set_xlabel("the tip's way, from above [mm]", fontsize=8)
     axes.tick_params(labelsize=7)
-
-
-def _pixels(figure: Figure) -> NDArray[np.uint8]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

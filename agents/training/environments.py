@@ -1,26 +1,22 @@
-"""The vector environments of a run's configuration."""
+"""The vector environments of a run's configuration, and wrappers of stable-baselines3's vector environments."""
+
+from collections.abc import Callable, Sequence
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.scoring.site_agent import SiteFacts, site_facts
 from agents.training.config import EnvironmentSettings
-from agents.training.site_belief import BelievingEnvs, SiteBelief
-from agents.training.wrappers import EpisodeMonitor, RepeatedAction, WithoutForce
+from agents.training.site_policy import SiteBelief
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
-
-# First seeds of training and of its periodic evaluation; scores use others
-# (`surgsim_env.palpation.scores.EVALUATION_SEEDS`, from 1,000,000 to 1,000,099).
-TRAINING_SEEDS_FROM = 2_000_000
-EVALUATION_SEED = 500_000
 
 
 def make_environments(settings: EnvironmentSettings, count: int | None = None) -> VecEnv:
     """The environments with all wrappers except the normalisation."""
-    count = settings.count if count is None else count
-    envs = _bare(settings, count)
+    envs = _bare(settings, settings.count if count is None else count)
     if settings.action_repeat > 1:
         envs = RepeatedAction(envs, settings.action_repeat)
     if settings.without_force:
@@ -28,21 +24,6 @@ def make_environments(settings: EnvironmentSettings, count: int | None = None) -
     if settings.belief:
         envs = BelievingEnvs(envs, SiteBelief(belief_facts(envs)))
     return EpisodeMonitor(envs)
-
-
-def normalized(envs: VecEnv, settings: EnvironmentSettings, gamma: float) -> VecEnv:
-    """The environments with normalised observations and rewards, according to the settings."""
-    if not settings.normalize_observation and not settings.normalize_reward:
-        return envs
-    return VecNormalize(
-        envs, norm_obs=settings.normalize_observation, norm_reward=settings.normalize_reward, gamma=gamma
-    )
-
-
-def training_seed(seed: int, steps: int) -> int:
-    """First seed of the environments' episodes, different at each start of a run."""
-    drawn = int(np.random.SeedSequence([seed, steps]).generate_state(1)[0])
-    return TRAINING_SEEDS_FROM + drawn % (2**31 - 2 * TRAINING_SEEDS_FROM)
 
 
 def force_entries(envs: VecEnv) -> list[int]:
@@ -78,7 +59,7 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
         )
         return VectorEnvForStableBaselines(envs)
     if settings.kind == "library":
-        from agents.training.press_library import PressLibraryEnv
+        from agents.press_library import PressLibraryEnv
 
         return DummyVecEnv([lambda: PressLibraryEnv(settings.library, **settings.kwargs)] * count)
     if settings.kind == "surrogate":
@@ -87,3 +68,104 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
         chosen = {name: value for name, value in settings.kwargs.items() if name != "level"}
         return VectorEnvForStableBaselines(PalpateSurrogate(count, **chosen))
     return DummyVecEnv([lambda: gym.make(settings.id, **settings.kwargs)] * count)
+
+
+# ---- wrappers -------------------------------------------------------------------------------------------------------
+
+
+class RepeatedAction(VecEnvWrapper):
+    """One decision lasts `count` control steps; their rewards are summed.
+
+    If an episode ends within a decision, its environment, which has begun the next episode, gets zero actions for the
+    rest of the decision; the rewards of those steps count for the next episode.
+    """
+
+    def __init__(self, envs: VecEnv, count: int) -> None:
+        super().__init__(envs)
+        self.count = count
+        self._carried = np.zeros(envs.num_envs)
+
+    def reset(self) -> VecEnvObs:
+        """Start an episode everywhere."""
+        self._carried[:] = 0.0
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Store the actions (n_env, n_action) for `step_wait`."""
+        self._actions = np.array(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One decision of all."""
+        total, over = self._carried.copy(), np.zeros(self.num_envs, dtype=np.bool_)
+        self._carried[:] = 0.0
+        ended: dict[int, dict] = {}
+        for _ in range(self.count):
+            observation, reward, done, infos = self.venv.step(self._actions)
+            total += np.where(over, 0.0, reward)
+            self._carried += np.where(over, reward, 0.0)
+            # An episode that ended during these zero actions would be lost, but no task ends so soon.
+            for index in np.flatnonzero(done & ~over):
+                ended[int(index)] = infos[index]
+            over |= done
+            self._actions[over] = 0.0
+        infos = [ended.get(index, info) for index, info in enumerate(infos)]
+        return observation, total.astype(np.float32), over, infos
+
+
+class Observed(VecEnvWrapper):
+    """Environments whose observations pass through a function, those at the end of an episode too."""
+
+    def __init__(self, envs: VecEnv, see: Callable[[np.ndarray], np.ndarray], **spaces: gym.Space) -> None:
+        super().__init__(envs, **spaces)
+        self.see = see
+
+    def reset(self) -> VecEnvObs:
+        """Start an episode everywhere."""
+        return self.see(np.asarray(self.venv.reset()))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One step of all."""
+        observation, reward, done, infos = self.venv.step_wait()
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"] = self.see(info["terminal_observation"][None])[0]
+        return self.see(np.asarray(observation)), reward, done, infos
+
+
+class WithoutForce(Observed):
+    """Observations with the entries of the force sensor set to 0."""
+
+    def __init__(self, envs: VecEnv, entries: Sequence[int]) -> None:
+        super().__init__(envs, lambda observation: blinded(observation, entries))
+
+
+class BelievingEnvs(Observed):
+    """Environments of SurgSim/PalpateSites-v0 whose observation is the belief and whose action is a site's number."""
+
+    def __init__(self, envs: VecEnv, belief: SiteBelief) -> None:
+        choice = gym.spaces.Discrete(belief.site_count**2)
+        super().__init__(envs, belief.features, observation_space=belief.space, action_space=choice)
+        self.belief = belief
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Press the sites (n_env,)."""
+        self.venv.step_async(self.belief.action(actions))
+
+
+class EpisodeMonitor(VecMonitor):
+    """Reports return, length and success of finished episodes to stable-baselines3's logger."""
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One step of all."""
+        observation, reward, done, infos = super().step_wait()
+        for index in np.flatnonzero(done):
+            if "success" in infos[index]:
+                infos[index]["is_success"] = bool(infos[index]["success"])
+        return observation, reward, done, infos
+
+
+def blinded(observation: VecEnvObs, entries: Sequence[int]) -> np.ndarray:
+    """A copy of observations (..., n) with some entries set to 0."""
+    seen = np.array(observation)
+    seen[..., list(entries)] = 0.0
+    return seen

@@ -9,7 +9,20 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from surgsim_env.tasks.palpate import PalpateTask
 
 
-class MemorySummary(BaseFeaturesExtractor):
+class _Entries(BaseFeaturesExtractor):
+    """Some entries of the observation."""
+
+    def __init__(self, observation_space: gym.Space, entries: list[int]) -> None:
+        super().__init__(observation_space, len(entries))
+        self.entries: torch.Tensor
+        self.register_buffer("entries", torch.tensor(entries))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """The chosen entries of normalised observations (n, n_observation)."""
+        return observations[:, self.entries]
+
+
+class MemorySummary(_Entries):
     """Of Palpate-v0 with memory: the tip's place, the force along z, the marks of the corners, the stiffest place.
 
     Velocity, friction, time and the other marks are left out: they reveal the last action, and a cloned network learns
@@ -36,17 +49,10 @@ class MemorySummary(BaseFeaturesExtractor):
         corners = (0, side - 1, site_count - side, site_count - 1)
         marks = [slices["visited"].start + corner for corner in corners]
         stiffest = slices["stiffest"]
-        entries = [*place_and_force(slices), *marks, *range(stiffest.start, stiffest.stop)]
-        super().__init__(observation_space, len(entries))
-        self.entries: torch.Tensor
-        self.register_buffer("entries", torch.tensor(entries))
-
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """The chosen entries of normalised observations (n, n_observation)."""
-        return observations[:, self.entries]
+        super().__init__(observation_space, [*place_and_force(slices), *marks, *range(stiffest.start, stiffest.stop)])
 
 
-class PlaceAndForce(BaseFeaturesExtractor):
+class PlaceAndForce(_Entries):
     """Of Palpate-v0 without memory: the tip's place and the force along z, for the reason given in `MemorySummary`."""
 
     def __init__(self, observation_space: gym.Space) -> None:
@@ -61,14 +67,7 @@ class PlaceAndForce(BaseFeaturesExtractor):
                 f"an observation of shape {observation_space.shape} is not that of Palpate-v0 with memory=False "
                 f"({length},): leave the features extractor out"
             )
-        entries = place_and_force(WITHOUT_MEMORY)
-        super().__init__(observation_space, len(entries))
-        self.entries: torch.Tensor
-        self.register_buffer("entries", torch.tensor(entries))
-
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """The chosen entries of normalised observations (n, 10)."""
-        return observations[:, self.entries]
+        super().__init__(observation_space, place_and_force(WITHOUT_MEMORY))
 
 
 # Channels of Palpate-v0's observation without memory.

@@ -8,20 +8,34 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
+import sb3_contrib
+import stable_baselines3
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.scoring.site_agent import SiteFacts
-from agents.training.algorithms import algorithm_class
-from agents.training.site_belief import SiteBelief
-from agents.training.wrappers import blinded
+from agents.training.environments import blinded
+from agents.training.site_policy import SiteBelief
+from surgsim_env.scene.load import nearest
 
 # Defaults of VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8
 CUT = 10.0
+
+
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """The class of an algorithm of stable-baselines3 or sb3-contrib.
+
+    Raises:
+        ValueError: an unknown name (suggests the nearest).
+    """
+    classes = [(one, getattr(package, one)) for package in (stable_baselines3, sb3_contrib) for one in package.__all__]
+    known = {one: kind for one, kind in classes if isinstance(kind, type) and issubclass(kind, BaseAlgorithm)}
+    if name not in known:
+        raise ValueError(f"algorithm {name!r} is unknown{nearest(name, sorted(known))} (known: {', '.join(known)})")
+    return known[name]
 
 
 @dataclass(frozen=True)
@@ -77,27 +91,30 @@ class TrainedPolicy:
         """Begin episodes in `count` environments."""
         self._state: Any = None
         self._since = np.zeros(count, dtype=np.int64)
-        self._actions = np.zeros((count, *self._actions_of.shape), dtype=self._actions_of.dtype)
+        # Of the model, or places where the model returns a site's number.
+        space: Any = self.model.action_space if self.belief is None else self.belief.action_space
+        self._actions = np.zeros((count, *space.shape), dtype=space.dtype)
 
-    @property
-    def _actions_of(self) -> gym.spaces.Space:
-        """The action space: the model's own, or places for a model that returns a site's number."""
-        return self.model.action_space if self.belief is None else self.belief.action_space
+    def act(self, observations: NDArray[Any], begins: NDArray[np.bool_] | None = None) -> NDArray:
+        """Deterministic actions (n, n_action) for raw observations (n, n_observation).
 
-    def act(self, observations: NDArray[Any], begins: NDArray[np.bool_], *, deterministic: bool = True) -> NDArray:
-        """Actions (n, n_action) for raw observations (n, n_observation); `begins` (n,): a new episode begins there."""
+        An episode begins where `begins` (n,) is true; without it at the first call after `reset` alone.
+        """
+        begins = self._since == 0 if begins is None else begins
         self._since[begins] = 0
         deciding = self._since % self.description.action_repeat == 0
         self._since += 1
         if deciding.any():
             seen = self.seen(observations)
-            actions, state = self.model.predict(
-                seen, state=self._state, episode_start=begins, deterministic=deterministic
-            )
+            actions, state = self.model.predict(seen, state=self._state, episode_start=begins, deterministic=True)
             if self.belief is not None:
                 actions = self.belief.action(actions)
             self._actions[deciding] = actions[deciding]
-            self._state = _updated(self._state, state, deciding)
+            if self._state is not None and state is not None and not deciding.all():
+                # The recurrent state (layers, n, size) is new where a decision was made.
+                pairs = zip(self._state, state, strict=True)
+                state = tuple(np.where(deciding[None, :, None], new, old) for old, new in pairs)
+            self._state = state
         return self._actions.copy()
 
     def seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
@@ -128,18 +145,6 @@ def load_policy(path: Path) -> TrainedPolicy:
     for suffix in (".zip", ".json"):
         if not path.with_suffix(suffix).is_file():
             raise ValueError(f"policy {path}: there is no file {path.with_suffix(suffix).name} beside it")
-    description = read_description(path)
+    description = PolicyDescription(**json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
     model = algorithm_class(description.algorithm).load(path.with_suffix(".zip"), device="cpu")
     return TrainedPolicy(model, description)
-
-
-def read_description(path: Path) -> PolicyDescription:
-    """Read NAME.json."""
-    return PolicyDescription(**json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
-
-
-def _updated(before: Any, after: Any, deciding: NDArray[np.bool_]) -> Any:
-    """The recurrent state (layers, n, size): new where a decision was made, unchanged elsewhere."""
-    if after is None or before is None or deciding.all():
-        return after
-    return tuple(np.where(deciding[None, :, None], new, old) for old, new in zip(before, after, strict=True))

@@ -1,25 +1,48 @@
-"""A training run in its folder, new or resumed from its last complete checkpoint."""
+"""A training run in its folder: begun, resumed, evaluated and saved."""
 
+import csv
 import json
 import math
-from dataclasses import asdict
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from agents.training.algorithms import algorithm_class, keywords, policy_class
 from agents.training.config import TrainingConfig, config_text
-from agents.training.environments import belief_facts, force_entries, make_environments, normalized, training_seed
-from agents.training.policy_files import PolicyDescription, describe, load_policy
-from agents.training.whole_folders import keep_newest, whole_folders, write_file, write_folder
+from agents.training.environments import belief_facts, force_entries, make_environments
+from agents.training.extractors import MemorySummary, PlaceAndForce
+from agents.training.policy_files import (
+    PolicyDescription,
+    TrainedPolicy,
+    algorithm_class,
+    describe,
+    load_policy,
+    save_policy,
+)
+from agents.training.site_policy import SitePolicy
 
+# First seeds of training and of its periodic evaluation; scores use others
+# (`surgsim_env.palpation.scores.EVALUATION_SEEDS`, from 1,000,000 to 1,000,099).
+TRAINING_SEEDS_FROM = 2_000_000
+EVALUATION_SEED = 500_000
 # Sample count of a warm start's normalisation: so large that new observations hardly change it.
 WARM_COUNT = 1e9
+
+# Classes that a configuration names.
+EXTRACTORS = {"MemorySummary": MemorySummary, "PlaceAndForce": PlaceAndForce}
+ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU}
+POLICIES = {"SitePolicy": SitePolicy}
 
 
 class Run:
@@ -40,11 +63,21 @@ class Run:
         self._claim_folder()
         saved = whole_folders(folder / "checkpoints")
         self.resumed_from = saved[-1] if saved else None
-        self.gamma = float(config.hyperparameters.get("gamma", 0.99))
         self.bare = make_environments(config.environment)
         self.blind_entries = force_entries(self.bare) if config.environment.without_force else []
         self.model = self._begin() if self.resumed_from is None else self._resume(self.resumed_from)
-        self.model.set_logger(self._logger())
+        # One progress file for each start, named by its first step.
+        start = self.model.num_timesteps
+        formats = [make_output_format(kind, str(folder), f"_{start:012d}") for kind in ("csv", "tensorboard")]
+        self.model.set_logger(Logger(str(folder), formats))
+        notes: dict[str, Any] = {}
+        if self.resumed_from is not None:
+            notes = json.loads((self.resumed_from / "notes.json").read_text(encoding="utf-8"))
+        self.saved_at = start
+        self.evaluated_at = notes.get("evaluated_at", start)
+        self.best_score: float | None = notes.get("best_score")
+        self._evaluated: VecEnv | None = None
+        _forget_rows_after(folder / "evaluations.csv", start)
 
     @property
     def normalization(self) -> VecNormalize | None:
@@ -67,8 +100,28 @@ class Run:
             score=score,
         )
 
-    def save_checkpoint(self, notes: dict) -> None:
-        """Write a checkpoint: model, normalisation, replay buffer, and the callbacks' notes."""
+    def between_rollouts(self) -> None:
+        """Evaluate and save where it is due; called when no update is in progress.
+
+        A resumed run thus has the same rollouts as an uninterrupted one, and ends with the same number of steps.
+        """
+        now, every = self.model.num_timesteps, self.config.evaluation.every
+        if every and now - self.evaluated_at >= every:
+            self.evaluate()
+        if now - self.saved_at >= self.config.checkpoint.every:
+            self.save()
+
+    def finish(self) -> None:
+        """After the last update: evaluate, save, write the final policy and close the environments."""
+        if self.config.evaluation.every:
+            self.evaluate()
+        self.save()
+        self._write_policy("final", self.description())
+        self.bare.close()
+
+    def save(self) -> None:
+        """Write a checkpoint: model, normalisation, replay buffer and notes on evaluations."""
+        self.saved_at = self.model.num_timesteps
 
         def fill(folder: Path) -> None:
             self.model.save(folder / "model.zip")
@@ -76,17 +129,38 @@ class Run:
                 self.normalization.save(str(folder / "normalization.pkl"))
             if isinstance(self.model, OffPolicyAlgorithm) and self.config.checkpoint.replay_buffer:
                 self.model.save_replay_buffer(folder / "replay_buffer.pkl")
+            notes = {"evaluated_at": self.evaluated_at, "best_score": self.best_score}
             (folder / "notes.json").write_text(json.dumps(notes), encoding="utf-8")
 
-        place = self.folder / "checkpoints"
-        write_folder(place, f"{self.model.num_timesteps:012d}", fill)
-        keep_newest(place, self.config.checkpoint.keep)
+        write_folder(self.folder / "checkpoints", f"{self.saved_at:012d}", fill)
+        keep_newest(self.folder / "checkpoints", self.config.checkpoint.keep)
 
-    def notes(self) -> dict:
-        """The callbacks' notes in the checkpoint that the run was resumed from; empty for a new run."""
-        if self.resumed_from is None:
-            return {}
-        return json.loads((self.resumed_from / "notes.json").read_text(encoding="utf-8"))
+    def evaluate(self) -> None:
+        """Play episodes, record the figures, save the policy if it is the best so far."""
+        settings, steps = self.config.evaluation, self.model.num_timesteps
+        if self._evaluated is None:
+            count = min(self.config.environment.count, settings.episodes)
+            self._evaluated = make_environments(self.config.environment, count)
+        # These environments repeat actions, remove force and compute beliefs themselves.
+        seen = replace(self.description(), action_repeat=1, force_entries=[], belief=None)
+        figures = mean_figures(play_episodes(TrainedPolicy(self.model, seen), self._evaluated, settings.episodes))
+        self.evaluated_at = steps
+        if settings.score not in figures:
+            raise ValueError(
+                f"evaluation.score is {settings.score!r}, which no episode reports; known are {', '.join(figures)}"
+            )
+        score = figures[settings.score]
+        _append_row(self.folder / "evaluations.csv", {"steps": steps, **figures})
+        for name, value in figures.items():
+            self.model.logger.record(f"evaluation/{name}", value)
+        if self.best_score is None or settings.score_sign * (score - self.best_score) > 0.0:
+            self.best_score = score
+            self._write_policy("best", self.description(score))
+
+    def _write_policy(self, place: str, description: PolicyDescription) -> None:
+        folder, name = self.folder / place, f"{self.model.num_timesteps:012d}"
+        write_folder(folder, name, lambda path: save_policy(self.model, description, path / "policy.zip"))
+        keep_newest(folder, 1)
 
     def _claim_folder(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -105,12 +179,14 @@ class Run:
         write_file(file, text)
 
     def _begin(self) -> BaseAlgorithm:
-        config = self.config
-        envs = normalized(self.bare, config.environment, self.gamma)
-        kind = algorithm_class(config.algorithm)
-        model = kind(
-            policy_class(config.policy), envs, seed=config.seed, device="cpu", **keywords(config.hyperparameters)
-        )
+        config, envs = self.config, self.bare
+        seen, paid = config.environment.normalize_observation, config.environment.normalize_reward
+        if seen or paid:
+            gamma = float(config.hyperparameters.get("gamma", 0.99))
+            envs = VecNormalize(envs, norm_obs=seen, norm_reward=paid, gamma=gamma)
+        policy: Any = POLICIES.get(config.policy, config.policy)
+        settings = {"seed": config.seed, "device": "cpu", **keywords(config.hyperparameters)}
+        model = algorithm_class(config.algorithm)(policy, envs, **settings)
         if config.warm_start is not None:
             self._warm(model, Path(config.warm_start))
         envs.seed(training_seed(config.seed, 0))
@@ -161,8 +237,166 @@ class Run:
         envs.seed(training_seed(self.config.seed, model.num_timesteps))
         return model
 
-    def _logger(self) -> Logger:
-        """A logger with one progress file for each start, named by its first step."""
-        start = f"_{self.model.num_timesteps:012d}"
-        kinds = ("csv", "tensorboard")
-        return Logger(str(self.folder), [make_output_format(kind, str(self.folder), start) for kind in kinds])
+
+class BetweenRollouts(BaseCallback):
+    """Evaluates and saves between rollouts, and trains the value function alone for the first steps.
+
+    A cloned policy has an untrained value function.
+    """
+
+    def __init__(self, run: Run) -> None:
+        super().__init__()
+        self.run = run
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.run.between_rollouts()
+        learns = self.num_timesteps >= self.run.config.critic_first
+        for name, parameter in self.model.policy.named_parameters():
+            if "value" not in name and "vf" not in name and "critic" not in name:
+                parameter.requires_grad_(learns)
+                if not learns:
+                    parameter.grad = None
+
+
+def keywords(hyperparameters: dict[str, Any]) -> dict[str, Any]:
+    """Hyperparameters as the algorithm's arguments: `{linear: x}` becomes a schedule, some names become classes.
+
+    Raises:
+        ValueError: an activation function or a features extractor that is unknown.
+    """
+    made: dict[str, Any] = {
+        name: LinearSchedule(float(value["linear"]), 0.0, 1.0)
+        if isinstance(value, dict) and set(value) == {"linear"}
+        else value
+        for name, value in hyperparameters.items()
+    }
+    policy = dict(made.get("policy_kwargs") or {})
+    for entry, known in (("activation_fn", ACTIVATIONS), ("features_extractor_class", EXTRACTORS)):
+        if entry in policy:
+            if policy[entry] not in known:
+                raise ValueError(
+                    f"hyperparameters.policy_kwargs.{entry} is {policy[entry]!r}; known are {', '.join(known)}"
+                )
+            policy[entry] = known[policy[entry]]
+    return made | {"policy_kwargs": policy} if policy else made
+
+
+def training_seed(seed: int, steps: int) -> int:
+    """First seed of the environments' episodes, different at each start of a run."""
+    drawn = int(np.random.SeedSequence([seed, steps]).generate_state(1)[0])
+    return TRAINING_SEEDS_FROM + drawn % (2**31 - 2 * TRAINING_SEEDS_FROM)
+
+
+# ---- evaluation -----------------------------------------------------------------------------------------------------
+
+
+def play_episodes(policy: TrainedPolicy, envs: VecEnv, episodes: int, seed: int = EVALUATION_SEED) -> list[dict]:
+    """The last infos of deterministic episodes, with their returns and lengths.
+
+    Each environment plays an equal share, so that short episodes are not over-represented. Environments that repeat
+    actions need a policy with action_repeat 1.
+    """
+    wanted = np.array([(episodes + index) // envs.num_envs for index in range(envs.num_envs)])
+    envs.seed(seed)
+    observations, begins = envs.reset(), np.ones(envs.num_envs, dtype=np.bool_)
+    policy.reset(envs.num_envs)
+    records: list[list[dict]] = [[] for _ in wanted]
+    while any(len(done) < count for done, count in zip(records, wanted, strict=True)):
+        observations, _, begins, infos = envs.step(policy.act(np.asarray(observations), begins))
+        for index in np.flatnonzero(begins):
+            if len(records[index]) < wanted[index]:
+                records[index].append(infos[index])
+    return [record for one in records for record in one]
+
+
+def mean_figures(records: list[dict[str, Any]]) -> dict[str, float]:
+    """Means over episodes of return, length and every number in the last info."""
+    figures = {
+        "return": float(np.mean([record["episode"]["r"] for record in records])),
+        "length": float(np.mean([record["episode"]["l"] for record in records])),
+    }
+    for name, value in records[0].items():
+        if isinstance(value, bool | int | float | np.number | np.bool_):
+            figures[name] = float(np.mean([float(record[name]) for record in records]))
+    return figures
+
+
+def _append_row(file: Path, row: dict[str, float]) -> None:
+    begins = not file.exists()
+    with file.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if begins:
+            writer.writeheader()
+        writer.writerow({name: f"{value:g}" if name != "steps" else value for name, value in row.items()})
+
+
+def _forget_rows_after(file: Path, steps: int) -> None:
+    """Drop rows that a killed run wrote after its last checkpoint: they will be evaluated again."""
+    if not file.exists():
+        return
+    header, *rows = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    kept = [row for row in rows if row.endswith("\n") and int(row.split(",", 1)[0]) <= steps]
+    write_file(file, "".join([header, *kept]))
+
+
+# ---- atomic writes: under another name, synced, then renamed ---------------------------------------------------------
+
+UNFINISHED = ".unfinished"
+
+
+def write_folder(parent: Path, name: str, fill: Callable[[Path], None]) -> Path:
+    """Let `fill` write the files of a new folder, which gets its name when all are on the disk.
+
+    After a kill at any moment the folder is complete or absent; the next call removes an unfinished one.
+    """
+    parent.mkdir(parents=True, exist_ok=True)
+    for leftover in parent.glob(f"*{UNFINISHED}"):
+        shutil.rmtree(leftover)
+    unfinished, finished = parent / f"{name}{UNFINISHED}", parent / name
+    unfinished.mkdir()
+    fill(unfinished)
+    for file in unfinished.iterdir():
+        _sync(file)
+    _sync(unfinished)
+    if finished.exists():
+        _remove(finished)
+    os.replace(unfinished, finished)
+    _sync(parent)
+    return finished
+
+
+def write_file(file: Path, text: str) -> None:
+    """Write a file atomically."""
+    unfinished = file.with_name(file.name + UNFINISHED)
+    unfinished.write_text(text, encoding="utf-8")
+    _sync(unfinished)
+    os.replace(unfinished, file)
+
+
+def whole_folders(parent: Path) -> list[Path]:
+    """The finished folders, in the order of their names."""
+    return sorted(path for path in parent.glob("*") if path.is_dir() and path.suffix != UNFINISHED)
+
+
+def keep_newest(parent: Path, count: int) -> None:
+    """Remove all but the last `count` folders."""
+    for old in whole_folders(parent)[:-count]:
+        _remove(old)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder; it is renamed first, so that no incomplete folder has its name."""
+    doomed = folder.with_name(f"{folder.name}.old{UNFINISHED}")
+    os.replace(folder, doomed)
+    shutil.rmtree(doomed)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -8,16 +8,62 @@ confidence bound.
 
 from collections.abc import Callable
 
+import gymnasium as gym
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
+from agents.scoring.site_agent import SiteFacts, SiteProcess
+from surgsim_env.palpation.lesion_estimator import EXCESS_SPREAD
+
+# Bound of a feature; expected excess is some 3 spreads at most.
+FEATURE_BOUND = 10.0
 # Initial score = SHARPNESS x (expected excess + CURIOSITY x deviation), both in units of the prior's deviation.
 SHARPNESS = 6.0
 CURIOSITY = 3.0
 WIDTH = 16
 # Score of an excluded site: probability 0, but finite, as the entropy requires.
 CLOSED_SCORE = -1e4
+
+
+class SiteBelief:
+    """Belief maps at the n x n sites of a chart's grid, row by row along its second axis: the observation of a policy.
+
+    They are the expected excess and its uncertainty, as the searches gp_* of agents/site_search.py have them.
+    """
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
+    def __init__(self, facts: SiteFacts) -> None:
+        self.facts, self.site_count = facts, facts.site_count
+        self.process = SiteProcess(facts)
+
+    @property
+    def space(self) -> gym.spaces.Box:
+        """Of the features."""
+        return gym.spaces.Box(-FEATURE_BOUND, FEATURE_BOUND, (3 * self.site_count**2 + 1,), dtype=np.float32)
+
+    def features(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Expected excess and its deviation over the prior's, visited sites, share of presses left, (m, 3 n n + 1).
+
+        Args:
+            observations: of SurgSim/PalpateSites-v0 with memory, shape (m, n_observation).
+        """
+        return np.stack([self._features(observation) for observation in np.asarray(observations, dtype=np.float64)])
+
+    def _features(self, observation: NDArray[np.float64]) -> NDArray[np.float32]:
+        belief, slices = self.process.belief(observation), self.facts.slices
+        maps = np.concatenate([belief.excess, belief.spread]) / EXCESS_SPREAD
+        bounded = np.clip(maps, -FEATURE_BOUND, FEATURE_BOUND)
+        rest = [observation[slices[name]] for name in ("pressed_map", "presses_left")]
+        return np.concatenate([bounded, *rest]).astype(np.float32)
+
+    def action(self, site: int | NDArray[np.integer]) -> NDArray[np.float32]:
+        """The environment's action that presses a site, shape (..., 2)."""
+        row, column = np.divmod(np.asarray(site), self.site_count)
+        return np.stack([column, row], axis=-1).astype(np.float32) * (2.0 / (self.site_count - 1)) - 1.0
 
 
 class SiteScores(nn.Module):

@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown
+from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.renderer import OrganRenderer
-from surgsim_env.rendering.window import Window
 from surgsim_env.tasks.declaration import documentation
 from surgsim_env.tasks.task import Task
 
@@ -86,8 +84,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         # The modes that this machine offers; the class names all that there are.
         self.metadata = self._view.metadata()  # type: ignore[misc]
         self.task = task
-        bounds = task.bounds(self.simulation.instrument)
-        self._low, self._high = bounds.low.astype(np.float32), bounds.high.astype(np.float32)
+        self._low, self._high = (side.astype(np.float32) for side in task.bounds(self.simulation.instrument))
         self._eye: EpisodeView | None = None
         if obs_mode == "rgb":
             sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_force": False}
@@ -119,8 +116,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             )
         self._take(values)
         self._begun = self._running = True
-        rewards = dict.fromkeys(self.task.weights, 0.0)
-        info = self._info("", saturated, self.task.blank_info(), rewards)
+        info = self._info("", saturated, self.task.info(None, ""), dict.fromkeys(self.task.weights, 0.0))
         self._show()
         return self._observed(), info
 
@@ -226,7 +222,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
         arrays["observation"] = self._observation.copy()
         arrays["running"] = np.array(self._running)
-        return packed(arrays)
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **arrays)
+        return buffer.getvalue()
 
     def load_state(self, state: bytes) -> None:
         """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene.
@@ -292,7 +290,14 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self._view.show(self._shown())
 
     def _maker(self) -> str:
-        return fingerprint(type(self).__name__, self.simulation)
+        """What a saved state must agree with: the kind of environment, its scene and mesh, the rates."""
+        scene, mesh = self.scene, self.simulation.anatomy.mesh
+        digest = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
+        digest = zlib.crc32(repr(replace(scene, folder=Path())).encode(), digest)
+        return (
+            f"{type(self).__name__} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
+            f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest:08x})"
+        )
 
     def _checked(self, action: Action | FloatArray) -> FloatArray:
         values = np.asarray(action, dtype=np.float64)
@@ -330,15 +335,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         }
 
 
-def packed(arrays: dict[str, np.ndarray]) -> bytes:
-    """Arrays in numpy's own format; nothing in it is executed."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()
-
-
 def unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
-    """The arrays of `packed`, whose entry `made_by` must be this one.
+    """The arrays of a saved state, whose entry `made_by` must be this one.
 
     Raises:
         ValueError: bytes that are no saved state, or one that another environment made (names both).
@@ -352,17 +350,6 @@ def unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
     if maker != made_by:
         raise ValueError(f"the state was saved by {maker}, this is {made_by}: use the same scene")
     return arrays
-
-
-def fingerprint(kind: str, simulation: Simulation) -> str:
-    """What a saved state must agree with: the kind of environment, its scene and mesh, the rates."""
-    scene, mesh = simulation.anatomy.scene, simulation.anatomy.mesh
-    digest = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
-    digest = zlib.crc32(repr(replace(scene, folder=Path())).encode(), digest)
-    return (
-        f"{kind} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
-        f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest:08x})"
-    )
 
 
 def check_entries(arrays: dict[str, np.ndarray], shapes: dict[str, tuple[int, ...]]) -> None:

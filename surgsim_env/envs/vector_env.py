@@ -3,6 +3,7 @@
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
@@ -107,17 +108,12 @@ class LaneVectorEnv(SyncVectorEnv):
         super().close_extras(**kwargs)
 
 
-# Vector environments that were made, by the environment of their lanes.
-_VECTOR_CLASSES: dict[type[SurgicalEnv], type[LaneVectorEnv]] = {}
-
-
+@cache
 def vector_class(single: type[SurgicalEnv]) -> type[LaneVectorEnv]:
     """The vector environment of an environment class."""
-    if single in _VECTOR_CLASSES:
-        return _VECTOR_CLASSES[single]
     name = single.__name__.removesuffix("Env") + "VectorEnv"
     told = {"single": single, "__module__": single.__module__, "__doc__": single.__doc__}
-    return _VECTOR_CLASSES.setdefault(single, type(name, (LaneVectorEnv,), told))
+    return type(name, (LaneVectorEnv,), told)
 
 
 def __getattr__(name: str) -> Any:

@@ -19,10 +19,10 @@ from surgsim_env.scripting.steps import (
     Step,
     StepFailed,
     Until,
+    View,
     WaitUntil,
 )
 from surgsim_env.scripting.trace import StepInterval, Trace
-from surgsim_env.scripting.view import View
 
 __all__ = [
     "AwaitEnd",

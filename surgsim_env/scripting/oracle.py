@@ -1,13 +1,12 @@
 """Oracles: scripts that know the truth and solve each task, as a bound on what an environment allows."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import gymnasium as gym
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from msdm_core.organ.support import Support
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.scene.anatomy import Anatomy
@@ -25,7 +24,6 @@ from surgsim_env.scripting.steps import (
     Step,
     Until,
 )
-from surgsim_env.scripting.view import View
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.retract import RetractTask, lifted_box
@@ -86,6 +84,8 @@ def oracle_script(env: gym.Env) -> list[Step]:
             return list(inner.task.oracle(inner.simulation))
         for kind in type(inner.task).__mro__:
             if kind in ORACLES:
+                if inner.task.drawn is None:
+                    raise ValueError("an oracle solves an episode, and none has begun: call env.reset(seed=...)")
                 return ORACLES[kind](inner.task, inner.simulation)
     known = ", ".join(kind.__name__ for kind in ORACLES)
     raise ValueError(
@@ -96,10 +96,8 @@ def oracle_script(env: gym.Env) -> list[Step]:
 
 def palpate_oracle(task: PalpateTask, simulation: Simulation) -> list[Step]:
     """Rise, go over the lesion, press gently along the surface's normal, hold and declare."""
-    lesion = task.lesion
-    if lesion is None or lesion.centre is None:
-        raise ValueError("the oracle presses on the lesion of an episode, and none has begun: call env.reset(seed=...)")
-    anatomy = simulation.anatomy
+    lesion, anatomy = task.lesion, simulation.anatomy
+    assert lesion is not None and lesion.centre is not None
     scene, approach = anatomy.scene, anatomy.face.approach
     site, normal = anatomy.face.project(lesion.centre)
     start = simulation.instrument.tip_position
@@ -118,21 +116,30 @@ def palpate_oracle(task: PalpateTask, simulation: Simulation) -> list[Step]:
 
 def retract_oracle(task: RetractTask, simulation: Simulation) -> list[Step]:
     """Grasp the free edge beside the target, fold the lobe back and wait for success."""
-    target = task.target
-    if target is None:
-        raise ValueError("the oracle uncovers the target of an episode, and none has begun: call env.reset(seed=...)")
+    assert task.target is not None
     return [
-        *retraction_steps(simulation, target.centre, task.turning_size, lambda _: task.goal_count >= SEEN_STEPS),
+        *retraction_steps(simulation, task.target.centre, task.turning_size, lambda _: task.goal_count >= SEEN_STEPS),
         AwaitEnd(10.0, name="keep it open"),
     ]
 
 
 def bimanual_oracle(task: BimanualRetractTask, simulation: Simulation) -> list[Step]:
-    """Fold the lobe back with the left arm, reach under it with the right one and press on the target."""
-    radius = simulation.anatomy.scene.instrument.tip_radius
-    if task.target is None:
-        raise ValueError("the oracle touches the target of an episode, and none has begun: call env.reset(seed=...)")
-    return bimanual_steps(simulation, task.target.centre, task.turning_size, radius)
+    """Fold the lobe back with the left arm, however much is seen; reach under it with the right one and press."""
+    assert task.target is not None
+    target, radius = task.target.centre, simulation.anatomy.scene.instrument.tip_radius
+    edge = float(simulation.organ_model.node_rest_position[:, 1].max())
+    x, y, z = target.tolist()
+    over = (x, y, z + radius + OVER)
+    right = [
+        MoveTo((x + BEFORE[0], edge + BEFORE[1], BEFORE[2]), tolerance=0.001, name="come to its mouth"),
+        MoveTo((x + MOUTH[0], y + MOUTH[1], MOUTH[2]), REACHING_SPEED, 0.001, name="reach under"),
+        MoveTo(over, REACHING_SPEED, name="stand over the target"),
+        PressSupport(PRESSING_FORCE, over, name="touch it"),
+    ]
+    left = retraction_steps(
+        simulation, target, task.turning_size, lambda _: False, aside=BESIDE, fold=FOLD_SHARE, lift=LIFT_SHARE
+    )
+    return [*(MayEnd(OfArm(step, "left")) for step in left), *(MayEnd(OfArm(step, "right")) for step in right)]
 
 
 # An oracle for each shipped task.
@@ -190,7 +197,7 @@ def flap_steps(
     box, surface = lifted_box(scene.retract, rest), simulation.anatomy.mesh.boundary_triangles
     free = surface[~np.isin(surface, simulation.anatomy.anchors).all(axis=1)]
     place, sides = edge_section(simulation.organ_state.node_position, free, along, float(box[0][1]))
-    bed = max((float(one.reach(np.array([0.0, 1.0, 0.0]))) for one in scene.supports), default=-math.inf)
+    bed = max((float(one.reach(OUTWARD)) for one in scene.supports), default=-math.inf)
     jaw = np.asarray(scene.instrument.tip_direction or (0.0, -1.0, 0.0))
     jaw = jaw / np.linalg.norm(jaw)
     # Across the jaw, which points along the middle of the edge.
@@ -210,14 +217,10 @@ def flap_steps(
         MayEnd(
             Until(
                 MoveTo(_point(risen), FLAP_SPEED, 0.001, _turn(TURN_RATE * lift, turning_size), name="lift"),
-                lambda view: enough(view) or _about_to_slip(view),
+                lambda view: enough(view) or (view.grasp is not None and view.grasp.friction_left < FRICTION_KEPT),
             )
         ),
     ]
-
-
-def _about_to_slip(view: View) -> bool:
-    return view.grasp is not None and view.grasp.friction_left < FRICTION_KEPT
 
 
 def _turn(angle: float, size: int) -> float | tuple[float, ...]:
@@ -301,7 +304,10 @@ def retraction_steps(
     along = float(target[0]) + aside
     near = edge & (np.abs(rest[:, 0] - along) <= GRASP_DEPTH)
     _, border, height = nodes[near].mean(axis=0).tolist()
-    bed = _reach_of_supports(simulation.anatomy.scene.supports, border)
+    # How far along y the supports reach that end before the edge [m].
+    supports = simulation.anatomy.scene.supports
+    reaches = (support.reach(OUTWARD) for support in supports if support.kind != "plane")
+    bed = max((reach for reach in reaches if reach < border), default=-math.inf)
     grasp = (along, max(border - GRASP_DEPTH, bed + SUPPORT_GAP + PAD_REACH), height)
     waiting = (along, border + WAITING_GAP, height)
     turns = [_turn(angle, turning_size) for angle in (TURNS[0], fold * TURNS[1])]
@@ -314,33 +320,3 @@ def retraction_steps(
         MayEnd(Until(MoveTo(risen, CARRYING_SPEED, 0.002, turns[0], name="lift"), enough)),
         MayEnd(Until(MoveTo(folded, CARRYING_SPEED, 0.001, turns[1], name="fold"), enough)),
     ]
-
-
-def _reach_of_supports(supports: Sequence[Support], border: float) -> float:
-    """How far along y the supports reach that end before a place [m]."""
-    reaches = (support.reach(OUTWARD) for support in supports if support.kind != "plane")
-    return max((reach for reach in reaches if reach < border), default=-math.inf)
-
-
-def bimanual_steps(simulation: Simulation, target: FloatArray, turning_size: int, tip_radius: float) -> list[Step]:
-    """Fold the lobe back beside a target [m] (3,), all the way however much is seen, go under it, press on it.
-
-    Args:
-        simulation: at rest, with a pair of arms on the free side, the left jaw open.
-        target: on the bed.
-        turning_size: entries of an arm's turning.
-        tip_radius: of the right tip [m].
-    """
-    edge = float(simulation.organ_model.node_rest_position[:, 1].max())
-    x, y, z = target.tolist()
-    over = (x, y, z + tip_radius + OVER)
-    right = [
-        MoveTo((x + BEFORE[0], edge + BEFORE[1], BEFORE[2]), tolerance=0.001, name="come to its mouth"),
-        MoveTo((x + MOUTH[0], y + MOUTH[1], MOUTH[2]), REACHING_SPEED, 0.001, name="reach under"),
-        MoveTo(over, REACHING_SPEED, name="stand over the target"),
-        PressSupport(PRESSING_FORCE, over, name="touch it"),
-    ]
-    left = retraction_steps(
-        simulation, target, turning_size, lambda _: False, aside=BESIDE, fold=FOLD_SHARE, lift=LIFT_SHARE
-    )
-    return [*(MayEnd(OfArm(step, "left")) for step in left), *(MayEnd(OfArm(step, "right")) for step in right)]

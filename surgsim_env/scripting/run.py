@@ -1,18 +1,18 @@
 """Run a script in an environment and record it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.coupling.haptic_record import HapticRecord
+from surgsim_env.coupling.simulation import HapticRecord, Simulation
 from surgsim_env.envs.surgical_env import SurgicalEnv
-from surgsim_env.scripting.steps import Control, MayEnd, Script, Step, StepFailed
+from surgsim_env.instruments.arm.pair import SIDES, Pair
+from surgsim_env.scripting.steps import Action, Control, MayEnd, Script, Step, StepFailed, View
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
-from surgsim_env.scripting.view import Action, View, look
 from surgsim_env.tasks.task import Task
 
 
@@ -45,9 +45,14 @@ def run_script(
         ValueError: an empty script, two steps of one name, a speed or an action beyond what the environment takes.
     """
     inner = _inner(env)
+    task: Task = inner.task
     names = _names(script)
-    task = _scripted(inner)
-    _check_speeds(script, names, task)
+    for step, name in zip(script, names, strict=True):
+        if step.speed > task.speed_limit * (1.0 + 1e-9):
+            raise ValueError(
+                f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
+                f"{task.speed_limit:g} m/s: ask for that or less"
+            )
     if seed is not None:
         observation, _ = env.reset(seed=seed)
     elif observation is None:
@@ -104,13 +109,11 @@ class _Run:
                 self._take(action, name, checked=not isinstance(step, Control))
                 view = self._look(began, first)
                 if self.terminated or self.truncated:
-                    meant = (
-                        step.ends_episode
-                        and not self._harm()
-                        and (last or (isinstance(step, MayEnd) and self._succeeded()))
-                    )
-                    self.ended = meant
-                    return "" if meant else f"{self._harm() or self._cut_short()}; {view.reached()}"
+                    harm = self._harm()
+                    allowed = last or (isinstance(step, MayEnd) and bool(self.infos[-1].get("success")))
+                    self.ended = step.ends_episode and not harm and allowed
+                    cut = "was cut short: the episode is over" + (", its time is up" if self.truncated else "")
+                    return "" if self.ended else f"{harm or cut}; {view.reached()}"
                 action = plan.send(view)
         except StopIteration:
             return ""
@@ -144,9 +147,27 @@ class _Run:
         )
 
     def _look(self, began: float, first: int) -> View:
+        """The view now; the step of the script began at a time [s], with a number of recorded haptic steps."""
         simulation, touched = self.inner.simulation, self.record.first_contact(first)
-        place = None if touched is None else self.record.tip_position_at(touched)
-        return look(simulation, self.task, self.observation, self.inner.task_observation, began, place)
+        instrument = simulation.instrument
+        view = View(
+            time=simulation.time,
+            step_time=simulation.time - began,
+            control_step=simulation.anatomy.scene.timing.control_step,
+            observation=np.array(self.observation),
+            tip_position=instrument.tip_position,
+            tip_velocity=instrument.tip_velocity,
+            true_force=simulation.contact_force,
+            # As no wrapper or picture has changed it.
+            sensed_force=self.task.sensed_force(self.inner.task_observation),
+            contact_position=None if touched is None else self.record.tip_position_at(touched),
+            approach=simulation.anatomy.face.approach.copy(),
+            grasp=simulation.grasp,
+            task=self.task,
+        )
+        if not isinstance(instrument, Pair):
+            return view
+        return replace(view, arms={side: _of_arm(view, simulation, instrument, side) for side in SIDES})
 
     def _take(self, action: Action, name: str, *, checked: bool) -> None:
         values = np.asarray(action, dtype=np.float32)
@@ -164,9 +185,6 @@ class _Run:
         self.rewards.append(float(reward))
         self.infos.append(dict(info))
 
-    def _succeeded(self) -> bool:
-        return bool(self.infos[-1].get("success"))
-
     def _harm(self) -> str:
         """The fault, the tear or the force limit that ended the episode; "" for none."""
         info = self.infos[-1]
@@ -179,27 +197,36 @@ class _Run:
         force = max(info["force_peak"], info.get("touch_force", 0.0))
         return f"passed the hard force limit ({force:.3f} N)" if info.get("hard_limit") else ""
 
-    def _cut_short(self) -> str:
-        return "was cut short: the episode is over" + (", its time is up" if self.truncated else "")
+
+def _of_arm(view: View, simulation: Simulation, pair: Pair, side: str) -> View:
+    """The view as one arm of a pair has it; its force is not sensed apart."""
+    arm, force = pair.arms[side], pair.contact_force(side, simulation.contact_wrench)
+    supports = simulation.anatomy.scene.supports
+    return replace(
+        view,
+        tip_position=arm.tip_position,
+        tip_velocity=arm.tip_velocity,
+        true_force=force,
+        sensed_force=force.copy(),
+        grasp=view.grasp if arm.jaw is not None else None,
+        support_force=max((pair.touch_force(side, support.name) for support in supports), default=0.0),
+        arm=side,
+    )
 
 
 def _inner(env: gym.Env) -> SurgicalEnv:
+    """The environment itself, which a script can command."""
     if isinstance(env, gym.vector.VectorEnv):
         raise TypeError("a script runs in one environment, not in several abreast: make one with gym.make")
     inner = env.unwrapped
     if not isinstance(inner, SurgicalEnv):
         raise TypeError(f'{type(inner).__name__} is no environment of this project: use gym.make("SurgSim/Palpate-v0")')
-    return inner
-
-
-def _scripted(inner: SurgicalEnv) -> Task:
-    task: Task = inner.task
-    if "velocity" not in task.action_slices or "contact_force" not in task.observation_slices:
+    if "velocity" not in inner.task.action_slices or "contact_force" not in inner.task.observation_slices:
         raise TypeError(
-            f"{type(task).__name__} cannot be scripted: steps command `velocity` and sense `contact_force`; declare a "
-            "command and a channel of these names"
+            f"{type(inner.task).__name__} cannot be scripted: steps command `velocity` and sense `contact_force`; "
+            "declare a command and a channel of these names"
         )
-    return task
+    return inner
 
 
 def _names(script: Sequence[Step]) -> list[str]:
@@ -218,12 +245,3 @@ def _names(script: Sequence[Step]) -> list[str]:
             raise ValueError(f"two steps are called {step.name!r}; the trace is cut by names: give each its own")
         names.append(f"{base} {count + 1}" if count else base)
     return names
-
-
-def _check_speeds(script: Sequence[Step], names: Sequence[str], task: Task) -> None:
-    for step, name in zip(script, names, strict=True):
-        if step.speed > task.speed_limit * (1.0 + 1e-9):
-            raise ValueError(
-                f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
-                f"{task.speed_limit:g} m/s: ask for that or less"
-            )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -118,15 +118,30 @@ class Trace:
         """Write haptic rate to `path` and control rate beside it (`run.csv`, `run_control.csv`); both paths.
 
         Columns name their units; numbers are written in full, so that reading them gives the same bits.
+
+        Raises:
+            ValueError: the path does not end in ".csv".
         """
-        return write_csv(self, Path(path))
+        path = Path(path)
+        if path.suffix != ".csv":
+            raise ValueError(
+                f'{str(path)!r} does not end in ".csv"; a second table is written beside it: name it run.csv'
+            )
+        beside = path.with_name(f"{path.stem}_control.csv")
+        _write(path, _haptic_rows(self))
+        _write(beside, _control_rows(self))
+        return path, beside
 
     def plot(self, where: str | Path | tuple[Axes, Axes]) -> None:
         """Draw force and depth over time, the steps marked: into a picture file, or into two axes of your own."""
         if isinstance(where, str | Path):
-            write_picture(self, Path(where))
+            from matplotlib.figure import Figure
+
+            figure = Figure(figsize=(10.0, 5.6), dpi=110, facecolor="white", layout="constrained")
+            _draw(self, *figure.subplots(2, 1, sharex=True, height_ratios=(1.25, 1.0)))
+            figure.savefig(where)
         else:
-            draw(self, *where)
+            _draw(self, *where)
 
     def step_names(self, times: FloatArray) -> list[str]:
         """The step of the script that each time [s] belongs to."""
@@ -166,66 +181,32 @@ POSE_COLUMNS = ("tip_x_m", "tip_y_m", "tip_z_m", "tip_qw", "tip_qx", "tip_qy", "
 WRENCH_COLUMNS = ("force_x_N", "force_y_N", "force_z_N", "torque_x_Nm", "torque_y_Nm", "torque_z_Nm")
 
 
-def write_csv(trace: Trace, path: Path) -> tuple[Path, Path]:
-    """Write both tables of a trace; returns their paths.
-
-    Raises:
-        ValueError: the path does not end in ".csv".
-    """
-    if path.suffix != ".csv":
-        raise ValueError(f'{str(path)!r} does not end in ".csv"; a second table is written beside it: name it run.csv')
-    beside = path.with_name(f"{path.stem}_control.csv")
-    _write(path, haptic_columns(trace), haptic_rows(trace))
-    _write(beside, control_columns(trace), control_rows(trace))
-    return path, beside
-
-
-def haptic_columns(trace: Trace) -> list[str]:
-    """Time, step, pose, depth, size of the total force, and a wrench for each tool."""
+def _haptic_rows(trace: Trace) -> Iterator[list]:
+    """The columns' names, then a row for each haptic step."""
     wrenches = [f"{tool}_{column}" for tool in trace.tool_names for column in WRENCH_COLUMNS]
-    return ["time_s", "step", *POSE_COLUMNS, "depth_m", "force_size_N", *wrenches]
-
-
-def haptic_rows(trace: Trace) -> Iterable[list]:
-    """One row a haptic step."""
+    yield ["time_s", "step", *POSE_COLUMNS, "depth_m", "force_size_N", *wrenches]
     names, sizes = trace.step_names(trace.haptic_time), trace.force_size.tolist()
     for row, time in enumerate(trace.haptic_time.tolist()):
         pose = [*trace.tip_position[row].tolist(), *trace.tip_orientation[row].tolist()]
         yield [time, names[row], *pose, float(trace.depth[row]), sizes[row], *trace.wrench[row].ravel().tolist()]
 
 
-def control_columns(trace: Trace) -> list[str]:
-    """Time, step, each entry of observation (none of a picture) and action, reward, the info's entries by name."""
-    observation = [f"observation_{index}" for index in range(_numbers(trace).shape[1])]
-    action = [f"action_{index}" for index in range(trace.action.shape[1])]
-    return ["time_s", "step", *observation, *action, "reward", *sorted(trace.info)]
-
-
-def control_rows(trace: Trace) -> Iterable[list]:
-    """One row a control step."""
-    names, keys, numbers = trace.step_names(trace.control_time), sorted(trace.info), _numbers(trace)
+def _control_rows(trace: Trace) -> Iterator[list]:
+    """The columns' names, then a row for each control step; observations that are pictures are left out."""
+    pictures = trace.observation.ndim != 2
+    observed = np.zeros((len(trace.observation), 0)) if pictures else trace.observation
+    parts = {"observation": observed, "action": trace.action}
+    entries = [f"{part}_{index}" for part, values in parts.items() for index in range(values.shape[1])]
+    names, keys = trace.step_names(trace.control_time), sorted(trace.info)
+    yield ["time_s", "step", *entries, "reward", *keys]
     for row, time in enumerate(trace.control_time.tolist()):
-        info = [trace.infos[row].get(key, "") for key in keys]
-        yield [
-            time,
-            names[row],
-            *numbers[row].tolist(),
-            *trace.action[row].tolist(),
-            float(trace.reward[row]),
-            *info,
-        ]
+        values = [*observed[row].tolist(), *trace.action[row].tolist(), float(trace.reward[row])]
+        yield [time, names[row], *values, *(trace.infos[row].get(key, "") for key in keys)]
 
 
-def _numbers(trace: Trace) -> NDArray[np.floating]:
-    """Observations (m, n_obs); (m, 0) where they are pictures."""
-    return trace.observation if trace.observation.ndim == 2 else np.zeros((len(trace.observation), 0))
-
-
-def _write(path: Path, columns: list[str], rows: Iterable[list]) -> None:
+def _write(path: Path, rows: Iterator[list]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 # ---- picture -------------------------------------------------------------------------------------------------------
@@ -235,31 +216,23 @@ FORCE, DEPTH, INK, BAND = "#b5322a", "#2b5f8a", "#20242c", "#eef1f5"
 NARROW = 0.12
 
 
-def write_picture(trace: Trace, path: Path) -> None:
-    """Write the picture of a trace to a file; its ending says which kind."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 5.6), dpi=110, facecolor="white", layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.25, 1.0))
-    draw(trace, upper, lower)
-    figure.savefig(path)
-
-
-def draw(trace: Trace, force: Axes, depth: Axes) -> None:
-    """Draw the force [N] into one pair of axes and the depth [mm] into another, the steps as bands with names."""
+def _draw(trace: Trace, force: Axes, below: Axes) -> None:
+    """Draw forces [N] above, depth [mm] or the visible share [%] of a retraction's target below; steps as bands."""
     if "visible" in trace.info:
-        _draw_retraction(trace, force, depth)
-        return
-    force.plot(trace.haptic_time, trace.force_size, color=FORCE, linewidth=1.3)
-    force.set_ylabel("contact force [N]")
-    force.set_ylim(0.0, max(1.15 * trace.peak_force, 0.01))
-    depth.plot(trace.haptic_time, trace.depth * 1e3, color=DEPTH, linewidth=1.3)
-    depth.axhline(0.0, color=INK, linewidth=0.6, linestyle=":")
-    depth.set_ylabel("depth past contact [mm]")
-    depth.set_xlabel("time since the reset [s]")
-    if len(trace.haptic_time):
-        depth.set_xlim(trace.start, float(trace.haptic_time[-1]))
-    _mark_steps(trace, force, depth)
+        ends = trace.control_time
+        _draw_retraction(trace, force, below)
+    else:
+        ends = trace.haptic_time
+        force.plot(trace.haptic_time, trace.force_size, color=FORCE, linewidth=1.3)
+        force.set_ylabel("contact force [N]")
+        force.set_ylim(0.0, max(1.15 * trace.peak_force, 0.01))
+        below.plot(trace.haptic_time, trace.depth * 1e3, color=DEPTH, linewidth=1.3)
+        below.axhline(0.0, color=INK, linewidth=0.6, linestyle=":")
+        below.set_ylabel("depth past contact [mm]")
+    below.set_xlabel("time since the reset [s]")
+    if len(ends):
+        below.set_xlim(trace.start, float(ends[-1]))
+    _mark_steps(trace, force, below)
     if trace.failure:
         force.set_xlabel(trace.failure, color=FORCE, fontsize=8, wrap=True)
 
@@ -277,11 +250,6 @@ def _draw_retraction(trace: Trace, force: Axes, seen: Axes) -> None:
     seen.plot(trace.control_time, 100.0 * share, color=INK, linewidth=1.3)
     seen.set_ylabel("target seen [%]")
     seen.set_ylim(-3.0, 103.0)
-    seen.set_xlabel("time since the reset [s]")
-    seen.set_xlim(trace.start, float(trace.control_time[-1]))
-    _mark_steps(trace, force, seen)
-    if trace.failure:
-        force.set_xlabel(trace.failure, color=FORCE, fontsize=8, wrap=True)
 
 
 def _mark_steps(trace: Trace, force: Axes, depth: Axes) -> None:

@@ -51,9 +51,7 @@ class Command:
     size_text: str = "by the scene"
 
     def __post_init__(self) -> None:
-        _check_name("command", self.name)
-        _check_size("command", self.name, self.size)
-        _check_meaning("command", self.name, self.meaning)
+        _check_part("command", self, self.size)
         if not 0.0 < self.scale < math.inf:
             raise ValueError(
                 f"command {self.name!r}: scale is {self.scale!r}; it is the SI value of an entry of 1: give a finite "
@@ -92,9 +90,7 @@ class Channel:
     bounds_text: str = "by the scene"
 
     def __post_init__(self) -> None:
-        _check_name("channel", self.name)
-        _check_size("channel", self.name, self.size)
-        _check_meaning("channel", self.name, self.meaning)
+        _check_part("channel", self, self.size)
         if not callable(self.read):
             raise ValueError(
                 f"channel {self.name!r}: read is {self.read!r}; it must be a function (task, simulation) that returns "
@@ -164,8 +160,7 @@ class Reward:
     value: Callable[[Any, Any], float] | None = None
 
     def __post_init__(self) -> None:
-        _check_name("reward", self.name)
-        _check_meaning("reward", self.name, self.meaning)
+        _check_part("reward", self)
         if not math.isfinite(self.weight):
             raise ValueError(f"reward {self.name!r}: weight is {self.weight!r}; it must be a finite number")
         if self.per not in PERIODS:
@@ -194,20 +189,16 @@ def check_declared(owner: str, what: str, parts: Sequence[Any], kind: type) -> N
             raise ValueError(f"{owner}.{what} has two entries called {name!r}; give each its own name")
 
 
-def _check_name(what: str, name: object) -> None:
-    if not isinstance(name, str) or not name.isidentifier():
-        raise ValueError(f"{what} name {name!r}: it must be a Python identifier such as 'contact_force'")
-
-
-def _check_size(what: str, name: str, size: object) -> None:
-    if callable(size) or (isinstance(size, int) and not isinstance(size, bool) and size > 0):
-        return
-    raise ValueError(f"{what} {name!r}: size is {size!r}; it must be a whole number above 0 or a function of the task")
-
-
-def _check_meaning(what: str, name: str, meaning: object) -> None:
-    if not isinstance(meaning, str) or not meaning.strip():
-        raise ValueError(f"{what} {name!r} has no meaning: say in a few words what it is, for the documentation")
+def _check_part(what: str, part: Any, size: object = 1) -> None:
+    """Check what commands, channels and rewards have in common."""
+    if not isinstance(part.name, str) or not part.name.isidentifier():
+        raise ValueError(f"{what} name {part.name!r}: it must be a Python identifier such as 'contact_force'")
+    if not callable(size) and (isinstance(size, bool) or not isinstance(size, int) or size <= 0):
+        raise ValueError(
+            f"{what} {part.name!r}: size is {size!r}; it must be a whole number above 0 or a function of the task"
+        )
+    if not isinstance(part.meaning, str) or not part.meaning.strip():
+        raise ValueError(f"{what} {part.name!r} has no meaning: say in a few words what it is, for the documentation")
 
 
 # ---- tables -------------------------------------------------------------------------------------------------------

@@ -51,14 +51,6 @@ class Verdict:
     info: dict[str, InfoValue]
 
 
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """Lower and upper bounds of the observation, shape (n_observation,) each; all finite."""
-
-    low: FloatArray
-    high: FloatArray
-
-
 class Task:
     """One episode after another on one anatomy; it reads the simulation and never advances it.
 
@@ -246,14 +238,14 @@ class Task:
         felt = [self.observation_slices[channel.name] for channel, _ in self._observed if channel.felt]
         return [index for part in felt for index in range(part.start, part.stop)]
 
-    def bounds(self, instrument: Instrument | None) -> Bounds:
-        """Bounds of the observation with an instrument, shape (n_observation,) each.
+    def bounds(self, instrument: Instrument | None) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the observation with an instrument, shape (n_observation,) each; all finite.
 
         Raises:
             ValueError: a channel whose bounds are not finite, do not fit its size, or are the wrong way round.
         """
         pairs = [self._channel_bounds(channel, size, instrument) for channel, size in self._observed]
-        return Bounds(np.concatenate([low for low, _ in pairs]), np.concatenate([high for _, high in pairs]))
+        return np.concatenate([low for low, _ in pairs]), np.concatenate([high for _, high in pairs])
 
     def _channel_bounds(
         self, channel: Channel, size: int, instrument: Instrument | None
@@ -433,10 +425,6 @@ class Task:
             "success": end == "success" or any(one.name == end for one in self.rewards if one.per == "success"),
             **self.measures(),
         }
-
-    def blank_info(self) -> dict[str, InfoValue]:
-        """The task's entries of `info` after a reset."""
-        return self.info(None, "")
 
     def measures(self) -> dict[str, InfoValue]:
         """A subclass's own entries of `info`: fixed keys; bools, floats or texts."""

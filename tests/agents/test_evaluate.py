@@ -106,7 +106,7 @@ class MiddleOfAll:
     def reset(self, count: int) -> None:
         """Nothing to forget."""
 
-    def act(self, observations: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    def act(self, observations: np.ndarray) -> np.ndarray:
         return np.zeros((len(observations), 2), dtype=np.float32)
 
 

@@ -10,8 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 import agents
 from agents import press_library
-from agents.press_library import FIRST_SEED, make_library
-from agents.training.press_library import KEPT, PressLibraryEnv, load_library
+from agents.press_library import FIRST_SEED, KEPT, PressLibraryEnv, load_library, make_library
 from surgsim_env.scene.levels import LEVELS
 
 SAMPLE = Path(agents.__file__).parent / "training" / "press_library_sample.npz"

@@ -71,8 +71,9 @@ def test_wrong_configurations_are_refused(tmp_path: Path, change: dict, message:
 
 
 def test_shipped_configurations_are_right():
-    from agents.training.algorithms import algorithm_class, keywords
     from agents.training.config import config_text, read_config
+    from agents.training.policy_files import algorithm_class
+    from agents.training.run import keywords
 
     files = sorted((Path(__file__).parents[2] / "agents" / "configs").glob("*.yaml"))
     assert files
@@ -84,7 +85,8 @@ def test_shipped_configurations_are_right():
 
 
 def test_an_unknown_algorithm_is_answered_with_the_nearest():
-    from agents.training.algorithms import algorithm_class, keywords
+    from agents.training.policy_files import algorithm_class
+    from agents.training.run import keywords
 
     with pytest.raises(ValueError, match="algorithm 'RecurentPPO' is unknown; did you mean 'RecurrentPPO'"):
         algorithm_class("RecurentPPO")
@@ -99,8 +101,8 @@ def test_an_unknown_algorithm_is_answered_with_the_nearest():
 def test_a_run_leaves_checkpoints_curves_and_policies_that_play(tmp_path: Path, algorithm: str):
     from agents.train import train
     from agents.training.environments import make_environments
-    from agents.training.evaluation import play_episodes
     from agents.training.policy_files import load_policy
+    from agents.training.run import play_episodes
 
     settings = config(algorithm)
     assert train(settings, tmp_path) == 320
@@ -126,11 +128,11 @@ import os, signal
 from agents import train
 from agents.training.run import Run
 
-def save_and_die(run, notes, save=Run.save_checkpoint):
-    save(run, notes)
+def save_and_die(run, save=Run.save):
+    save(run)
     os.kill(os.getpid(), signal.SIGKILL)
 
-Run.save_checkpoint = save_and_die
+Run.save = save_and_die
 train.main()
 """
 
@@ -262,7 +264,7 @@ class Counting:
 
 
 def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
-    from agents.training.wrappers import RepeatedAction
+    from agents.training.environments import RepeatedAction
 
     envs = RepeatedAction(Counting(), 4)
     envs.reset()
@@ -275,7 +277,7 @@ def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
 
 
 def test_without_force_blinds_all_that_is_observed():
-    from agents.training.wrappers import WithoutForce
+    from agents.training.environments import WithoutForce
 
     envs = WithoutForce(Counting(), [1])
     assert envs.reset().tolist() == [[0, 0], [0, 0]]
@@ -328,7 +330,7 @@ def test_a_policy_without_its_description_is_refused(tmp_path: Path):
 
 
 def test_folders_are_whole_or_absent(tmp_path: Path):
-    from agents.training.whole_folders import keep_newest, whole_folders, write_folder
+    from agents.training.run import keep_newest, whole_folders, write_folder
 
     def broken(folder: Path) -> None:
         (folder / "half").write_text("half")

@@ -1,6 +1,9 @@
-"""Behaviour cloning: fit the policy of a stable-baselines3 model to observations and the actions taken there.
+"""Imitation: behaviour cloning, and DAgger (Ross, Gordon & Bagnell 2011).
 
-The model is fitted in place, so that reinforcement learning can continue from it:
+Cloning fits the policy of a stable-baselines3 model to observations and the actions taken there. It sees the states
+that the expert visits, but a policy's small errors lead it to others: each round of DAgger adds the states that the
+policy visited, labelled by the expert, and fits the policy to all rounds together. The model is fitted in place, so
+that reinforcement learning can continue from it:
 
     model = PPO("MlpPolicy", envs)
     normalise_by(envs, observations)  # envs is a VecNormalize, or leave it out
@@ -11,13 +14,14 @@ Supported are PPO (any feed-forward policy on flat observations), SAC and sb3-co
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -219,7 +223,8 @@ def _fit(model: BaseAlgorithm, data: dict[str, torch.Tensor], options: CloningOp
 def _validate(model: BaseAlgorithm, data: dict[str, torch.Tensor], rows: NDArray, options: CloningOptions) -> float:
     model.policy.set_training_mode(False)
     parts = np.array_split(rows, math.ceil(len(rows) / options.batch_size))
-    return float(np.average([_loss(model, _rows(data, part), options).item() for part in parts], weights=_sizes(parts)))
+    losses = [_loss(model, _rows(data, part), options).item() for part in parts]
+    return float(np.average(losses, weights=[len(part) for part in parts]))
 
 
 @torch.no_grad()
@@ -241,10 +246,6 @@ def _set_spread(model: BaseAlgorithm, data: dict[str, torch.Tensor], rows: NDArr
 
 def _rows(data: dict[str, torch.Tensor], rows: NDArray) -> dict[str, torch.Tensor]:
     return {name: values[rows] for name, values in data.items()}
-
-
-def _sizes(parts: list[NDArray]) -> list[int]:
-    return [len(part) for part in parts]
 
 
 def _checked(
@@ -281,3 +282,102 @@ def _checked(
         raise ValueError(f"weights go from {data['weight'].min()}; they must not be negative, nor all zero")
     data["weight"] /= data["weight"].mean()
     return data
+
+
+# ---- DAgger ---------------------------------------------------------------------------------------------------------
+
+# Actions (n_env, n_action) for observations (n_env, n_observation); the second argument (n_env,) is true where an
+# episode begins, for an expert with a state.
+Expert = Callable[[NDArray, NDArray[np.bool_]], NDArray]
+
+
+@dataclass(frozen=True)
+class DaggerRound:
+    """Results of a round."""
+
+    index: int
+    expert_share: float
+    sample_count: int  # of all rounds together
+    episode_count: int  # that ended in this round
+    success_share: float  # of those with `success` in their last info; nan without one
+    validation_loss: float
+
+
+def halving(index: int) -> float:
+    """The usual share of the expert's actions: 1, 1/2, 1/4, ..."""
+    return 0.5**index
+
+
+def dagger(
+    envs: VectorEnv,
+    expert: Expert,
+    model: BaseAlgorithm,
+    *,
+    rounds: int,
+    steps: int,
+    expert_share: Callable[[int], float] = halving,
+    disturbance: float = 0.0,
+    normalisation: VecNormalize | None = None,
+    action_weight: ArrayLike = 1.0,
+    options: CloningOptions | None = None,
+    seed: int = 0,
+) -> Iterator[DaggerRound]:
+    """Play and fit in turns; yields each round's results and changes `model` in place.
+
+    Args:
+        envs: with autoreset_mode="SameStep".
+        expert: the imitated policy.
+        model: PPO or SAC.
+        rounds: number of rounds.
+        steps: of each environment in a round.
+        expert_share: function from the round's index to the share of steps in which the expert's action is played.
+        disturbance: standard deviation of noise on the played actions, not on the labels (Laskey et al. 2017, DART), so
+            that the policy can recover from the exploration noise of reinforcement learning.
+        normalisation: recomputed each round from all observations so far.
+        action_weight: shape (n_action,), as `clone` takes it.
+        options: of each fit.
+        seed: of the environments and of the choice of player.
+
+    Raises:
+        ValueError: another autoreset mode, or a recurrent policy.
+    """
+    mode = AutoresetMode(envs.metadata["autoreset_mode"])
+    if mode is not AutoresetMode.SAME_STEP:
+        raise ValueError(f'autoreset_mode is {mode.value!r}; DAgger needs "SameStep"')
+    if is_recurrent(model):
+        raise ValueError("DAgger labels single steps; clone a recurrent policy from whole episodes")
+    rng = np.random.default_rng(seed)
+    seen: list[NDArray] = []
+    labels: list[NDArray] = []
+    observation, _ = envs.reset(seed=seed)
+    begun = np.ones(envs.num_envs, dtype=np.bool_)
+    for index in range(rounds):
+        share = expert_share(index)
+        # Of the episodes that ended in this round; nan where the last info has no `success`.
+        won: list[float] = []
+        for _ in range(steps):
+            wanted = expert(observation, begun)
+            seen.append(observation)
+            labels.append(np.clip(wanted, -1.0, 1.0).astype(np.float32))
+            taken = labels[-1]
+            if share < 1.0:
+                by_expert = rng.random(envs.num_envs) < share
+                shown = observation if normalisation is None else normalisation.normalize_obs(observation)
+                taken = np.where(by_expert[:, None], taken, model.predict(shown, deterministic=True)[0])
+            if disturbance:
+                noise = rng.normal(scale=disturbance, size=taken.shape)
+                taken = np.clip(taken + noise, -1.0, 1.0).astype(np.float32)
+            observation, _, terminated, truncated, info = envs.step(taken)
+            observation, begun = observation.copy(), terminated | truncated
+            final, ended = info.get("final_info", {}), np.flatnonzero(begun)
+            known = final.get("_success", np.full(envs.num_envs, "success" in final))
+            won += [float(final["success"][index]) if known[index] else math.nan for index in ended]
+        observations, actions = np.concatenate(seen), np.concatenate(labels)
+        if normalisation is not None:
+            normalise_by(normalisation, observations)
+        curve = clone(
+            model, observations, actions, action_weight=action_weight, normalisation=normalisation, options=options
+        )
+        told = [one for one in won if not math.isnan(one)]
+        success = float(np.mean(told)) if told else math.nan
+        yield DaggerRound(index, share, len(actions), len(won), success, curve.validation[curve.best])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import eigsh, spsolve
 
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -127,9 +127,10 @@ def punch_stiffness(body: Elements, radius: float) -> float:
     under = (body.place[:, 1] > -1e-12) & (body.place[:, 0] <= radius + 1e-9) & (body.axis == 1)
     displacement = np.where(under, -1.0, 0.0)
     free = np.flatnonzero(~(under | body.held))
-    right = -(body.stiffness @ displacement)[free]
-    displacement[free] = spsolve(body.stiffness[free][:, free].tocsc(), right)
-    return float(displacement @ (body.stiffness @ displacement))
+    stiffness = csc_array(body.stiffness)
+    right = -(stiffness @ displacement)[free]
+    displacement[free] = spsolve(stiffness[free][:, free].tocsc(), right)
+    return float(displacement @ (stiffness @ displacement))
 
 
 def ball_force(body: Elements, radius: float, depth: float, contact_stiffness: float) -> float:
@@ -158,9 +159,9 @@ def ball_force(body: Elements, radius: float, depth: float, contact_stiffness: f
     force = 0.0
     for _ in range(60):
         before = surface.interpolate(displacement)
-        held_off, load = csr_array(stiff.assemble(surface, prev=before)), push.assemble(surface, prev=before)
+        held_off, load = csc_array(stiff.assemble(surface, prev=before)), push.assemble(surface, prev=before)
         # The sum of sparse arrays is typed as their base, which has no indexing.
-        whole = csr_array(body.stiffness + held_off)[free][:, free].tocsc()
+        whole = csc_array(csc_array(body.stiffness) + held_off)[free][:, free].tocsc()
         displacement[free] = np.asarray(spsolve(whole, -load[free]))
         previous, force = force, float((held_off @ displacement + load)[body.axis == 1].sum())
         if abs(force - previous) <= 1e-6 * abs(force):

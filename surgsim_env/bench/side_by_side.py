@@ -15,16 +15,16 @@ SHARE = 0.02
 # A round that takes longer than this [s] is not repeated.
 LONGEST_ROUND = 60.0
 NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] the explicit solver's, the longest that is stable in the press is used
-METHOD = """One press of a frictionless ball of 8 mm, 4 mm deep at 40 mm/s and 0.1 s of rest, on a block of
+METHOD = """One press of a frictionless ball of 8 mm radius, 4 mm deep at 40 mm/s, then 0.1 s of rest, on a block of
 60 x 60 x 30 mm, E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each
 round. `wall` and `processor` are seconds of wall clock and of processor time per simulated second (1 is real time),
-medians; they differ where other processes took the core, and `ratio`, over this project's, is that of processor time.
-What takes longer than a minute a round is not repeated. Force is the mean of two places, over a node of the block's
-middle and half a cell aside; `error` is against axisymmetric quadratic finite elements with small strains:
-{references}. This project presses with its friction of 0.2
-(which a straight press barely feels), through its own contact law, with its instrument in MuJoCo and its force read
-at every haptic step; of a peer the force is read once, at the end. Grids of peers have their nodes on a cubic or
-nearly cubic grid, this project's on a body-centred lattice: as many nodes as the grid allows, not the same ones."""
+medians; they differ where other processes took the core. `ratio` is processor time relative to surgsim. A round that
+takes more than a minute is not repeated. Force is the mean of two places, over a node in the block's middle and half a
+cell to the side; `error` is relative to axisymmetric quadratic finite elements with small strains:
+{references}. surgsim presses with its own contact
+law (friction 0.2, which hardly affects a straight press) and its instrument in MuJoCo, and reads the force in every
+haptic step; the force of the other simulators is read once, at the end. They have nodes on a cubic or nearly cubic
+grid, surgsim on a body-centred lattice: numbers of nodes are similar, positions differ."""
 WALL, PROCESSOR, RATIO = ("wall", "s/s"), ("processor", "s/s"), ("ratio to surgsim", "1")
 FORCE, ERROR = ("force", "N"), ("error", "%")
 
@@ -64,7 +64,7 @@ def measure(effort: Effort) -> Section:
     references = "scikit-fem is absent, no error is given"
     if has_fem():
         references = f"{reference_force(organ_press(effort.organ_cells).contact):.4f} N with this project's contact "
-        references += f"stiffness, {reference_force(RIGID):.4f} N with a rigid one, for the peers"
+        references += f"stiffness, {reference_force(RIGID):.4f} N with a rigid one, for the other simulators"
     section = Section(
         "side_by_side", "Beside MuJoCo flex and Newton", METHOD.format(references=references), closing=LIMITS
     )
@@ -126,7 +126,7 @@ def _figures(tally: Tally, own: Tally) -> list[Figure]:
 
 
 # From running the two that are measured (mujoco 4.0.0, newton 1.8.0), from the others' repositories and threads.
-LIMITS = """### What each can give
+LIMITS = """### What each provides
 
 | simulator | moduli per region | tool force in newtons | Gymnasium environment of a soft organ | source |
 |---|---|---|---|---|
@@ -143,4 +143,4 @@ ScheiklP/sofa_env 85bf7e0 |
 | PyBullet soft bodies | one a body | no: the normal force is always 1 | no | bullet3 #4406, #3326, #4333 |
 | FF-SRL | one a mesh | no | no, two demonstrations | SanoScience/FF-SRL 1036742 |
 
-Only the first four were run here; the others are read from their code and threads, and may have moved since."""
+Only the first four were run here; the others are described from their code and threads, and may have changed since."""

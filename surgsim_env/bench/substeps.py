@@ -20,8 +20,9 @@ CELL = 0.005  # [m]
 # The exponent is that of blocks with at least this number of nodes: in smaller ones calls and start-up dominate.
 LEAST_NODES = 600
 METHOD = """Blocks of cubic 5 mm cells, E 5 kPa, nu 0.45, springs and volume term, no contact, one thread, bottom held,
-slightly sheared so that every force is at work. Microseconds of processor time per substep AND organ; medians, all
-sizes in turn in each round. A node or spring update is one node or spring in one substep."""
+slightly sheared so that no force is zero. Microseconds of processor time per substep and organ; medians, all sizes in
+turn in each round. "Abreast" are organs side by side in lanes. A node or spring update is one node or spring in one
+substep."""
 
 Substep = Callable[[], float]
 

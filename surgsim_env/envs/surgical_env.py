@@ -201,7 +201,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         return self._view.window
 
     def close(self) -> None:
-        """Close the window and give back the graphics; more than once is no harm."""
+        """Close the window and release the graphics; may be called repeatedly."""
         self._view.close()
         if self._eye is not None:
             self._eye.close()
@@ -227,7 +227,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         return buffer.getvalue()
 
     def load_state(self, state: bytes) -> None:
-        """Go on from what `save_state` gave, to the bit, in this or another environment of the same scene.
+        """Restore a state from `save_state`, to the bit, in this or another environment of the same scene.
 
         Raises:
             ValueError: bytes that are no saved state, or one of another scene or mesh (names both).

@@ -173,6 +173,7 @@ def test_a_fault_stops_its_lane_and_no_other():
         assert same(get_lane(both.state, lane), get_lane(whole.state, lane)) == []
 
 
+@pytest.mark.slow  # compiles float32 for rest shapes of their own
 def test_float32_presses_like_float64():
     """Within 0.5 % of the largest force of a press."""
     both, off, largest = Both([drawn(index) for index in range(8)], np.float32), 0.0, 0.0

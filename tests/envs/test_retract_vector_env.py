@@ -89,6 +89,7 @@ def test_a_fault_leaves_the_neighbours_untouched():
         found, expected = spoilt.step(still), whole.step(still)
 
 
+@pytest.mark.slow  # compiles float32 for rest shapes of their own
 def test_single_precision_feels_the_same_force():
     """Over an approach and a grasp: within 0.5 % of the largest force on a finger."""
     exact, fast = side_by_side(), side_by_side(dtype="float32")

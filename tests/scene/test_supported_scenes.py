@@ -196,7 +196,7 @@ def test_pictures_show_the_bed_as_background():
     assert np.isfinite(depth[below]).all()
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
 def test_lobes_side_by_side_rest_as_they_do_alone(dtype):
     """Two lobes pressed aside on their beds: in float64 to the bit, in float32 within 0.5 % of the force."""
     alone, together = [simulation() for _ in range(2)], [simulation() for _ in range(2)]

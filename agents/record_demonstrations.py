@@ -42,7 +42,7 @@ Player = Callable[[gym.Env, int], None]
 
 
 @dataclass
-class Episode:
+class RecordedEpisode:
     """A recorded episode, with one observation and one info more than actions."""
 
     seed: int | None
@@ -79,17 +79,17 @@ class Recorder(gym.Wrapper):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        self.all_episodes: list[Episode] = []
+        self.all_episodes: list[RecordedEpisode] = []
 
     @property
-    def episodes(self) -> list[Episode]:
+    def episodes(self) -> list[RecordedEpisode]:
         """The episodes with at least one step."""
         return [episode for episode in self.all_episodes if episode.actions]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self.all_episodes.append(Episode(seed))
+        self.all_episodes.append(RecordedEpisode(seed))
         self._see(observation, info)
         return observation, info
 
@@ -146,7 +146,7 @@ def play_agent(env: gym.Env, seed: int, agent: Any) -> None:
         over = terminated or truncated
 
 
-def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[Episode]:
+def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[RecordedEpisode]:
     """Play an episode for each seed; returns those that succeeded, or all.
 
     Raises:
@@ -164,7 +164,7 @@ def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: b
 
 
 def write_dataset(
-    episodes: Sequence[Episode], env: gym.Env, name: str, *, algorithm_name: str, author: str = "surgsim"
+    episodes: Sequence[RecordedEpisode], env: gym.Env, name: str, *, algorithm_name: str, author: str = "surgsim"
 ) -> minari.MinariDataset:
     """Write episodes as a Minari dataset with the spec of its environment.
 

@@ -132,7 +132,7 @@ class GpLevelSet(GpVariance):
         return np.minimum(excess + margin - level, level - excess + margin)
 
 
-class Truth:
+class TruthAgent:
     """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %.
 
     It presses the middle of the chart, as the environment asks for presses; `estimate` and `estimate_map` are scored
@@ -155,7 +155,7 @@ class Truth:
         return replace(made, excess=made.lesion.astype(np.float64), outline=made.outline_true)
 
 
-class Middle(Truth):
+class Middle(TruthAgent):
     """The blind guess: one lesion in the middle of the chart, regardless of the presses."""
 
     def estimate(self, task: Any) -> NDArray[np.float64]:
@@ -177,7 +177,7 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "gp_variance": GpVariance,
     "gp_ucb": GpUcb,
     "gp_level_set": GpLevelSet,
-    "truth": Truth,
+    "truth": TruthAgent,
     "middle": Middle,
 }
 

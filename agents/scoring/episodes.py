@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.scoring.site_agent import SiteAgent, site_facts
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
-from surgsim_env.palpation.scores import Figure, MapScore, PalpationRecord, with_intervals
+from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, with_intervals
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 # Actions (n, n_action) for observations (n, n_observation); where the second (n,) is true an episode begins.
 Actor = Callable[[NDArray[Any], NDArray[np.bool_]], NDArray[Any]]
 
 
-class Record(Protocol):
+class EpisodeRecord(Protocol):
     """What is kept of an episode."""
 
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
@@ -28,7 +28,7 @@ class Record(Protocol):
         ...
 
 
-R = TypeVar("R", bound=Record)
+R = TypeVar("R", bound=EpisodeRecord)
 
 
 def make_envs(
@@ -113,7 +113,7 @@ def play_tasks(
 
 def task_figures(
     records: Sequence[TaskRecord], control_step: float, soft_force: float, rng: np.random.Generator
-) -> dict[str, Figure]:
+) -> dict[str, ScoreEstimate]:
     """The figures of a policy, with bootstrap intervals over episodes.
 
     Args:
@@ -187,7 +187,7 @@ def play_sites(
 ) -> list[PalpationRecord]:
     """`play` for baselines, or for one policy in all environments.
 
-    An agent with a method `estimate`, as `agents.site_search.Truth` has it, replaces the estimator.
+    An agent with a method `estimate`, as `agents.site_search.TruthAgent` has it, replaces the estimator.
     """
     singles = envs.unwrapped.envs  # type: ignore[attr-defined]
 

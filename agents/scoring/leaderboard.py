@@ -7,7 +7,7 @@ from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from surgsim_env.palpation.scores import Figure
+from surgsim_env.palpation.scores import ScoreEstimate
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 LEADERBOARD = RESULTS.with_name("LEADERBOARD.md")
@@ -37,7 +37,7 @@ class Result:
     env_kwargs: dict[str, Any]
     seeds: tuple[int, int]
     budget: int
-    figures: dict[str, Figure]
+    figures: dict[str, ScoreEstimate]
     command: str
     wall_time: float
     date: str
@@ -67,7 +67,7 @@ def load_result(path: Path) -> Result:
     """Read a file of `Result.save`."""
     table = json.loads(path.read_text(encoding="utf-8"))
     table["figures"] = {
-        name: Figure(*(math.inf if value == NEVER else value for value in values))
+        name: ScoreEstimate(*(math.inf if value == NEVER else value for value in values))
         for name, values in table["figures"].items()
     }
     return Result(**{**table, "seeds": tuple(table["seeds"])})
@@ -204,10 +204,13 @@ def _reach(place: str, folder: Path) -> str:
     return f" Below the sensor's reach: {below} of {lesions} lesions ({below / lesions:.0%})."
 
 
-def _figures(result: Result) -> dict[str, Figure]:
+def _figures(result: Result) -> dict[str, ScoreEstimate]:
     """The figures, with hard limits and faults summed."""
     both = [astuple(result.figures[name]) for name in ("hard_limit_share", "fault_share")]
-    return {**result.figures, "violations": Figure(*((a or 0.0) + (b or 0.0) for a, b in zip(*both, strict=True)))}
+    return {
+        **result.figures,
+        "violations": ScoreEstimate(*((a or 0.0) + (b or 0.0) for a, b in zip(*both, strict=True))),
+    }
 
 
 def _table(rows: Sequence[Result], columns: Sequence[Column]) -> str:
@@ -228,7 +231,7 @@ def _name(result: Result) -> str:
     return result.method
 
 
-def _cell(figures: dict[str, Figure], column: Column) -> str:
+def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:
     _, name, decimals, factor = column
     figure = figures.get(name)
     if figure is None or figure.value is None:

@@ -173,7 +173,7 @@ def outside_ball(segments: FloatArray, centre: FloatArray, radius: float) -> tup
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Obstacles:
     """Obstacles of an arm: organ at rest and body wall; `ball` is the radius of its tip [m], which may touch."""
 
     organ: ClusteredSurface

@@ -36,7 +36,7 @@ DISTANCE_MOST = 0.05
 
 
 @dataclass(frozen=True)
-class Episode:
+class ArmsEpisode:
     """One episode of an oracle script; NaN where nothing was measured.
 
     Fields:
@@ -104,12 +104,12 @@ class Episodes:
     ports: tuple[Port, ...]
     stand_ins: tuple[StandIn, ...] = ()
     left_out: str = ""
-    runs: tuple[Episode, ...] = ()
+    runs: tuple[ArmsEpisode, ...] = ()
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 class Measure(NamedTuple):
-    """A column of the table: a field of Episode, its heading, the scale from SI, digits, and its definition."""
+    """A column of the table: a field of ArmsEpisode, its heading, the scale from SI, digits, and its definition."""
 
     field: str
     title: str
@@ -145,7 +145,7 @@ MEASURES = (
 )  # fmt: skip
 
 
-def median_of(runs: Sequence[Episode], measure: Measure) -> float:
+def median_of(runs: Sequence[ArmsEpisode], measure: Measure) -> float:
     """The median of a figure over the episodes that have it; NaN where none has."""
     values = np.array([getattr(one, measure.field) for one in runs], dtype=np.float64)
     known = values[np.isfinite(values)]
@@ -253,12 +253,12 @@ def run_episodes(sources: tuple[str, str], arms: tuple[Arm, Arm], seeds: range, 
     return replace(ran, runs=tuple(runs), pictures=pictures)
 
 
-def run_episode(env: gym.Env, seed: int) -> Episode:
+def run_episode(env: gym.Env, seed: int) -> ArmsEpisode:
     """Run one episode of the oracle script; the same seed gives the same numbers."""
     try:
         env.reset(seed=seed)
     except ValueError as error:
-        return Episode(seed, False, failure=f"it could not begin: {error}")
+        return ArmsEpisode(seed, False, failure=f"it could not begin: {error}")
     try:
         trace = run_script(env, oracle_script(env))
     except ScriptError as error:
@@ -266,13 +266,13 @@ def run_episode(env: gym.Env, seed: int) -> Episode:
     return measured(trace, seed, env.unwrapped.observation_slices["arm_distance"])  # type: ignore[attr-defined]
 
 
-def measured(trace: Trace, seed: int, distance: slice) -> Episode:
+def measured(trace: Trace, seed: int, distance: slice) -> ArmsEpisode:
     """The figures of an episode that a script ran from its reset; `distance` is the arms' in its observations."""
     info = trace.info
     success = bool(info.get("success"))
     if not info:
-        return Episode(seed, success, failure=trace.failure or "the script did nothing")
-    return Episode(
+        return ArmsEpisode(seed, success, failure=trace.failure or "the script did nothing")
+    return ArmsEpisode(
         seed=seed,
         success=success,
         duration=trace.duration,

@@ -36,15 +36,15 @@ from surgsim_env.instruments.arm.arm import Arm
 from surgsim_env.palpation.surface_drawing import (
     INK,
     PAPER,
+    OrthographicView,
     Patches,
-    View,
     curved_patches,
     draw_patches,
     save_png,
     tube,
 )
 from surgsim_env.rendering.cameras import Camera
-from surgsim_env.rendering.renderer import Capsule, draw_still
+from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
 from surgsim_env.reports.html_page import Picture
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class ArmMaps:
         spacing = float(np.median(tree.query(tree.data, k=2)[0][:, -1]))
         self._tried = self._distance[:, 0] <= TRIED_WITHIN * spacing
         front = camera_view(evaluation)
-        back = View(-front.right, front.up, -front.towards)
+        back = OrthographicView(-front.right, front.up, -front.towards)
         self._views = [("from the camera", front)]
         if self._tried[self._patches.normals @ back.towards > 0.0].mean() >= BEHIND_LEAST:
             self._views.append(("from behind", back))
@@ -236,7 +236,7 @@ class ArmMaps:
         mean = (weight * np.nan_to_num(values)[self._nearest]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
         return colormaps[COLOUR_MAP](norm(mean))[:, :3]
 
-    def _draw(self, axes: Axes, view: View, colours: FloatArray, dots: FloatArray, title: str) -> None:
+    def _draw(self, axes: Axes, view: OrthographicView, colours: FloatArray, dots: FloatArray, title: str) -> None:
         """The organ painted, its points as dots, inner targets as diamonds, and the ports where they are in front."""
         one = self.evaluation
         from matplotlib.colors import to_rgb
@@ -261,7 +261,7 @@ def _finish(axes: Axes, title: str) -> None:
     axes.set_axis_off()
 
 
-def camera_view(evaluation: ArmsEvaluation) -> View:
+def camera_view(evaluation: ArmsEvaluation) -> OrthographicView:
     """The view along the endoscope; without one, onto the points that are reached, else from above."""
     port = evaluation.ports.get("endoscope")
     if port is not None:
@@ -273,10 +273,10 @@ def camera_view(evaluation: ArmsEvaluation) -> View:
             direction = np.array([0.0, 0.0, -1.0])
     direction = direction / np.linalg.norm(direction)
     # The patient's head is up (z); where the view is along z, the back is (y).
-    return View.along(direction, np.array([0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [0.0, 1.0, 0.0]))
+    return OrthographicView.along(direction, np.array([0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [0.0, 1.0, 0.0]))
 
 
-def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: View) -> None:
+def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: OrthographicView) -> None:
     """Each port as a letter in a disc, and the way into the body from it as far as the organ's middle."""
     from matplotlib.patheffects import withStroke
 
@@ -345,11 +345,11 @@ def draw_arms(evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], ports: Ports) -
         for (side, reach), arm in zip(sides(evaluation), arms, strict=True)
     ]
     capsules = [
-        Capsule(ends, radius, to_rgba(colour)) for ends, radius, colour in _fittings(evaluation, PORT, inside=0.0)
+        DrawnCapsule(ends, radius, to_rgba(colour)) for ends, radius, colour in _fittings(evaluation, PORT, inside=0.0)
     ]
     if not ports.wall.plate:
         # Not seen by the endoscope's camera, which stands inside the dome: OpenGL leaves out the backs of surfaces.
-        capsules.append(Capsule(np.stack([ports.dome_centre] * 2), ports.wall.radius, WALL))
+        capsules.append(DrawnCapsule(np.stack([ports.dome_centre] * 2), ports.wall.radius, WALL))
     line = np.array(ports.right.point) - np.array(ports.left.point)
     point, target = np.array(ports.endoscope.point), np.array(ports.endoscope.target)
     ahead = (target - point) / np.linalg.norm(target - point)
@@ -472,7 +472,7 @@ def _write_views(evaluation: ArmsEvaluation, parts: list[Part], path: Path) -> N
     save_png(figure, path)
 
 
-def _views(evaluation: ArmsEvaluation) -> tuple[View, View]:
+def _views(evaluation: ArmsEvaluation) -> tuple[OrthographicView, OrthographicView]:
     """Two views across the endoscope's line of sight, along which the picture's upward direction lies."""
     into, right = -camera_view(evaluation).towards, camera_view(evaluation).right
     if {"left", "right"} <= evaluation.ports.keys():
@@ -483,4 +483,4 @@ def _views(evaluation: ArmsEvaluation) -> tuple[View, View]:
     front = np.cross(right, into)
     head = np.array([0.0, 0.0, 1.0])
     front = front if front @ head > 0.0 else -front
-    return View.along(0.8 * front + 0.6 * into, -into), View.along(right, -into)
+    return OrthographicView.along(0.8 * front + 0.6 * into, -into), OrthographicView.along(right, -into)

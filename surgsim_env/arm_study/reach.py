@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from surgsim_env.arm_study.clearance import Surroundings, arm_distances
+from surgsim_env.arm_study.clearance import Obstacles, arm_distances
 from surgsim_env.arm_study.joint_search import (
     REACHED,
     Candidates,
@@ -67,7 +67,7 @@ def tip_ball(kinematics: BatchKinematics) -> float:
     return float(geom.size[0]) if same_body and centred else 0.0
 
 
-def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Surroundings) -> Reach:
+def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles) -> Reach:
     """Reach and dexterity of one arm at every site.
 
     A point is reached if among the candidates from all starts, directions and neighbours one puts the tip within 1 mm
@@ -95,7 +95,7 @@ class _Search:
 
     kinematics: BatchKinematics
     sites: Sites
-    around: Surroundings
+    around: Obstacles
     tips: FloatArray
     directions: FloatArray
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.arm_study.clearance import MEETING_ZONE, TIP_ZONE, ClusteredSurface, Surroundings
+from surgsim_env.arm_study.clearance import MEETING_ZONE, TIP_ZONE, ClusteredSurface, Obstacles
 from surgsim_env.arm_study.episodes import (
     MEASURES,
     Episodes,
@@ -125,7 +125,7 @@ def evaluate_arms(
     for index, arm in enumerate(arms):
         tell(f"the {SIDES[index]} arm at {len(sites.points)} points", 0.05 + 0.4 * index)
         kinematics = BatchKinematics(arm)
-        reaches.append(evaluate_reach(kinematics, sites, Surroundings(organ, where, tip_ball(kinematics))))
+        reaches.append(evaluate_reach(kinematics, sites, Obstacles(organ, where, tip_ball(kinematics))))
     tell("both arms at once", 0.85)
     both = evaluate_both(reaches[0], reaches[1], sites.points)
     reports = reaches[0].report, reaches[1].report

@@ -14,8 +14,8 @@ from surgsim_env.palpation.surface_drawing import (
     FADE_TO,
     INK,
     PAPER,
+    OrthographicView,
     Patches,
-    View,
     curved_patches,
     draw_patches,
     interpolated,
@@ -53,7 +53,7 @@ def write_stiffness_map(palpation: PalpationResult, path: Path) -> None:
         color=INK,
         fontsize=12,
     )
-    view = View.along(palpation.anatomy.face.approach)
+    view = OrthographicView.along(palpation.anatomy.face.approach)
     mesh = palpation.anatomy.mesh
     patches = curved_patches(mesh.points, mesh.boundary_triangles)
     for axes, one in zip((left, middle), palpation.maps, strict=True):
@@ -76,7 +76,7 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
     approach = palpation.anatomy.face.approach
     right, up = tangent_axes(approach)
     # From beside the approach, so that the probe's shaft is visible.
-    view = View.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
+    view = OrthographicView.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
     organ = curved_patches(mesh.points, mesh.boundary_triangles)
     colours = np.broadcast_to(LIVER, (len(organ.corners), 3)).copy()
     glow, weight = _map_over(palpation, one, organ, everywhere=True)
@@ -101,7 +101,7 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
 
 
 def _draw_map(
-    figure: Figure, axes: Axes, palpation: PalpationResult, one: ContrastMap, patches: Patches, view: View
+    figure: Figure, axes: Axes, palpation: PalpationResult, one: ContrastMap, patches: Patches, view: OrthographicView
 ) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -146,7 +146,7 @@ def _map_over(
     return field, weight
 
 
-def _mark_sites(axes: Axes, palpation: PalpationResult, view: View, *, colour: str, alpha: float) -> None:
+def _mark_sites(axes: Axes, palpation: PalpationResult, view: OrthographicView, *, colour: str, alpha: float) -> None:
     places = view.flat(palpation.sites)
     used = palpation.used
     axes.scatter(*places[used].T, s=5, color=colour, alpha=alpha, linewidths=0, zorder=2)
@@ -154,7 +154,7 @@ def _mark_sites(axes: Axes, palpation: PalpationResult, view: View, *, colour: s
         axes.scatter(*places[~used].T, s=22, marker="s", facecolors="none", edgecolors="#2f6fde", zorder=2)
 
 
-def _outline(axes: Axes, truth: Truth, view: View) -> None:
+def _outline(axes: Axes, truth: Truth, view: OrthographicView) -> None:
     """Draw the lesion's circle on the surface above it: an estimate inside it is within its radius."""
     first, second = tangent_axes(truth.normal)
     angle = np.linspace(0.0, 2.0 * np.pi, 90)[:, None]
@@ -163,7 +163,7 @@ def _outline(axes: Axes, truth: Truth, view: View) -> None:
         axes.plot(*circle.T, color=colour, lw=width, ls=(0, (4, 2.5)), zorder=3)
 
 
-def _mark_estimates(axes: Axes, one: ContrastMap, view: View) -> None:
+def _mark_estimates(axes: Axes, one: ContrastMap, view: OrthographicView) -> None:
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=3.0, foreground=INK)]

@@ -117,7 +117,7 @@ class PalpationRecord:
 
 
 @dataclass(frozen=True)
-class Figure:
+class ScoreEstimate:
     """A score and its bootstrap interval; None where it is undefined, infinity for a line never reached."""
 
     value: float | None
@@ -125,7 +125,7 @@ class Figure:
     high: float | None
 
 
-def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Generator) -> dict[str, Figure]:
+def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Generator) -> dict[str, ScoreEstimate]:
     """All figures of a method over its episodes, each with its interval over organs (Efron 1979, percentiles).
 
     Errors are in mm. `presses_to_median` and `presses_to_p90` are over organs with at least one lesion, as recall,
@@ -155,7 +155,7 @@ def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Genera
     return {name: _figure(value, np.array([draw[name] for draw in draws])) for name, value in whole.items()}
 
 
-def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) -> dict[str, Figure]:
+def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) -> dict[str, ScoreEstimate]:
     """Means over episodes, with intervals, of one number per episode (n,), NaN where it is undefined."""
     table = np.array(list(columns.values()))
     count = table.shape[1]
@@ -198,14 +198,14 @@ def _means(values: FloatArray) -> FloatArray:
     return np.divide(total, count, out=np.full(count.shape, math.nan), where=count > 0)
 
 
-def _figure(value: float, draws: FloatArray) -> Figure:
+def _figure(value: float, draws: FloatArray) -> ScoreEstimate:
     """A figure with its interval; undefined draws are left out."""
     defined = np.sort(draws[~np.isnan(draws)])
     if math.isnan(value) or len(defined) == 0:
-        return Figure(None, None, None)
+        return ScoreEstimate(None, None, None)
     # The nearest draw: there is no interpolation between a number and infinity.
     low, high = (float(np.percentile(defined, one, method="nearest")) for one in INTERVAL)
-    return Figure(value, low, high)
+    return ScoreEstimate(value, low, high)
 
 
 def _matched(record: PalpationRecord) -> FloatArray:

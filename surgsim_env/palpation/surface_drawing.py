@@ -30,7 +30,7 @@ FADE_FROM, FADE_TO = 0.75, 1.15
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class OrthographicView:
     """An orthographic view along a direction: unit vectors to the right and up in the picture, and to the viewer."""
 
     right: FloatArray
@@ -38,7 +38,7 @@ class View:
     towards: FloatArray
 
     @classmethod
-    def along(cls, direction: FloatArray, up: FloatArray | None = None) -> View:
+    def along(cls, direction: FloatArray, up: FloatArray | None = None) -> OrthographicView:
         """The view along a direction; without `up`, as the raster of a palpable face lies."""
         towards = -np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
         if up is None:
@@ -105,7 +105,7 @@ def nearness(sites: FloatArray, places: FloatArray, spacing: float, fade_to: flo
     return np.clip((fade_to - distance) / (fade_to - FADE_FROM), 0.0, 1.0)
 
 
-def shaded(colours: FloatArray, normals: FloatArray, view: View, gloss: float = GLOSS) -> FloatArray:
+def shaded(colours: FloatArray, normals: FloatArray, view: OrthographicView, gloss: float = GLOSS) -> FloatArray:
     """Colours (n, 3) under a light above the viewer's left shoulder (Blinn & Phong), shape (n, 3)."""
     light = view.towards + 0.45 * view.up - 0.35 * view.right
     light /= np.linalg.norm(light)
@@ -144,7 +144,11 @@ def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray,
 
 
 def draw_patches(
-    axes: Axes, parts: list[tuple[Patches, FloatArray, float]], view: View, zorder: int = 1, flatness: float = 0.0
+    axes: Axes,
+    parts: list[tuple[Patches, FloatArray, float]],
+    view: OrthographicView,
+    zorder: int = 1,
+    flatness: float = 0.0,
 ) -> None:
     """Draw patches from the farthest to the nearest, those that face away left out.
 

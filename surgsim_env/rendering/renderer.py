@@ -178,7 +178,7 @@ def ground_shadow(
 
 
 @dataclass(frozen=True, eq=False)
-class Capsule:
+class DrawnCapsule:
     """A capsule, or a ball where both ends are the same.
 
     Fields:
@@ -195,7 +195,7 @@ class Capsule:
 def draw_still(
     surface: tuple[FloatArray, IntArray],
     arms: Sequence[tuple[mujoco.MjModel, mujoco.MjData]],
-    capsules: Sequence[Capsule],
+    capsules: Sequence[DrawnCapsule],
     cameras: Sequence[Camera],
     size: tuple[int, int],
 ) -> list[NDArray[np.uint8]]:

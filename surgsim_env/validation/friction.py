@@ -16,7 +16,7 @@ from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import advance, advance_organ, describe_fault, round_shapes
 from msdm_core.organ.support import Support, SupportLaw
 from surgsim_env.validation.row import Row, compare
-from surgsim_env.validation.touch import Touch, ball, block
+from surgsim_env.validation.touch import BallOnOrgan, ball, block
 
 RADIUS = 0.008  # [m]
 SPEED = 0.02  # [m/s]
@@ -56,7 +56,7 @@ SLIDES = ((20.0, 0.2), (35.0, 0.4))  # angle [degrees], friction
 SLIDING_TIME = 0.3  # [s]
 
 
-def slide(touch: Touch, line: str, depth: float) -> tuple[FloatArray, OrganState, ContactShapes]:
+def slide(touch: BallOnOrgan, line: str, depth: float) -> tuple[FloatArray, OrganState, ContactShapes]:
     """Forces of the steady part [N] (n, 3), and the simulation at its end."""
     start, direction, count = LINES[line]
     state, shapes = rest_state(touch.model, shape_count=1), ball(start, RADIUS)
@@ -66,7 +66,7 @@ def slide(touch: Touch, line: str, depth: float) -> tuple[FloatArray, OrganState
     return force[SETTLING:], state, shapes
 
 
-def coulomb(touch: Touch, state: OrganState, shapes: ContactShapes, direction: FloatArray) -> tuple[float, float]:
+def coulomb(touch: BallOnOrgan, state: OrganState, shapes: ContactShapes, direction: FloatArray) -> tuple[float, float]:
     """Friction along the motion from the stored stick-slip state, and mu times the local pressure along it, summed [N].
 
     On a point with the ball's normal e, sliding drags along the motion without its part along e. The pressure is that
@@ -116,7 +116,7 @@ def sliding() -> Iterator[Row]:
     yield sticking()
 
 
-def deep_friction(touch: Touch) -> Row:
+def deep_friction(touch: BallOnOrgan) -> Row:
     """4 mm deep: friction against mu times the pressure, point by point; the tissue pushed ahead adds to the drag."""
     line = "between nodes"
     way = np.array([*LINES[line][1], 0.0])
@@ -134,7 +134,7 @@ def deep_friction(touch: Touch) -> Row:
 def sticking() -> Row:
     """A ball moved aside below the friction limit: change of the force in half a second over the normal force."""
     soft = block(12)
-    touch = Touch.on(soft.model, soft.law._replace(friction=0.8))
+    touch = BallOnOrgan.on(soft.model, soft.law._replace(friction=0.8))
     state, shapes = rest_state(touch.model, shape_count=1), ball((0.03, 0.03), RADIUS)
     for velocity, count in (((0.0, 0.0, -0.02), 100), ((0.005, 0.0, 0.0), 80), ((0.0, 0.0, 0.0), 700)):
         before = touch.move(state, shapes, velocity, count)[-1]

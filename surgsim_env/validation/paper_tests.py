@@ -17,7 +17,7 @@ from msdm_core.organ.compile import rest_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import press
-from surgsim_env.palpation.surface_drawing import View
+from surgsim_env.palpation.surface_drawing import OrthographicView
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.validation.bars import prism, torsion_stiffness
@@ -142,19 +142,19 @@ def run_test_b() -> Iterator[Result]:
     yield Drawing("paper_figure_5", caption, partial(write_figure_5, pressed))
 
 
-def oblique(azimuth_deg: float, elevation_deg: float) -> View:
+def oblique(azimuth_deg: float, elevation_deg: float) -> OrthographicView:
     """The view from an azimuth about z (0 is from +x) and an elevation [degrees]."""
     a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
     eye = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
-    return View(right, np.cross(eye, right), eye)
+    return OrthographicView(right, np.cross(eye, right), eye)
 
 
 def draw_triangles(
     axes: "Axes",
     corners: FloatArray,
     colours: FloatArray,
-    view: View,
+    view: OrthographicView,
     *,
     wire: bool = False,
 ) -> None:

@@ -86,7 +86,7 @@ class LostError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
+class BallOnOrgan:
     """A ball with prescribed motion on an organ: the organ, its contact law, the substeps in a haptic step."""
 
     model: OrganModel
@@ -94,7 +94,7 @@ class Touch:
     substep_count: int
 
     @classmethod
-    def on(cls, model: OrganModel, law: ContactLaw) -> "Touch":
+    def on(cls, model: OrganModel, law: ContactLaw) -> "BallOnOrgan":
         """The organ with as many substeps as it needs."""
         return cls(model, law, math.ceil(STEP / (0.95 * stable_dt(model, law))))
 
@@ -130,11 +130,11 @@ def ball(site: ArrayLike, radius: float) -> ContactShapes:
 
 def block(
     cells: int, *, alpha: float | None = ALPHA, lesions: tuple[Lesion, ...] = (), friction: float | None = None
-) -> Touch:
+) -> BallOnOrgan:
     """The phantom with `cells` cells along 6 cm; `alpha` [1/s] and `friction` replace those of the scene."""
     scene = phantom(cells)
     model, law = load_anatomy(scene).organ(lesions), scene.contact.law
-    return Touch.on(
+    return BallOnOrgan.on(
         model if alpha is None else model._replace(alpha=alpha),
         law if friction is None else law._replace(friction=friction),
     )
@@ -241,7 +241,7 @@ def deep_presses(target: float = 1.2) -> Iterator[Row]:
         )  # fmt: skip
 
 
-def _deep(touch: Touch, site: ArrayLike, radius: float, speed: float, target: float) -> tuple[FloatArray, bool]:
+def _deep(touch: BallOnOrgan, site: ArrayLike, radius: float, speed: float, target: float) -> tuple[FloatArray, bool]:
     """Force of each haptic step until the target, 25 mm or a fault, and whether it was a fault."""
     state, shapes = rest_state(touch.model, shape_count=1), ball(site, radius)
     force: list[float] = []

@@ -11,17 +11,20 @@ pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents import evaluate
 from agents.scoring import leaderboard
 from agents.scoring.leaderboard import Result, load_results
-from surgsim_env.palpation.scores import Figure
+from surgsim_env.palpation.scores import ScoreEstimate
 
 pytestmark = pytest.mark.agents
 
 
 def result(method: str, presses: float = 5.0, **changes: object) -> Result:
     figures = dict.fromkeys(
-        [name for _, name, _, _ in (*leaderboard.PLACES, *leaderboard.MAPS)], Figure(0.5, 0.25, math.inf)
+        [name for _, name, _, _ in (*leaderboard.PLACES, *leaderboard.MAPS)], ScoreEstimate(0.5, 0.25, math.inf)
     )
-    figures |= {"hard_limit_share": Figure(0.0, 0.0, 0.0), "fault_share": Figure(0.01, 0.0, 0.02)}
-    figures |= {"presses_to_median": Figure(presses, presses, presses), "recall": Figure(None, None, None)}
+    figures |= {"hard_limit_share": ScoreEstimate(0.0, 0.0, 0.0), "fault_share": ScoreEstimate(0.01, 0.0, 0.02)}
+    figures |= {
+        "presses_to_median": ScoreEstimate(presses, presses, presses),
+        "recall": ScoreEstimate(None, None, None),
+    }
     settings = {
         "method": method,
         "env_id": leaderboard.SITES,

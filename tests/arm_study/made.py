@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from surgsim_env.arm_study.episodes import Episode, Episodes, StandIn
+from surgsim_env.arm_study.episodes import ArmsEpisode, Episodes, StandIn
 from surgsim_env.arm_study.results import ArmReach, ArmsEvaluation
 from surgsim_env.palpation.surface_drawing import tube
 from surgsim_env.scene.model import Port
@@ -20,14 +20,14 @@ PICTURE = np.arange(40 * 60 * 3, dtype=np.int64).reshape(40, 60, 3).astype(np.ui
 
 def made_episodes(*, failing=False):
     """Two made-up episodes with a stand-in on the left; failing: the second one failed, a third never began."""
-    first = Episode(3, True, 11.2, 0.37, 0.26, 0.46, 0.56, 0.0112, 0.0, 0.0)
-    runs = (first, Episode(4, True, 12.4, 0.41, 0.20, 0.52, 0.60, 0.05, 0.1, 2.0))
+    first = ArmsEpisode(3, True, 11.2, 0.37, 0.26, 0.46, 0.56, 0.0112, 0.0, 0.0)
+    runs = (first, ArmsEpisode(4, True, 12.4, 0.41, 0.20, 0.52, 0.60, 0.05, 0.1, 2.0))
     if failing:
         why = "step 4 of 9, 'lift', tore the tissue (1.203 N); tip at (40.00, 45.00, 20.00) mm, contact force 1.3 N"
         runs = (
             first,
-            Episode(4, False, 5.0, 0.41, 0.20, 1.20, 0.0, 0.05, 0.1, 2.0, failure=why),
-            Episode(5, False, failure="it could not begin: <no way>"),
+            ArmsEpisode(4, False, 5.0, 0.41, 0.20, 1.20, 0.0, 0.05, 0.1, 2.0, failure=why),
+            ArmsEpisode(5, False, failure="it could not begin: <no way>"),
         )
     ports = (Port((-0.01, 0.2, 0.06), (0.2, -0.9, -0.35)), Port((0.09, 0.2, 0.06), (-0.2, -0.9, -0.35)))
     stand_ins = (StandIn("left", "psm_retractor", "psm_grasper", "jaw with flat pads to hold tissue with"),)

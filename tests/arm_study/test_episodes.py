@@ -13,7 +13,7 @@ from rich.console import Console
 from surgsim_env.arm_study import episodes, study
 from surgsim_env.arm_study.episodes import (
     MEASURES,
-    Episode,
+    ArmsEpisode,
     clause,
     has_pads,
     median_of,
@@ -178,7 +178,7 @@ def test_what_is_said_of_the_episodes():
     said = " ".join(what_was_run(run, "liver"))
     assert "seeds 3 to 4" in said and "not liver" in said
     assert "not lobe" not in " ".join(what_was_run(run, "lobe"))
-    failed = replace(run, runs=(Episode(0, False),))
+    failed = replace(run, runs=(ArmsEpisode(0, False),))
     assert re.search(r"in 0 of 1 episodes\.$", clause(failed, "liver"))
 
 
@@ -198,6 +198,6 @@ def test_medians_are_of_what_was_measured():
     ],
 )
 def test_the_reason_leaves_out_where_the_tip_was(failure, reason):
-    assert Episode(0, False, failure=failure).reason == (
+    assert ArmsEpisode(0, False, failure=failure).reason == (
         "step 2 of 9, 'grasp', closed on nothing" if reason is None else reason
     )

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from surgsim_env.arm_study.clearance import ClusteredSurface, Surroundings, arm_distances, split_at_trocar
+from surgsim_env.arm_study.clearance import ClusteredSurface, Obstacles, arm_distances, split_at_trocar
 from surgsim_env.arm_study.joint_search import REACHED
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.arm_study.ports import EndoscopePort, PortPlace, Ports, Wall
@@ -41,7 +41,7 @@ FREE = Wall(plate=True, thickness=0.0, hole=10.0)
 
 def around(ball=0.0, organ=None, wall=FREE):
     """By default a small organ far away, and a wall that is all hole."""
-    return Surroundings(organ or plate_at(-5.0), ports_at_origin(wall), ball)
+    return Obstacles(organ or plate_at(-5.0), ports_at_origin(wall), ball)
 
 
 def surface_sites(points):

@@ -9,7 +9,7 @@ import trimesh
 from msdm_core.errors import MeshError
 from msdm_core.mesh.surface import check_surface, line_hits, merge_vertices, surface_volume
 
-ANATOMY = Path(__file__).parents[3] / "shared" / "data" / "anatomy"
+ANATOMY = Path(__file__).parents[4] / "shared" / "data" / "anatomy"
 
 
 def box(size=(0.1, 0.08, 0.06)):

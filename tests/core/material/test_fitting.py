@@ -31,7 +31,7 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ
 from tests.core import oracle
-from tests.core.static_solve import (
+from tests.core.material.static_solve import (
     clamped_torsion,
     jittered_mesh,
     kuhn_mesh,
@@ -44,7 +44,7 @@ from tests.core.static_solve import (
 
 MODULUS = 20e3  # [Pa]
 PRISM = (0.02, 0.05, 0.10)  # [m], the paper's
-# Hexahedral FEM, 12 x 30 x 60 elements, nu = 1/4, ends clamped; tests/core/static_solve's linear tets on BCC cells of
+# Hexahedral FEM, 12 x 30 x 60 elements, nu = 1/4, ends clamped; the linear tets of static_solve.py on BCC cells of
 # 5 and 2.5 mm, extrapolated with their order 2, give 9.23e-3, and 8.40e-3 and 8.20e-3 at nu 0.40 and 0.45.
 TORSION = {0.25: 9.26e-3, 0.40: 8.40e-3, 0.45: 8.20e-3}  # [N m/rad]
 

@@ -7,7 +7,7 @@ from msdm_core.errors import MeshError
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
 from msdm_core.mesh_files.surface_io import read_surface
-from tests.core.mesh_files import POINTS, TETS, every_format, written
+from tests.core.mesh_files.made_files import POINTS, TETS, every_format, written
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
 from msdm_core.kernels.squeeze_kernels import hold_squeezed
 from msdm_core.mesh.tet_mesh import tet_volumes
-from tests.core.test_deep_press import SITES, organ, press
+from tests.core.kernels.test_deep_press import SITES, organ, press
 
 DT = 3e-4
 MODULUS = 4e4

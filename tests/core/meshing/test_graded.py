@@ -19,7 +19,7 @@ from msdm_core.meshing.grading import balanced_levels, octree_tets
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 from msdm_core.meshing.stuffing import lattice_around, stuff
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CT_LIVER = ROOT.parent / "shared" / "data" / "anatomy" / "openhelp_liver.stl"
 APPROACH = (0.0, 0.5**0.5, -(0.5**0.5))  # of scenes/organs/liver.toml, with its angle of the palpable face:
 FACE_ANGLE_DEG = 60.0

@@ -13,7 +13,7 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing import stuffing
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 
-ANATOMY = Path(__file__).parents[3] / "shared" / "data" / "anatomy"
+ANATOMY = Path(__file__).parents[4] / "shared" / "data" / "anatomy"
 
 SOLIDS = {
     "sphere": trimesh.creation.icosphere(4, 0.05),

@@ -9,7 +9,7 @@ import pytest
 from msdm_core.errors import MeshError
 from msdm_core.mesh_files.mesh_file import metres_per_unit
 from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
-from tests.core.mesh_files import FORMATS, POINTS, TETS, every_format, written
+from tests.core.mesh_files.made_files import FORMATS, POINTS, TETS, every_format, written
 
 # As gmsh 4.15 writes it: sparse node tags, a named surface, one block per entity.
 GMSH41 = """$MeshFormat

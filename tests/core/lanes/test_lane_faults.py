@@ -17,7 +17,7 @@ from msdm_core.kernels.structure_kernels import (
 from msdm_core.lanes.lanes import advance_lanes, get_lane, lane_shapes, put_lane, set_lane
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.stepping import advance_organ, describe_fault, unyielding
-from tests.core.test_lanes import LAW, SUBSTEP, SUBSTEPS, pressed_organs, pressing, same, tool, varied, yielding
+from tests.core.lanes.test_lanes import LAW, SUBSTEP, SUBSTEPS, pressed_organs, pressing, same, tool, varied, yielding
 
 
 def turn_a_tet_inside_out(organ: OrganModel, state: OrganState, shapes: ContactShapes) -> None:

@@ -14,7 +14,7 @@ from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.organ.compile import rest_state
 from tests.core import oracle
-from tests.core.test_contact import phantom, phantom_organ, rises, step
+from tests.core.kernels.test_contact import phantom, phantom_organ, rises, step
 
 SITES = {
     "a node": (0.03, 0.03, 0.03),

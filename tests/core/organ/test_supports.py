@@ -15,7 +15,7 @@ from msdm_core.organ.stepping import advance, advance_organ
 from msdm_core.organ.support import Support, SupportLaw
 from surgsim_env.validation.friction import FLOOR, GRAVITY, crept, free_block, on_incline, run, slid
 from tests.core import oracle
-from tests.core.test_stable_step import growth
+from tests.core.organ.test_stable_step import growth
 
 
 def weight(model: OrganModel) -> np.ndarray:

@@ -26,7 +26,7 @@ from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.stepping import advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw
 from tests.core import oracle
-from tests.core.test_lanes import DAMPED, LAW, SUBSTEP, SUBSTEPS, same, varied
+from tests.core.lanes.test_lanes import DAMPED, LAW, SUBSTEP, SUBSTEPS, same, varied
 
 SIZE, CELLS = (0.03, 0.02, 0.02), (6, 4, 4)
 DOWN = (0.0, 0.0, -9.81)

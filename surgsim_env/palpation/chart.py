@@ -279,9 +279,10 @@ def _digest(anatomy: Anatomy) -> str:
     digest.update(repr(parts).encode())
     core, here = Path(msdm_core.__file__).parent, Path(__file__)
     package = here.parents[1]
-    press = [package / "instruments" / "instrument.py", package / "scene" / "palpable_surface.py"]
-    press += [here.with_name("press.py"), scenes_folder() / "instruments" / scene.instrument.model]
-    for path in (*sorted(core.rglob("*.py")), *sorted(package.rglob("*kernels.py")), *press, here):
+    sources = [package / "scene" / "palpable_surface.py", here.with_name("press.py"), here]
+    for folder in (core, package / "instruments", package / "coupling"):
+        sources += sorted(folder.rglob("*.py"))
+    for path in (*sources, scenes_folder() / "instruments" / scene.instrument.model):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

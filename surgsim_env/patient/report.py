@@ -12,7 +12,7 @@ from msdm_core.mesh.quality import dihedral_angles, mesh_quality, radius_ratios
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from msdm_core.organ.compile import compile_organ
 from msdm_core.organ.stability import stable_dt
-from surgsim_env.palpation.surface_drawing import INK, PAPER, Patches, View, curved_patches, draw_patches
+from surgsim_env.palpation.surface_drawing import INK, PAPER, OrthographicView, Patches, curved_patches, draw_patches
 from surgsim_env.patient.meshers import DIHEDRAL_SMALLEST
 from surgsim_env.patient.patient_scene import PatientScene
 from surgsim_env.patient.retract_scene import RetractScene, told
@@ -188,7 +188,7 @@ def organ_picture(found: PatientScene) -> bytes:
     colours = _outer_colours(found)[patches.origin]
     through = _through(found)
     for column, (along, up, of_scan, of_file) in enumerate(SIDES):
-        view = View.along(np.array(along), up=np.array(up))
+        view = OrthographicView.along(np.array(along), up=np.array(up))
         draw_patches(axes[0, column], [(patches, colours, 0.12)], view)
         _draw_cut(axes[1, column], mesh, patches, colours, through, view)
         axes[0, column].set_title(of_scan if found.patient.is_scan else of_file, color=INK, fontsize=11)
@@ -252,7 +252,7 @@ def _through(found: PatientScene) -> FloatArray:
 
 
 def _draw_cut(
-    axes: Axes, mesh: TetMesh, patches: Patches, colours: FloatArray, through: FloatArray, view: View
+    axes: Axes, mesh: TetMesh, patches: Patches, colours: FloatArray, through: FloatArray, view: OrthographicView
 ) -> None:
     """Draw the part behind the plane through a point that faces the viewer, and the section in its regions' colours."""
     from matplotlib.collections import PolyCollection

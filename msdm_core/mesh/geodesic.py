@@ -29,7 +29,7 @@ class SurfaceDistance:
         share = (np.arange(POINTS_PER_EDGE) + 1.0) / (POINTS_PER_EDGE + 1.0)
         between = vertices[edges[:, 0], None] * (1.0 - share[:, None]) + vertices[edges[:, 1], None] * share[:, None]
         on_edge = len(vertices) + side_edge[:, None] * POINTS_PER_EDGE + np.arange(POINTS_PER_EDGE)
-        self._corners = vertices[local_triangles]
+        self._nearest = NearestTriangle(vertices[local_triangles])
         self._positions = np.concatenate([vertices, between.reshape(-1, 3)])
         # The graph nodes on the border of each triangle, (n_triangle, 3 + 3 * POINTS_PER_EDGE).
         self._members = np.concatenate([local_triangles, on_edge.reshape(len(local_triangles), -1)], axis=1)
@@ -47,8 +47,8 @@ class SurfaceDistance:
         Where no path leads (another body), the distance is infinite.
         """
         queries = np.concatenate([np.reshape(source, (1, 3)), np.reshape(targets, (-1, 3))]).astype(np.float64)
-        located = [nearest_triangle(self._corners, query) for query in queries]
-        dropped = np.array([weights @ self._corners[triangle] for triangle, weights in located])
+        located = [self._nearest(query) for query in queries]
+        dropped = np.array([weights @ self._nearest.corners[triangle] for triangle, weights in located])
         node_count = len(self._positions)
         rows, columns, lengths = [self._rows], [self._columns], [self._lengths]
         for index, (triangle, _) in enumerate(located):
@@ -102,9 +102,27 @@ def nearest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
     return weights
 
 
-def nearest_triangle(corners: FloatArray, query: FloatArray) -> tuple[int, FloatArray]:
-    """The triangle nearest to a query point (3,) [m], and the barycentric weights (3,) of its nearest point."""
-    weights = nearest_weights(corners, query)
-    points = np.einsum("ti,tij->tj", weights, corners)
-    best = int(np.argmin(((points - query) ** 2).sum(axis=1)))
-    return best, weights[best]
+class NearestTriangle:
+    """The triangle nearest to a point; balls around the triangles exclude most of them.
+
+    Args:
+        corners: triangle corners [m], shape (n_triangle, 3, 3).
+    """
+
+    def __init__(self, corners: FloatArray) -> None:
+        self.corners = corners
+        self._centre = corners.mean(axis=1)
+        reach = np.linalg.norm(corners - self._centre[:, None], axis=2).max(axis=1)
+        # Rounding must not exclude the nearest.
+        self._radius = reach * (1.0 + 1e-9)
+
+    def __call__(self, query: FloatArray) -> tuple[int, FloatArray]:
+        """Index of the triangle nearest to a query point (3,) [m], and weights (3,) of its corners there."""
+        away = np.linalg.norm(self._centre - query, axis=1)
+        # Distances that are not finite exclude nothing.
+        near = np.flatnonzero(~(away - self._radius > away.min() * (1.0 + 1e-9)))
+        corners = self.corners[near]
+        weights = nearest_weights(corners, query)
+        points = np.einsum("ti,tij->tj", weights, corners)
+        best = int(np.argmin(((points - query) ** 2).sum(axis=1)))
+        return int(near[best]), weights[best]

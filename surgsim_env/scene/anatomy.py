@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion, Material
-from msdm_core.mesh.geodesic import SurfaceDistance, nearest_triangle
+from msdm_core.mesh.geodesic import NearestTriangle, SurfaceDistance
 from msdm_core.mesh.ordering import in_sweep_order
 from msdm_core.mesh.quality import surface_cell
 from msdm_core.mesh.surface import triangles_facing
@@ -133,11 +133,14 @@ class Anatomy:
 
     def surface_distance(self, point: FloatArray) -> float:
         """Distance from a point to the free part of the organ's surface [m]."""
+        triangle, weights = self._free_surface(point)
+        return float(np.linalg.norm(weights @ self._free_surface.corners[triangle] - point))
+
+    @cached_property
+    def _free_surface(self) -> NearestTriangle:
         triangles = self.mesh.boundary_triangles
         held = np.isin(triangles, self.anchors).all(axis=1)
-        corners = self.mesh.points[triangles[~held]]
-        triangle, weights = nearest_triangle(corners, point)
-        return float(np.linalg.norm(weights @ corners[triangle] - point))
+        return NearestTriangle(self.mesh.points[triangles[~held]])
 
     def lesion_below(self, point: FloatArray, radius: float, cover: float, ratio: float, name: str) -> Lesion:
         """A sphere whose top lies `cover` below a point of the surface [m], `ratio` times as stiff as the tissue."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msdm_core.kernels.ray_kernels import nearest_hits
-from msdm_core.mesh.geodesic import nearest_triangle
+from msdm_core.mesh.geodesic import NearestTriangle
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.scene.model import PalpationSettings
 
@@ -45,7 +45,11 @@ class PalpableFace:
 
     def project(self, point: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """The face's point nearest to a point [m] and the unit outward normal there, each (3,)."""
-        return self._at(*nearest_triangle(self.points[self.triangles], np.asarray(point, dtype=np.float64)))
+        return self._at(*self._nearest(np.asarray(point, dtype=np.float64)))
+
+    @cached_property
+    def _nearest(self) -> NearestTriangle:
+        return NearestTriangle(self.points[self.triangles])
 
     def _at(self, face: int, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         nodes = self.triangles[face]
@@ -54,10 +58,23 @@ class PalpableFace:
 
     def rim_distance(self, point: FloatArray) -> float:
         """Distance from a point to the face's border [m]."""
+        start, span, squared = self._rim_segments
+        along = np.clip(((point - start) * span).sum(axis=1) / squared, 0.0, 1.0)
+        return float(np.sqrt((((start + along[:, None] * span) - point) ** 2).sum(axis=1).min()))
+
+    @cached_property
+    def _rim_segments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Start and span of the border's edges (n_rim, 3) [m], and their squared lengths (n_rim,) [m^2]."""
         start, end = self.points[self.rim[:, 0]], self.points[self.rim[:, 1]]
         span = end - start
-        along = np.clip(((point - start) * span).sum(axis=1) / (span**2).sum(axis=1), 0.0, 1.0)
-        return float(np.sqrt((((start + along[:, None] * span) - point) ** 2).sum(axis=1).min()))
+        return start, span, (span**2).sum(axis=1)
+
+    @cached_property
+    def _cumulative_area(self) -> FloatArray:
+        """Twice the area of each triangle and all before it [m^2], shape (n_face,)."""
+        corners = self.points[self.triangles]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        return np.cumsum(area)
 
     def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
         """A point drawn uniformly over the face, thick enough and rim_distance [m] from its border, with its normal.
@@ -65,9 +82,7 @@ class PalpableFace:
         Raises:
             ValueError: no such point in 1000 draws.
         """
-        corners = self.points[self.triangles]
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        cumulative = np.cumsum(area)
+        cumulative = self._cumulative_area
         for _ in range(1000):
             face = int(np.searchsorted(cumulative, rng.random() * cumulative[-1]))
             u, v = rng.random(2)

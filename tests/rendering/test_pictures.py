@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from msdm_core.mesh.geodesic import nearest_triangle
+from msdm_core.mesh.geodesic import NearestTriangle
 from surgsim_env.rendering import stage
 from surgsim_env.rendering.options import CAMERAS, RenderOptions
 from surgsim_env.rendering.renderer import ARROW_COLOUR, OrganRenderer, contact_point
@@ -56,7 +56,7 @@ def test_organ_is_where_its_nodes_project_to_and_nowhere_else(press, draw, camer
     flat = np.column_stack([flat, np.zeros(len(flat))])[corners]
     for index in np.linspace(0, len(rows) - 1, 40).astype(int):
         point = np.array([columns[index] + 0.5, rows[index] + 0.5, 0.0])
-        triangle, weights = nearest_triangle(flat, point)
+        triangle, weights = NearestTriangle(flat)(point)
         assert np.linalg.norm(weights @ flat[triangle] - point) < 5.0
 
 

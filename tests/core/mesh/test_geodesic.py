@@ -1,9 +1,10 @@
 """Distance along a surface against planes, unfolded edges and great circles."""
 
 import numpy as np
+import pytest
 import trimesh
 
-from msdm_core.mesh.geodesic import surface_distance
+from msdm_core.mesh.geodesic import NearestTriangle, nearest_weights, surface_distance
 from msdm_core.meshing.lattice_meshing import box_mesh
 
 # Paths between Steiner points are never shorter than the geodesic and, over several triangles, at most 2 % longer.
@@ -46,3 +47,19 @@ def test_the_other_side_of_a_thin_plate_is_far():
 def test_same_point_is_zero_away():
     mesh = box_mesh((0.06, 0.06, 0.03), (6, 6, 3))
     assert surface_distance(mesh.points, mesh.boundary_triangles, [0.02, 0.02, 0.03], [[0.02, 0.02, 0.03]])[0] == 0.0
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.002, 0.2])
+def test_balls_exclude_no_nearest_triangle(size):
+    """Index and weights equal those of a search of all triangles: from near and far, at centres and corners."""
+    rng = np.random.default_rng(4)
+    places, sizes = rng.uniform(-0.05, 0.05, (400, 1, 3)), rng.uniform(0.0, 0.02, (400, 1, 1))
+    corners = places + sizes * rng.uniform(-1.0, 1.0, (400, 3, 3))
+    nearest = NearestTriangle(corners)
+    queries = np.concatenate([rng.uniform(-0.2, 0.2, (50, 3)), corners.mean(axis=1)[:30], corners[30:60, 1]])
+    for query in queries + size * rng.standard_normal(queries.shape):
+        weights = nearest_weights(corners, query)
+        squared = ((np.einsum("ti,tij->tj", weights, corners) - query) ** 2).sum(axis=1)
+        found, found_weights = nearest(query)
+        assert found == np.argmin(squared)
+        np.testing.assert_array_equal(found_weights, weights[found])

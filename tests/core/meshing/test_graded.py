@@ -10,7 +10,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 
 from msdm_core.material.stiffness import spring_network
-from msdm_core.mesh.geodesic import nearest_triangle
+from msdm_core.mesh.geodesic import NearestTriangle
 from msdm_core.mesh.quality import dihedral_angles, mesh_quality
 from msdm_core.mesh.surface import check_surface, triangles_facing
 from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh
@@ -125,7 +125,7 @@ def test_a_graded_body_is_sound_on_the_surface_and_well_shaped(seed, coarsening)
     corners, nodes = vertices[faces], mesh.points[mesh.boundary_nodes]
     # A node that lies on the surface lies on a triangle whose middle is near.
     for place, near in zip(nodes, KDTree(corners.mean(axis=1)).query(nodes, k=50)[1], strict=True):
-        triangle, weights = nearest_triangle(corners[near], place)
+        triangle, weights = NearestTriangle(corners[near])(place)
         assert np.linalg.norm(weights @ corners[near[triangle]] - place) < 1e-12
 
 

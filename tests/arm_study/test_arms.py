@@ -131,7 +131,7 @@ def test_run_repeats_to_the_byte(found, phantom):
 def test_summary_tells_versions_seed_and_inputs(found):
     summary = json.loads(json.dumps(found.summary, allow_nan=False))
     assert summary["seed"] == 0 and summary["points"] == 25
-    assert {"surgsim", "numpy", "scipy", "mujoco", "python"} <= set(summary["versions"])
+    assert {"surgsim", "python", "numpy", "scipy", "mujoco", "matplotlib"} == set(summary["versions"])
     inputs = summary["inputs"]
     assert (inputs["scene"], inputs["left"], inputs["right"]) == ("phantom", "psm_palpator", "psm_grasper")
     assert inputs["ports"]["wall"]["thickness"] == 0.02

@@ -10,13 +10,14 @@ channels. The result is a policy of stable-baselines3's PPO, from which `agents.
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
-from gymnasium.wrappers.vector import TransformObservation
+from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
@@ -47,6 +48,27 @@ class SeeingExpert:
         return np.array([self._expert.act(one.task_observation) for one in self._singles])
 
 
+class Blind(VectorWrapper):
+    """Environments with some entries of their observations set to 0; `final_obs` is not changed.
+
+    Gymnasium's own wrapper refuses environments that reset in the same step.
+    """
+
+    def __init__(self, envs: VectorEnv, entries: Sequence[int]) -> None:
+        super().__init__(envs)
+        self._entries = list(entries)
+
+    def reset(self, **kwargs: Any) -> tuple[NDArray, dict[str, Any]]:
+        """Start an episode everywhere."""
+        observations, info = self.env.reset(**kwargs)
+        return blinded(observations, self._entries), info
+
+    def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
+        """One control step of all."""
+        observations, *rest = self.env.step(actions)
+        return (blinded(observations, self._entries), *rest)  # type: ignore[return-value]
+
+
 def learn(arguments: argparse.Namespace) -> None:
     """Run DAgger; save the policy and print a line of figures after each round."""
     torch.set_num_threads(1)
@@ -60,7 +82,7 @@ def learn(arguments: argparse.Namespace) -> None:
     options = CloningOptions(epochs=arguments.epochs, patience=15, std=0.05, seed=arguments.seed)
     began, rounds = time.time(), []
     for done in dagger(
-        TransformObservation(envs, lambda observations: blinded(observations, entries)),
+        Blind(envs, entries),
         expert,
         model,
         rounds=arguments.rounds,

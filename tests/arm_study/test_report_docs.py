@@ -32,7 +32,7 @@ def test_the_ports_file_is_read_and_is_where_ports_are_by_default():
 
 @pytest.mark.usefixtures("few_maps")
 def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch):
-    (command,) = set(re.findall(r"^surgsim (arms .*--out.*)$", DOCS + README, flags=re.M))
+    (command,) = set(re.findall(r"^surgsim (arms .*--compare.*)$", DOCS + README, flags=re.M))
     (text,) = re.findall(r"```toml\n(.*?)```", DOCS, flags=re.S)
     monkeypatch.chdir(tmp_path)
     for name in ("ports.toml", "wide.toml"):

@@ -39,7 +39,7 @@ def test_bench(tmp_path, monkeypatch, capsys):
     report = (tmp_path / "deep" / "benchmarks.md").read_text(encoding="utf-8")
     for name in ("Newton explicit", "Newton vbd"):
         assert re.search(rf"\| {name} \| absent \|.*not installed", report)
-    assert "trilinear 1x1x1" in report and "What each can give" in report
+    assert "trilinear 1x1x1" in report and side_by_side.LIMITS.strip() in report
 
 
 def test_no_folder_can_be_made_of_a_file(tmp_path, capsys):

@@ -37,7 +37,7 @@ class Told:
         self.task, self.simulation = env.task, env.simulation
         self.returned = 0.0
         self._tell({})
-        monkeypatch.setattr(self.task, "_grasp", lambda _: HELD if self.holds else EMPTY)
+        monkeypatch.setattr(type(self.simulation), "grasp", property(lambda _: HELD if self.holds else EMPTY))
         monkeypatch.setattr(self.task, "_feel", self._feel)
         monkeypatch.setattr(self.task, "_from_target", lambda _: np.array([self.place, 0.0, 0.0]))
         monkeypatch.setattr(Pair, "collision_force", property(lambda _: self.collision))

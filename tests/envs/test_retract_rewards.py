@@ -16,7 +16,7 @@ class Told:
     def __init__(self, env, monkeypatch):
         self.task, self.simulation = env.task, env.simulation
         self.returned, self.verdict = 0.0, None
-        monkeypatch.setattr(self.task, "_grasp", lambda _: HELD if self.holds else EMPTY)
+        monkeypatch.setattr(type(self.simulation), "grasp", property(lambda _: HELD if self.holds else EMPTY))
         self.holds = False
 
     def step(self, visible=0.0, holds=False, force=0.0, pull=0.0, fault=""):

@@ -42,10 +42,10 @@ def test_levels_are_those_of_the_code() -> None:
 
 def test_the_estimators_numbers_are_those_of_the_code() -> None:
     for said in (
-        f"N(0, {lesion_estimator.BACKGROUND_SPREAD:g}^2)",
-        f"GP(0, {lesion_estimator.EXCESS_SPREAD:g}^2",
-        f"l = {1000.0 * lesion_estimator.EXCESS_LENGTH:g} mm",
-        f"+ {lesion_estimator.MODEL_SPREAD:g}^2",
+        f"b \\sim N(0, \\, {lesion_estimator.BACKGROUND_SPREAD:g}^2)",
+        f"\\left( 0, \\, {lesion_estimator.EXCESS_SPREAD:g}^2",
+        f"l = {1000.0 * lesion_estimator.EXCESS_LENGTH:g} \\text{{ mm}}",
+        f"+ {lesion_estimator.MODEL_SPREAD:g}²",
         f"above {lesion_estimator.EXCESS_LEAST:g} + {lesion_estimator.EXCESS_LEAST_NOISE:g} (sensor's noise",
         f"at least {1000.0 * lesion_estimator.DISTANCE_LEAST:g} mm apart",
         f"within {1000.0 * lesion_estimator.CENTROID_RADIUS:g} mm",

@@ -81,6 +81,7 @@ def test_the_files_and_the_summary(folder, made, capsys):
     assert made[0][0].ports.endoscope.point == (0.03, -0.02, 0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_a_run_repeats_to_the_byte_wherever_it_is_written(folder, made, tmp_path_factory):
     other = tmp_path_factory.mktemp("other") / "deep" / "er"

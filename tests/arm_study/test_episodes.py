@@ -45,6 +45,7 @@ def page_of(run, folder, organ="liver"):
     return Page((folder / "report.html").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_a_real_episode_in_the_report_and_its_json(tmp_path, monkeypatch):
     """One episode through the command; its figures against a run of the same script by hand."""

@@ -211,6 +211,7 @@ def returns_of_places(places):
     return total.mean()
 
 
+@pytest.mark.slow
 def test_a_search_is_paid_more_than_pressing_one_place_again_and_again():
     """An even raster against the middle of the chart, 16 presses each, level "standard"."""
     side = np.linspace(-0.75, 0.75, 4)

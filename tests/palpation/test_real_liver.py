@@ -31,6 +31,7 @@ def strongest_is_within_radius(summary, name):
     return lesion["felt"] and lesion["estimate"] == 0
 
 
+@pytest.mark.slow
 def test_one_place(tmp_path):
     ball = ",".join(map(str, [*PLACES["below"][0], 0.034]))
     summary = palpate(0, tmp_path, "--around", ball)

@@ -185,7 +185,7 @@ def flap_steps(
 
     Args:
         simulation: at rest, the jaw open before the edge.
-        target: what shall be seen.
+        target: centre of the disc to expose [m], shape (3,).
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
         enough: whether the target is seen well enough to lift the edge no farther.
         aside: how far beside the target the edge is grasped, along x [m].
@@ -288,7 +288,7 @@ def retraction_steps(
 
     Args:
         simulation: at rest, the jaw open on the free side.
-        target: what shall be seen.
+        target: centre of the disc to expose [m], shape (3,).
         enough: whether the target is seen well enough to carry the lobe no farther.
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
         aside: how far beside the target the edge is grasped, along x [m].

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -179,10 +178,6 @@ class BimanualRetractTask(RetractTask):
                 "[[supports]] that bear the target: add them, or take a scene that has them, such as 'lobe'"
             )
         self.touch_force = self.uncovered_share = 0.0
-
-    def right_force(self, observation: NDArray[np.floating]) -> FloatArray:
-        """The right arm's force reading in an observation [N], shape (3,)."""
-        return np.asarray(observation[self.observation_slices["right_force"]], dtype=np.float64)
 
     def command(self, action: FloatArray, instrument: Instrument) -> None:
         """Set both tips' velocities and rotations, and the left jaw's target."""

@@ -15,7 +15,7 @@ from surgsim_env.reports.html_page import POLICY
 from tests.arm_study.made import made_episodes, made_evaluation
 from tests.chromium import Browser
 
-# What the browser made of it: the widths of its pictures, the widest part beside the window, what was fetched.
+# Measured in the page: the widths of its pictures, its width and that of the window, the addresses it has fetched.
 MADE = """({
   images: [...document.images].map(one => one.complete ? one.naturalWidth : 0),
   widest: document.documentElement.scrollWidth, window: innerWidth,

@@ -1,4 +1,4 @@
-"""The main job on a CT-derived human liver, with a small raster around one of the fixed places; `slow`: all five."""
+"""The main job on a CT-derived human liver: a small raster around one of the fixed places, and all five."""
 
 import json
 from pathlib import Path

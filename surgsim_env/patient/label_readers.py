@@ -1,9 +1,12 @@
 """Readers of label images, NIfTI, NRRD, MetaImage and DICOM: shape, geometry in the patient, and voxels in runs."""
 
 import io
+import logging
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from logging.handlers import BufferingHandler
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +34,18 @@ RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
 # Most that may precede the image's first voxel, and follow its last one [bytes].
 HEADER_BYTES = TAIL_BYTES = 1_000_000
-# SimpleITK reads whole images [bytes].
-ITK_BYTES_MOST = 4_000_000_000
+# nibabel has some ten checks of a header, one remark each.
+REMARKS_MOST = 100
+# SimpleITK and pydicom read whole images: most that the image, the decoder's copies of it and the labels found, a byte
+# a voxel, may take together [bytes].
+IMAGE_BYTES_MOST = 1_600_000_000
+# What they hold of an image at once: ITK unpacks NRRD and MetaImage in place, GDCM and pydicom copy.
+COPIES = {".nrrd": 1, ".mha": 1, ".dcm": 2}
 # Only so much of a library's message is quoted [characters].
 REASON_LENGTH = 200
 READERS = {".nrrd": "NrrdImageIO", ".mha": "MetaImageIO", ".dcm": "GDCMImageIO"}
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
-# pydicom holds the whole file and its unpacked frames in memory [bytes].
-DICOM_BYTES_MOST = 2_000_000_000
 # Frame positions may be off the grid by this share of the slice step, or of 1 mm where slices are thinner.
 SLACK = 0.02
 
@@ -183,19 +189,20 @@ def open_nifti(file: Path) -> LabelSource:
     if packed != file.name.lower().endswith(".gz"):
         name, what = (".nii.gz", "is not") if not packed else (".nii", "is")
         raise MeshError(f"{file}: is named {name} and {what} compressed by gzip: rename it, or {ADVICE}")
-    header = _header(file)
+    header, notes = _header(file)
     shape = checked_shape(parsed(file, lambda _: header.get_data_shape(), ADVICE), file)
     dtype = np.dtype(parsed(file, lambda _: header.get_data_dtype(), ADVICE))
     checked_kind(dtype, file)
-    offset = int(header.get_data_offset())
-    if not 0 <= offset <= HEADER_BYTES:
+    # The header's own number, infinite or not; nibabel's method would make a whole number of it.
+    stated = float(header["vox_offset"])
+    if not 0 <= stated <= HEADER_BYTES:
         raise MeshError(
-            f"{file}: its header puts the first voxel at byte {offset} (vox_offset); the rule is 0 to {HEADER_BYTES}: "
-            "export it without header extensions"
+            f"{file}: its header puts the first voxel at byte {stated:.10g} (vox_offset); the rule is 0 to "
+            f"{HEADER_BYTES}: export it without header extensions"
         )
+    offset = int(header.get_data_offset())
     slope, shift = parsed(file, lambda _: header.get_slope_inter(), ADVICE)
     scaling = (1.0 if slope is None else float(slope), 0.0 if shift is None else float(shift))
-    notes = []
     unit = str(parsed(file, lambda _: header.get_xyzt_units(), ADVICE)[0])
     if unit not in METRES:
         notes.append("the header states no length unit: millimetres are assumed, as NIfTI's readers do")
@@ -209,8 +216,8 @@ def open_nifti(file: Path) -> LabelSource:
     return LabelSource(file, shape, geometry, runs, tuple(notes))
 
 
-def _header(file: Path) -> Any:
-    """The header without its extensions, whose stated sizes nibabel.load would trust."""
+def _header(file: Path) -> tuple[Any, list[str]]:
+    """The header without its extensions, whose stated sizes nibabel.load would trust, and what nibabel mended in it."""
     try:
         from nibabel.nifti1 import Nifti1Header
         from nibabel.nifti2 import Nifti2Header
@@ -222,9 +229,18 @@ def _header(file: Path) -> Any:
     # Positions of the magic words in the two versions of the format.
     for kind, magic, place in ((Nifti1Header, b"n+1\0", 344), (Nifti2Header, b"n+2\0", 4)):
         if raw[place : place + 4] == magic:
-            size = kind.template_dtype.itemsize
-            return parsed(file, lambda _, kind=kind, size=size: kind.from_fileobj(io.BytesIO(raw[:size])), ADVICE)
+            block = io.BytesIO(raw[: kind.template_dtype.itemsize])
+            return parsed(file, lambda _, kind=kind, block=block: _checked_header(kind, block), ADVICE)
     raise MeshError(f"{file}: is no NIfTI image of one file (no n+1 or n+2 in its header): {ADVICE}")
+
+
+def _checked_header(kind: Any, block: io.BytesIO) -> tuple[Any, list[str]]:
+    """A header after nibabel's checks. Their remarks go to a logger of this call; nibabel's own prints to stderr."""
+    header, said = kind.from_fileobj(block, check=False), BufferingHandler(REMARKS_MOST)
+    logger = logging.Logger(__name__, logging.WARNING)
+    logger.addHandler(said)
+    header.check_fix(logger=logger)
+    return header, [f"the header is unusual: {record.getMessage()}" for record in said.buffer]
 
 
 def _opened(file: Path, size: int) -> bytes:
@@ -281,11 +297,7 @@ def open_itk(file: Path) -> LabelSource:
         raise MeshError(f"{file}: each voxel has {components} numbers; the rule is one label: export one layer of it")
     pixel = SimpleITK.GetPixelIDValueAsString(reader.GetPixelID())
     width = next((size for name, size in (("8-bit", 1), ("16-bit", 2), ("32-bit", 4)) if name in pixel), 8)
-    if np.prod(np.array(shape, dtype=np.float64)) * width > ITK_BYTES_MOST:
-        raise MeshError(
-            f"{file}: holds {' x '.join(map(str, shape))} voxels of {width} bytes; at most {ITK_BYTES_MOST / 1e9:g} GB "
-            "of this format are read at once: crop it, or save it as NIfTI of 8 bits"
-        )
+    _check_memory(file, shape, width)
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
     matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
@@ -300,6 +312,18 @@ def open_itk(file: Path) -> LabelSource:
             yield first, values[first : first + RUN_VOXELS]
 
     return LabelSource(file, shape, geometry, runs, notes)
+
+
+def _check_memory(file: Path, shape: tuple[int, int, int], width: int) -> None:
+    """Refuse, before it is decoded, an image whose voxels of `width` bytes take more than IMAGE_BYTES_MOST."""
+    voxels, copies = shape[0] * shape[1] * shape[2], COPIES[file.suffix.lower()]
+    taken = voxels * (copies * width + 1)
+    if taken > IMAGE_BYTES_MOST:
+        raise MeshError(
+            f"{file}: holds {' x '.join(map(str, shape))} voxels of {width} bytes, which take {taken / 1e9:.3g} GB to "
+            f"read; at most {IMAGE_BYTES_MOST / 1e9:g} GB of this format are read at once: crop it, or save it as "
+            "NIfTI, which is read in parts"
+        )
 
 
 def _asked(file: Path, question: Callable[[], Any]) -> Any:
@@ -336,8 +360,10 @@ def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
         import pydicom
     except ImportError:
         raise MeshError(f"{file}: reading DICOM needs pydicom: pip install 'surgsim[patient]'") from None
-    if file.stat().st_size > DICOM_BYTES_MOST:
-        raise MeshError(f"{file}: has more than {DICOM_BYTES_MOST / 1e9:g} GB: crop it to the organ")
+    # pydicom holds the whole file.
+    if file.stat().st_size > IMAGE_BYTES_MOST:
+        raise MeshError(f"{file}: has more than {IMAGE_BYTES_MOST / 1e9:g} GB: crop it to the organ")
+    parsed(file, lambda _: _check_deflated(file), ADVICE)
     data: Any = parsed(file, pydicom.dcmread, ADVICE)
     if str(data.get("SOPClassUID", "")) not in CLASSES:
         return None
@@ -346,6 +372,26 @@ def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
     except (AttributeError, KeyError, IndexError, TypeError) as error:
         reason = " ".join(str(error).split())[:REASON_LENGTH]
         raise MeshError(f"{file}: is no complete DICOM segmentation ({reason}): {ADVICE}") from None
+
+
+def _check_deflated(file: Path) -> None:
+    """Refuse a deflated data set that unpacks to more than IMAGE_BYTES_MOST; pydicom would unpack it at once."""
+    from pydicom.filereader import read_file_meta_info
+    from pydicom.uid import DeflatedExplicitVRLittleEndian
+
+    meta = read_file_meta_info(file)
+    if meta.get("TransferSyntaxUID") != DeflatedExplicitVRLittleEndian:
+        return
+    unpacked, inflate = 0, zlib.decompressobj(-zlib.MAX_WBITS)
+    with file.open("rb") as stream:
+        # The preamble with its magic word, and the element that states the length of the file meta information.
+        stream.seek(144 + int(meta.FileMetaInformationGroupLength))
+        waiting = stream.read(RUN_VOXELS)
+        while waiting and not inflate.eof:
+            unpacked += len(inflate.decompress(waiting, RUN_VOXELS))
+            if unpacked > IMAGE_BYTES_MOST:
+                raise ValueError(f"its deflated data are more than {IMAGE_BYTES_MOST / 1e9:g} GB: crop it to the organ")
+            waiting = inflate.unconsumed_tail or stream.read(RUN_VOXELS)
 
 
 def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
@@ -359,7 +405,11 @@ def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
         raise MeshError(f"{file}: segment {missing[0]} is nowhere in it; there are {there}: correct --labels")
     frames = list(data.PerFrameFunctionalGroupsSequence)
     rows, columns = int(data.Rows), int(data.Columns)
-    checked_shape((columns, rows, len(frames)), file)
+    stated = int(data.NumberOfFrames)
+    if stated != len(frames):
+        raise MeshError(f"{file}: states {stated} frames and describes {len(frames)}: {ADVICE}")
+    width = -(-int(data.BitsAllocated) * int(data.SamplesPerPixel) // 8)
+    _check_memory(file, checked_shape((columns, rows, len(frames)), file), width)
     geometry, slices = _geometry(file, data, frames)
     shape = checked_shape((columns, rows, int(slices.max()) + 1), file)
     identified = frames if kind == "BINARY" else []

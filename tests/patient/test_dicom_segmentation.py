@@ -3,6 +3,7 @@
 import numpy as np
 import pydicom
 import pytest
+from pydicom.uid import DeflatedExplicitVRLittleEndian
 
 from msdm_core.errors import MeshError
 from surgsim_env.patient.label_image import parse_labels, read_label_image
@@ -73,12 +74,17 @@ def without_segments(data):
     del data.SegmentSequence
 
 
+def with_more_frames(data):
+    data.NumberOfFrames = 2_000_000_000
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (fractional, "its segments are FRACTIONAL; the rule is BINARY or LABELMAP"),
         (turned_once, "its frames have 2 orientations; the rule is one stack"),
         (one_slice_without_thickness, "has one slice and states no thickness"),
+        (with_more_frames, "states 2000000000 frames and describes 30"),
         (without_segments, r"is no complete DICOM segmentation \(.*SegmentSequence"),
     ],
 )
@@ -86,3 +92,16 @@ def test_a_segmentation_that_is_no_stack_of_labels_is_refused(change, words, tmp
     file, _ = segmentation(tmp_path)
     with pytest.raises(MeshError, match=words):
         read_label_image(edited(file, change), BOTH)
+
+
+def test_a_deflated_segmentation_is_read_up_to_the_limit(tmp_path, monkeypatch):
+    def deflated(data):
+        data.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
+
+    file, labels = segmentation(tmp_path)
+    edited(file, deflated)
+    both = parse_labels("liver=1,lesion=3")
+    assert np.count_nonzero(read_label_image(file, both).tags) == np.count_nonzero(labels)
+    monkeypatch.setattr("surgsim_env.patient.label_readers.IMAGE_BYTES_MOST", 2 * file.stat().st_size)
+    with pytest.raises(MeshError, match=r"its deflated data are more than .* crop it to the organ"):
+        read_label_image(file, both)

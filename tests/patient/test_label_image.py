@@ -176,8 +176,9 @@ def test_voxels_of_several_numbers_and_too_many_bytes_for_itk(tmp_path, monkeypa
     SimpleITK.WriteImage(SimpleITK.Image([4, 4, 4], SimpleITK.sitkVectorUInt8, 3), str(tmp_path / "rgb.nrrd"))
     refused(tmp_path / "rgb.nrrd", "each voxel has 3 numbers; the rule is one label")
     SimpleITK.WriteImage(SimpleITK.Image([4, 5, 6], SimpleITK.sitkInt16), str(tmp_path / "big.nrrd"))
-    monkeypatch.setattr("surgsim_env.patient.label_readers.ITK_BYTES_MOST", 2 * 4 * 5 * 6 - 1)
-    refused(tmp_path / "big.nrrd", r"holds 4 x 5 x 6 voxels of 2 bytes; at most .* of this format are read at once")
+    # Two bytes a voxel for the image, one for the labels in it.
+    monkeypatch.setattr("surgsim_env.patient.label_readers.IMAGE_BYTES_MOST", 3 * 4 * 5 * 6 - 1)
+    refused(tmp_path / "big.nrrd", r"holds 4 x 5 x 6 voxels of 2 bytes, which take .*; at most .* are read at once")
 
 
 def test_a_huge_image_is_refused_by_its_header(tmp_path):
@@ -245,6 +246,32 @@ def test_a_long_header_extension_is_refused_unread(tmp_path):
     assert peak < 5_000_000
     below = with_extension(tmp_path / "b.nii.gz", 16, room=56, vox_offset=-400.0)
     refused(below, "cannot be parsed|first voxel at byte -400")
+
+
+@pytest.mark.parametrize(("offset", "shown"), [(np.inf, "inf"), (np.nan, "nan"), (2.0**100, r"1\.2676506e\+30")])
+def test_a_first_voxel_at_no_byte_is_one_line(offset, shown, tmp_path):
+    file = with_extension(tmp_path / "a.nii.gz", 16, room=56, vox_offset=offset)
+    refused(file, rf"first voxel at byte {shown}\d* \(vox_offset\); the rule is 0 to 1000000")
+
+
+def test_remarks_of_nibabel_are_notes_and_not_printed(tmp_path, capfd):
+    """A form code that NIfTI has not is set to 0 by nibabel, which prints that it was."""
+    data = bytearray(plain(tmp_path / "a.nii").read_bytes())
+    data[254:256] = struct.pack("<h", 200)  # sform_code
+    (tmp_path / "a.nii").write_bytes(data)
+    refused(tmp_path / "a.nii", "label 7 .* is nowhere", parse_labels("liver=7"))
+    assert capfd.readouterr() == ("", "")
+    notes = " ".join(read_label_image(tmp_path / "a.nii", BOTH).notes)
+    assert "the header is unusual: sform_code 200 not valid" in notes
+
+
+def test_what_decoding_takes_is_refused_by_the_header(tmp_path):
+    """4 bytes a voxel and one for its label: 5 GB. Nothing is decoded, so the data are left out."""
+    (tmp_path / "a.nrrd").write_bytes(
+        b"NRRD0004\ntype: uint32\ndimension: 3\nsizes: 1000 1000 1000\nspacings: 1 1 1\nendian: little\n"
+        b"encoding: gzip\n\n" + gzip.compress(bytes(1000))
+    )
+    refused(tmp_path / "a.nrrd", "voxels of 4 bytes, which take 5 GB to read; at most 1.6 GB of this format")
 
 
 @pytest.mark.parametrize("slope", [1.0, 2.0])

@@ -25,6 +25,7 @@ def mesh() -> "trimesh.Trimesh":
     return trimesh.load(COMMITTED, process=False)
 
 
+@pytest.mark.slow
 def test_generator_writes_the_committed_file(tmp_path: Path) -> None:
     written = tmp_path / "liver.ply"
     subprocess.run([sys.executable, str(MESHES / "make_liver.py"), str(written)], check=True, timeout=600)

@@ -362,7 +362,7 @@ def _number(cell: str) -> float | None:
 
 for _scene, _steps in (("phantom", 40), ("phantom_small", 80), ("liver", 40)):
     case(f"Palpate-v0 {_scene} random", play_random, "Palpate-v0", _scene, _steps)
-    case(f"Palpate-v0 {_scene} oracle", play_oracle, "Palpate-v0", _scene, slow=_scene == "liver")
+    case(f"Palpate-v0 {_scene} oracle", play_oracle, "Palpate-v0", _scene, slow=_scene != "phantom_small")
 case("Palpate-v0 phantom_small random, plain loop", play_random, "Palpate-v0", "phantom_small", 80, loop="python")
 case("Palpate-v0 phantom_small random, memory", play_random, "Palpate-v0", "phantom_small", 40, memory=True)
 case(
@@ -395,12 +395,12 @@ case(
     instrument="psm_palpator",
 )
 case("Retract-v0 lobe random", play_random, "Retract-v0", "lobe", 40)
-case("Retract-v0 lobe random, plain loop", play_random, "Retract-v0", "lobe", 40, loop="python")
+case("Retract-v0 lobe random, plain loop", play_random, "Retract-v0", "lobe", 40, loop="python", slow=True)
 case("Retract-v0 lobe random, psm_retractor", play_random, "Retract-v0", "lobe", 40, instrument="psm_retractor")
-case("Retract-v0 lobe oracle", play_oracle, "Retract-v0", "lobe")
+case("Retract-v0 lobe oracle", play_oracle, "Retract-v0", "lobe", slow=True)
 case("Retract-v0 lobe oracle, psm_retractor", play_oracle, "Retract-v0", "lobe", instrument="psm_retractor", slow=True)
 case("BimanualRetract-v0 lobe random", play_random, "BimanualRetract-v0", "lobe", 40)
-case("BimanualRetract-v0 lobe oracle, first steps", play_oracle, "BimanualRetract-v0", "lobe", 4)
+case("BimanualRetract-v0 lobe oracle, first steps", play_oracle, "BimanualRetract-v0", "lobe", 4, slow=True)
 case("BimanualRetract-v0 lobe oracle", play_oracle, "BimanualRetract-v0", "lobe", slow=True)
 
 case("Palpate-v0 phantom vector", play_vector, "Palpate-v0", "phantom", 30)
@@ -420,7 +420,7 @@ case(
     level="standard",
 )
 case("Palpate-v0 phantom vector, psm_palpator", play_vector, "Palpate-v0", "phantom", 12, instrument="psm_palpator")
-case("Palpate-v0 liver vector", play_vector, "Palpate-v0", "liver", 12)
+case("Palpate-v0 liver vector", play_vector, "Palpate-v0", "liver", 12, slow=True)
 case("PalpateSites-v0 phantom_small vector", play_vector, "PalpateSites-v0", "phantom_small", 7, budget=4)
 case(
     "PalpateSites-v0 phantom vector, SameStep, float32",
@@ -428,9 +428,18 @@ case(
     budget=3,
     autoreset_mode="SameStep",
     dtype="float32",
+    slow=True,
 )
 case("Retract-v0 lobe vector", play_vector, "Retract-v0", "lobe", 32, max_episode_steps=29)
-case("Retract-v0 lobe vector, psm_retractor", play_vector, "Retract-v0", "lobe", 25, instrument="psm_retractor")
+case(
+    "Retract-v0 lobe vector, psm_retractor",
+    play_vector,
+    "Retract-v0",
+    "lobe",
+    25,
+    instrument="psm_retractor",
+    slow=True,
+)
 # It alone compiles float32 for rest shapes of their own.
 case("Retract-v0 lobe vector, float32", play_vector, "Retract-v0", "lobe", 25, dtype="float32", slow=True)
 

@@ -11,6 +11,7 @@ import surgsim_env  # noqa: F401
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "agents"))
 
 
+@pytest.mark.slow
 def test_raster_agent_finds_the_lesion():
     import raster
 

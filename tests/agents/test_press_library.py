@@ -16,6 +16,7 @@ from surgsim_env.scene.levels import LEVELS
 SAMPLE = Path(agents.__file__).parent / "training" / "press_library_sample.npz"
 
 
+@pytest.mark.slow
 def test_what_is_looked_up_is_what_would_be_simulated(tmp_path, monkeypatch):
     """Presses at sites of the grid, then between them, without noise: to float32, and within a few hundredths."""
     library = make_library(tmp_path / "small.npz", "phantom_small", "standard", 2, dtype=np.float64, lanes=8)

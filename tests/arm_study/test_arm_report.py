@@ -278,6 +278,7 @@ def test_inputs_are_told_whatever_their_shape(evaluation, tmp_path):
     assert page.row("compare")[1] == "none" and page.row("ports, hole")[1] == "0.03"
 
 
+@pytest.mark.slow
 def test_every_map_is_a_picture_with_something_in_it(folder):
     maps = sorted(folder.glob("map_*.png"))
     assert len(maps) == 11
@@ -329,6 +330,7 @@ def test_the_first_view_is_the_cameras(evaluation):
     assert without.towards @ np.array([0.0, -0.74, 0.67]) > 0.9
 
 
+@pytest.mark.slow
 def test_arms_are_drawn_where_both_reach_when_no_picture_came(tmp_path):
     evaluation = made_evaluation(pictures=False)
     arms = tuple(load_arm(name, PORTS[side]) for name, side in (("psm_grasper", "left"), ("psm_palpator", "right")))
@@ -341,6 +343,7 @@ def test_arms_are_drawn_where_both_reach_when_no_picture_came(tmp_path):
     assert f"the left arm with its tip at point {places['left']}" in picture.description
 
 
+@pytest.mark.slow
 def test_nothing_reached_is_told_as_that(tmp_path):
     evaluation = made_evaluation(left_to=-2.0, right_to=-2.0, pictures=False)
     assert not evaluation.left.reachable.any()
@@ -350,6 +353,7 @@ def test_nothing_reached_is_told_as_that(tmp_path):
     assert page.row("tip force [N]")[1:] == ["–"] * 9
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_everything_reached_without_inner_targets(tmp_path):
     evaluation = made_evaluation(inner_count=0, count=60)
@@ -361,6 +365,7 @@ def test_everything_reached_without_inner_targets(tmp_path):
     assert "missed" not in verdict(evaluation)
 
 
+@pytest.mark.slow
 def test_the_files_repeat_to_the_byte(evaluation, folder, tmp_path):
     again = written(evaluation, tmp_path / "elsewhere" if (tmp_path / "elsewhere").mkdir() is None else tmp_path)
     names = {path.name for path in folder.iterdir()}

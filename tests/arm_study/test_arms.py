@@ -156,6 +156,7 @@ def mirrored_place(place):
     return PortPlace((-x, y, z), (-u, v, w), roll=-place.roll)
 
 
+@pytest.mark.slow
 def test_mirrored_scene_has_the_mirrored_report():
     """x to -x, left to right: the same points, reasons and figures, to what the search leaves of rounding."""
     anatomy = load_anatomy(make_scene("liver"))

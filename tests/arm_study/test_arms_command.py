@@ -117,6 +117,7 @@ def test_a_real_run_repeats_to_the_byte_and_says_what_was_found(folder):
     assert row["both"] == pytest.approx(summary["reachable"]["both"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_the_command_in_the_report_makes_it_again(folder, made):
     assert (
@@ -132,6 +133,7 @@ def test_the_command_in_the_report_makes_it_again(folder, made):
     assert (folder / "again" / "report.html").read_bytes() == (folder / "out" / "report.html").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_compare_ranks_ports_and_robots(folder, made, capsys):
     assert main(arguments("--compare", "wide.toml", "six_axis")) == 0
@@ -246,6 +248,7 @@ def test_a_missing_option_is_refused_in_one_line(capsys):
     refused(["arms", "--left", "psm_grasper"], "--right", capsys)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_without_a_ports_file_they_stand_as_laparoscopy_places_them(folder, made):
     given = arguments()

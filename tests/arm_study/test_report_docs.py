@@ -30,6 +30,7 @@ def test_the_ports_file_is_read_and_is_where_ports_are_by_default():
     assert ports.wall == usual.wall and len(ports.targets) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch):
     (command,) = set(re.findall(r"^surgsim (arms .*--compare.*)$", DOCS + README, flags=re.M))

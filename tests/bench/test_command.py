@@ -17,6 +17,7 @@ TINY = Effort(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:scene:UserWarning")
 def test_bench(tmp_path, monkeypatch, capsys):
     def missing(name: str):

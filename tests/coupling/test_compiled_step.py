@@ -67,11 +67,11 @@ def press(both, seed, count):
 
 EPISODES = [
     ("phantom", "probe", 3, 30),
-    ("phantom", "probe", 11, 20),
-    ("liver", "probe", 5, 20),
+    pytest.param("phantom", "probe", 11, 20, marks=pytest.mark.slow),
+    pytest.param("liver", "probe", 5, 20, marks=pytest.mark.slow),
     ("phantom", "psm_palpator", 3, 30),
-    ("liver", "psm_palpator", 5, 20),
-    ("phantom", "six_axis", 3, 20),
+    pytest.param("liver", "psm_palpator", 5, 20, marks=pytest.mark.slow),
+    pytest.param("phantom", "six_axis", 3, 20, marks=pytest.mark.slow),
 ]
 
 

@@ -28,6 +28,8 @@ QUICK = {
     # The evaluation looks for ports before all else; the slow test runs it.
     "own_robot": [("surgsim arms --left psm_grasper", "pip # --left psm_grasper")],
 }
+# An organ of one's own from a mesh to an agent, and six episodes of a controller.
+SLOW = {"own_organ", "test_a_controller"}
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 # Numbers repeat to the bit on one machine; libraries of other versions may mesh or round otherwise.
 RELATIVE, ABSOLUTE = 0.05, 0.015
@@ -117,7 +119,11 @@ TRAINS_LAST = {"own_task"}
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.agents) if name in NEEDS_AGENTS else name for name in NAMES]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.agents] * (name in NEEDS_AGENTS) + [pytest.mark.slow] * (name in SLOW))
+        for name in NAMES
+    ],
 )
 def test_it_runs(name, folder, capsys):
     if name in NEEDS_AGENTS:

@@ -18,21 +18,23 @@ from tests.envs.walks import rollout
 
 OWN = load_own_task()
 IDS = [*sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/")), OWN]
-# A press a step, which takes as long as some ten steps of the other ids: enough of them for walks that are shorter.
-SETTINGS = {"SurgSim/PalpateSites-v0": {"budget": 20}}
+# A small organ where the id has one. A press a step, which takes as long as some ten steps of the other ids: enough of
+# them for walks that are shorter.
+SETTINGS = {
+    "SurgSim/Palpate-v0": {"scene": "phantom_small"},
+    "SurgSim/PalpateSites-v0": {"scene": "phantom_small", "budget": 20},
+}
 SHORTER = {"SurgSim/PalpateSites-v0": 5}
 # Every id with its scene's own instrument, and some with an arm.
 CASES = [(env_id, SETTINGS.get(env_id, {})) for env_id in IDS] + [
-    ("SurgSim/Palpate-v0", {"instrument": "psm_palpator"}),
-    ("SurgSim/Retract-v0", {"instrument": "psm_retractor"}),
+    ("SurgSim/Palpate-v0", {"scene": "phantom", "instrument": "psm_palpator"}),
+    pytest.param(("SurgSim/Retract-v0", {"instrument": "psm_retractor"}), marks=pytest.mark.slow),
 ]
-# The scene that an id has by default, its number of cells, and fewer.
-SCENES = {
-    "SurgSim/Palpate-v0": ("phantom", "[12, 12, 6]", "[6, 6, 3]"),
-    "SurgSim/PalpateSites-v0": ("phantom", "[12, 12, 6]", "[6, 6, 3]"),
-    "SurgSim/Retract-v0": ("lobe", "[20, 13, 3]", "[20, 13, 2]"),
-    "SurgSim/BimanualRetract-v0": ("lobe", "[20, 13, 3]", "[20, 13, 2]"),
-    OWN: ("phantom_small", "[8, 8, 4]", "[6, 6, 3]"),
+# The cells of a scene, and fewer.
+CELLS = {
+    "phantom": ("[12, 12, 6]", "[6, 6, 3]"),
+    "phantom_small": ("[8, 8, 4]", "[6, 6, 3]"),
+    "lobe": ("[20, 13, 3]", "[20, 13, 2]"),
 }
 # Entries of an observation that a walk of some steps leaves as they are: the axis of a wrist that is a hinge, what is
 # grasped and what is seen.
@@ -52,7 +54,7 @@ def made(request):
     env_id, settings = request.param
 
     def make(**more):
-        return (gym.make_vec if "num_envs" in more else gym.make)(env_id, **settings, **more)
+        return (gym.make_vec if "num_envs" in more else gym.make)(env_id, **{**settings, **more})
 
     return make
 
@@ -128,7 +130,8 @@ def test_foreign_or_broken_states_are_refused(made, tmp_path):
         env.save_state()
     env.reset(seed=0)
     saved = env.save_state()
-    name, cells, fewer = SCENES[env.spec.id]
+    name = env.scene.name
+    cells, fewer = CELLS[name]
     text = (scenes_folder() / "organs" / f"{name}.toml").read_text()
     assert cells in text
     (tmp_path / f"{name}.toml").write_text(text.replace(cells, fewer))

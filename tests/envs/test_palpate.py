@@ -166,6 +166,7 @@ def test_ending_without_finding_never_pays_more_than_searching_on():
         assert PalpateTask.weights[failure] < 0.0
 
 
+@pytest.mark.slow
 def test_a_blind_declare_pays_less_than_an_honest_search_that_finds_nothing(env):
     rng = np.random.default_rng(0)
     found, returns = 0, []

@@ -55,6 +55,7 @@ def test_the_organ_is_the_one_that_was_drawn(shared_retract):
     assert np.ptp(along) <= drawn.held_share * extent[0] * (1.0 + 1e-6)
 
 
+@pytest.mark.slow
 def test_a_target_in_plain_view_is_drawn_again(shared_retract, monkeypatch):
     seen = iter([0.5, 0.11, 0.02])
     monkeypatch.setattr(shared_retract.task, "_look", lambda _: next(seen, 0.02))

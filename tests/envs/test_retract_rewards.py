@@ -58,7 +58,9 @@ def worst_full_return(told):
     return told.returned
 
 
-@pytest.mark.parametrize("failure", FAILURES)
+@pytest.mark.parametrize(
+    "failure", ["torn", *(pytest.param(one, marks=pytest.mark.slow) for one in ("hard_force", "fault"))]
+)
 def test_no_failed_episode_returns_more_than_the_worst_full_one(told, failure):
     """The best way to fail: all seen but never for long, grasped, without pressing; then, sooner or later, harm."""
     worst = worst_full_return(told)

@@ -42,7 +42,11 @@ def action(observation: np.ndarray, goal: np.ndarray, *, grasp: bool, size: int)
 
 @pytest.mark.parametrize(
     ("mode", "instrument"),
-    [pytest.param("NextStep", None, marks=pytest.mark.slow), ("SameStep", None), ("SameStep", "psm_retractor")],
+    [
+        pytest.param("NextStep", None, marks=pytest.mark.slow),
+        pytest.param("SameStep", None, marks=pytest.mark.slow),
+        ("SameStep", "psm_retractor"),
+    ],
 )
 def test_equals_environments_one_after_the_other(mode: str, instrument: str | None):
     """Approach, grasp and pull, over an episode's end: observations, rewards, ends, infos, and all that is saved."""

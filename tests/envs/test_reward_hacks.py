@@ -182,6 +182,7 @@ def test_no_cheat_is_paid_like_an_honest_episode(played):
         assert paid <= idle + 1e-9, cheat.__name__
 
 
+@pytest.mark.slow
 def test_a_search_by_touch_is_paid_more_than_any_cheat():
     """Not only the oracle, which knows: an agent that feels."""
     from agents.raster import RasterAgent, run_episode

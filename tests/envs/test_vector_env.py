@@ -46,7 +46,8 @@ def assert_equal(one: object, other: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "instrument"), [("NextStep", "probe"), ("SameStep", "probe"), ("SameStep", "psm_palpator")]
+    ("mode", "instrument"),
+    [("NextStep", "probe"), ("SameStep", "probe"), pytest.param("SameStep", "psm_palpator", marks=pytest.mark.slow)],
 )
 def test_equals_environments_one_after_the_other(mode: str, instrument: str):
     """Observations, rewards, ends and infos of 45 control steps with several episodes each, and all that is saved."""

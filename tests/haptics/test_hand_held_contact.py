@@ -132,7 +132,7 @@ def tapping(device_mass: float, seconds: float, encoder: float) -> None:
     assert (np.diff(taken[1:]) > 0.0).all()
 
 
-@pytest.mark.parametrize("encoder", [0.0, 2e-5])
+@pytest.mark.parametrize("encoder", [0.0, pytest.param(2e-5, marks=pytest.mark.slow)])
 def test_ten_seconds_of_tapping_give_no_energy(encoder):
     tapping(0.05, 10.0, encoder)
 

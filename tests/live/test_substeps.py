@@ -1,6 +1,7 @@
 """The live view takes as few substeps as a little mass buys, and nobody feels the difference."""
 
 import numpy as np
+import pytest
 
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.device import DevicePose
@@ -27,6 +28,7 @@ class Follower:
         self.time += 1e-3
 
 
+@pytest.mark.slow
 def test_fewer_substeps_feel_the_same():
     """A press into the liver in 2 substeps instead of 4, all the way in and half the way out."""
     scene = make_scene("liver")

@@ -106,6 +106,7 @@ def test_the_lesion_raises_the_stiffness_above_it(rows):
     assert np.linalg.norm(stiffest - [0.036, 0.026]) < 0.008
 
 
+@pytest.mark.slow
 def test_same_seed_same_table_and_another_seed_another(run, tmp_path, capsys):
     around = ["--around", "0.036,0.026,0.03,0.008"]
     for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
@@ -121,6 +122,7 @@ def test_same_seed_same_table_and_another_seed_another(run, tmp_path, capsys):
     assert "felt" in said
 
 
+@pytest.mark.slow
 def test_no_lesion_on_a_surface_of_ones_own(tmp_path, capsys):
     cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
     arguments = ["palpate", "--surface", str(cube), "--length-unit", "mm", "--cell-size", "0.010"]
@@ -134,6 +136,7 @@ def test_no_lesion_on_a_surface_of_ones_own(tmp_path, capsys):
     assert "no lesion was hidden" in said
 
 
+@pytest.mark.slow
 def test_organ_reports_and_writes(tmp_path, capsys):
     cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
     out = tmp_path / "organ.vtu"

@@ -8,6 +8,7 @@ from surgsim_env.scene.levels import DrawnOrgan, find_level
 from surgsim_env.scene.load import make_scene
 
 
+@pytest.mark.slow
 def test_noise_hides_a_small_difference() -> None:
     assert LesionReach(force=0.219, force_without=0.20, noise=0.01).below
     assert not LesionReach(force=0.221, force_without=0.20, noise=0.01).below

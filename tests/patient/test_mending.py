@@ -12,6 +12,7 @@ from tests.patient.scans import LABELS, affine_of, labels_on, write_nifti
 from tests.patient.surfaces import ball
 
 
+@pytest.mark.slow
 def test_what_is_dropped_filled_or_cut_off_is_said(tmp_path, capsys):
     affine, shape = affine_of(margin=0.0)
     labels = labels_on(affine, shape)
@@ -30,6 +31,7 @@ def test_what_is_dropped_filled_or_cut_off_is_said(tmp_path, capsys):
     assert "mended: 1 cavity(ies) inside the labels, 0.216 ml, were filled with liver" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_surfaces_one_file_a_region(tmp_path, capsys):
     organ, lesion = ball(tmp_path / "kidney.stl"), ball(tmp_path / "tumour.ply", 9.0, (8.0, 0.0, 5.0))
     other = ball(tmp_path / "x.obj", 7.0, (-12.0, 0.0, 0.0))
@@ -65,6 +67,7 @@ def test_a_broken_surface_is_mended_only_when_asked(tmp_path, refusal, capsys):
     assert read_mesh(out).volumes.sum() == pytest.approx(whole, rel=0.02)
 
 
+@pytest.mark.slow
 def test_surfaces_that_cross_are_joined_when_mended(tmp_path, refusal):
     first, second = (trimesh.creation.icosphere(3, 30.0).apply_translation([x, 0.0, 0.0]) for x in (0.0, 25.0))
     both = trimesh.util.concatenate([first, second])

@@ -57,6 +57,7 @@ def test_strings_of_a_scene_are_toml_whatever_a_file_is_called(name):
     assert value == re.sub("[\ud800-\udfff]", "\ufffd", name)
 
 
+@pytest.mark.slow
 def test_a_scan_of_any_name_becomes_a_scene(tmp_path):
     file = scan(tmp_path / "scan\U0001f600.nii.gz", spacing=(3.0, 3.0, 3.0))
     out = tmp_path / "out\U0001f600.vtu"

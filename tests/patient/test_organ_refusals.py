@@ -102,6 +102,7 @@ def test_surfaces_of_regions_that_are_no_one_body(tmp_path, refusal):
     assert "encloses nothing, also when mended" in refusal("organ", tmp_path / "sheet.stl", "--mend", *given)
 
 
+@pytest.mark.slow
 def test_options_that_do_not_fit_surfaces_or_tets(written, tmp_path, refusal):
     surface = ball(tmp_path / "liver.stl")
     unit = ["--length-unit", "mm"]

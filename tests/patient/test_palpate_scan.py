@@ -33,6 +33,7 @@ def test_palpate_goes_from_a_scan_to_a_map_in_one_command(tmp_path, capsys):
     assert "written" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_command_that_was_given(tmp_path, monkeypatch):
     given = ["--anchors=-0.06,0.025,0.08,0.03", "--tip-radius", "0.008", "--press-depth", "0.004", "--spacing", "0.012"]
     file = scan(tmp_path / "ct.nii.gz", spacing=(3.0, 3.0, 3.0))

@@ -40,6 +40,7 @@ def test_an_organ_nobody_knows_takes_the_liver_s_modulus_and_says_so():
     assert "the liver's: nothing is known of 'pancreas' here" in organ_material("pancreas").source
 
 
+@pytest.mark.slow
 def test_a_raster_of_too_many_sites_is_made_wider(tmp_path, monkeypatch):
     monkeypatch.setattr("surgsim_env.patient.patient_scene.SITES_MOST", 6)
     file = scan(tmp_path / "ct.nii.gz", spacing=(4.0, 4.0, 4.0))
@@ -51,6 +52,7 @@ def test_a_raster_of_too_many_sites_is_made_wider(tmp_path, monkeypatch):
     assert scene.palpation.site_spacing > 13 / 12 * scene.instrument.tip_radius + 1e-3
 
 
+@pytest.mark.slow
 def test_a_thin_organ_is_pressed_all_over_and_may_have_no_room_for_hidden_lesions(tmp_path, capsys, monkeypatch):
     """A plate of 16 mm, pressed 3.8 mm deep: less than five depths, more than three; lesions of 29 mm and more."""
     monkeypatch.setattr("surgsim_env.patient.patient_scene.LESION_SHRINKS", (1.5,))

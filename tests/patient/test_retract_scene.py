@@ -57,6 +57,7 @@ def env(folder):
     made.close()
 
 
+@pytest.mark.slow
 def test_the_patient_s_scene_names_its_scene_of_retraction(folder, scene):
     assert load_scene(folder / "patient.toml").retract_scene == "patient_retract.toml"
     assert scene.name == "patient_retract"
@@ -171,6 +172,7 @@ def test_a_real_liver_s_edge_is_lifted_from_the_command_line(tmp_path, anatomy_f
         assert not summary["torn"] and not summary["failure"]
 
 
+@pytest.mark.slow
 def test_an_organ_without_a_thin_edge_says_so(tmp_path, capsys):
     ball = trimesh.creation.icosphere(3, 30.0)
     ball.export(tmp_path / "ball.stl")

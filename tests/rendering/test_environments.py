@@ -24,6 +24,13 @@ def env_id(request):
     return request.param
 
 
+# Pictures go the same way for every id: one is enough where many are drawn.
+EACH_ID = pytest.mark.parametrize(
+    "env_id", [pytest.param(one, marks=[pytest.mark.slow] * (one != PALPATE)) for one in IDS], indirect=True
+)
+
+
+@EACH_ID
 @needs_opengl
 def test_passes_gymnasiums_checker_without_a_warning(env_id):
     with warnings.catch_warnings():
@@ -32,6 +39,7 @@ def test_passes_gymnasiums_checker_without_a_warning(env_id):
 
 
 @pytest.mark.agents
+@EACH_ID
 @needs_opengl
 def test_passes_stable_baselines3s_checker_without_a_warning(env_id):
     checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the `agents` extra")
@@ -40,6 +48,7 @@ def test_passes_stable_baselines3s_checker_without_a_warning(env_id):
         checker.check_env(gym.make(env_id, render_mode="rgb_array").unwrapped, skip_render_check=False)
 
 
+@EACH_ID
 @needs_opengl
 def test_pictures_change_no_bit_of_an_episode(env_id):
     """Observations, rewards, infos and saved states with a picture of each kind after each step, and without any."""
@@ -61,6 +70,7 @@ def test_pictures_change_no_bit_of_an_episode(env_id):
     drawn.close()
 
 
+@EACH_ID
 @needs_opengl
 def test_loaded_state_looks_like_the_saved_one(env_id):
     env, other = (gym.make(env_id, render_mode="rgb_array", show_lesion=True).unwrapped for _ in range(2))

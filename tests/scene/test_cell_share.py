@@ -61,6 +61,7 @@ def test_a_scene_whose_mesh_is_felt_warns_and_a_finer_one_does_not():
         load_anatomy(replace(scene, name="fine"))
 
 
+@pytest.mark.slow
 def test_organ_reports_its_share(tmp_path, capsys):
     path = tmp_path / "ball.stl"
     trimesh.creation.icosphere(subdivisions=3, radius=40.0).export(path)
@@ -72,6 +73,7 @@ def test_organ_reports_its_share(tmp_path, capsys):
         assert ("the mesh itself is felt" in printed.err) == warned
 
 
+@pytest.mark.slow
 def test_palpate_reports_its_share(tmp_path, capsys):
     around = "0.03,0.03,0.03,0.006"
     given = ["palpate", "--scene", "phantom", "--spacing", "0.006", "--around", around, "--out", str(tmp_path)]

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import surgsim_env.scripting
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,12 +23,14 @@ def run_pytest(folder, text):
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, env=settings)
 
 
+@pytest.mark.slow
 def test_the_guides_test_file_passes(tmp_path):
     done = run_pytest(tmp_path, TEST_FILE)
     assert done.returncode == 0, done.stdout
     assert "4 passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_the_guides_test_file_fails_with_a_controller_that_swings(tmp_path):
     worse = TEST_FILE.replace("gain = 0.05 ", "gain = 0.5 ").replace("[0, 1, 2]", "[0]")
     assert worse.count("gain = 0.5 ") == 1

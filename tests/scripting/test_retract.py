@@ -74,6 +74,7 @@ def test_until_ends_a_step_and_keeps_its_name(env):
         Until(Hold(0.1), True)
 
 
+@pytest.mark.slow
 def test_only_a_step_that_may_end_in_success_does(env):
     """The oracle without its MayEnd: success in the middle of the script is an error, named as one."""
     env.reset(seed=1)
@@ -88,7 +89,12 @@ def test_only_a_step_that_may_end_in_success_does(env):
 
 
 @pytest.mark.parametrize(
-    ("env_id", "instrument"), [("Retract", "grasper"), ("Retract", "psm_retractor"), ("BimanualRetract", "psm_pair")]
+    ("env_id", "instrument"),
+    [
+        ("Retract", "grasper"),
+        pytest.param("Retract", "psm_retractor", marks=pytest.mark.slow),
+        pytest.param("BimanualRetract", "psm_pair", marks=pytest.mark.slow),
+    ],
 )
 def test_oracle_retracts(env_id, instrument):
     check_oracle(env_id, instrument, range(1))
@@ -137,6 +143,7 @@ def test_random_actions_do_not_retract(env_id):
     assert successes <= 1
 
 
+@pytest.mark.slow
 def test_pulling_at_the_speed_limit_does_not_ring(env):
     """A grasped edge pulled by 8 mm at 20 mm/s: it moves by 2 % a haptic step at most; then it creeps."""
     trace = grasped(env, after=[MoveTo((0.040, 0.0525, 0.012), 0.02, name="pull"), Hold(1.0, name="rest")])
@@ -149,6 +156,7 @@ def test_pulling_at_the_speed_limit_does_not_ring(env):
     assert pull.max() < 1.15 * last.mean()
 
 
+@pytest.mark.slow
 def test_pressing_at_the_speed_limit_neither_tunnels_nor_rings(env):
     """The open jaw's lower pad laid on the lobe and pressed down at 20 mm/s, to 1.2 N: the force rises and rests."""
     script = [

@@ -107,7 +107,9 @@ def oracle_run(scene, instrument, seeds):
         yield env.unwrapped, run_script(env, oracle_script(env))
 
 
-@pytest.mark.parametrize(("scene", "instrument"), CASES)
+@pytest.mark.parametrize(
+    ("scene", "instrument"), [*CASES[:2], *(pytest.param(*one, marks=pytest.mark.slow) for one in CASES[2:])]
+)
 def test_the_oracle_finds_the_lesion_gently(scene, instrument):
     ((env, trace),) = oracle_run(scene, instrument, [1])
     limits = env.scene.limits

@@ -9,7 +9,15 @@ from surgsim_env.validation import suite
 from surgsim_env.validation.elements import has_fem
 from surgsim_env.validation.row import Case, Row, bounded, compare
 
-PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else []) for case in suite.CASES]
+# Cases of a quick run that take more than three seconds each.
+LONG = {
+    *("passivity, bounces", "fitted springs, torsion", "cosine load", "capsule, pulled", "on supports", "deep presses"),
+    *("contrast, coarse", "fitted springs, tension", "fitted springs, cantilever", "grasped strip"),
+}
+PARAMETERS = [
+    pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow or case.name in LONG else [])
+    for case in suite.CASES
+]
 
 
 @pytest.mark.parametrize("case", PARAMETERS)

@@ -42,6 +42,7 @@ def test_open_jaw_leaves_nothing(hanging: HangingStrip):
     assert hanging.gauge_length == pytest.approx(GAUGE[1] - GAUGE[0], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_hold_turns_with_the_jaw(hanging: HangingStrip):
     """Jaw and gravity turn together by a right angle: seen from the jaw nothing changes, friction's memory included.
 

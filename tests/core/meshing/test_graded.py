@@ -107,7 +107,9 @@ def test_cells_of_one_size_give_the_uniform_mesh_to_the_bit():
     np.testing.assert_array_equal(corner_sets(*graded), corner_sets(*plain))
 
 
-@pytest.mark.parametrize(("seed", "coarsening"), [(0, 2), (1, 2), (2, 4), (3, 4)])
+@pytest.mark.parametrize(
+    ("seed", "coarsening"), [(0, 2), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, 2), (2, 4), (3, 4)))]
+)
 def test_a_graded_body_is_sound_on_the_surface_and_well_shaped(seed, coarsening):
     vertices, faces = bumpy_body(seed)
     fine = triangles_facing(vertices, faces, (0, 0, -1), 50.0)
@@ -187,6 +189,7 @@ def test_shipped_liver_with_a_fine_palpable_face():
     assert_meets_the_targets(np.array(solid.vertices), solid.faces, 0.009, 4, 0.04)
 
 
+@pytest.mark.slow
 def test_ct_liver_with_a_fine_palpable_face():
     if not CT_LIVER.exists():
         pytest.skip(f"{CT_LIVER} is not here: anatomy is not shipped with the project")
@@ -194,6 +197,7 @@ def test_ct_liver_with_a_fine_palpable_face():
     assert_meets_the_targets(np.array(solid.vertices) * 1e-3, solid.faces, 0.008, 2, 0.015)
 
 
+@pytest.mark.slow
 def test_all_of_the_surface_is_fine_when_nothing_is_chosen_and_deeper_where_asked():
     solid = trimesh.creation.icosphere(4, 0.08)
     uniform, along, deep = (

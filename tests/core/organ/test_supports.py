@@ -82,6 +82,7 @@ def test_without_friction_bed_and_wall_bear_along_their_normals():
     assert (state.node_position[edge, 2] < 0.0).all() and (state.node_position[edge, 0] < -0.02).all()
 
 
+@pytest.mark.slow
 def test_what_nothing_holds_does_not_settle():
     """On an incline steeper than friction holds, tan 20 degrees > 0.3."""
     tilt = np.radians(20.0)

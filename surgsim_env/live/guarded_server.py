@@ -3,17 +3,18 @@
 import hmac
 import http
 import ipaddress
+import logging
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
-from http.cookies import CookieError, SimpleCookie
 from importlib.resources import files
 from io import StringIO
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import viser
 import viser.infra
@@ -21,13 +22,21 @@ from viser import _messages
 from websockets import Headers
 from websockets.asyncio import server as websocket_server
 from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.frames import CTRL_OPCODES, Frame
 from websockets.http11 import Request, Response
 
 from surgsim_env.live.exchange_records import LiveError
-from surgsim_env.live.messages import HAND_PATH, InvalidMessageError, MessageFilter, RateLimit
+from surgsim_env.live.messages import (
+    CONTROL_BURST_MOST,
+    CONTROL_RATE_MOST,
+    HAND_PATH,
+    InvalidMessageError,
+    MessageFilter,
+    RateLimit,
+)
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-TOKEN_FIELD = "token"
 # Headers that forbid the browser to cache the page, to frame it, and to contact other servers from it.
 SAFE_HEADERS = {
     "Cache-Control": "no-store",
@@ -49,6 +58,12 @@ MESSAGE_SIZE_MOST = 16 * 1024
 SOCKETS_MOST = 16
 # How long a client may be silent to a ping before it is given up [s].
 PING_INTERVAL = 10.0
+# Bytes that are decoded between two looks at the pace of a client; a read may hold 43 000 empty pings.
+BYTES_AT_ONCE = 4096
+# How long a refused client may take to close its side [s].
+CLOSE_TIMEOUT = 5.0
+# A line of the log is not repeated before [s].
+LOG_PERIOD = 10.0
 
 # In this order: the second tells the server what the first counts.
 SCRIPTS = ("drawing.js", "hand.js")
@@ -61,8 +76,9 @@ class Gate:
     """Accepts requests that name this server, come from its own page, and carry the token of this run.
 
     The check of Host stops DNS rebinding, the check of Origin stops sockets opened by pages of other sites, and the
-    token stops everyone else on the machine or the network. The address that is opened first contains the token; a
-    cookie keeps it, which scripts cannot read and requests of other sites do not carry.
+    token stops everyone else on the machine or the network. The token is the first part of every path, of the page and
+    of its sockets: viser's page opens its socket below its own address. A cookie would also reach every other server on
+    the same host, as cookies do not distinguish ports.
 
     Args:
         port: of this server.
@@ -76,11 +92,6 @@ class Gate:
     remote: bool = False
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
 
-    @property
-    def cookie(self) -> str:
-        """Name of the cookie, with the port: cookies are shared between ports."""
-        return f"surgsim_{self.port}"
-
     def refusal(self, request: Request) -> Response | None:
         """A response that refuses a request with its reason, or None for an accepted one."""
         hosts = request.headers.get_all("Host")
@@ -91,16 +102,14 @@ class Gate:
             return refuse(http.HTTPStatus.FORBIDDEN, "a socket is opened with one Origin")
         if origins and (len(origins) != 1 or origins[0].lower() != f"http://{hosts[0]}".lower()):
             return refuse(http.HTTPStatus.FORBIDDEN, "that page is not this server's own (Origin)")
-        if not self._has_token(request):
+        if self.path_behind_token(request) is None:
             return refuse(http.HTTPStatus.UNAUTHORIZED, "open the whole address that `surgsim view` printed (token)")
         return None
 
-    def welcome(self, request: Request, response: Response) -> None:
-        """Add the security headers and the cookie to the page's response."""
-        for name, value in SAFE_HEADERS.items():
-            response.headers[name] = value
-        if self._is_token(_query_token(request)):
-            response.headers["Set-Cookie"] = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+    def path_behind_token(self, request: Request) -> str | None:
+        """The path of a request without its token and its query, "/" for the page; None without the token."""
+        first, _, rest = request.path.partition("?")[0].removeprefix("/").partition("/")
+        return f"/{rest}" if self._is_token(first) else None
 
     def _is_here(self, host: str) -> bool:
         try:
@@ -111,18 +120,6 @@ class Gate:
         if name is None or port != self.port or parts.path or parts.query or parts.fragment or "@" in host:
             return False
         return name in self.hosts or (self.remote and _is_address(name))
-
-    def _has_token(self, request: Request) -> bool:
-        if self._is_token(_query_token(request)):
-            return True
-        for header in request.headers.get_all("Cookie"):
-            try:
-                found = SimpleCookie(header).get(self.cookie)
-            except CookieError:
-                continue
-            if found is not None and self._is_token(found.value):
-                return True
-        return False
 
     def _is_token(self, text: str) -> bool:
         return hmac.compare_digest(text.encode("utf-8", "surrogateescape"), self.token.encode())
@@ -175,7 +172,7 @@ class GuardedServer:
         self._forget_tunnels()
         shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
         shown = f"[{shown}]" if ":" in shown else shown
-        self.address = f"http://{shown}:{bound_port}/?token={self.gate.token}"
+        self.address = f"http://{shown}:{bound_port}/{self.gate.token}"
 
     def stop(self) -> None:
         """Close all sockets and the port."""
@@ -200,6 +197,7 @@ class GuardedServer:
                         "ping_interval": PING_INTERVAL,
                         "ping_timeout": PING_INTERVAL,
                         "open_timeout": PING_INTERVAL,
+                        "logger": _log,
                         "create_connection": guarded._connection_type(),
                         "process_request": guarded._answer(given["process_request"]),
                     },
@@ -231,12 +229,16 @@ class GuardedServer:
             # Not packed: there is a script to put in.
             if "Accept-Encoding" in request.headers:
                 del request.headers["Accept-Encoding"]
+            path = self.gate.path_behind_token(request)
+            assert path is not None
+            request.path = path
             response = viser_answer(connection, request)
             if response is None:
                 return refuse(http.HTTPStatus.BAD_REQUEST, "no request for a page or a socket")
-            if response.status_code == http.HTTPStatus.OK and request.path.partition("?")[0] == "/":
+            if response.status_code == http.HTTPStatus.OK and path == "/":
                 response = _with_script(response)
-            self.gate.welcome(request, response)
+            for name, value in SAFE_HEADERS.items():
+                response.headers[name] = value
             return response
 
         return answer
@@ -244,7 +246,7 @@ class GuardedServer:
     def _dispatch(self, viser_handler: Callable[..., Awaitable[None]]) -> Callable[[ServerConnection], Awaitable[None]]:
         async def handle(connection: ServerConnection) -> None:
             assert connection.request is not None
-            if connection.request.path.partition("?")[0] == HAND_PATH:
+            if self.gate.path_behind_token(connection.request) == HAND_PATH:
                 await self._serve_hand(connection)
             else:
                 await viser_handler(connection)
@@ -252,27 +254,65 @@ class GuardedServer:
         return handle
 
     def _connection_type(self) -> type[ServerConnection]:
-        message_filter = self.message_filter
+        gate, message_filter = self.gate, self.message_filter
 
         class FilteredConnection(ServerConnection):
-            """A connection whose messages are filtered before viser decodes them; an invalid one closes it."""
+            """A connection whose frames are counted, and whose messages are filtered before viser decodes them.
+
+            A client that sends too much or an invalid message is refused: it is closed with the reason, and what it
+            sends after that is not decoded.
+            """
 
             def __init__(self, *given: Any, **named: Any) -> None:
                 super().__init__(*given, **named)
-                self._rate = RateLimit()
+                self._messages = RateLimit()
+                self._control = RateLimit(CONTROL_RATE_MOST, CONTROL_BURST_MOST, "pings and pongs")
+                self._refused = False
+
+            def connection_made(self, transport: Any) -> None:
+                super().connection_made(_OpenTransport(transport))
+
+            def data_received(self, data: bytes) -> None:
+                for start in range(0, len(data), BYTES_AT_ONCE):
+                    if not self._refused:
+                        super().data_received(data[start : start + BYTES_AT_ONCE])
+
+            def process_event(self, event: Any) -> None:
+                if self._refused:
+                    return
+                if isinstance(event, Frame):
+                    try:
+                        # Fragments count as messages: a message may have any number of empty ones.
+                        (self._control if event.opcode in CTRL_OPCODES else self._messages).count()
+                    except InvalidMessageError as error:
+                        self._refuse(error)
+                        return
+                super().process_event(event)
 
             async def recv(self, decode: bool | None = None) -> Any:
                 while True:
                     message = await super().recv(decode)
+                    # Messages that were received before the client was refused.
+                    if self._refused:
+                        continue
+                    if self.request is not None and gate.path_behind_token(self.request) == HAND_PATH:
+                        return message
                     try:
-                        self._rate.count()
-                        if self.request is not None and self.request.path.partition("?")[0] == HAND_PATH:
-                            return message
                         if message_filter.accepts(message):
                             return message
                     except InvalidMessageError as error:
-                        message_filter.dropped += 1
-                        await self.close(1008, str(error)[:100])
+                        self._refuse(error)
+
+            def _refuse(self, error: InvalidMessageError) -> None:
+                self._refused = True
+                message_filter.dropped += 1
+                # The error may quote the client, and a closing frame has room for 123 bytes.
+                reason = str(error).encode("unicode_escape").decode("ascii")[:100]
+                _log.warning("surgsim: a client of the live page was disconnected: %s", reason)
+                # Unlike close(), this reads no more messages, and it does not wait for a client that does not answer.
+                self.protocol.fail(1008, reason)
+                self.send_data()
+                self.loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
 
         return FilteredConnection
 
@@ -289,6 +329,51 @@ class GuardedServer:
 
 
 _SERVING = threading.Lock()
+
+
+class _OpenTransport:
+    """A transport that drops what is written once it is closing; asyncio's own logs a line for each of these writes."""
+
+    def __init__(self, transport: Any) -> None:
+        self._transport = transport
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+    def write(self, data: bytes) -> None:
+        if not self._transport.is_closing():
+            self._transport.write(data)
+
+
+class CalmLog(logging.Filter):
+    """Drops errors that say only that a client left or spoke no HTTP, and repeats no message within LOG_PERIOD."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin with nothing logged."""
+        super().__init__()
+        self._clock = clock
+        self._logged: dict[str, float] = {}
+        self._dropped: dict[str, int] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record is logged; one that follows dropped ones says how many."""
+        error = record.exc_info[1] if record.exc_info else None
+        if isinstance(error, ConnectionClosed | InvalidHandshake | ConnectionError | EOFError):
+            return False
+        if record.levelno < logging.WARNING:
+            return True
+        kind, now = str(record.msg), self._clock()
+        if now - self._logged.get(kind, -LOG_PERIOD) < LOG_PERIOD:
+            self._dropped[kind] = self._dropped.get(kind, 0) + 1
+            return False
+        self._logged[kind] = now
+        if count := self._dropped.pop(kind, 0):
+            record.msg = f"{kind} (and {count} more like it since the last line)"
+        return True
+
+
+_log = logging.getLogger(__name__)
+_log.addFilter(CalmLog())
 
 
 def _with_script(response: Response) -> Response:
@@ -353,14 +438,6 @@ def names_of(host: str, *, remote: bool) -> tuple[str, ...]:
     """Accepted names of a server on this host."""
     own = (host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()) if remote else ()
     return tuple(dict.fromkeys((*LOOPBACK, *own)))
-
-
-def _query_token(request: Request) -> str:
-    try:
-        values = parse_qs(request.path.partition("?")[2], max_num_fields=16).get(TOKEN_FIELD, [])
-    except ValueError:
-        return ""
-    return values[0] if len(values) == 1 else ""
 
 
 def _is_address(name: str) -> bool:

@@ -2,7 +2,6 @@
 // Every second the server is told how the browser draws (drawing.js).
 (() => {
   "use strict";
-  if (location.search.includes("token=")) history.replaceState(null, "", location.pathname);
   const PERIOD = 25, DEAD = 0.12;
   const held = new Set();
   let arm = 0, socket = null, wasMoving = false, armButton = false, jaw = false, jawButton = false;
@@ -15,7 +14,8 @@
     socket.send(packet.buffer);
   };
   const connect = () => {
-    socket = new WebSocket(location.origin.replace(/^http/, "ws") + "/hand");
+    // Below the page's own address, which begins with the token.
+    socket = new WebSocket(location.origin.replace(/^http/, "ws") + location.pathname.replace(/\/$/, "") + "/hand");
     socket.onopen = () => report(null);
     socket.onclose = () => { socket = null; setTimeout(connect, 1000); };
   };

@@ -12,6 +12,8 @@ from msgspec import Meta, Struct
 
 # A dragged mouse sends about 60 messages a second, a slider as many.
 RATE_MOST, BURST_MOST = 300.0, 600.0
+# Pings and pongs: no page can send a ping, and a browser answers one of ours every 10 s.
+CONTROL_RATE_MOST, CONTROL_BURST_MOST = 5.0, 50.0
 
 
 class InvalidMessageError(ValueError):
@@ -99,23 +101,37 @@ _DECODER = msgspec.msgpack.Decoder(
 
 
 class RateLimit:
-    """Limits the messages of one client: a token bucket that fills at RATE_MOST a second, up to BURST_MOST."""
+    """Limits what one client sends: a token bucket that fills at a rate up to a burst, by default of messages."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin with a full bucket."""
-        self._clock, self._left, self._then = clock, BURST_MOST, clock()
+    def __init__(
+        self,
+        rate: float = RATE_MOST,
+        burst: float = BURST_MOST,
+        what: str = "messages",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin with a full bucket.
+
+        Args:
+            rate: at which it fills [1/s].
+            burst: that it holds.
+            what: it counts, for the error.
+            clock: tells the time [s].
+        """
+        self._rate, self._burst, self._what, self._clock = rate, burst, what, clock
+        self._left, self._then = burst, clock()
 
     def count(self) -> None:
-        """Count one message.
+        """Count one.
 
         Raises:
             InvalidMessageError: the bucket is empty.
         """
         now = self._clock()
-        self._left = min(BURST_MOST, self._left + RATE_MOST * (now - self._then)) - 1.0
+        self._left = min(self._burst, self._left + self._rate * (now - self._then)) - 1.0
         self._then = now
         if self._left < 0.0:
-            raise InvalidMessageError(f"more than {RATE_MOST:g} messages a second")
+            raise InvalidMessageError(f"more than {self._rate:g} {self._what} a second")
 
 
 @dataclass

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import msgspec.msgpack
 import numpy as np
@@ -40,7 +40,7 @@ class ProtocolClient:
         """
         parts = urlsplit(address)
         self._origin = f"{parts.scheme}://{parts.netloc}"
-        self._socket = f"ws://{parts.netloc}/?token={parse_qs(parts.query)['token'][0]}"
+        self._socket = f"ws://{parts.netloc}{parts.path}"
         self._path, self._rate, self._pause = path, rate, pause
         self.updates, self.bytes = 0, 0
         self.errors: list[str] = []

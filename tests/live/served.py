@@ -61,9 +61,8 @@ class Served:
     def socket(self, path="/"):
         gate = self.page.server.gate
         return connect(
-            f"ws://127.0.0.1:{gate.port}{path}",
+            f"ws://127.0.0.1:{gate.port}/{gate.token}{path}",
             origin=f"http://127.0.0.1:{gate.port}",
-            additional_headers={"Cookie": f"{gate.cookie}={gate.token}"},
             subprotocols=[f"viser-v{viser.__version__}"] if path == "/" else None,
             max_size=None,
             compression=None,

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from websockets import Headers
-from websockets.http11 import Request, Response
+from websockets.http11 import Request
 
 from surgsim_env.live.guarded_server import Gate, listening_socket, names_of
 
@@ -14,12 +14,10 @@ WORDS = st.text(st.characters(min_codepoint=33, max_codepoint=255, exclude_categ
 OWN = "http://127.0.0.1:8080"
 
 
-def request(path="/", *, host="127.0.0.1:8080", token="cookie", **headers) -> Request:
+def request(path=f"/{TOKEN}", *, host="127.0.0.1:8080", **headers) -> Request:
     found = Headers()
     if host is not None:
         found["Host"] = host
-    if token == "cookie":
-        found["Cookie"] = f"other=1; surgsim_8080={TOKEN}"
     for name, value in headers.items():
         found[name.replace("_", "-")] = value
     return Request(path, found)
@@ -34,11 +32,20 @@ def gate() -> Gate:
     return Gate(8080, token=TOKEN)
 
 
-def test_the_page_opens_with_its_token_and_then_with_the_cookie(gate):
-    assert gate.refusal(request(f"/?token={TOKEN}", token=None)) is None
-    assert gate.refusal(request()) is None
-    assert gate.refusal(socket_request()) is None
-    assert gate.refusal(socket_request(path=f"/?token={TOKEN}", token=None)) is None
+@pytest.mark.parametrize(
+    ("path", "behind"),
+    [
+        (f"/{TOKEN}", "/"),
+        (f"/{TOKEN}/", "/"),
+        (f"/{TOKEN}/?websocket=ws://127.0.0.1:8080/{TOKEN}", "/"),
+        (f"/{TOKEN}/hand", "/hand"),
+        (f"/{TOKEN}/a/b?c=d", "/a/b"),
+    ],
+)
+def test_page_and_sockets_lie_below_the_token(gate, path, behind):
+    for made in (request(path), socket_request(path=path)):
+        assert gate.refusal(made) is None
+        assert gate.path_behind_token(made) == behind
 
 
 @pytest.mark.parametrize("host", ["localhost:8080", "LOCALHOST:8080", "[::1]:8080", "127.0.0.1:8080"])
@@ -91,18 +98,22 @@ def test_a_socket_needs_an_origin_whatever_it_is_called(gate, words):
 @pytest.mark.parametrize(
     "made",
     [
-        request(token=None),
-        request("/?token=", token=None),
-        request("/?token=wrong", token=None),
-        request(f"/?token={TOKEN}x", token=None),
-        request(f"/?token={TOKEN}&token=b", token=None),
-        request(f"/?other={TOKEN}", token=None),
-        request(token=None, Cookie=f"surgsim_8081={TOKEN}"),
-        request(token=None, Cookie="surgsim_8080="),
-        request(token=None, Cookie='surgsim_8080="\\'),
-        request("/?token=%ff%00é", token=None),
-        request(f"/?token={TOKEN}" + "&a=1" * 16, token=None),
-        socket_request(token=None),
+        request("/"),
+        request("//"),
+        request(""),
+        request("/wrong"),
+        request(f"/{TOKEN}x"),
+        request(f"/{TOKEN[:-1]}"),
+        request(f"//{TOKEN}"),
+        request(f"/x/{TOKEN}"),
+        request(f"/?token={TOKEN}"),
+        request(f"/?/{TOKEN}"),
+        request(f"http://127.0.0.1:8080/{TOKEN}"),
+        request("/%ff%00é"),
+        # No cookie opens anything: the browser sends it to every port of the host.
+        request("/", Cookie=f"surgsim_8080={TOKEN}"),
+        socket_request(path="/", Cookie=f"surgsim_8080={TOKEN}"),
+        socket_request(path="/"),
     ],
 )
 def test_without_the_token_there_is_nothing(gate, made):
@@ -117,7 +128,7 @@ def test_no_words_get_in_without_the_token(host, path, cookie):
     assert gate.refusal(Request("/" + path, found)) is not None
     found = Headers()
     found["Host"], found["Cookie"] = "127.0.0.1:8080", cookie
-    assert gate.refusal(Request("/?" + path, found)).status_code == 401
+    assert gate.refusal(Request("/" + path, found)).status_code == 401
 
 
 def test_a_remote_gate_knows_addresses_but_no_strange_names():
@@ -131,18 +142,6 @@ def test_tokens_are_new_each_time_and_not_in_the_representation():
     one, other = Gate(8080), Gate(8080)
     assert one.token != other.token and len(one.token) >= 40
     assert one.token not in repr(one)
-
-
-def test_the_page_is_kept_from_frames_scripts_and_other_sites(gate):
-    response = Response(200, "OK", Headers(), b"")
-    gate.welcome(request(f"/?token={TOKEN}"), response)
-    cookie = response.headers["Set-Cookie"]
-    assert TOKEN in cookie and "HttpOnly" in cookie and "SameSite=Strict" in cookie
-    assert response.headers["X-Frame-Options"] == "DENY"
-    assert "connect-src 'self'" in response.headers["Content-Security-Policy"]
-    plain = Response(200, "OK", Headers(), b"")
-    gate.welcome(request(), plain)
-    assert "Set-Cookie" not in plain.headers
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])

@@ -149,12 +149,12 @@ def test_what_passes_is_finite_and_whole(fields, data):
 
 def test_a_flood_is_stopped_and_a_hand_is_not():
     now = [0.0]
-    pace = RateLimit(lambda: now[0])
+    pace = RateLimit(clock=lambda: now[0])
     for _ in range(int(BURST_MOST)):
         pace.count()
     with pytest.raises(InvalidMessageError, match="messages a second"):
         pace.count()
-    pace = RateLimit(lambda: now[0])
+    pace = RateLimit(clock=lambda: now[0])
     for _ in range(5000):
         now[0] += 1.0 / 120.0
         pace.count()

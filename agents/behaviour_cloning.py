@@ -1,10 +1,10 @@
 """Clone a policy from a Minari dataset and measure how often the clone succeeds.
 
-    python -m agents.behaviour_cloning surgsim/retract/oracle-v0 --out runs/clone.zip
+    python -m agents.behaviour_cloning surgsim/retract/oracle-v0 --out runs/clone.safetensors
 
 The dataset names its environment (`agents/record_demonstrations.py` writes such datasets). The result is a PPO or
 RecurrentPPO of stable-baselines3 with its normalisation; reinforcement learning starts from it with
-`warm_start: runs/clone.zip` in a configuration of `agents/train.py`.
+`warm_start: runs/clone.safetensors` in a configuration of `agents/train.py`.
 """
 
 import argparse
@@ -18,7 +18,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from agents.scoring.episodes import play_tasks
 from agents.training.imitation import CloningCurve, CloningOptions, clone, normalise_by, pad
-from agents.training.policy_files import TrainedPolicy, algorithm_class, describe, save_policy
+from agents.training.networks import algorithm_class
+from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 
 # Episodes are scored on seeds from here on; demonstrations come from lower ones.
 FIRST_SEED = 500_000
@@ -50,14 +51,17 @@ def clone_dataset(
     curve = clone(model, seen, taken, sample_weight=weight, normalisation=normalisation, options=options)
     spec = dataset.spec.env_spec
     assert spec is not None
-    return TrainedPolicy(model, describe(model, normalisation, env_id=spec.id, env_kwargs=dict(spec.kwargs))), curve
+    description = describe(model, normalisation, env_id=spec.id, env_kwargs=dict(spec.kwargs))
+    return TrainedPolicy(model.policy, description), curve
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Clone, save, play, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", help="its name, such as surgsim/retract/oracle-v0")
-    parser.add_argument("--out", type=Path, default=Path("runs/clone.zip"), help="where the policy is written")
+    parser.add_argument(
+        "--out", type=policy_path, default=Path("runs/clone.safetensors"), help="the policy's file, NAME.safetensors"
+    )
     parser.add_argument("--epochs", type=int, default=CloningOptions.epochs)
     parser.add_argument("--recurrent", action="store_true", help="a policy with an LSTM")
     parser.add_argument("--width", type=int, default=128, help="of the layers")
@@ -69,8 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         epochs=given.epochs, seed=given.seed, batch_size=16 if given.recurrent else CloningOptions.batch_size
     )
     policy, curve = clone_dataset(dataset, recurrent=given.recurrent, width=given.width, options=options)
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    save_policy(policy.model, policy.description, given.out)
+    save_policy(policy.networks, policy.description, given.out)
     held = curve.validation[curve.best]
     print(
         f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps; "

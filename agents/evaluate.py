@@ -2,12 +2,12 @@
 
     python -m agents.evaluate --agent gp_ucb --scene phantom --level standard
     python -m agents.evaluate --all --scene phantom --level standard     # every baseline and every policy for it
-    python -m agents.evaluate --policy agents/policies/NAME.zip --episodes 20 --video out.mp4
+    python -m agents.evaluate --policy agents/policies/NAME.safetensors --episodes 20 --video out.mp4
     python -m agents.evaluate --reach --scene phantom --level hard       # lesions below the sensor's reach
     python -m agents.evaluate --leaderboard
 
-Results go to agents/results/, one file per method, scene and level; the leaderboard is written from all of them. A
-policy is a zip of pickles: load only files that you trust.
+Results go to agents/results/, one file per method, scene and level; the leaderboard is written from all of them.
+Reading NAME.safetensors runs no code of its author; a zip of stable-baselines3 is read with --trust-pickle only.
 """
 
 import argparse
@@ -21,9 +21,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from agents.command_line import one_line_errors
 from agents.expert_palpate import PalpateExpert
 from agents.expert_retract import RetractExpert
 from agents.scoring.episodes import Actor, SiteActor, make_envs, play_sites, play_tasks, task_figures
@@ -31,6 +31,9 @@ from agents.scoring.leaderboard import RESULTS, SITES, Result, write_leaderboard
 from agents.scoring.site_agent import SiteAgent
 from agents.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score
+
+with one_line_errors(__name__, "agents"):
+    from tqdm import tqdm
 
 # Seed of the bootstrap; time between two messages of progress [s].
 BOOTSTRAP_SEED, PROGRESS_EVERY = 0, 60.0
@@ -82,9 +85,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--all", action="store_true", help="every baseline, and every policy for this scene")
     what.add_argument("--agent", help=f"one of {', '.join([*AGENTS, *TASK_AGENTS])}")
-    what.add_argument("--policy", type=Path, help="NAME.zip, with NAME.json beside it")
+    what.add_argument("--policy", type=Path, help="NAME.safetensors, with NAME.json beside it")
     what.add_argument("--reach", action="store_true", help="count the lesions below the sensor's reach")
     what.add_argument("--leaderboard", action="store_true", help="write the leaderboard only")
+    parser.add_argument(
+        "--trust-pickle", action="store_true", help="let --policy be a zip, which runs any code of its author"
+    )
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--level", default="standard")
     parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
@@ -122,7 +128,7 @@ def evaluate_all(options: argparse.Namespace) -> None:
     for path in sorted(POLICIES.glob("*.json")):
         kwargs = json.loads(path.read_text(encoding="utf-8"))["env_kwargs"]
         if kwargs.get("scene", "phantom") == options.scene:
-            evaluate_policy(path.with_suffix(".zip"), options)
+            evaluate_policy(path.with_suffix(".safetensors"), options)
 
 
 def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
@@ -146,7 +152,13 @@ def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
     """A trained policy on its own environment; `--level` sets the level if the environment has one."""
     from agents.training.policy_files import load_policy
 
-    policy = load_policy(path)
+    policy = load_policy(path, trust_pickle=options.trust_pickle)
+    module, _, _ = policy.description.env_id.rpartition(":")
+    if module not in ("", "surgsim_env") and not options.trust_pickle:
+        raise ValueError(
+            f"policy {path}: env_id {policy.description.env_id!r} imports the module {module!r}: give --trust-pickle "
+            "if you trust the policy's author"
+        )
     kwargs = dict(policy.description.env_kwargs)
     command = f"python -m agents.evaluate --policy {_from_here(path)}"
     if "level" in kwargs or policy.description.env_id == SITES:
@@ -159,19 +171,33 @@ def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
     if policy.description.env_id == SITES:
         kwargs = {"scene": "phantom", **kwargs}
     policy.reset(min(options.envs, options.episodes))
-    return _evaluate(path.stem, policy.act, policy.description.env_id, kwargs, command, options)
+
+    def check(env: gym.Env) -> None:
+        policy.check_environment(env, f"policy {path}")
+
+    return _evaluate(path.stem, policy.act, policy.description.env_id, kwargs, command, options, check)
 
 
 def _evaluate(
-    name: str, actor: Actor | SiteActor, env_id: str, kwargs: dict[str, Any], command: str, options: argparse.Namespace
+    name: str,
+    actor: Actor | SiteActor,
+    env_id: str,
+    kwargs: dict[str, Any],
+    command: str,
+    options: argparse.Namespace,
+    check: Callable[[gym.Env], None] = lambda env: None,
 ) -> Result:
     """Play the evaluation seeds; save and print the result."""
     seeds, rng = EVALUATION_SEEDS[: options.episodes], np.random.default_rng(BOOTSTRAP_SEED)
     if env_id == SITES and options.budget is not None:
         kwargs = {**kwargs, "budget": options.budget}
     count = min(options.envs, options.episodes)
-    envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
+    try:
+        envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
+    except (gym.error.Error, TypeError) as error:
+        raise ValueError(f"{name}: {env_id} with {kwargs} cannot be made: {error}") from error
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
+    check(first)
     start, bar = time.perf_counter(), tqdm(desc=name, unit=" steps", mininterval=PROGRESS_EVERY)
     scored: dict[str, Any]
     if env_id == SITES:
@@ -246,4 +272,5 @@ def _from_here(path: Path) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents"):
+        main()

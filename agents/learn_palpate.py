@@ -1,6 +1,6 @@
 """Teach a network the scripted expert of SurgSim/Palpate-v0 on a fast surrogate with a force formula.
 
-    python -m agents.learn_palpate --scene phantom --out runs/palpate_phantom_cloned.zip
+    python -m agents.learn_palpate --scene phantom --out runs/palpate_phantom_cloned.safetensors
 
 The expert labels synthetic observations all over the face (`imagined`) and the states that the network reaches (DAgger,
 Ross, Gordon & Bagnell 2011). PPO continues from the result: `warm_start` in agents/configs/palpate_*.yaml.
@@ -8,7 +8,6 @@ Ross, Gordon & Bagnell 2011). PPO continues from the result: `warm_start` in age
 
 import argparse
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from agents.training.environments import blinded
 from agents.training.extractors import MemorySummary
 from agents.training.imitation import CloningOptions, clone, normalise_by
 from agents.training.palpate_surrogate import PalpateSurrogate
-from agents.training.policy_files import TrainedPolicy, describe, save_policy
+from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
@@ -95,7 +94,7 @@ def main() -> None:
     """Train; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--steps", type=int, default=200, help="steps of each environment in a round")
     parser.add_argument("--envs", type=int, default=128)
@@ -148,8 +147,8 @@ def main() -> None:
             force_entries=entries,
             trained_steps=len(real),
         )
-        save_policy(model, description, arguments.out)
-        policy = TrainedPolicy(model, description)
+        save_policy(model.policy, description, arguments.out)
+        policy = TrainedPolicy(model.policy, description)
         policy.reset(envs.num_envs)
 
 

@@ -1,6 +1,6 @@
 """Teach an LSTM the scripted expert of SurgSim/Palpate-v0 from observations without memory.
 
-    python -m agents.learn_palpate_recurrent --scene phantom --out runs/palpate_phantom_recurrent_cloned.zip
+    python -m agents.learn_palpate_recurrent --scene phantom --out runs/palpate_phantom_recurrent_cloned.safetensors
 
 The expert reads the contrast map from the observation; the network sees place and force alone and must remember the
 rest, so whole episodes are cloned. First the expert plays, with random errors; then the network plays and the expert
@@ -9,7 +9,6 @@ labels its states.
 
 import argparse
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from agents.learn_palpate import ERROR, ERROR_KEPT
 from agents.training.extractors import WITHOUT_MEMORY, PlaceAndForce
 from agents.training.imitation import CloningOptions, clone, normalise_by, pad
 from agents.training.palpate_surrogate import PalpateSurrogate
-from agents.training.policy_files import TrainedPolicy, describe, save_policy
+from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {
@@ -83,7 +82,7 @@ def main() -> None:
     """Train; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="phantom")
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
     parser.add_argument("--rounds", type=int, default=1, help="rounds; the network plays those after the first")
     parser.add_argument("--envs", type=int, default=512, help="episodes of a round")
     parser.add_argument("--steps", type=int, default=420, help="largest number of steps of an episode")
@@ -138,8 +137,8 @@ def main() -> None:
             action_repeat=arguments.repeat,
             trained_steps=int(sum(len(one) for one in episodes[0])),
         )
-        save_policy(model, description, arguments.out)
-        policy = TrainedPolicy(model, description)
+        save_policy(model.policy, description, arguments.out)
+        policy = TrainedPolicy(model.policy, description)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Learn SurgSim/Retract-v0 from the scripted expert with DAgger: the policy plays, the expert labels.
 
-    python -m agents.learn_retract --rounds 6 --out agents/policies/retract_dagger.zip
-    python -m agents.learn_retract --rounds 6 --without-force --out agents/policies/retract_dagger_without_force.zip
+    python -m agents.learn_retract --rounds 6 --out runs/retract_dagger.safetensors
+    python -m agents.learn_retract --rounds 6 --without-force --out runs/retract_dagger_without_force.safetensors
 
 With `--without-force` the policy sees 0 in place of the jaw's wrench, its grip and its pull; the expert sees all
 channels. The result is a policy of stable-baselines3's PPO, from which `agents.train` can start (`warm_start`).
@@ -11,7 +11,6 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -26,7 +25,7 @@ import surgsim_env  # noqa: F401  (registers the ids)
 from agents.expert_retract import RetractExpert
 from agents.training.environments import blinded
 from agents.training.imitation import CloningOptions, dagger
-from agents.training.policy_files import describe, save_policy
+from agents.training.policy_files import describe, policy_path, save_policy
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 ID = "SurgSim/Retract-v0"
@@ -103,15 +102,14 @@ def learn(arguments: argparse.Namespace) -> None:
             trained_steps=done.sample_count,
             seed=arguments.seed,
         )
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        save_policy(model, description, arguments.out)
+        save_policy(model.policy, description, arguments.out)
     envs.close()
 
 
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="the policy's file, NAME.zip")
+    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--steps", type=int, default=170, help="control steps of each environment in a round")
     parser.add_argument("--envs", type=int, default=16)

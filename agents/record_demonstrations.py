@@ -36,6 +36,7 @@ from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
 CODE = "agents/record_demonstrations.py of surgsim"
+POLICY_SUFFIXES = (".safetensors", ".zip")
 
 # Plays one episode in an environment, reset with a seed.
 Player = Callable[[gym.Env, int], None]
@@ -119,19 +120,25 @@ def play_oracle(env: gym.Env, seed: int) -> None:
         print(f"seed {seed}: {failure}")
 
 
-def player(by: str, env: gym.Env) -> Player:
-    """The player of a name: "oracle", a policy's NAME.zip, or MODULE:CLASS with `reset()` and `act(observation)`."""
+def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
+    """The player of a name: "oracle", a policy's file, or MODULE:CLASS with `reset()` and `act(observation)`.
+
+    Args:
+        by: the name.
+        env: where it plays.
+        trust_pickle: the policy may be a zip of stable-baselines3, which runs any code that its author put there.
+    """
     if by == "oracle":
         return play_oracle
-    if by.endswith(".zip"):
+    if by.endswith(POLICY_SUFFIXES):
         from agents.training.policy_files import load_policy
 
-        policy = load_policy(Path(by))
+        policy = load_policy(Path(by), trust_pickle=trust_pickle)
         alone = SimpleNamespace(reset=lambda: policy.reset(1), act=lambda seen: policy.act(seen[None])[0])
         return lambda env, seed: play_agent(env, seed, alone)
     module, _, name = by.partition(":")
     if not name:
-        raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.zip or MODULE:CLASS")
+        raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.safetensors or MODULE:CLASS")
     agent = getattr(importlib.import_module(module), name)(env)
     return lambda env, seed: play_agent(env, seed, agent)
 
@@ -208,7 +215,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
-    parser.add_argument("--by", default="oracle", help="oracle, NAME.zip, or MODULE:CLASS with reset() and act()")
+    parser.add_argument("--by", default="oracle", help="oracle, a policy's NAME.safetensors, or MODULE:CLASS")
+    parser.add_argument("--trust-pickle", action="store_true", help="let --by be a zip, which runs code of its author")
     parser.add_argument("--episodes", type=int, default=10, help="number of episodes to play")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
@@ -216,8 +224,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     env = gym.make(given.env, **given.env_arguments)
     seeds = range(given.first_seed, given.first_seed + given.episodes)
-    episodes = record(env, player(given.by, env), seeds, keep_failures=given.keep_failures)
-    who = Path(given.by).stem if given.by.endswith(".zip") else given.by
+    episodes = record(
+        env, player(given.by, env, trust_pickle=given.trust_pickle), seeds, keep_failures=given.keep_failures
+    )
+    who = Path(given.by).stem if given.by.endswith(POLICY_SUFFIXES) else given.by
     dataset = write_dataset(episodes, env, given.dataset, algorithm_name=who)
     print(
         f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps, in {dataset.spec.data_path}"

@@ -2,11 +2,13 @@
 
     python -m agents.train agents/configs/palpate_phantom_small_ppo.yaml
     python -m agents.train agents/configs/sites_ppo.yaml --seed 3     # the same with another seed
+    python -m agents.train agents/configs/retract_ppo.yaml --warm-start runs/clone.safetensors
     tensorboard --logdir runs
 
 The run's folder (runs/NAME-seedSEED unless --out names another) holds checkpoints, the best policy of the periodic
-evaluations with its normalisation (best/STEPS/policy.zip and .json), the final one, csv files and TensorBoard's.
-A resumed run starts new episodes and ends with the same number of steps.
+evaluations with its normalisation (best/STEPS/policy.safetensors and .json), the final one, csv files and those of
+TensorBoard. A resumed run starts new episodes and ends with the same number of steps. Checkpoints are pickles: resume
+only runs of your own.
 """
 
 import argparse
@@ -17,9 +19,9 @@ from agents.training.config import TrainingConfig, read_config
 from agents.training.run import BetweenRollouts, Run
 
 
-def train(config: TrainingConfig, folder: Path, *, progress: bool = False) -> int:
+def train(config: TrainingConfig, folder: Path, *, progress: bool = False, trust_pickle: bool = False) -> int:
     """Train up to the configuration's number of steps; returns the number reached."""
-    run = Run(config, folder)
+    run = Run(config, folder, trust_pickle=trust_pickle)
     model, start = run.model, run.model.num_timesteps
     if run.resumed_from is not None:
         print(f"resuming from {run.resumed_from} ({start} of {config.total_steps} steps)", flush=True)
@@ -39,12 +41,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="the run's folder")
     parser.add_argument("--seed", type=int, help="instead of the configuration's")
     parser.add_argument("--total-steps", type=int, help="instead of the configuration's")
+    parser.add_argument("--warm-start", help="a policy's file to begin with, instead of the configuration's")
+    parser.add_argument(
+        "--trust-pickle", action="store_true", help="let the warm start be a zip, which runs any code of its author"
+    )
     parser.add_argument("--no-progress", action="store_true", help="no progress bar")
     arguments = parser.parse_args()
     try:
-        config = read_config(arguments.config, seed=arguments.seed, total_steps=arguments.total_steps)
+        changes = {name: getattr(arguments, name) for name in ("seed", "total_steps", "warm_start")}
+        config = read_config(arguments.config, **changes)
         folder = arguments.out or Path("runs") / f"{config.name}-seed{config.seed}"
-        steps = train(config, folder, progress=not arguments.no_progress and sys.stderr.isatty())
+        progress = not arguments.no_progress and sys.stderr.isatty()
+        steps = train(config, folder, progress=progress, trust_pickle=arguments.trust_pickle)
     except ValueError as error:
         sys.exit(f"train: {error}")
     print(f"{steps} steps; best and final policy in {folder}")

@@ -26,9 +26,10 @@ ORDER = {
     ),
     # Shared machinery, then one script each.
     "agents": (
-        *("__init__", "scoring", "press_library", "training", "site_search", "raster", "keyboard", "expert_palpate"),
-        *("expert_retract", "learn_palpate", "learn_palpate_recurrent", "learn_retract", "record_demonstrations"),
-        *("behaviour_cloning", "train", "train_rllib", "evaluate", "palpation_figures"),
+        *("__init__", "command_line", "scoring", "press_library", "training", "site_search", "raster", "keyboard"),
+        *("expert_palpate", "expert_retract", "learn_palpate", "learn_palpate_recurrent", "learn_retract"),
+        *("record_demonstrations", "behaviour_cloning", "train", "train_rllib", "evaluate"),
+        *("palpation_figures", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

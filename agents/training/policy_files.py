@@ -1,41 +1,47 @@
-"""Policies as files: NAME.zip is stable-baselines3's, NAME.json states its environment and preprocessing.
+"""Policies as files: NAME.safetensors holds the weights, NAME.json the networks, environment and preprocessing.
 
-A zip holds pickles: load only files that you trust.
+Reading them runs no code of theirs: networks are built from names of fixed tables (`agents.training.networks`), weights
+are checked before they are used. A zip of stable-baselines3 is a set of pickles, which run any code that their author
+put there: it is read only where `trust_pickle` says so, and `python -m agents.convert_policy` makes files without
+pickles from it.
 """
 
+import argparse
+import hashlib
 import json
-from dataclasses import asdict, dataclass, field
+import math
+import warnings
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+import gymnasium as gym
 import numpy as np
-import sb3_contrib
-import stable_baselines3
+import safetensors
+import safetensors.torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.scoring.site_agent import SiteFacts
 from agents.training.environments import blinded
+from agents.training.networks import (
+    NetworkDescription,
+    algorithm_class,
+    build_networks,
+    describe_networks,
+    load_weights,
+    shortened,
+)
 from agents.training.site_policy import SiteBelief
-from surgsim_env.scene.load import nearest
+from surgsim_env.scene.load import fill
 
 # Defaults of VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8
 CUT = 10.0
-
-
-def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """The class of an algorithm of stable-baselines3 or sb3-contrib.
-
-    Raises:
-        ValueError: an unknown name (suggests the nearest).
-    """
-    classes = [(one, getattr(package, one)) for package in (stable_baselines3, sb3_contrib) for one in package.__all__]
-    known = {one: kind for one, kind in classes if isinstance(kind, type) and issubclass(kind, BaseAlgorithm)}
-    if name not in known:
-        raise ValueError(f"algorithm {name!r} is unknown{nearest(name, sorted(known))} (known: {', '.join(known)})")
-    return known[name]
+# Sizes beyond which a file is not read [bytes].
+MOST_WEIGHT_BYTES, MOST_TEXT_BYTES = 400_000_000, 20_000_000
 
 
 @dataclass(frozen=True)
@@ -43,13 +49,15 @@ class PolicyDescription:
     """Content of NAME.json.
 
     Fields:
-        algorithm: class of the model in NAME.zip
+        algorithm: class of stable-baselines3 or sb3-contrib that trained it
         env_id, env_kwargs: environment of the policy
         action_repeat: control steps per decision
         force_entries: entries of the observation that are set to 0; empty for a policy with force
-        belief: fields of `SiteFacts` for a policy on belief maps whose action is a site's number; else None
+        belief: for a policy on belief maps whose action is a site's number; else None
         observation_mean, observation_variance: of the normalisation; None without one
         trained_steps, seed, score: of its training
+        network: its networks; None only beside a zip of an earlier version
+        sha256: of NAME.safetensors; None only beside a zip
     """
 
     algorithm: str
@@ -57,42 +65,72 @@ class PolicyDescription:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     action_repeat: int = 1
     force_entries: list[int] = field(default_factory=list)
-    belief: dict[str, Any] | None = None
+    belief: SiteFacts | None = None
     observation_mean: list[float] | None = None
     observation_variance: list[float] | None = None
     trained_steps: int = 0
     seed: int = 0
     score: float | None = None
+    network: NetworkDescription | None = None
+    sha256: str | None = None
 
 
 def describe(model: BaseAlgorithm, normalisation: VecNormalize | None, **fields: Any) -> PolicyDescription:
-    """The description of a model with its normalisation; `fields` are the other entries."""
+    """The description of a model with its normalisation; `fields` are the other entries.
+
+    Raises:
+        ValueError: networks that a policy's file has no names for.
+    """
     if normalisation is not None and normalisation.norm_obs:
         statistics: Any = normalisation.obs_rms
         fields |= {"observation_mean": statistics.mean.tolist(), "observation_variance": statistics.var.tolist()}
-    return PolicyDescription(algorithm=type(model).__name__, **fields)
+    return PolicyDescription(algorithm=type(model).__name__, network=describe_networks(model), **fields)
 
 
 class TrainedPolicy:
     """A policy with its preprocessing and action repeat; `act` is called each control step.
 
-    policy = load_policy(Path("agents/policies/NAME.zip"))
+    policy = load_policy(Path("agents/policies/NAME.safetensors"))
     policy.reset(env_count)
     actions = policy.act(observations, begins)
     """
 
-    def __init__(self, model: BaseAlgorithm, description: PolicyDescription) -> None:
-        self.model = model
+    def __init__(self, networks: BasePolicy, description: PolicyDescription) -> None:
+        self.networks = networks
         self.description = description
-        self.belief = None if description.belief is None else SiteBelief(SiteFacts(**description.belief))
+        self.belief = None if description.belief is None else SiteBelief(description.belief)
         self.reset(1)
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        """Shape of the raw observation."""
+        if self.description.belief is not None:
+            return (max(part.stop for part in self.description.belief.slices.values()),)
+        return self.networks.observation_space.shape or ()
+
+    def check_environment(self, env: gym.Env, name: str = "the policy") -> None:
+        """Check that this is an environment for the policy, which messages call `name`.
+
+        Raises:
+            ValueError: it has observations or actions of another shape.
+        """
+        actions: Any = self.networks.action_space if self.belief is None else self.belief.action_space
+        for what, space, shape in (
+            ("observations", env.observation_space, self.observation_shape),
+            ("actions", env.action_space, actions.shape),
+        ):
+            if space.shape != shape:
+                raise ValueError(
+                    f"{name} has {what} of shape {shape}, {self.description.env_id} with "
+                    f"{shortened(self.description.env_kwargs)} those of {space.shape}: env_id or env_kwargs are wrong"
+                )
 
     def reset(self, count: int) -> None:
         """Begin episodes in `count` environments."""
         self._state: Any = None
         self._since = np.zeros(count, dtype=np.int64)
-        # Of the model, or places where the model returns a site's number.
-        space: Any = self.model.action_space if self.belief is None else self.belief.action_space
+        # Of the networks, or places where the networks return a site's number.
+        space: Any = self.networks.action_space if self.belief is None else self.belief.action_space
         self._actions = np.zeros((count, *space.shape), dtype=space.dtype)
 
     def act(self, observations: NDArray[Any], begins: NDArray[np.bool_] | None = None) -> NDArray:
@@ -106,7 +144,7 @@ class TrainedPolicy:
         self._since += 1
         if deciding.any():
             seen = self.seen(observations)
-            actions, state = self.model.predict(seen, state=self._state, episode_start=begins, deterministic=True)
+            actions, state = self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=True)
             if self.belief is not None:
                 actions = self.belief.action(actions)
             self._actions[deciding] = actions[deciding]
@@ -129,22 +167,192 @@ class TrainedPolicy:
         return np.clip((values - np.asarray(one.observation_mean)) / scale, -CUT, CUT).astype(np.float32)
 
 
-def save_policy(model: BaseAlgorithm, description: PolicyDescription, path: Path) -> None:
-    """Write NAME.zip and, beside it, NAME.json."""
-    model.save(path.with_suffix(".zip"))
-    text = json.dumps(asdict(description), indent=1)
-    path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+# ---- files ----------------------------------------------------------------------------------------------------------
 
 
-def load_policy(path: Path) -> TrainedPolicy:
-    """The policy of NAME.zip, which NAME.json describes.
+def policy_path(text: str) -> Path:
+    """The path of a policy that is to be written, as `type` of an option of a command line."""
+    try:
+        _check_suffix(Path(text))
+    except ValueError as error:
+        # Of a ValueError argparse would not show the text.
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return Path(text)
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix != ".safetensors":
+        raise ValueError(f"policy {path}: the rule is NAME.safetensors; NAME.json is written beside it")
+
+
+def save_policy(networks: BasePolicy, description: PolicyDescription, path: Path) -> None:
+    """Write NAME.safetensors and, beside it, NAME.json.
 
     Raises:
-        ValueError: one of the two files is missing.
+        ValueError: another suffix, or a description without networks.
     """
-    for suffix in (".zip", ".json"):
-        if not path.with_suffix(suffix).is_file():
-            raise ValueError(f"policy {path}: there is no file {path.with_suffix(suffix).name} beside it")
-    description = PolicyDescription(**json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
-    model = algorithm_class(description.algorithm).load(path.with_suffix(".zip"), device="cpu")
-    return TrainedPolicy(model, description)
+    _check_suffix(path)
+    if description.network is None:
+        raise ValueError(f"policy {path}: its description has no networks (`describe` adds them)")
+    # Extractors that actor and critic share would be refused; each name gets its own copy.
+    content = safetensors.torch.save({name: one.detach().clone() for name, one in networks.state_dict().items()})
+    written = replace(description, sha256=hashlib.sha256(content).hexdigest())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    path.with_suffix(".json").write_text(json.dumps(asdict(written), indent=1) + "\n", encoding="utf-8")
+
+
+def load_policy(path: Path, *, trust_pickle: bool = False) -> TrainedPolicy:
+    """The policy of NAME.safetensors, or of a zip of stable-baselines3, which NAME.json describes.
+
+    Args:
+        path: of either.
+        trust_pickle: read the zip, which runs any code that its author put there; with a warning.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the other (names file, entry, value and rule); a zip
+            without `trust_pickle`.
+    """
+    readers = {".safetensors": _read_weights, ".zip": _read_zip}
+    if path.suffix not in readers:
+        raise ValueError(f"policy {path}: the rule is NAME.safetensors, or a NAME.zip of stable-baselines3")
+    for file in (path, path.with_suffix(".json")):
+        if not file.is_file():
+            other = path.with_suffix(".safetensors")
+            hint = f"; {other.name} is" if file == path and other.is_file() else ""
+            raise ValueError(f"policy {path}: there is no file {file.name} there{hint}")
+    if path.suffix == ".zip" and not trust_pickle:
+        refuse_pickle(path)
+    description = read_description(path.with_suffix(".json"))
+    networks = readers[path.suffix](path, description)
+    _check_preprocessing(description, networks, path.with_suffix(".json"))
+    policy = TrainedPolicy(networks, description)
+    _try(policy, path)
+    return policy
+
+
+def refuse_pickle(path: Path) -> NoReturn:
+    """Say that a zip is not read without `--trust-pickle`, as a ValueError."""
+    raise ValueError(
+        f"policy {path} is a zip of pickles, which runs any code that its author put there: give NAME.safetensors, or "
+        "--trust-pickle if you trust the author"
+    )
+
+
+def read_description(file: Path) -> PolicyDescription:
+    """The description in NAME.json.
+
+    Raises:
+        ValueError: a file that is no JSON table, or an entry that is unknown, missing or wrong.
+    """
+    try:
+        table = json.loads(_read(file, MOST_TEXT_BYTES).decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"policy {file} is not valid JSON: {' '.join(str(error).split())}") from None
+    if not isinstance(table, dict):
+        raise ValueError(f"policy {file} must hold a table of entries, not {shortened(table)}")
+    try:
+        description = fill(PolicyDescription, table, f"policy {file}")
+    except ValueError as error:
+        said = " ".join(str(error).split())
+        raise ValueError(said if len(said) <= 400 else f"{said[:400]}...") from None
+    if description.action_repeat < 1:
+        raise ValueError(f"policy {file}: action_repeat is {description.action_repeat}; it must be at least 1")
+    return description
+
+
+def _read(file: Path, most: int) -> bytes:
+    size = file.stat().st_size
+    if size > most:
+        raise ValueError(f"policy {file} has {size} bytes; the rule is at most {most}")
+    return file.read_bytes()
+
+
+def _read_weights(path: Path, description: PolicyDescription) -> BasePolicy:
+    document = path.with_suffix(".json")
+    for entry in ("network", "sha256"):
+        if getattr(description, entry) is None:
+            raise ValueError(
+                f"policy {document}: entry {entry!r} is missing; `python -m agents.convert_policy` writes it"
+            )
+    assert description.network is not None
+    content = _read(path, MOST_WEIGHT_BYTES)
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != description.sha256:
+        raise ValueError(
+            f"policy {path}: its SHA-256 is {digest}, {document.name} has {shortened(description.sha256, 66)}: the "
+            "two are not of one policy, or one is damaged"
+        )
+    networks = build_networks(description.algorithm, description.network, f"policy {document}: network")
+    try:
+        weights = safetensors.torch.load(content)
+    except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        raise ValueError(f"policy {path} is not a file of safetensors: {' '.join(str(error).split())}") from None
+    load_weights(networks, weights, f"policy {path}")
+    return networks
+
+
+def _read_zip(path: Path, description: PolicyDescription) -> BasePolicy:
+    return load_model(path, description).policy
+
+
+def load_model(path: Path, description: PolicyDescription) -> BaseAlgorithm:
+    """The model of a trusted zip of stable-baselines3, with a warning.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    warnings.warn(f"policy {path} is read with pickle, which runs any code that its author put there", stacklevel=4)
+    kind = algorithm_class(description.algorithm)
+    try:
+        return kind.load(path, device="cpu")
+    except Exception as error:  # a damaged pickle may raise anything
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"policy {path} cannot be read as a {description.algorithm}: {said}") from None
+
+
+def _check_preprocessing(description: PolicyDescription, networks: BasePolicy, document: Path) -> None:
+    """Refuse a normalisation, a belief or entries of force that do not fit the networks' spaces."""
+    shape, actions = networks.observation_space.shape or (), networks.action_space
+    where = f"policy {document}"
+    raw = shape[0] if len(shape) == 1 else 0
+    facts = description.belief
+    if facts is not None:
+        numbers = (*facts.extent, facts.tip_radius, facts.noise)
+        if len(facts.extent) != 2 or not all(map(math.isfinite, numbers)) or min(numbers[:-1]) <= 0.0:
+            raise ValueError(f"{where}: belief is {facts}; the rule is two extents, all positive and finite")
+        count = facts.site_count**2
+        if facts.site_count < 2 or shape != (3 * count + 1,) or getattr(actions, "n", 0) != count:
+            raise ValueError(
+                f"{where}: belief.site_count is {facts.site_count}, for n of which networks read 3 n^2 + 1 numbers and "
+                f"choose among n^2 sites; these read {shape} and choose from {actions}"
+            )
+        raw = max(part.stop for part in facts.slices.values())
+    for index, entry in enumerate(description.force_entries):
+        if not 0 <= entry < raw:
+            raise ValueError(f"{where}: force_entries[{index}] is {entry}; the observation has entries 0 to {raw - 1}")
+    pair = {name: getattr(description, name) for name in ("observation_mean", "observation_variance")}
+    if list(pair.values()).count(None) == 1:
+        raise ValueError(f"{where}: observation_mean and observation_variance go together; one is missing")
+    for name, values in pair.items():
+        if values is None:
+            continue
+        if shape != (len(values),):
+            raise ValueError(f"{where}: {name} has {len(values)} entries; the networks read {shape}")
+        for index, value in enumerate(values):
+            if not math.isfinite(value) or (name == "observation_variance" and value < 0.0):
+                raise ValueError(
+                    f"{where}: {name}[{index}] is {value}; the rule is a finite number, for a variance at least 0"
+                )
+
+
+def _try(policy: TrainedPolicy, path: Path) -> None:
+    """Refuse networks that fail on the first observation, or answer it with what is no action."""
+    space = policy.networks.observation_space
+    try:
+        actions, _ = policy.networks.predict(np.zeros((1, *(space.shape or ())), dtype=space.dtype), deterministic=True)
+    except Exception as error:  # networks that do not fit their spaces may raise anything
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"policy {path} cannot act: {said}") from None
+    if not np.isfinite(actions).all():
+        raise ValueError(f"policy {path} answers an observation of zeros with {actions[0]}; actions must be finite")

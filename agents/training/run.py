@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +21,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.training.config import TrainingConfig, config_text
 from agents.training.environments import belief_facts, force_entries, make_environments
-from agents.training.extractors import MemorySummary, PlaceAndForce
-from agents.training.policy_files import (
-    PolicyDescription,
-    TrainedPolicy,
-    algorithm_class,
-    describe,
-    load_policy,
-    save_policy,
-)
-from agents.training.site_policy import SitePolicy
+from agents.training.networks import POLICIES, algorithm_class, describe_networks, with_classes
+from agents.training.policy_files import PolicyDescription, TrainedPolicy, describe, load_policy, save_policy
 
 # First seeds of training and of its periodic evaluation; scores use others
 # (`surgsim_env.palpation.scores.EVALUATION_SEEDS`, from 1,000,000 to 1,000,099).
@@ -39,26 +31,29 @@ EVALUATION_SEED = 500_000
 # Sample count of a warm start's normalisation: so large that new observations hardly change it.
 WARM_COUNT = 1e9
 
-# Classes that a configuration names.
-EXTRACTORS = {"MemorySummary": MemorySummary, "PlaceAndForce": PlaceAndForce}
-ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU}
-POLICIES = {"SitePolicy": SitePolicy}
-
 
 class Run:
     """The algorithm, its environments and its folder.
 
-    The folder holds config.yaml, checkpoints/STEPS/, best/STEPS/ (policy.zip and policy.json), evaluations.csv, one
+    The folder holds config.yaml, checkpoints/STEPS/, best/STEPS/ (policy.safetensors and .json), evaluations.csv, one
     progress csv and one TensorBoard file for each start, and at the end final/STEPS/.
     """
 
-    def __init__(self, config: TrainingConfig, folder: Path) -> None:
+    def __init__(self, config: TrainingConfig, folder: Path, *, trust_pickle: bool = False) -> None:
         """Begin a run, or resume it from its folder's last complete checkpoint.
 
+        Checkpoints are pickles, as stable-baselines3 writes them: resume only runs of your own.
+
+        Args:
+            config: of the run.
+            folder: of the run.
+            trust_pickle: a warm start may be a zip of stable-baselines3, which runs any code that its author put there.
+
         Raises:
-            ValueError: the folder holds a run with another configuration.
+            ValueError: the folder holds a run with another configuration, a warm start that cannot be read or does not
+                fit, or networks that a policy's file has no names for.
         """
-        self.config, self.folder = config, folder
+        self.config, self.folder, self.trust_pickle = config, folder, trust_pickle
         torch.set_num_threads(config.torch_threads)
         self._claim_folder()
         saved = whole_folders(folder / "checkpoints")
@@ -66,6 +61,8 @@ class Run:
         self.bare = make_environments(config.environment)
         self.blind_entries = force_entries(self.bare) if config.environment.without_force else []
         self.model = self._begin() if self.resumed_from is None else self._resume(self.resumed_from)
+        # Refused now, and not when the first policy is written.
+        describe_networks(self.model)
         # One progress file for each start, named by its first step.
         start = self.model.num_timesteps
         formats = [make_output_format(kind, str(folder), f"_{start:012d}") for kind in ("csv", "tensorboard")]
@@ -94,7 +91,7 @@ class Run:
             env_kwargs=settings.kwargs,
             action_repeat=settings.action_repeat,
             force_entries=self.blind_entries,
-            belief=asdict(belief_facts(self.bare)) if settings.belief else None,
+            belief=belief_facts(self.bare) if settings.belief else None,
             trained_steps=self.model.num_timesteps,
             seed=self.config.seed,
             score=score,
@@ -143,7 +140,9 @@ class Run:
             self._evaluated = make_environments(self.config.environment, count)
         # These environments repeat actions, remove force and compute beliefs themselves.
         seen = replace(self.description(), action_repeat=1, force_entries=[], belief=None)
-        figures = mean_figures(play_episodes(TrainedPolicy(self.model, seen), self._evaluated, settings.episodes))
+        figures = mean_figures(
+            play_episodes(TrainedPolicy(self.model.policy, seen), self._evaluated, settings.episodes)
+        )
         self.evaluated_at = steps
         if settings.score not in figures:
             raise ValueError(
@@ -159,7 +158,8 @@ class Run:
 
     def _write_policy(self, place: str, description: PolicyDescription) -> None:
         folder, name = self.folder / place, f"{self.model.num_timesteps:012d}"
-        write_folder(folder, name, lambda path: save_policy(self.model, description, path / "policy.zip"))
+        networks = self.model.policy
+        write_folder(folder, name, lambda path: save_policy(networks, description, path / "policy.safetensors"))
         keep_newest(folder, 1)
 
     def _claim_folder(self) -> None:
@@ -198,13 +198,13 @@ class Run:
         Raises:
             ValueError: other networks, or only one of policy and run has a normalisation.
         """
-        warm = load_policy(path)
+        warm = load_policy(path, trust_pickle=self.trust_pickle)
         try:
-            model.policy.load_state_dict(warm.model.policy.state_dict())
+            model.policy.load_state_dict(warm.networks.state_dict())
         except RuntimeError as error:
             raise ValueError(
                 f"warm_start {path}: its networks are not those of this run; set policy and policy_kwargs alike: "
-                f"{error}"
+                f"{' '.join(str(error).split())}"
             ) from None
         if self.config.warm_spread is not None:
             policy: Any = model.policy
@@ -273,15 +273,9 @@ def keywords(hyperparameters: dict[str, Any]) -> dict[str, Any]:
         else value
         for name, value in hyperparameters.items()
     }
-    policy = dict(made.get("policy_kwargs") or {})
-    for entry, known in (("activation_fn", ACTIVATIONS), ("features_extractor_class", EXTRACTORS)):
-        if entry in policy:
-            if policy[entry] not in known:
-                raise ValueError(
-                    f"hyperparameters.policy_kwargs.{entry} is {policy[entry]!r}; known are {', '.join(known)}"
-                )
-            policy[entry] = known[policy[entry]]
-    return made | {"policy_kwargs": policy} if policy else made
+    if made.get("policy_kwargs"):
+        made["policy_kwargs"] = with_classes(made["policy_kwargs"], "hyperparameters.policy_kwargs")
+    return made
 
 
 def training_seed(seed: int, steps: int) -> int:

@@ -56,10 +56,10 @@ def test_a_policy_is_cloned_in_one_script(dataset, tmp_path, capsys):
     from agents.behaviour_cloning import main
     from agents.training.policy_files import load_policy
 
-    main([NAME, "--out", str(tmp_path / "clone.zip"), "--epochs", "3", "--episodes", "1", "--width", "32"])
+    main([NAME, "--out", str(tmp_path / "clone.safetensors"), "--epochs", "3", "--episodes", "1", "--width", "32"])
     said = capsys.readouterr().out
     assert f"{NAME}: 2 episodes, {dataset.total_steps} steps" in said and "of 1 episodes, mean return" in said
-    policy = load_policy(tmp_path / "clone.zip")
+    policy = load_policy(tmp_path / "clone.safetensors")
     assert policy.description.env_id == "SurgSim/Palpate-v0" and policy.description.algorithm == "PPO"
 
 
@@ -84,7 +84,7 @@ def test_a_policy_with_a_memory_is_cloned(dataset, tmp_path):
 
     options = CloningOptions(epochs=30, batch_size=1, learning_rate=3e-3)
     policy, curve = clone_dataset(dataset, recurrent=True, width=16, options=options)
-    assert type(policy.model).__name__ == "RecurrentPPO"
+    assert policy.description.algorithm == "RecurrentPPO"
     assert curve.training[-1] < 0.5 * curve.training[0]
     policy.reset(1)
     first = policy.act(dataset[0].observations[:1], np.array([True]))

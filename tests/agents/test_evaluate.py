@@ -67,6 +67,13 @@ def test_the_leaderboard_has_a_table_a_place_and_the_best_raster_alone(tmp_path:
     assert "--agent raster_4`" in text
 
 
+def test_results_name_policies_that_are_there() -> None:
+    for made in load_results():
+        if "--policy" in made.command:
+            policy = evaluate.POLICIES.parent.parent / made.command.split("--policy ")[1].split()[0]
+            assert policy.is_file() and policy.with_suffix(".json").is_file(), made.command
+
+
 def test_a_baseline_is_played_and_scored(tmp_path: Path) -> None:
     evaluate.main(["--agent", "gp_ucb", "--episodes", "2", "--budget", "3", "--envs", "2", "--results", str(tmp_path)])
     (made,) = load_results(tmp_path)

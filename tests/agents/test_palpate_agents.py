@@ -167,7 +167,7 @@ def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script
 
     from agents.training.policy_files import load_policy
 
-    file = tmp_path / "taught.zip"
+    file = tmp_path / "taught.safetensors"
     sizes = ["--rounds", "3", "--envs", "4", "--steps", "30", "--epochs", "1"]
     monkeypatch.setattr(sys, "argv", [script, "--out", str(file), *sizes, *more])
     import_module(f"agents.{script}").main()
@@ -192,10 +192,10 @@ def test_committed_policies_search_as_they_were_taught(path: Path):
     """
     from agents.training.policy_files import load_policy
 
-    policy = load_policy(path)
+    policy = load_policy(path.with_suffix(".safetensors"))
     kwargs = dict(policy.description.env_kwargs)
     assert kwargs.pop("level") == "standard" and policy.description.env_id == ID
-    assert path.with_suffix(".zip").stat().st_size < 2e6
+    assert path.with_suffix(".safetensors").stat().st_size < 2e6
     envs = surrogate(32, **kwargs)
     observation, _ = envs.reset(seed=11)
     begins, first = np.ones(32, dtype=bool), np.full(32, np.nan)

@@ -83,7 +83,7 @@ def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypa
     asked = []
     act = learn_retract.RetractExpert.act
     monkeypatch.setattr(learn_retract.RetractExpert, "act", lambda self, seen: (asked.append(seen), act(self, seen))[1])
-    out = tmp_path / "policy.zip"
+    out = tmp_path / "policy.safetensors"
     settings = {
         "envs": 2,
         "dtype": "float64",

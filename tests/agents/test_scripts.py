@@ -22,6 +22,7 @@ SMALL: dict[str, tuple[list[str], str]] = {
 # Scripts that other tests run.
 ELSEWHERE = {
     "behaviour_cloning": "test_demonstrations.py",
+    "convert_policy": "test_policy_files.py",
     "evaluate": "test_evaluate.py",
     "expert_retract": "test_retract_agents.py",
     "learn_palpate": "test_palpate_agents.py",

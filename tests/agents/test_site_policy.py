@@ -1,7 +1,5 @@
 """The learned acquisition function: it sees the belief of the searches gp_* and names the site that is pressed."""
 
-from dataclasses import asdict
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from stable_baselines3 import PPO
 
 from agents.evaluate import POLICIES
 from agents.scoring.site_agent import LENGTH_SHARE, SiteFacts, SiteProcess
-from agents.training.policy_files import PolicyDescription, load_policy, save_policy
+from agents.training.policy_files import describe, load_policy, save_policy
 from agents.training.site_policy import CURIOSITY, SHARPNESS, SiteBelief, SitePolicy
 from surgsim_env.palpation.lesion_estimator import (
     BACKGROUND_SPREAD,
@@ -112,11 +110,10 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
     assert chosen.tolist() == np.where(touched, -np.inf, bound).argmax(axis=1).tolist()
 
 
-@pytest.mark.parametrize("path", sorted(POLICIES.glob("sites_*.zip")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(POLICIES.glob("sites_*.safetensors")), ids=lambda path: path.stem)
 def test_shipped_policies_load(path):
-    """Each zip names its policy's class by module; here in a process that knows none but today's modules."""
     policy = load_policy(path)
-    assert isinstance(policy.model.policy, SitePolicy) and policy.belief is not None
+    assert isinstance(policy.networks, SitePolicy) and policy.belief is not None
     count = policy.belief.site_count**2
     actions = policy.act(np.zeros((1, 2 * count + 6), dtype=np.float32), np.ones(1, dtype=bool))
     assert (np.abs(actions) < 1.0).all()
@@ -130,8 +127,9 @@ def test_a_saved_policy_presses_what_its_scores_say(tmp_path):
         action_space = gym.spaces.Discrete(SITES)
 
     model = PPO(SitePolicy, Sites(), n_steps=8, batch_size=8)
-    save_policy(model, PolicyDescription("PPO", "SurgSim/PalpateSites-v0", belief=asdict(SETTINGS)), tmp_path / "p.zip")
-    policy = load_policy(tmp_path / "p.zip")
+    file = tmp_path / "p.safetensors"
+    save_policy(model.policy, describe(model, None, env_id="SurgSim/PalpateSites-v0", belief=SETTINGS), file)
+    policy = load_policy(file)
     policy.reset(2)
     observations = np.stack([observed({3: 0.1, 17: 0.5}), observed({40: 0.3})])
     actions = policy.act(observations, np.ones(2, dtype=bool))

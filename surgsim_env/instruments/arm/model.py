@@ -1,6 +1,7 @@
 """An arm's MuJoCo model: read from MJCF or URDF, checked against its description, placed at a port, compiled."""
 
 import math
+import os
 from collections.abc import Iterable, Sequence
 from typing import Any
 from xml.etree import ElementTree
@@ -9,6 +10,7 @@ import mujoco
 import numpy as np
 
 from msdm_core.organ.support import Support
+from surgsim_env.instruments.arm.model_limits import check_model, read_spec, read_xml
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription
 from surgsim_env.scene.load import nearest
@@ -51,27 +53,23 @@ def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, 
 
 
 def _read_spec(description: ArmDescription) -> mujoco.MjSpec:
-    path = description.folder / description.model
-    try:
-        root = ElementTree.fromstring(path.read_bytes())
-    except OSError as error:
-        raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None
-    except ElementTree.ParseError as error:
-        raise ValueError(f"model file {path} is not valid XML: {error}") from None
+    path, text = description.folder / description.model, ""
+    root = read_xml(path)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"model file {path} begins with <{root.tag}>; it must be MJCF (<mujoco>) or URDF (<robot>)")
     _check_repeated_names(root)
-    if root.tag == "mujoco":
-        spec = mujoco.MjSpec.from_file(str(path))
-    else:
+    if root.tag == "robot":
         if root.find("mujoco") is None:
             ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-        spec.modelfiledir = str(path.parent)
+        text = ElementTree.tostring(root, encoding="unicode")
+    wrong = check_model(path, root, text)
+    spec = read_spec(str(path), text)
     for mesh in spec.meshes:
         file = path.parent / spec.meshdir / mesh.file
-        if mesh.file and not file.is_file():
+        if mesh.file and not os.path.isfile(file):
             raise ValueError(f"mesh file {file} is missing: put it there, or take the mesh out of {path.name}")
+    if wrong:
+        raise ValueError(wrong)
     return spec
 
 

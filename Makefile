@@ -15,7 +15,7 @@ WITH_RAY := --editable=.[dev,distributed]
 # A file's tests run in one worker, which makes what they share once.
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: help demo test test-all test-agents test-distributed with-ray bench docs lint clean distclean
+.PHONY: help demo test test-all test-agents test-distributed with-ray bench soak docs lint clean distclean
 .NOTPARALLEL:
 
 help:
@@ -25,6 +25,7 @@ help:
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
 	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
+	@echo "make soak         play all environments for an hour with random, corner and adversarial actions"
 	@echo "make docs         the documentation site, in site/; warnings are errors"
 	@echo "make lint         ruff and pyright"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
@@ -57,6 +58,9 @@ with-ray: $(VENV)/.ready-distributed
 
 bench: $(VENV)/.ready-bench
 	$(VENV)/bin/surgsim bench --out docs
+
+soak: $(VENV)/.ready-demo
+	$(PY) benchmarks/soak.py --minutes 60
 
 # Material for MkDocs advertises its successor at each build.
 docs: $(VENV)/.ready-dev

@@ -1,0 +1,451 @@
+"""Play environments for as long as wanted with random, corner and adversarial actions, and watch what must not happen.
+
+    python benchmarks/soak.py --minutes 60
+    python benchmarks/soak.py --minutes 1 --quick    small organs, alone and in float64: kernels that tests compile too
+    python benchmarks/soak.py --replay 0:17          repeats run 17 of seed 0, to the bit (--quick if it was)
+
+A run makes an environment of one of CASES, alone or several side by side, plays some seconds of it and goes on to the
+next; runs are drawn from a seed and their number. Watched in every control step: observations lie in their space,
+rewards are finite, each end has a name (a fault of FAULTS, a limit, a success, the time), and no tet is turned inside
+out unless the fault says so, by volumes that are computed here from the nodes' positions. At the end of a run a reset
+with the first seed must give the first saved state to the bit. Memory is what a process holds between runs.
+
+One process for each core (`--processes`); one that dies is a finding, and another takes its place. Prints a table and
+exits 1 with findings.
+"""
+
+import argparse
+import contextlib
+import gc
+import itertools
+import multiprocessing
+import os
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.bench.report import core_count, describe, load
+from surgsim_env.scene.levels import LEVELS
+
+# What each id is played with.
+CASES: dict[str, dict[str, tuple[Any, ...]]] = {
+    "SurgSim/Palpate-v0": {
+        "scene": ("phantom_small", "phantom", "phantom_wide", "liver"),
+        "level": tuple(LEVELS),
+        "instrument": (None, "psm_palpator"),
+    },
+    "SurgSim/PalpateSites-v0": {"scene": ("phantom_small", "phantom", "liver"), "level": tuple(LEVELS)},
+    "SurgSim/Retract-v0": {"instrument": (None, "psm_retractor")},
+    "SurgSim/BimanualRetract-v0": {},
+}
+# Environments side by side and their precision; an id without lanes is played alone.
+WIDTHS: tuple[tuple[int, str], ...] = (
+    *((1, "alone"), (8, "float64"), (5, "float64")),
+    *((8, "float32"), (16, "float32")),
+)
+# Of a quick soak: the scene of palpation, and how many of WIDTHS.
+QUICK_SCENE, QUICK_WIDTHS = "phantom_small", 3
+# Control steps of a run; a step of PalpateSites is a press, which takes as long as many.
+STEPS, PRESSES = 80, 4
+# A fault's name, and the words of `sim_fault` that it goes with.
+FAULTS = {
+    "tet inverted": "turned inside out",
+    "contact lost": "contact lost",
+    "not finite": "no longer finite",
+    "wrench not finite": "wrench is not finite",
+    "force cap": "beyond the physical cap",
+    "MuJoCo warning": "MuJoCo warning",
+    "out of bounds": "left its bounds",
+}
+# Entries of `info` that name an end which is no fault.
+ENDS = ("success", "hard_limit", "torn", "collided", "declared")
+# Share of the time until memory counts, how much a process may gain from then on [bytes], in a soak of so long [s].
+WARM_UP, GROWTH_MOST, GROWTH_TIME = 0.2, 20e6, 1800.0
+
+
+# ---- actions ---------------------------------------------------------------------------------------------------------
+
+Action = NDArray[np.float32]
+
+
+def random_actions(rng: np.random.Generator, size: int) -> Generator[Action, float, None]:
+    """Each entry anew in every step; ignores what is sent to it."""
+    while True:
+        yield rng.uniform(-1.0, 1.0, size).astype(np.float32)
+
+
+def corner_actions(rng: np.random.Generator, size: int) -> Generator[Action, float, None]:
+    """Entries at -1, 0 or 1, held for up to 20 steps."""
+    while True:
+        corner = rng.integers(-1, 2, size).astype(np.float32)
+        for _ in range(int(rng.integers(1, 21))):
+            yield corner
+
+
+def adversarial_actions(rng: np.random.Generator, size: int) -> Generator[Action, float, None]:
+    """Corners that raise the force: one that did is kept, of one that did not an entry is turned round.
+
+    It is sent the largest contact force of each step [N].
+    """
+    corner, before = rng.choice((-1.0, 1.0), size).astype(np.float32), 0.0
+    while True:
+        force = yield corner.copy()
+        if force <= before:
+            corner[rng.integers(size)] *= -1.0
+        before = force
+
+
+ACTORS: dict[str, Callable[[np.random.Generator, int], Generator[Action, float, None]]] = {
+    "random": random_actions,
+    "corner": corner_actions,
+    "adversarial": adversarial_actions,
+}
+
+
+# ---- a run -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: what is made, and how it is played."""
+
+    seed: int
+    number: int
+    env_id: str
+    settings: dict[str, Any]
+    width: int
+    dtype: str
+    actor: str
+
+    @classmethod
+    def drawn(cls, seed: int, number: int, *, quick: bool = False) -> "Run":
+        """Run `number` of a seed."""
+        rng = np.random.default_rng((seed, number))
+        env_id = str(rng.choice(list(CASES)))
+        settings = {name: values[rng.integers(len(values))] for name, values in CASES[env_id].items()}
+        if quick and "scene" in settings:
+            settings["scene"] = QUICK_SCENE
+        width, dtype = WIDTHS[rng.integers(QUICK_WIDTHS if quick else len(WIDTHS))]
+        if gym.spec(env_id).vector_entry_point is None:
+            width, dtype = WIDTHS[0]
+        return cls(seed, number, env_id, settings, width, dtype, str(rng.choice(list(ACTORS))))
+
+    @property
+    def name(self) -> str:
+        """How the run is given to --replay."""
+        return f"{self.seed}:{self.number}"
+
+    def __str__(self) -> str:
+        chosen = ", ".join(f"{name}={value}" for name, value in self.settings.items() if value is not None)
+        return f"run {self.name}, {self.env_id}({chosen}), {self.width} x {self.dtype}, {self.actor} actions"
+
+    def make(self) -> gym.vector.VectorEnv:
+        """The environments, which are reset one by one."""
+        if self.dtype == "alone":
+            mode = gym.vector.AutoresetMode.DISABLED
+            return gym.make_vec(self.env_id, 1, "sync", vector_kwargs={"autoreset_mode": mode}, **self.settings)
+        lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled", "threads": 1}
+        return gym.make_vec(self.env_id, num_envs=self.width, dtype=self.dtype, **lanes, **self.settings)
+
+
+@dataclass
+class Outcome:
+    """What a run counted; `findings` are what must not happen, a sentence each."""
+
+    substeps: int = 0
+    steps: int = 0
+    episodes: int = 0
+    ends: Counter[str] = field(default_factory=Counter)
+    findings: list[str] = field(default_factory=list)
+    memory: float = 0.0
+
+
+def play(run: Run) -> Outcome:
+    """Make a run's environments, play them, and check them."""
+    outcome = Outcome()
+    with contextlib.closing(run.make()) as envs:
+        Watch(run, envs, outcome).play()
+    return outcome
+
+
+class Watch:
+    """Plays environments and checks each step."""
+
+    def __init__(self, run: Run, envs: Any, outcome: Outcome) -> None:
+        self.run, self.envs, self.outcome = run, envs, outcome
+        self.singles = [env.unwrapped for env in envs.envs]
+        self.sites = run.env_id == "SurgSim/PalpateSites-v0"
+        self.elapsed = np.zeros(len(self.singles))
+
+    def play(self) -> None:
+        """All steps of the run; an episode that ends is followed by one of another seed."""
+        rng = np.random.default_rng((self.run.seed, self.run.number, 1))
+        first = self.seeds(rng)
+        begun = self.reset(first)
+        size = self.singles[0].action_space.shape[0]
+        actors = [ACTORS[self.run.actor](rng, size) for _ in self.singles]
+        actions = np.array([next(actor) for actor in actors])
+        for _ in range(PRESSES if self.sites else STEPS):
+            observations, rewards, terminated, truncated, infos = self.envs.step(actions)
+            self.outcome.steps += len(self.singles)
+            self.check(observations, rewards)
+            over = terminated | truncated
+            for index, env in enumerate(self.singles):
+                self.count(index, env)
+                told = {name: values[index] for name, values in infos.items() if not name.startswith("_")}
+                end = self.end_of(env, told, bool(truncated[index])) if over[index] else ""
+                self.check_tets(index, env, end)
+            forces = infos["force_peak"]
+            actions = np.array([actor.send(float(force)) for actor, force in zip(actors, forces, strict=True)])
+            if over.any():
+                self.elapsed[over] = 0.0
+                self.envs.reset(seed=self.seeds(rng), options={"reset_mask": over.copy()})
+        if self.reset(first) != begun:
+            self.find("a reset with the first seed does not give the first state")
+
+    def seeds(self, rng: np.random.Generator) -> list[int]:
+        """A seed for each environment."""
+        return rng.integers(2**31, size=len(self.singles)).tolist()
+
+    def reset(self, seeds: list[int]) -> list[bytes]:
+        """Reset all; returns their saved states."""
+        self.envs.reset(seed=seeds)
+        return [env.save_state() for env in self.singles]
+
+    def find(self, what: str) -> None:
+        self.outcome.findings.append(f"{self.run}: {what}")
+
+    def check(self, observations: NDArray[Any], rewards: NDArray[Any]) -> None:
+        """Observations lie in their space, rewards are finite."""
+        space = self.singles[0].observation_space
+        for index, observation in enumerate(observations):
+            if not space.contains(observation):
+                bad = np.flatnonzero(~((observation >= space.low) & (observation <= space.high)))
+                self.find(f"observation[{bad[:1]}] of environment {index} is {observation[bad[:1]]}")
+        if not np.isfinite(rewards).all():
+            self.find(f"rewards {rewards} are not finite")
+
+    def count(self, index: int, env: Any) -> None:
+        """Add the substeps since the last look."""
+        simulation, timing = env.simulation, env.scene.timing
+        elapsed = env.task.felt.seconds if self.sites else simulation.time
+        new, self.elapsed[index] = elapsed - self.elapsed[index], elapsed
+        self.outcome.substeps += round(new / timing.haptic_step) * timing.substep_count
+
+    def end_of(self, env: Any, info: dict[str, Any], truncated: bool) -> str:
+        """The name of an episode's end, counted."""
+        self.outcome.episodes += 1
+        fault = info["sim_fault"]
+        if fault:
+            end = next((name for name, words in FAULTS.items() if words in fault), "")
+        elif truncated:
+            end = "time"
+        elif self.sites and not info["success"] and env.task.step_count == env.task.budget:
+            end = "budget"
+        else:
+            end = next((name for name in ENDS if info.get(name)), "")
+        if not end:
+            self.find(f"an end without a name: {fault or info}")
+        self.outcome.ends[end or "unnamed"] += 1
+        return end
+
+    def check_tets(self, index: int, env: Any, end: str) -> None:
+        """No tet is inside out or not finite, unless the fault says so."""
+        ratios = volume_ratios(env.simulation)
+        if not ratios.min() > 0.0 and end not in ("tet inverted", "not finite"):
+            self.find(
+                f"tet {int(ratios.argmin())} of environment {index} has volume ratio {ratios.min():.3g}, no fault"
+            )
+
+
+def volume_ratios(simulation: Any) -> NDArray[np.float64]:
+    """Volume of each tet over its volume at rest, (n_tet,), from the definition."""
+    tets = simulation.anatomy.mesh.tets
+
+    def volumes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        edges = points[tets[:, 1:]] - points[tets[:, :1]]
+        return np.linalg.det(edges)
+
+    return volumes(simulation.organ_state.node_position) / volumes(simulation.organ_model.node_rest_position)
+
+
+def memory_held() -> float:
+    """Memory of this process [bytes]; 0 where the system does not say."""
+    gc.collect()
+    status = Path("/proc/self/statm")
+    return float(int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")) if status.exists() else 0.0
+
+
+# ---- processes -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Soak:
+    """What a soak is: its seed, its processes, when it ends (time.time()), and whether it is a quick one."""
+
+    seed: int
+    processes: int
+    deadline: float
+    quick: bool
+
+
+def work(soak: Soak, first: int, pipe: Connection) -> None:
+    """Play every so many-th run from `first` until the deadline; each is announced, and followed by its outcome."""
+    for number in itertools.count(first, soak.processes):
+        if time.time() >= soak.deadline:
+            break
+        run = Run.drawn(soak.seed, number, quick=soak.quick)
+        pipe.send(run)
+        try:
+            outcome = play(run)
+        except Exception:  # whatever it is, it is a finding, and the next run goes on
+            outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
+        outcome.memory = memory_held()
+        pipe.send(outcome)
+    pipe.send(None)
+
+
+@dataclass
+class Worker:
+    """A process, its runs, and the memory that it held after each: time since the soak's start [s], [bytes]."""
+
+    process: Any
+    pipe: Connection
+    run: Run | None = None
+    memory: list[tuple[float, float]] = field(default_factory=list)
+    over: bool = False
+
+    def growth(self, warm: float) -> float:
+        """Memory of the last runs over that of the first after `warm` seconds, medians of five [bytes]."""
+        held = [memory for when, memory in self.memory if when >= warm]
+        return float(np.median(held[-5:]) - np.median(held[:5])) if len(held) >= 10 else 0.0
+
+
+def start(soak: Soak, first: int) -> Worker:
+    """A process that plays runs from `first` on."""
+    context = multiprocessing.get_context("spawn")
+    mine, its = context.Pipe(duplex=False)
+    process = context.Process(target=work, args=(soak, first, its), daemon=True)
+    process.start()
+    its.close()
+    return Worker(process, mine)
+
+
+def play_all(soak: Soak, console: Console) -> int:
+    """Play until the deadline and print the table; returns the exit status."""
+    before, begin = load(), time.time()
+    workers = [start(soak, index) for index in range(soak.processes)]
+    ended: list[Worker] = []
+    totals: dict[str, Outcome] = {}
+    findings: list[str] = []
+
+    def find(what: str) -> None:
+        findings.append(what)
+        console.print(f"finding: {what}", markup=False, highlight=False, soft_wrap=True)
+
+    with console.status("soak") as status:
+        while workers:
+            for ready in wait([worker.pipe for worker in workers]):
+                worker = next(worker for worker in workers if worker.pipe is ready)
+                try:
+                    message = worker.pipe.recv()
+                except EOFError:
+                    workers.remove(worker)
+                    ended.append(worker)
+                    if not worker.over:
+                        worker.process.join()
+                        find(f"{worker.run}: the process died with exit code {worker.process.exitcode}")
+                        following = worker.run.number + soak.processes if worker.run else 0
+                        workers.append(start(soak, following))
+                    continue
+                if message is None:
+                    worker.over = True
+                elif isinstance(message, Run):
+                    worker.run = message
+                else:
+                    assert worker.run is not None
+                    worker.memory.append((time.time() - begin, message.memory))
+                    add(totals.setdefault(worker.run.env_id, Outcome()), message)
+                    for one in message.findings:
+                        find(one)
+                runs = sum(len(worker.memory) for worker in (*workers, *ended))
+                done = sum(total.substeps for total in totals.values())
+                left = max(soak.deadline - time.time(), 0.0)
+                status.update(f"{runs} runs, {done:.3g} substeps, {len(findings)} findings, {left:.0f} s left")
+    whole = soak.deadline - begin
+    memory = []
+    for number, worker in enumerate(ended):
+        held = worker.memory[-1][1] if worker.memory else 0.0
+        growth = worker.growth(WARM_UP * whole)
+        memory.append(
+            f"{held / 1e6:.0f} MB at the end, {growth / 1e6:+.1f} MB since the first {WARM_UP:.0%} of the time"
+        )
+        if whole >= GROWTH_TIME and growth > GROWTH_MOST:
+            find(f"process {number} gained {growth / 1e6:.1f} MB; the rule is {GROWTH_MOST / 1e6:.0f} MB")
+    show(totals, console)
+    runs = sum(len(worker.memory) for worker in ended)
+    for line in (
+        f"{runs} runs of seed {soak.seed} in {(time.time() - begin) / 60.0:.1f} min, {len(findings)} findings",
+        *(f"process {number}: {text}" for number, text in enumerate(memory)),
+        describe(before),
+    ):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return 1 if findings else 0
+
+
+def add(total: Outcome, outcome: Outcome) -> None:
+    """Add a run's outcome to that of its id."""
+    total.substeps += outcome.substeps
+    total.steps += outcome.steps
+    total.episodes += outcome.episodes
+    total.ends += outcome.ends
+    total.findings += outcome.findings
+
+
+def show(totals: dict[str, Outcome], console: Console) -> None:
+    """The table: a row an id."""
+    table = Table("id", "substeps", "control steps", "episodes", "ends", "findings")
+    for env_id, total in sorted(totals.items()):
+        ends = ", ".join(f"{count} {name}" for name, count in total.ends.most_common())
+        counts = (f"{number:,}".replace(",", " ") for number in (total.substeps, total.steps, total.episodes))
+        table.add_row(env_id, *counts, ends, str(len(total.findings)))
+    console.print(table)
+
+
+def main() -> int:
+    """Read the arguments and play."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=1.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=core_count())
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--replay", metavar="SEED:RUN")
+    options = parser.parse_args()
+    console = Console(width=120)
+    if options.replay:
+        run = Run.drawn(*map(int, options.replay.split(":")), quick=options.quick)
+        console.print(str(run), markup=False, highlight=False, soft_wrap=True)
+        outcome = play(run)
+        show({run.env_id: outcome}, console)
+        for one in outcome.findings:
+            console.print(one, markup=False, highlight=False, soft_wrap=True)
+        return 1 if outcome.findings else 0
+    deadline = time.time() + 60.0 * options.minutes
+    return play_all(Soak(options.seed, options.processes, deadline, options.quick), console)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,93 @@
+"""`surgsim doctor`: a sound installation, what is missing, what is broken."""
+
+import warnings
+from importlib import metadata
+
+import pytest
+from packaging.requirements import Requirement
+
+from surgsim_env.cli import doctor
+from surgsim_env.cli.main import main
+from surgsim_env.coupling import mujoco_library
+from surgsim_env.rendering import gl
+
+
+def states(capsys):
+    """The state of each subject of a run that just ended, and its text."""
+    lines = capsys.readouterr().out.splitlines()
+    return {line[9:].partition(":")[0]: (line[:8].strip(), line) for line in lines}
+
+
+def test_this_installation_is_sound(capsys):
+    assert main(["doctor"]) == 0
+    found = states(capsys)
+    assert list(found)[:7] == [
+        *("Python", "processor", "OpenGL", "compiled code", "haptic steps", "self-test", "packages"),
+    ]
+    assert list(found)[7:] == sorted(doctor.FEATURES)
+    assert {state for state, _ in found.values()} <= {"ok", "missing"}
+    for subject in ("self-test", "haptic steps", "packages", "live"):
+        assert found[subject][0] == "ok", found[subject]
+
+
+def test_every_extra_has_its_feature_named():
+    extras = set(metadata.metadata("surgsim").get_all("Provides-Extra"))
+    assert set(doctor.FEATURES) == extras - {"dev"}
+
+
+def test_another_force_is_broken(monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "PRESS_FORCE", doctor.PRESS_FORCE * (1.0 + 2.0 * doctor.FORCE_TOLERANCE))
+    assert main(["doctor"]) == 1
+    state, text = states(capsys)["self-test"]
+    assert state == "broken" and "it must be" in text
+
+
+def test_a_check_that_fails_is_broken_and_the_others_go_on(monkeypatch, capsys):
+    def fails():
+        raise RuntimeError("no such\nthing")
+
+    monkeypatch.setattr(doctor, "press", fails)
+    assert main(["doctor"]) == 1
+    found = states(capsys)
+    assert found["fails"][1] == "broken   fails: RuntimeError: no such thing" and "packages" in found
+
+
+def test_packages_that_are_absent_or_of_another_version(monkeypatch):
+    assert doctor.lack(Requirement("numpy>=2.0")) == ""
+    assert "the rule is <1" in doctor.lack(Requirement("numpy<1"))
+    assert doctor.lack(Requirement("no-such-package")) == "no-such-package is not installed"
+    required = ["numpy<1", "no-such-package>=2; extra == 'live'"]
+    monkeypatch.setattr(metadata, "requires", lambda name: required)
+    found = {finding.subject: finding for finding in doctor.packages()}
+    assert found["packages"].state == "broken" and "numpy is" in found["packages"].text
+    assert found["live"].state == "missing" and "pip install 'surgsim[live]'" in found["live"].text
+    assert found["video"].state == "ok"
+
+
+def test_the_plain_loop_and_its_reason_are_said(monkeypatch):
+    monkeypatch.setenv(mujoco_library.LOOP_VARIABLE, "python")
+    assert doctor.loop().state == "ok" and "SURGSIM_LOOP=python" in doctor.loop().text
+    monkeypatch.setattr(mujoco_library, "missing", lambda: "no library of MuJoCo")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = doctor.loop()
+    assert found.state == "missing" and found.text.endswith("no library of MuJoCo")
+
+
+def test_no_opengl_and_no_cache_are_missing_features(monkeypatch):
+    def none():
+        raise gl.NoGLError("install libegl1")
+
+    monkeypatch.setattr(gl, "context", none)
+    assert doctor.opengl().state == "missing" and "libegl1" in doctor.opengl().text
+    monkeypatch.setattr(doctor.tempfile, "TemporaryFile", lambda dir: (_ for _ in ()).throw(OSError(30, "Read-only")))
+    found = doctor.cache()
+    assert found.state == "missing" and "NUMBA_CACHE_DIR" in found.text
+
+
+@pytest.mark.parametrize(
+    ("features", "bits"), [({}, 128), ({"avx2": True}, 256), ({"avx2": True, "avx512f": True}, 512)]
+)
+def test_vector_registers(monkeypatch, features, bits):
+    monkeypatch.setattr(doctor.llvmlite.binding, "get_host_cpu_features", lambda: features)
+    assert f"registers of {bits} bits" in doctor.cores().text

@@ -11,15 +11,19 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-import minari
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from agents.command_line import one_line_errors
 from agents.scoring.episodes import play_tasks
-from agents.training.imitation import CloningCurve, CloningOptions, clone, normalise_by, pad
-from agents.training.networks import algorithm_class
-from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
+
+with one_line_errors(__name__, "agents", "demonstrations"):
+    import minari
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    from agents.training.imitation import CloningCurve, CloningOptions, clone, normalise_by, pad
+    from agents.training.networks import algorithm_class
+    from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 
 # Episodes are scored on seeds from here on; demonstrations come from lower ones.
 FIRST_SEED = 500_000
@@ -87,4 +91,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents", "demonstrations"):
+        main()

@@ -10,18 +10,22 @@ import argparse
 import time
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecNormalize
 
+from agents.command_line import one_line_errors
 from agents.expert_palpate import PalpateExpert
-from agents.training.environments import blinded
-from agents.training.extractors import MemorySummary
-from agents.training.imitation import CloningOptions, clone, normalise_by
 from agents.training.palpate_surrogate import PalpateSurrogate
-from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
-from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+
+with one_line_errors(__name__, "agents"):
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from agents.training.environments import blinded
+    from agents.training.extractors import MemorySummary
+    from agents.training.imitation import CloningOptions, clone, normalise_by
+    from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
 # Rounds that the expert plays, with random errors, so that the data show how to correct them.
@@ -153,4 +157,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents"):
+        main()

@@ -11,18 +11,22 @@ import argparse
 import time
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from sb3_contrib import RecurrentPPO
-from stable_baselines3.common.vec_env import VecNormalize
 
+from agents.command_line import one_line_errors
 from agents.expert_palpate import PalpateExpert
-from agents.learn_palpate import ERROR, ERROR_KEPT
-from agents.training.extractors import WITHOUT_MEMORY, PlaceAndForce
-from agents.training.imitation import CloningOptions, clone, normalise_by, pad
 from agents.training.palpate_surrogate import PalpateSurrogate
-from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
-from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+
+with one_line_errors(__name__, "agents"):
+    import torch
+    from sb3_contrib import RecurrentPPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from agents.learn_palpate import ERROR, ERROR_KEPT
+    from agents.training.extractors import WITHOUT_MEMORY, PlaceAndForce
+    from agents.training.imitation import CloningOptions, clone, normalise_by, pad
+    from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 NETWORK = {
     "lstm_hidden_size": 96,
@@ -142,4 +146,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents"):
+        main()

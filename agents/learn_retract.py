@@ -15,18 +15,22 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from agents.command_line import one_line_errors
 from agents.expert_retract import RetractExpert
-from agents.training.environments import blinded
-from agents.training.imitation import CloningOptions, dagger
-from agents.training.policy_files import describe, policy_path, save_policy
-from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+
+with one_line_errors(__name__, "agents"):
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from agents.training.environments import blinded
+    from agents.training.imitation import CloningOptions, dagger
+    from agents.training.policy_files import describe, policy_path, save_policy
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 ID = "SurgSim/Retract-v0"
 # The same as in the configurations of `agents.train` that start from the result.
@@ -123,4 +127,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents"):
+        main()

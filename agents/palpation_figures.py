@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.evaluate import POLICIES, find_agent
+from agents.command_line import one_line_errors
 from agents.scoring.leaderboard import SITES, Result, best_raster_alone, load_results
 from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
 from agents.scoring.site_agent import site_facts
@@ -22,6 +22,9 @@ from surgsim_env.palpation.scores import ERROR_LINE
 
 matplotlib.use("Agg")
 from matplotlib.figure import Figure
+
+with one_line_errors(__name__, "agents"):
+    from agents.evaluate import POLICIES, find_agent
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 # Colours of the methods in alphabetical order (Okabe & Ito 2008, with a darker yellow).
@@ -117,4 +120,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents"):
+        main()

@@ -25,15 +25,18 @@ from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
-import minari
 import numpy as np
-from minari.data_collector.episode_buffer import EpisodeBuffer
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from agents.command_line import one_line_errors
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
+
+with one_line_errors(__name__, "agents", "demonstrations"):
+    import minari
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+    from tqdm import tqdm
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".safetensors", ".zip")
@@ -235,4 +238,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents", "demonstrations"):
+        main()

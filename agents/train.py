@@ -15,8 +15,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from agents.training.config import TrainingConfig, read_config
-from agents.training.run import BetweenRollouts, Run
+from agents.command_line import one_line_errors
+
+with one_line_errors(__name__, "agents"):
+    from agents.training.config import TrainingConfig, read_config
+    from agents.training.run import BetweenRollouts, Run
 
 
 def train(config: TrainingConfig, folder: Path, *, progress: bool = False, trust_pickle: bool = False) -> int:
@@ -47,16 +50,14 @@ def main() -> None:
     )
     parser.add_argument("--no-progress", action="store_true", help="no progress bar")
     arguments = parser.parse_args()
-    try:
-        changes = {name: getattr(arguments, name) for name in ("seed", "total_steps", "warm_start")}
-        config = read_config(arguments.config, **changes)
-        folder = arguments.out or Path("runs") / f"{config.name}-seed{config.seed}"
-        progress = not arguments.no_progress and sys.stderr.isatty()
-        steps = train(config, folder, progress=progress, trust_pickle=arguments.trust_pickle)
-    except ValueError as error:
-        sys.exit(f"train: {error}")
+    changes = {name: getattr(arguments, name) for name in ("seed", "total_steps", "warm_start")}
+    config = read_config(arguments.config, **changes)
+    folder = arguments.out or Path("runs") / f"{config.name}-seed{config.seed}"
+    progress = not arguments.no_progress and sys.stderr.isatty()
+    steps = train(config, folder, progress=progress, trust_pickle=arguments.trust_pickle)
     print(f"{steps} steps; best and final policy in {folder}")
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "agents"):
+        main()

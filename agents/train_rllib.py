@@ -17,14 +17,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from agents.command_line import one_line_errors
+
+with one_line_errors(__name__, "distributed"):
+    import ray
+    from ray.rllib.algorithms.algorithm import Algorithm
+    from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+    from ray.rllib.connectors.env_to_module import MeanStdFilter
+    from ray.tune.registry import get_trainable_cls, register_env
+
 # No usage report and no question about it.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
-import ray
-from ray.rllib.algorithms.algorithm import Algorithm
-from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.connectors.env_to_module import MeanStdFilter
-from ray.tune.registry import get_trainable_cls, register_env
 
 STEPS = "num_env_steps_sampled_lifetime"
 # Time limit of a sample [s]: the first environment on a machine compiles its kernels, which may take minutes.
@@ -211,4 +215,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "distributed"):
+        main()

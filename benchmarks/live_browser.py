@@ -10,13 +10,16 @@ import threading
 import time
 from pathlib import Path
 
-from surgsim_env.cli.view import report_lines
+from agents.command_line import one_line_errors
 from surgsim_env.haptics.pacing import timeliness
-from surgsim_env.live.page import Page
-from surgsim_env.live.protocol_client import press_path
-from surgsim_env.live.session import Session
 from surgsim_env.scene.load import make_scene
 from tests.chromium import Browser, Chromium
+
+with one_line_errors(__name__, "live"):
+    from surgsim_env.cli.view import report_lines
+    from surgsim_env.live.page import Page
+    from surgsim_env.live.protocol_client import press_path
+    from surgsim_env.live.session import Session
 
 # Only frames that show something new count.
 COUNTED = "[window.pictures, window.frames_drawn]"
@@ -107,4 +110,5 @@ def measure(session: Session, browser: Browser, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__, "live"):
+        main()

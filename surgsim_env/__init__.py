@@ -91,6 +91,7 @@ _LAZY = {
     "RenderOptions": "surgsim_env.rendering.options",
     "VectorEnvForStableBaselines": "surgsim_env.envs.stable_baselines",
 }
+_EXTRAS = {"BimanualRetractParallelEnv": "pettingzoo", "VectorEnvForStableBaselines": "agents"}
 
 
 def __getattr__(name: str) -> Any:
@@ -98,7 +99,14 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("surgsim_env.scripting")
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_LAZY[name]), name)
+    try:
+        module = importlib.import_module(_LAZY[name])
+    except ModuleNotFoundError as error:
+        if name not in _EXTRAS:
+            raise
+        missing = (error.name or "").partition(".")[0]
+        raise ImportError(f"surgsim_env.{name} needs {missing}: pip install 'surgsim[{_EXTRAS[name]}]'") from None
+    return getattr(module, name)
 
 
 register()

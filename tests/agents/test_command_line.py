@@ -1,0 +1,101 @@
+"""Without the packages of an extra, every script that needs them says in one line what to install."""
+
+import re
+import runpy
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import surgsim_env
+from agents.command_line import one_line_errors
+
+ROOT = Path(__file__).resolve().parents[2]
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+# Names that packages of the extras are imported by.
+PACKAGES = {
+    *("minari", "moviepy", "msgspec", "pettingzoo", "ray", "safetensors", "sb3_contrib", "sklearn"),
+    *("stable_baselines3", "tensorboard", "torch", "tqdm", "viser", "websockets", "yaml"),
+}
+# Of ours, what imports them; imported anew here.
+NEEDING = ("agents", "surgsim_env.cli.view", "surgsim_env.envs", "surgsim_env.live")
+SCRIPTS = {
+    path.relative_to(ROOT).as_posix(): match[1]
+    for folder in ("agents", "benchmarks", "docs")
+    for path in sorted((ROOT / folder).glob("*.py"))
+    if '__name__ == "__main__"' in (text := path.read_text(encoding="utf-8"))
+    and (match := re.search(r"^with one_line_errors\(__name__, (.*)\):", text, re.MULTILINE))
+}
+
+
+class Absent:
+    """A finder of modules that refuses the packages of the extras."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
+        if name.partition(".")[0] in PACKAGES:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+@pytest.fixture
+def without_extras(monkeypatch) -> Iterator[None]:
+    """As if no extra were installed."""
+    before = dict(sys.modules)
+    ours = {name: module for name, module in before.items() if name.startswith(NEEDING)}
+    for name in [*ours, *(name for name in before if name.partition(".")[0] in PACKAGES)]:
+        del sys.modules[name]
+    monkeypatch.setattr(sys, "meta_path", [Absent(), *sys.meta_path])
+    yield
+    for name in set(sys.modules) - set(before):
+        del sys.modules[name]
+    sys.modules.update(before)
+    for name, module in ours.items():
+        parent, _, leaf = name.rpartition(".")
+        if parent in before:
+            setattr(before[parent], leaf, module)
+
+
+def test_the_scripts_that_need_extras_declare_them():
+    names = {Path(name).stem for name in SCRIPTS}
+    assert names >= {"behaviour_cloning", "convert_policy", "evaluate", "learn_palpate", "learn_palpate_recurrent"}
+    assert names >= {"learn_retract", "live_browser", "palpation_figures", "record_demonstrations", "train"}
+    for extras in SCRIPTS.values():
+        assert all(extra.strip('"') in EXTRAS for extra in extras.split(", "))
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_missing_extra_is_named_in_one_line(without_extras, name: str, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / name), run_name="__main__")
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    install = f"pip install 'surgsim[{SCRIPTS[name].replace(', ', ',').replace(chr(34), '')}]'"
+    assert re.fullmatch(rf"{Path(name).stem}: error: \w+ is not installed: {re.escape(install)}", line)
+
+
+@pytest.mark.parametrize("name", ["expert_palpate", "expert_retract", "press_library", "raster"])
+def test_the_other_agents_need_no_extra(without_extras, name: str, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / "agents" / f"{name}.py"), run_name="__main__")
+    assert not ended.value.code and "usage" in capsys.readouterr().out
+
+
+def test_public_names_that_need_an_extra_name_it(without_extras):
+    for name, extra in (("VectorEnvForStableBaselines", "agents"), ("BimanualRetractParallelEnv", "pettingzoo")):
+        with pytest.raises(ImportError, match=rf"surgsim_env\.{name} needs \w+: pip install 'surgsim\[{extra}\]'"):
+            getattr(surgsim_env, name)
+
+
+def test_wrong_input_ends_a_script_in_one_line_and_is_raised_in_a_module(capsys):
+    with pytest.raises(SystemExit) as ended, one_line_errors("__main__", "agents"):
+        raise ValueError("two\nlines")
+    assert ended.value.code == 2 and capsys.readouterr().err.endswith(": error: two lines\n")
+    with pytest.raises(ValueError, match="two"), one_line_errors("agents.evaluate", "agents"):
+        raise ValueError("two\nlines")
+    # A module of our own that is missing is our mistake.
+    with pytest.raises(ModuleNotFoundError), one_line_errors("__main__", "agents"):
+        import agents.nowhere  # type: ignore[import-not-found]  # noqa: F401

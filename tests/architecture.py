@@ -8,6 +8,7 @@ import ast
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -46,6 +47,7 @@ def module_files() -> dict[str, Path]:
     }
 
 
+@cache
 def file_imports() -> dict[str, set[str]]:
     """For each module, the modules of the project that it imports, at whatever place."""
     files = module_files()

@@ -361,7 +361,7 @@ def _number(cell: str) -> float | None:
 
 
 for _scene, _steps in (("phantom", 40), ("phantom_small", 80), ("liver", 40)):
-    case(f"Palpate-v0 {_scene} random", play_random, "Palpate-v0", _scene, _steps)
+    case(f"Palpate-v0 {_scene} random", play_random, "Palpate-v0", _scene, _steps, slow=_scene == "liver")
     case(f"Palpate-v0 {_scene} oracle", play_oracle, "Palpate-v0", _scene, slow=_scene != "phantom_small")
 case("Palpate-v0 phantom_small random, plain loop", play_random, "Palpate-v0", "phantom_small", 80, loop="python")
 case("Palpate-v0 phantom_small random, memory", play_random, "Palpate-v0", "phantom_small", 40, memory=True)
@@ -403,7 +403,7 @@ case("BimanualRetract-v0 lobe random", play_random, "BimanualRetract-v0", "lobe"
 case("BimanualRetract-v0 lobe oracle, first steps", play_oracle, "BimanualRetract-v0", "lobe", 4, slow=True)
 case("BimanualRetract-v0 lobe oracle", play_oracle, "BimanualRetract-v0", "lobe", slow=True)
 
-case("Palpate-v0 phantom vector", play_vector, "Palpate-v0", "phantom", 30)
+case("Palpate-v0 phantom vector", play_vector, "Palpate-v0", "phantom", 30, slow=True)
 case(
     "Palpate-v0 phantom_small vector, SameStep",
     play_vector,
@@ -430,7 +430,7 @@ case(
     dtype="float32",
     slow=True,
 )
-case("Retract-v0 lobe vector", play_vector, "Retract-v0", "lobe", 32, max_episode_steps=29)
+case("Retract-v0 lobe vector", play_vector, "Retract-v0", "lobe", 32, max_episode_steps=29, slow=True)
 case(
     "Retract-v0 lobe vector, psm_retractor",
     play_vector,
@@ -451,7 +451,7 @@ case("organ of phantom, level hard", scene_organ, "Palpate-v0", "phantom", level
 case("organ, block", block_organ)
 case("organ, hanging block", heavy_block)
 case("meshes", meshes)
-case("surgsim palpate phantom_small", scan, "phantom_small", "0.02,0.02,0.02,0.012")
+case("surgsim palpate phantom_small", scan, "phantom_small", "0.02,0.02,0.02,0.012", slow=True)
 case("surgsim palpate liver", scan, "liver", "-0.07,-0.02,0.04,0.02", slow=True)
 
 

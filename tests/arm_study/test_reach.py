@@ -68,6 +68,7 @@ def test_pivot_reaches_its_cone_and_depths_and_nothing_else(tmp_path):
     assert report.position_error[inside].max() < 1e-6
 
 
+@pytest.mark.slow
 def test_psm_reaches_its_cone_and_depths():
     """Within yaw and pitch limits every depth from the trocar on to the straight instrument's end is reached.
 

@@ -24,7 +24,7 @@ SETTINGS = {
     "SurgSim/Palpate-v0": {"scene": "phantom_small"},
     "SurgSim/PalpateSites-v0": {"scene": "phantom_small", "budget": 20},
 }
-SHORTER = {"SurgSim/PalpateSites-v0": 5}
+SHORTER = {"SurgSim/PalpateSites-v0": 5, "SurgSim/Retract-v0": 2, "SurgSim/BimanualRetract-v0": 2}
 # Every id with its scene's own instrument, and some with an arm.
 CASES = [(env_id, SETTINGS.get(env_id, {})) for env_id in IDS] + [
     ("SurgSim/Palpate-v0", {"scene": "phantom", "instrument": "psm_palpator"}),
@@ -86,7 +86,7 @@ def test_passes_stable_baselines3s_checker_without_a_warning(made):
 
 def test_same_seed_repeats_to_the_bit_also_after_other_episodes(made):
     env = made()
-    steps = 30 // SHORTER.get(env.spec.id, 1)
+    steps = 6 if "Sites" in env.spec.id else 30  # until a walk touches the organ
     first = rollout(env, seed=3, steps=steps)
     rollout(env, seed=11, steps=5, action_seed=8)
     assert_same(first, rollout(env, seed=3, steps=steps))
@@ -150,7 +150,7 @@ def test_foreign_or_broken_states_are_refused(made, tmp_path):
         kept = {name: array for name, array in {**arrays, **change}.items() if array is not None}
         buffer = io.BytesIO()
         np.savez(buffer, **kept)
-        with pytest.raises(ValueError, match=f"{next(iter(change))} has shape"):
+        with pytest.raises(ValueError, match=f"{next(iter(change))} (has shape|is missing)"):
             env.load_state(buffer.getvalue())
     assert env.save_state() == saved, "nothing was changed by what was refused"
 
@@ -240,7 +240,7 @@ def test_works_in_make_vec(made, mode):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_bad_actions_are_refused(env_id):
-    env = gym.make(env_id).unwrapped
+    env = gym.make(env_id, **SETTINGS.get(env_id, {})).unwrapped
     env.reset(seed=0)
     still = np.zeros(env.action_space.shape, dtype=np.float32)
     with pytest.raises(ValueError, match="shape"):

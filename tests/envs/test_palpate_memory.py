@@ -88,6 +88,7 @@ def test_a_saved_state_holds_the_memory():
         gym.make(ID).unwrapped.load_state(saved)
 
 
+@pytest.mark.slow
 def test_side_by_side_is_as_alone():
     envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", memory=True)
     rows = [envs.reset(seed=[8, 3])[0]]

@@ -71,6 +71,7 @@ def test_the_organ_is_at_rest_again_before_the_next_press():
     assert left < 0.001 * scene.palpation.press_depth
 
 
+@pytest.mark.slow
 def test_force_stops_a_press_before_the_hard_limit_does():
     """On an organ four times as stiff: the tip stops above the stop force, below the hard limit, and not as deep."""
     anatomy = small_anatomy()
@@ -291,7 +292,7 @@ def test_an_unknown_level_is_refused():
 # ---- many side by side ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("mode", ["NextStep", pytest.param("SameStep", marks=pytest.mark.slow)])
 def test_equals_environments_one_after_the_other(mode: str):
     """Observations, rewards, ends and infos of several episodes, organs with capsules and added mass among them."""
     count, settings = 3, {"budget": 3, **SMALL}

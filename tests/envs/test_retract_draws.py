@@ -32,6 +32,7 @@ def check_draws(env, seeds):
     return drawn
 
 
+@pytest.mark.slow
 def test_draws_are_in_their_ranges_and_hide_the_target(shared_retract):
     drawn = check_draws(shared_retract, range(15))
     assert len(set(drawn)) == 15

@@ -106,6 +106,7 @@ def test_scripts_feel_forces_where_pictures_are_observed(tmp_path):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_the_checker_accepts_pictures():
     from gymnasium.utils.env_checker import check_env

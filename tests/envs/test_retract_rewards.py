@@ -131,6 +131,7 @@ def test_a_step_that_tears_ends_in_its_very_haptic_step(shared_retract):
     assert abs(steps - round(steps)) > 0.01
 
 
+@pytest.mark.slow
 def test_the_hard_limit_ends_it(shared_retract):
     shared_retract.reset(seed=2)
     task, limits = shared_retract.task, shared_retract.task.limits

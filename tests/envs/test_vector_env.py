@@ -47,7 +47,11 @@ def assert_equal(one: object, other: object) -> None:
 
 @pytest.mark.parametrize(
     ("mode", "instrument"),
-    [("NextStep", "probe"), ("SameStep", "probe"), pytest.param("SameStep", "psm_palpator", marks=pytest.mark.slow)],
+    [
+        ("NextStep", "probe"),
+        pytest.param("SameStep", "probe", marks=pytest.mark.slow),
+        pytest.param("SameStep", "psm_palpator", marks=pytest.mark.slow),
+    ],
 )
 def test_equals_environments_one_after_the_other(mode: str, instrument: str):
     """Observations, rewards, ends and infos of 45 control steps with several episodes each, and all that is saved."""
@@ -169,6 +173,7 @@ def test_states_are_saved_and_loaded_as_alone():
     np.testing.assert_array_equal(envs.step(np.tile(actions(5)[1], (COUNT, 1)))[0][0], ahead)
 
 
+@pytest.mark.slow
 def test_threads_and_the_number_of_environments_change_nothing():
     """Ten environments in two groups, on one thread and on two, against the first three alone."""
     runs = []

@@ -241,6 +241,7 @@ def test_contact_as_shipped_gives_at_most_what_the_spring_holds():
     assert held[4999] > held[3999] > held[2999]
 
 
+@pytest.mark.slow
 def test_a_slew_limit_that_always_acts_gives_more():
     """The bound of the test above can be missed."""
     held, _, bound = tapped_with_a_cut(HapticSettings(limits=ForceLimits(slew_largest=0.5)))

@@ -128,6 +128,7 @@ def test_jaw_opens_both_fingers_alike():
         assert between == pytest.approx(angle + closed, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_generator_writes_the_committed_files(tmp_path):
     subprocess.run([sys.executable, str(INSTRUMENTS / "make_psm.py"), str(tmp_path)], check=True, timeout=600)
     for name in TIP_LENGTH:

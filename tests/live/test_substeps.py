@@ -47,6 +47,7 @@ def test_fewer_substeps_feel_the_same():
     np.testing.assert_allclose(forces[1], forces[0], atol=0.001 * max(forces[0]))
 
 
+@pytest.mark.slow
 def test_a_scene_that_needs_its_substeps_keeps_them():
     scene = make_scene("phantom_small")
     assert live_scene(scene).timing.substep_count == scene.timing.substep_count

@@ -86,6 +86,7 @@ def read_only(installation, open_folder, clean_environ):
     return python, temporary
 
 
+@pytest.mark.slow
 def test_numba_alone_can_not_import_there(read_only):
     """The control: without the package's help, numba refuses."""
     python, _ = read_only

@@ -69,6 +69,7 @@ def test_who_sees_the_truth_has_all_of_it() -> None:
     assert figures["presses_to_median"].value == figures["presses_to_p90"].value == 1.0
 
 
+@pytest.mark.slow
 def test_who_guesses_the_middle_has_what_chance_predicts() -> None:
     """Mean distance from a square's middle: side (sqrt 2 + asinh 1) / 6; share within r of it: pi r^2 / side^2."""
     pytest.importorskip("sklearn", reason="needs the `agents` extra")

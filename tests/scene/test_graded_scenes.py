@@ -22,6 +22,7 @@ def longest_edges(face):
     return np.linalg.norm(np.roll(corners, 1, axis=1) - corners, axis=2).max(axis=1)
 
 
+@pytest.mark.slow
 def test_graded_liver_has_the_palpable_face_of_the_uniform_one():
     """Cell <= contact radius over the palpable face, with at most 0.4 of the uniform lattice's nodes."""
     uniform = load_anatomy(changed_scene("liver", "surface", coarse_cell_size=None))

@@ -102,7 +102,13 @@ def test_saved_and_restored_to_the_bit():
 
 
 @pytest.mark.parametrize(
-    ("place", "instrument"), [("bare bed", None), ("lobe", None), ("bare bed", "psm_palpator"), ("bare bed", "grasper")]
+    ("place", "instrument"),
+    [
+        ("bare bed", None),
+        ("lobe", None),
+        pytest.param("bare bed", "psm_palpator", marks=pytest.mark.slow),
+        pytest.param("bare bed", "grasper", marks=pytest.mark.slow),
+    ],
 )
 def test_a_tool_meets_the_bed_alike_in_both_loops(place: str, instrument: str | None):
     """Pressed 10 mm into the bare bed, or through the lobe towards it: calm, and to the bit in the compiled loop."""

@@ -50,6 +50,7 @@ def test_the_other_examples_run(tmp_path, monkeypatch, capsys):
     assert {path.name for path in tmp_path.iterdir()} == {"run.csv", "run_control.csv", "run.png"}
 
 
+@pytest.mark.slow
 def test_the_guide_to_retraction_runs(capsys):
     text = (ROOT / "docs" / "retraction.md").read_text(encoding="utf-8")
     code = re.findall(r"```python\n(.*?)```", text, flags=re.S)[-1]  # the first one is run by tests/test_readme.py

@@ -37,6 +37,7 @@ def grasped(env, seed=0, *, after=()):
     )
 
 
+@pytest.mark.slow
 def test_jaw_closes_to_its_force_and_opens_to_nothing(env):
     trace = grasped(env, after=[OpenJaw(0.018), MoveTo((0.040, 0.068, 0.006)), Hold(0.2)])
     jaw, normals = env.unwrapped.simulation.instrument.jaw, trace.between("Hold")

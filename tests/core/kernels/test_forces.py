@@ -189,7 +189,11 @@ def touched_state(model: OrganModel, name: str) -> OrganState:
     return state
 
 
-@pytest.mark.parametrize("name", SHAPES)
+# Shapes with many points in contact.
+LONG = {"ball and shaft", "capsule's side", "rounded box"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(one, marks=[pytest.mark.slow] * (one in LONG)) for one in SHAPES])
 def test_contact_forces_are_minus_the_gradient_over_the_nodes(name: str):
     """f_i = -dE/dx_i, E = sum (k_p / 2) w A0 g^2: the turning of the normals with the corners included."""
     model = oracle.irregular_organ(4)

@@ -194,6 +194,7 @@ def guard_pushes(organ: OrganModel, state: OrganState, ball: ContactShapes) -> b
     return False
 
 
+@pytest.mark.slow
 def test_the_guard_is_that_of_the_organ_alone():
     """Balls so small that the guard takes over, pressed until it pushes in every lane: wrench and state to the bit."""
     organs = pressed_organs()

@@ -131,6 +131,7 @@ def test_a_graded_body_is_sound_on_the_surface_and_well_shaped(seed, coarsening)
         assert np.linalg.norm(weights @ corners[near[triangle]] - place) < 1e-12
 
 
+@pytest.mark.slow
 def test_cells_are_split_around_poor_angles(monkeypatch):
     """Nodes that move as far at the seams as among BCC tets leave bad angles there: the lattice is refined."""
     monkeypatch.setattr(grading, "ALPHA_TRANSITION", 0.45)
@@ -184,6 +185,7 @@ def assert_meets_the_targets(vertices, faces, cell_size, coarsening, volume_erro
     assert area.sum() == pytest.approx(face_edges(uniform)[1].sum(), rel=0.02)
 
 
+@pytest.mark.slow
 def test_shipped_liver_with_a_fine_palpable_face():
     solid = trimesh.load(ROOT / "scenes" / "meshes" / "liver.ply", process=False)
     assert_meets_the_targets(np.array(solid.vertices), solid.faces, 0.009, 4, 0.04)
@@ -212,7 +214,7 @@ def test_all_of_the_surface_is_fine_when_nothing_is_chosen_and_deeper_where_aske
     assert mesh_quality(deep).dihedral_smallest_deg == pytest.approx(mesh_quality(uniform).dihedral_smallest_deg)
 
 
-@pytest.mark.parametrize(("coarsening", "share"), [(2, 0.4), (4, 0.33)])
+@pytest.mark.parametrize(("coarsening", "share"), [pytest.param(2, 0.4, marks=pytest.mark.slow), (4, 0.33)])
 def test_graded_block_is_exact_and_fine_on_top(coarsening, share):
     size, cells = (0.12, 0.08, 0.08), (24, 16, 16)
     uniform, mesh = box_mesh(size, cells), box_mesh(size, cells, coarsening=coarsening, fine_depth=0.015)
@@ -256,6 +258,7 @@ def uniaxial_modulus(mesh, axis):
     return (matrix @ place).reshape(-1, 3)[high, axis].sum() / strain
 
 
+@pytest.mark.slow
 def test_one_seam_costs_a_known_share_of_the_modulus():
     """A seam from cells h to 2 h acts like 0.4 h of slack across it and 0.3 h of added tissue along it.
 

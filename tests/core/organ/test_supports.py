@@ -93,6 +93,7 @@ def test_what_nothing_holds_does_not_settle():
 # ---- friction -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_block_sticks_below_the_angle_of_friction():
     """tan 30 degrees = 0.577 < 0.6: in half a second it does not creep by 0.1 um."""
     assert crept(np.radians(30.0), 0.6) < 1e-7

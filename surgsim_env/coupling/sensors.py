@@ -1,6 +1,7 @@
 """The force sensor: bias, noise and range between the simulated force and what is observed."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.model import ForceSensor
@@ -13,9 +14,10 @@ class ForceReading:
     observation, and it is reported.
     """
 
-    def __init__(self, sensor: ForceSensor) -> None:
+    def __init__(self, sensor: ForceSensor, bias: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+        """Take the description of a sensor, and its present bias [N] (3,)."""
         self.sensor = sensor
-        self.bias = np.zeros(3)
+        self.bias = np.array(bias, dtype=np.float64)
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draw the episode's bias [N], uniform in +-sensor.bias on each axis."""

@@ -1,8 +1,9 @@
 """The simulation: an organ and an instrument that exchange forces at haptic rate, the clock, and recordings of both."""
 
+import copy
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import mujoco
@@ -24,6 +25,8 @@ from surgsim_env.scene.model import substeps_needed
 
 # The fields of an organ's state that are saved.
 KEPT_FIELDS = tuple(name for name in OrganState._fields if name not in SCRATCH_FIELDS)
+# Haptic steps of a saved state lie below this, so that a float holds each.
+STEP_MOST = 2**53
 # The tip may move this far beyond the organ's bounding box [m].
 WORKSPACE_MARGIN = 0.04
 
@@ -286,18 +289,24 @@ class Simulation:
             "fault": np.array(self.fault),
         }
 
-    def state_shapes(self, organ_model: OrganModel) -> dict[str, tuple[int, ...]]:
-        """Shapes of the arrays of `get_state` with another organ of the same scene, by name."""
-        shapes = {name: array.shape for name, array in self.get_state().items()}
-        blank = blank_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
-        shapes |= {f"organ_{name}": getattr(blank, name).shape for name in KEPT_FIELDS}
-        return shapes | {"rest_position": blank.node_position.shape, "rest_stretch": blank.support_stretch.shape}
+    def set_state(self, organ_model: OrganModel, arrays: Mapping[str, np.ndarray]) -> None:
+        """Restore arrays from `get_state`, to the bit; arrays that are refused change nothing.
 
-    def set_state(self, organ_model: OrganModel, arrays: dict[str, np.ndarray]) -> None:
-        """Restore arrays from `get_state`, to the bit."""
-        self.organ_model = organ_model
+        Args:
+            organ_model: the organ that they belong to, of this scene.
+            arrays: by name; all finite, unless their `fault` says what ended the simulation.
+
+        Raises:
+            OrganError: the scene's number of substeps is too small for this organ (says how many it needs).
+            ValueError: an entry that is missing, unknown or of another type or shape, or a value out of range.
+        """
         # Scratch arrays have the size of this organ.
         blank = blank_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
+        self._check_state(arrays, blank)
+        # The present organ has passed, and most states are of its episode.
+        if not all(map(np.array_equal, organ_model, self.organ_model)):
+            self._check_step(organ_model)
+        self.organ_model = organ_model
         self.organ_state = blank._replace(**{name: arrays[f"organ_{name}"].copy() for name in KEPT_FIELDS})
         self.instrument.set_state(arrays["instrument"])
         self._rest_position = arrays["rest_position"].copy()
@@ -329,6 +338,35 @@ class Simulation:
             self._record.note(self.time, self._wrench)
         return taken
 
+    def _check_state(self, arrays: Mapping[str, np.ndarray], blank: OrganState) -> None:
+        """Refuse arrays that `get_state` does not give with an organ whose blank state is given."""
+        like = self.get_state() | {f"organ_{name}": getattr(blank, name) for name in KEPT_FIELDS}
+        check_entries(arrays, {**like, "rest_position": blank.node_position, "rest_stretch": blank.support_stretch})
+        # What diverged need not be finite, and is not stepped again.
+        if not str(arrays["fault"]):
+            for name, array in arrays.items():
+                if array.dtype.kind == "f" and not np.isfinite(array).all():
+                    place = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+                    raise ValueError(f"{name}{list(place)} is {array[place]}; without a fault it must be finite")
+        shapes, triangles = blank.contact_candidates.shape
+        passed = np.maximum([shapes, triangles], 1)
+        ranges = {
+            "step": (arrays["step"], STEP_MOST),
+            "pull_peak": (arrays["pull_peak"], math.inf),
+            "organ_contact_engaged": (arrays["organ_contact_engaged"], 2),
+            "organ_contact_passed": (arrays["organ_contact_passed"], passed),
+        }
+        for name, (array, end) in ranges.items():
+            if not ((array >= 0) & (array < end)).all():
+                raise ValueError(f"{name} is {array.min()} to {array.max()}; the rule is 0 <= {name} < {end}")
+        # A copy shows whether the instrument gives back the same bits: flags other than 0 and 1 it does not.
+        vector, model = arrays["instrument"], self.instrument.model
+        twin = copy.deepcopy(self.instrument, {id(model): model})
+        twin.set_state(vector)
+        different = np.flatnonzero(twin.get_state().view(np.uint64) != vector.view(np.uint64))
+        if different.size:
+            raise ValueError(f"instrument[{different[0]}] is {vector[different[0]]}, which no such instrument has")
+
     def _check_step(self, organ_model: OrganModel) -> None:
         limit = stable_dt(organ_model, self.contact)
         needed = substeps_needed(self.haptic_dt, limit)
@@ -338,3 +376,22 @@ class Simulation:
                 f"are too long for this organ, whose stable step with contact is {limit * 1e3:.3g} ms: "
                 f"set timing.substep_count = {needed}, timing.mass_scaling = true, or use softer lesions"
             )
+
+
+def check_entries(arrays: Mapping[str, np.ndarray], like: Mapping[str, np.ndarray]) -> None:
+    """Refuse arrays by name that have other names, types or shapes than examples; a text may have any length.
+
+    Raises:
+        ValueError: names the entry that is missing, unknown or different, and the rule.
+    """
+    for name in arrays:
+        if name not in like:
+            raise ValueError(f"{name!r:.80} is unknown; the entries are {', '.join(like)}")
+    for name, example in like.items():
+        if name not in arrays:
+            raise ValueError(f"{name} is missing")
+        array, text = arrays[name], example.dtype.kind == "U"
+        if array.dtype.kind != "U" if text else array.dtype != example.dtype:
+            raise ValueError(f"{name} is of type {array.dtype}; it must be {'text' if text else example.dtype}")
+        if array.shape != example.shape:
+            raise ValueError(f"{name} has shape {array.shape}; it must be {example.shape}")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import check_entries
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.tasks.declaration import documentation
@@ -30,6 +31,8 @@ DRAWS_MOST = 20
 # Kinds of observation, and the size of an observed picture [pixels].
 OBSERVATION_MODES = ("state", "rgb")
 PICTURE_SIZE = 84
+# Characters of a refused state's text that a message shows.
+LINE_MOST = 400
 
 
 class SurgicalEnv(gym.Env[Observation, Action]):
@@ -229,25 +232,31 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def load_state(self, state: bytes) -> None:
         """Restore a state from `save_state`, to the bit, in this or another environment of the same scene.
 
+        The whole state is read, checked and built before anything changes: a refused one leaves the environment as it
+        was.
+
         Raises:
-            ValueError: bytes that are no saved state, or one of another scene or mesh (names both).
+            ValueError: bytes that are no saved state, or one of another scene or mesh (names both); names the entry
+                that is missing, unknown or wrong.
         """
         arrays = unpacked(state, made_by=self._maker())
-        shapes = {"task": (), "random": (), "running": (), "observation": self._observation.shape}
-        check_entries(arrays, shapes)
-        before = self.task.get_state() if self._begun else None
-        organ = self.task.set_state(str(arrays["task"]))
+        text = np.array("")
+        like = {"made_by": text, "task": text, "random": text, "observation": self._observation, "running": np.False_}
+        own = {name: arrays.pop(name) for name in like if name in arrays}
         try:
-            check_entries(arrays, self.simulation.state_shapes(organ))
-        except ValueError:
-            # Nothing is changed by what is refused.
-            if before is not None:
-                self.task.set_state(before)
-            raise
-        self.simulation.set_state(organ, arrays)
-        self.np_random.bit_generator.state = json.loads(str(arrays["random"]))
-        self._take(arrays["observation"])
-        self._begun, self._running = True, bool(arrays["running"])
+            check_entries(own, like)
+            if wrong := self._out_of_bounds(own["observation"]):
+                raise ValueError(wrong)
+            random = self._random_state(str(own["random"]))
+            task, organ = self.task.restored(str(own["task"]))
+            # The first change, which leaves all as it is if it is refused.
+            self.simulation.set_state(organ, arrays)
+        except ValueError as error:
+            raise _refused("this environment", error) from error.__cause__
+        self.task.become(task)
+        self.np_random.bit_generator.state = random
+        self._take(own["observation"])
+        self._begun, self._running = True, bool(own["running"])
 
     def _draw(self) -> None:
         """Draw episodes until the task accepts one."""
@@ -299,6 +308,21 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest:08x})"
         )
 
+    def _random_state(self, text: str) -> dict[str, Any]:
+        """The state in a saved JSON text, which must be one of this environment's kind of bit generator."""
+        # Asking for np_random would make a generator where there is none yet.
+        own = self._np_random
+        kind = np.random.PCG64 if own is None else type(own.bit_generator)
+        try:
+            twin = kind(0)
+            twin.state = json.loads(text)
+            if json.dumps(twin.state) == text:
+                return json.loads(text)
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError, AttributeError):
+            # What a bit generator raises for a state that it cannot take.
+            pass
+        raise ValueError(f"random is {text!r:.60}; it must be the state of a {kind.__name__} generator")
+
     def _checked(self, action: Action | FloatArray) -> FloatArray:
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape:
@@ -342,19 +366,36 @@ def unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
         ValueError: bytes that are no saved state, or one that another environment made (names both).
     """
     try:
+        with zipfile.ZipFile(io.BytesIO(state)) as archive:
+            entries = archive.infolist()
+            # Entries that are compressed, or share their bytes, could be larger than memory.
+            if packed := [one.filename for one in entries if one.compress_type != zipfile.ZIP_STORED]:
+                raise ValueError(f"{packed[0]!r:.80} is compressed, which save_state does not do")
+            if (size := sum(one.file_size for one in entries)) > len(state):
+                raise ValueError(f"its entries have {size} bytes, and all of it has {len(state)}")
         with np.load(io.BytesIO(state), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        maker = str(arrays["made_by"])
-    except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"not a saved state of this kind of environment: {error}") from None
+            if len(set(archive.files)) < len(archive.files):
+                raise ValueError("it has two entries of one name")
+            arrays = {name: np.asarray(archive[name]) for name in archive.files}
+        # Texts with code points that there are not raise here.
+        texts = {name: str(array) for name, array in arrays.items() if array.dtype.kind == "U"}
+        if "made_by" not in texts:
+            raise ValueError("made_by, the text that names its environment, is missing")
+        maker = texts["made_by"]
+    except Exception as error:
+        # Damaged bytes raise any of a dozen kinds in zipfile and numpy, from KeyError to NotImplementedError.
+        raise _refused("this kind of environment", error) from None
     if maker != made_by:
-        raise ValueError(f"the state was saved by {maker}, this is {made_by}: use the same scene")
+        raise ValueError(f"the state was saved by {_line(maker)}, this is {made_by}: use the same scene")
     return arrays
 
 
-def check_entries(arrays: dict[str, np.ndarray], shapes: dict[str, tuple[int, ...]]) -> None:
-    """Refuse an archive that lacks an entry or has one of another shape."""
-    for name, shape in shapes.items():
-        if name not in arrays or arrays[name].shape != shape:
-            found = arrays[name].shape if name in arrays else "nothing"
-            raise ValueError(f"not a saved state of this environment: {name} has shape {shape}, found {found}")
+def _refused(whose: str, error: Exception) -> ValueError:
+    reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    return ValueError(f"not a saved state of {whose}, which load_state takes as save_state gave it: {_line(reason)}")
+
+
+def _line(text: str) -> str:
+    """A text from a damaged file as one line of a message."""
+    line = " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
+    return line if len(line) <= LINE_MOST else f"{line[:LINE_MOST]} ..."

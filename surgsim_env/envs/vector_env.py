@@ -70,14 +70,32 @@ class LaneVectorEnv(SyncVectorEnv):
             for members in self._members
         ]
         self._pool = ThreadPoolExecutor(max_workers=min(len(self._groups), threads))
+        # The threads live in this process alone: a forked child has none of them, and would wait for them for ever.
+        self._process = os.getpid()
 
     @property
     def observation_slices(self) -> dict[str, slice]:
         """The entries of an observation that each channel has: `observations[:, observation_slices["time_left"]]`."""
         return self._singles[0].observation_slices
 
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in all environments, or in those that `options={"reset_mask": ...}` names.
+
+        Raises:
+            RuntimeError: a forked child calls it; see `step`.
+        """
+        self._check_process()
+        return super().reset(seed=seed, options=options)
+
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control step of all environments whose episode runs; the others are reset as their mode says."""
+        """One control step of all environments whose episode runs; the others are reset as their mode says.
+
+        Raises:
+            RuntimeError: a forked child calls it, where the threads that advance the organs do not run.
+        """
+        self._check_process()
         active = np.zeros(self.num_envs, dtype=np.bool_)
         for index, action in enumerate(iterate(self.action_space, actions)):
             if not (self._autoreset_envs[index] and self.autoreset_mode is AutoresetMode.NEXT_STEP):
@@ -91,6 +109,14 @@ class LaneVectorEnv(SyncVectorEnv):
             )
         )
         return super().step(actions)
+
+    def _check_process(self) -> None:
+        if (child := os.getpid()) != self._process:
+            raise RuntimeError(
+                f"{type(self).__name__} of {self.num_envs} environments was made in process {self._process}, and "
+                f"process {child} was forked from it, in which its threads do not run: make it in the child process, "
+                'with gym.make_vec in the worker\'s own function, or start workers with the method "spawn"'
+            )
 
     def _command(self, index: int, action: Any) -> None:
         """Give an environment's instrument the commands of an action."""

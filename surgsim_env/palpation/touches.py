@@ -1,16 +1,18 @@
 """Running records of touches on a chart: of single presses, and of a moving tip in a fixed size for observations."""
 
+import copy
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.chart import Chart, ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.press import PressResult
-from surgsim_env.scene.model import PalpationSettings
+from surgsim_env.scene.model import PalpationSettings, Vector
 
 # Speed of the tip between sites [m/s]; this travel is counted, not simulated.
 TRAVEL_SPEED = 0.02
@@ -44,6 +46,27 @@ class Touch:
     def stiffness(self) -> float:
         """Force over depth [N/m]; 0 where the tip did not get below the surface."""
         return self.force / self.depth if self.depth > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class SavedTouches:
+    """What `SiteTouches.get_state` writes: the touches, `seconds` and `path_length`, where the last press began [m]."""
+
+    touches: list[Touch]
+    way: tuple[float, float]
+    last_start: Vector | None
+
+    def __post_init__(self) -> None:
+        for number, touch in enumerate(self.touches):
+            if not (max(map(abs, touch.place)) <= 1.0 and abs(touch.log_contrast) <= LOG_CONTRAST_BOUND):
+                raise ValueError(
+                    f"touches[{number}] is at {list(touch.place)} with log contrast {touch.log_contrast:g}; a place is "
+                    f"in [-1, 1], a log contrast at most {LOG_CONTRAST_BOUND:g}"
+                )
+            if touch.moved < 0.0:
+                raise ValueError(f"touches[{number}].moved is {touch.moved:g} m; it must be at least 0")
+        if min(self.way) < 0.0:
+            raise ValueError(f"way is {list(self.way)} [s, m]; both must be at least 0")
 
 
 class SiteTouches:
@@ -118,14 +141,16 @@ class SiteTouches:
             "last_start": None if self._last_start is None else self._last_start.tolist(),
         }
 
-    def set_state(self, table: dict[str, Any]) -> None:
-        """Restore the record from `get_state`."""
-        self.touches = [Touch(**{**touch, "place": tuple(touch["place"])}) for touch in table["touches"]]
-        self.seconds, self.path_length = table["way"]
-        self._last_start = None if table["last_start"] is None else np.array(table["last_start"])
-        self._maps = np.zeros_like(self._maps)
-        for touch in self.touches:
-            self._mark(touch)
+    def restored(self, saved: SavedTouches) -> Self:
+        """A copy with the record that `get_state` gave; this one stays as it is."""
+        other = copy.copy(self)
+        other.clear()
+        other.touches = list(saved.touches)
+        other.seconds, other.path_length = saved.way
+        other._last_start = None if saved.last_start is None else np.array(saved.last_start)
+        for touch in saved.touches:
+            other._mark(touch)
+        return other
 
 
 @dataclass(frozen=True)
@@ -171,6 +196,20 @@ class TouchMemory:
     def forget(self) -> None:
         """Begin an episode."""
         self.product, self.square = np.zeros((2, self.chart.side_count**2))
+
+    def restored(self, product: ArrayLike, square: ArrayLike) -> Self:
+        """A copy with other sums of the readings, (n_site,) each; this one stays as it is.
+
+        Raises:
+            ValueError: another number of sites, or a square below 0.
+        """
+        other = copy.copy(self)
+        other.product, other.square = np.array(product, dtype=np.float64), np.array(square, dtype=np.float64)
+        sites = (self.chart.side_count**2,)
+        if other.product.shape != sites or other.square.shape != sites or (other.square < 0.0).any():
+            shapes = f"{other.product.shape} and {other.square.shape}"
+            raise ValueError(f"memory: sums of shapes {shapes}; they must be {sites}, and squares at least 0")
+        return other
 
     def feel(self, place: FloatArray, depth: float, force: float) -> None:
         """Add a reading of the force along the normal [N], at a place of the chart (2,) and a depth [m]."""

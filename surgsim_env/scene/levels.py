@@ -3,8 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,8 +11,8 @@ from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Capsule, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.load import nearest
-from surgsim_env.scene.model import LesionDraw, Range, Scene
+from surgsim_env.scene.load import fill_json, nearest
+from surgsim_env.scene.model import LesionDraw, Range, Scene, require_number
 
 # Least distance between lesions' balls under a tip of radius REFERENCE_TIP [m], in proportion for other tips: nearer
 # lesions are felt as one.
@@ -26,6 +25,10 @@ TRIES_MOST = 200
 # is 20 N/m, which adds some 7 % to an indentation, as a human one does (Roan 2010, doi 10.1115/1.4002369).
 CAPSULE_THICKNESS = 2e-5
 CAPSULE_STIFFNESS = (5.0, 20.0)
+# Most lesions of a saved draw: each takes time to compile.
+SAVED_LESIONS_MOST = 100
+# Largest modulus [Pa], stiffness [N/m] or factor of a saved draw: that of diamond in Pa. Far beyond, numbers overflow.
+SAVED_MOST = 1e12
 
 
 @dataclass(frozen=True)
@@ -155,17 +158,40 @@ class DrawnOrgan:
     def to_json(self) -> str:
         """The draw as JSON, with numbers written exactly."""
         lesions = [[*lesion.centre, lesion.radius, lesion.material.youngs_modulus] for lesion in self.lesions]  # type: ignore[misc, union-attr]
-        return json.dumps({**asdict(self), "lesions": lesions})
+        # A whole number in a user's own draw is written as the float that it is read as.
+        numbers = {"background": float(self.background), "capsule_stiffness": float(self.capsule_stiffness)}
+        return json.dumps({"lesions": [list(map(float, one)) for one in lesions], **numbers})
 
     @classmethod
     def from_json(cls, text: str, anatomy: Anatomy) -> "DrawnOrgan":
-        """The draw that `to_json` wrote for the same anatomy."""
-        table: dict[str, Any] = json.loads(text)
+        """The draw that `to_json` wrote for the same anatomy.
+
+        Raises:
+            ValueError: names the entry that is missing or wrong.
+        """
+        saved = fill_json(_SavedDraw, text, "drawn")
         lesions = [
             anatomy.lesion_of_modulus(numbers[:3], numbers[3], numbers[4], f"lesion {n + 1}")
-            for n, numbers in enumerate(table["lesions"])
+            for n, numbers in enumerate(saved.lesions)
         ]
-        return cls(tuple(lesions), table["background"], table["capsule_stiffness"])
+        return cls(tuple(lesions), saved.background, saved.capsule_stiffness)
+
+
+@dataclass(frozen=True)
+class _SavedDraw:
+    """What `DrawnOrgan.to_json` writes: of each lesion its centre and radius [m] and its modulus [Pa]."""
+
+    lesions: list[tuple[float, float, float, float, float]]
+    background: float
+    capsule_stiffness: float
+
+    def __post_init__(self) -> None:
+        require_number("background", self.background, 0.0, "", above=True, most=SAVED_MOST)
+        require_number("capsule_stiffness", self.capsule_stiffness, 0.0, "N/m", most=SAVED_MOST)
+        for number, (*_, modulus) in enumerate(self.lesions):
+            require_number(f"lesions[{number}][4]", modulus, 0.0, "Pa", above=True, most=SAVED_MOST)
+        if len(self.lesions) > SAVED_LESIONS_MOST:
+            raise ValueError(f"lesions has {len(self.lesions)} entries; at most {SAVED_LESIONS_MOST} are possible")
 
 
 def _share(bounds: Range, share: Range) -> Range:

@@ -16,10 +16,13 @@ Vector = tuple[float, float, float]
 Range = tuple[float, float]
 
 
-def require_number(what: str, value: float, least: float, unit: str, *, above: bool = False) -> None:
-    """Raise a ValueError for an entry that is not finite and at least (or above) a bound."""
-    if not (math.isfinite(value) and (value > least if above else value >= least)):
+def require_number(
+    what: str, value: float, least: float, unit: str, *, above: bool = False, most: float = math.inf
+) -> None:
+    """Raise a ValueError for an entry that is not finite, at least (or above) a bound, and at most another one."""
+    if not (math.isfinite(value) and (value > least if above else value >= least) and value <= most):
         rule = f"above {least:g}" if above else f"at least {least:g}"
+        rule += f" and at most {most:g}" if most < math.inf else ""
         raise ValueError(f"{what} is {value:g} {unit}".rstrip() + f"; it must be finite and {rule}")
 
 

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +13,8 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.load import fill_json
+from surgsim_env.scene.model import Vector, require_number
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.retract import AXIS_BOUND, FORCE_BOUND, SUCCESS_SHARE, TURNING_FULL_SCALE, RetractTask
 from surgsim_env.tasks.task import (
@@ -21,6 +23,7 @@ from surgsim_env.tasks.task import (
     TIP_POSITION,
     InfoValue,
     Start,
+    check_share,
     soft_force_share,
 )
 
@@ -260,11 +263,24 @@ class BimanualRetractTask(RetractTask):
         return json.dumps({"left": super().get_state(), **right})
 
     def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the lobe of that episode."""
-        table = json.loads(text)
-        self.sensors["right_force"].bias = np.array(table["bias"])
-        self.uncovered_share, self.touch_force = table["felt"]
-        return super().set_state(table["left"])
+        """As `Task.set_state`."""
+        state = fill_json(_SavedBimanual, text, "task")
+        uncovered, touch_force = state.felt
+        check_share("felt[0]", uncovered)
+        require_number("task: felt[1]", touch_force, 0.0, "N")
+        organ = super().set_state(state.left)
+        self.sensors = self.biased({"right_force": state.bias})
+        self.uncovered_share, self.touch_force = uncovered, touch_force
+        return organ
+
+
+@dataclass(frozen=True)
+class _SavedBimanual:
+    """What `BimanualRetractTask.get_state` writes: RetractTask's text, and of the right arm bias and measures."""
+
+    left: str
+    bias: Vector
+    felt: tuple[float, float]
 
 
 def _check_tips(pair: Pair) -> None:

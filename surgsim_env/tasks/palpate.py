@@ -1,6 +1,7 @@
 """Palpation: find one hidden lesion by touch and declare it while pressing on it."""
 
 import json
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from surgsim_env.palpation.chart import make_chart
 from surgsim_env.palpation.touches import Indenter, TouchMemory
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import DrawnOrgan
+from surgsim_env.scene.load import fill_json
+from surgsim_env.scene.model import Vector
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import (
     CONTACT_FORCE,
@@ -22,6 +25,7 @@ from surgsim_env.tasks.task import (
     TIP_VELOCITY,
     InfoValue,
     Task,
+    check_count,
     soft_force_share,
 )
 
@@ -249,12 +253,32 @@ class PalpateTask(Task):
         )
 
     def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the organ of that episode."""
-        table = json.loads(text)
-        self.drawn = DrawnOrgan.from_json(table["drawn"], self.anatomy)
-        self.sensors["contact_force"].bias = np.array(table["bias"])
-        self.step_count, self.declare_count = table["counts"]
-        self._declare_value = table["declare_value"]
-        if self.memory is not None:
-            self.memory.product, self.memory.square = np.array(table["memory"])
-        return self.drawn.compiled(self.anatomy)
+        """As `Task.set_state`."""
+        state = fill_json(_SavedPalpation, text, "task")
+        step_count, declare_count = state.counts
+        check_count("counts[0]", step_count, self.episode_steps)
+        check_count("counts[1]", declare_count, DECLARE_STEPS)
+        if (state.memory is None) != (self.memory is None):
+            has, needs = ("no", "with") if state.memory is None else ("a", "without")
+            raise ValueError(f"task: the episode has {has} memory, and this environment was made {needs} one")
+        memory = None if self.memory is None or state.memory is None else self.memory.restored(*state.memory)
+        drawn = DrawnOrgan.from_json(state.drawn, self.anatomy)
+        if not drawn.lesions:
+            raise ValueError("task: drawn.lesions is empty; a palpation has a lesion to find")
+        organ = drawn.compiled(self.anatomy)
+        self.drawn, self.memory = drawn, memory
+        self.sensors = self.biased({"contact_force": state.bias})
+        self.step_count, self.declare_count = step_count, declare_count
+        self._declare_value = state.declare_value
+        return organ
+
+
+@dataclass(frozen=True)
+class _SavedPalpation:
+    """What `PalpateTask.get_state` writes."""
+
+    drawn: str
+    bias: Vector
+    counts: tuple[int, int]
+    declare_value: float
+    memory: tuple[list[float], list[float]] | None

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -15,12 +16,13 @@ from surgsim_env.palpation.chart import HealthyMap, Site, charted_face, healthy_
 from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
-from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SiteTouches, Touch
+from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, SiteTouches, Touch
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
-from surgsim_env.scene.load import make_scene, with_instrument
+from surgsim_env.scene.load import fill_json, make_scene, with_instrument
+from surgsim_env.scene.model import Vector
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
-from surgsim_env.tasks.task import InfoValue, Start, Task, soft_force_share
+from surgsim_env.tasks.task import InfoValue, Start, Task, check_count, check_share, soft_force_share
 
 # Presses of an episode; BUDGET_WIDE where the chart's longer side exceeds WIDE tip radii.
 BUDGET, BUDGET_WIDE, WIDE = 25, 60, 10.0
@@ -335,23 +337,38 @@ class PalpateSitesTask(Task):
         )
 
     def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the organ of that episode.
+        """As `Task.set_state`.
 
         Raises:
-            ValueError: the episode has another budget, which what is observed and paid goes with.
+            ValueError: also if the episode has another budget, which what is observed and paid goes with.
         """
-        table = json.loads(text)
-        if table["budget"] != self.budget:
+        state = fill_json(_SavedSites, text, "task")
+        if state.budget != self.budget:
             raise ValueError(
-                f"the state is of an episode of {table['budget']} presses, this environment's have {self.budget}: make "
-                f"it with budget={table['budget']}"
+                f"the state is of an episode of {state.budget} presses, this environment's have {self.budget}: make "
+                f"it with budget={state.budget}"
             )
-        self.drawn = DrawnOrgan.from_json(table["drawn"], self.anatomy)
-        self.truth = self.drawn.places(self.anatomy)
-        self.reading.bias = np.array(table["bias"])
-        self.felt.set_state(table["felt"])
-        self.step_count = table["step_count"]
+        check_count("step_count", state.step_count, self.budget)
+        check_count("the number of felt.touches", len(state.felt.touches), state.step_count)
+        check_share("found_before", state.found_before)
+        drawn = DrawnOrgan.from_json(state.drawn, self.anatomy)
+        organ, truth, felt = drawn.compiled(self.anatomy), drawn.places(self.anatomy), self.felt.restored(state.felt)
+        self.drawn, self.truth, self.felt = drawn, truth, felt
+        self.reading = ForceReading(self.reading.sensor, state.bias)
+        self.step_count = state.step_count
         self._pending = None
         self._believe()
-        self._reached = {"found": table["found_before"]}
-        return self.drawn.compiled(self.anatomy)
+        self._reached = {"found": state.found_before}
+        return organ
+
+
+@dataclass(frozen=True)
+class _SavedSites:
+    """What `PalpateSitesTask.get_state` writes."""
+
+    drawn: str
+    bias: Vector
+    felt: SavedTouches
+    step_count: int
+    budget: int
+    found_before: float

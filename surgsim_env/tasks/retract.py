@@ -16,8 +16,9 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Grasp, Instrument
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.load import make_retract_scene, with_instrument
-from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera
+from surgsim_env.scene.levels import SAVED_MOST
+from surgsim_env.scene.load import fill_json, make_retract_scene, with_instrument
+from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera, Vector, require_number
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import (
     SPEED_FULL_SCALE,
@@ -27,6 +28,9 @@ from surgsim_env.tasks.task import (
     InfoValue,
     Start,
     Task,
+    check_count,
+    check_names,
+    check_share,
     soft_force_share,
 )
 from surgsim_env.tasks.visibility import Disc, hiding_geoms, visible
@@ -374,16 +378,20 @@ class RetractTask(Task):
         )
 
     def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the lobe of that episode."""
-        table = json.loads(text)
-        self.drawn = RetractionDraw.from_table(table["drawn"])
-        self.record = RetractionRecord(**table["record"])
-        for name, bias in zip(("contact_force", "contact_torque"), table["bias"], strict=True):
-            self.sensors[name].bias = np.array(bias)
-        self.step_count, self.goal_count = table["counts"]
-        self.jaw_target = table["jaw_target"]
-        self.visible_share, self._reached = table["visible"], table["reached"]
-        return self.drawn.compiled(self.anatomy)
+        """As `Task.set_state`."""
+        state = fill_json(_SavedRetraction, text, "task")
+        step_count, goal_count = state.counts
+        check_count("counts[0]", step_count, self.episode_steps)
+        check_count("counts[1]", goal_count, step_count)
+        check_count("record.steps", state.record.steps, step_count)
+        check_names("reached", state.reached, [one.name for one in self.rewards if one.per == "change"])
+        organ = state.drawn.compiled(self.anatomy)
+        self.drawn, self.record = state.drawn, state.record
+        self.sensors = self.biased(dict(zip(("contact_force", "contact_torque"), state.bias, strict=True)))
+        self.step_count, self.goal_count = step_count, goal_count
+        self.jaw_target = state.jaw_target
+        self.visible_share, self._reached = state.visible, state.reached
+        return organ
 
 
 def jaw_wrench(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
@@ -426,8 +434,6 @@ def _nearest_nodes(points: FloatArray, box: tuple[FloatArray, FloatArray]) -> ND
 
 # ---- what an episode draws -------------------------------------------------------------------------------------
 
-Vector = tuple[float, float, float]
-
 # A drawn capsule is this thick [m]; what counts is its modulus times this.
 CAPSULE_THICKNESS = 1e-4
 # A target lies this far above its bed [m], so that the bed does not hide it.
@@ -459,6 +465,13 @@ class RetractionDraw:
     # A lobe has none.
     lesions: ClassVar[tuple[Lesion, ...]] = ()
 
+    def __post_init__(self) -> None:
+        require_number("scale", self.scale, 0.0, "", above=True, most=SAVED_MOST)
+        require_number("youngs_modulus", self.youngs_modulus, 0.0, "Pa", above=True, most=SAVED_MOST)
+        require_number("capsule_stiffness", self.capsule_stiffness, 0.0, "N/m", most=SAVED_MOST)
+        if not 0.0 <= self.held_share <= 1.0:
+            raise ValueError(f"held_share is {self.held_share:g}; it must be in [0, 1]")
+
     def compiled(self, anatomy: Anatomy) -> OrganModel:
         """The scene's lobe as the episode has it."""
         plain = anatomy.specification()
@@ -474,12 +487,6 @@ class RetractionDraw:
             anchors=held_nodes(mesh.points, anatomy.anchors, self.held_share),
         )
         return anatomy.compiled(specification)
-
-    @classmethod
-    def from_table(cls, table: dict[str, Any]) -> "RetractionDraw":
-        """The draw whose fields JSON gave back."""
-        vectors: dict[str, Any] = {name: tuple(value) for name, value in table.items() if isinstance(value, list)}
-        return cls(**table | vectors)
 
 
 def draw_retraction(table: Retraction, endoscope: Endoscope, rng: np.random.Generator) -> RetractionDraw:
@@ -608,6 +615,32 @@ class RetractionRecord:
             "path_length": self.path,
             **{f"strain_{region}": value for region, value in zip(REGIONS, self.strain)},
         }
+
+
+@dataclass(frozen=True)
+class _SavedRetraction:
+    """What `RetractTask.get_state` writes."""
+
+    drawn: RetractionDraw
+    record: RetractionRecord
+    bias: tuple[Vector, Vector]
+    counts: tuple[int, int]
+    jaw_target: float
+    visible: float
+    reached: dict[str, float]
+
+    def __post_init__(self) -> None:
+        record = self.record
+        for name, value in vars(record).items():
+            if name not in ("slipping", "held", "tip") and np.min(value) < 0.0:
+                raise ValueError(f"record.{name} is {value}; it must be at least 0")
+        if record.held_steps > record.steps:
+            raise ValueError(f"record.held_steps is {record.held_steps}; it must be at most {record.steps}, the steps")
+        if len(record.strain) != len(REGIONS) or (record.tip is not None and len(record.tip) != 3):
+            raise ValueError(f"record.strain is {record.strain}, record.tip {record.tip}; each must be 3 numbers")
+        if not -1.0 <= self.jaw_target <= 1.0:
+            raise ValueError(f"jaw_target is {self.jaw_target:g}; it must be in [-1, 1]")
+        check_share("visible", self.visible)
 
 
 def region_strains(model: OrganModel, node_position: FloatArray, box: tuple[FloatArray, FloatArray]) -> list[float]:

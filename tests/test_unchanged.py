@@ -366,7 +366,11 @@ for _scene, _steps in (("phantom", 40), ("phantom_small", 80), ("liver", 40)):
 case("Palpate-v0 phantom_small random, plain loop", play_random, "Palpate-v0", "phantom_small", 80, loop="python")
 case("Palpate-v0 phantom_small random, memory", play_random, "Palpate-v0", "phantom_small", 40, memory=True)
 case(
-    "Palpate-v0 phantom random, memory, level hard", play_random, "Palpate-v0", "phantom", 30, memory=True, level="hard"
+    "Palpate-v0 phantom random, memory, level hard",
+    *(play_random, "Palpate-v0", "phantom", 30),
+    memory=True,
+    level="hard",
+    slow=True,
 )
 case("Palpate-v0 phantom_small oracle, level standard", play_oracle, "Palpate-v0", "phantom_small", level="standard")
 case("Palpate-v0 phantom random, psm_palpator", play_random, "Palpate-v0", "phantom", 30, instrument="psm_palpator")
@@ -379,7 +383,8 @@ case(
     slow=True,
 )
 for _scene in ("phantom_small", "phantom", "liver"):
-    _slow = _scene == "liver"  # its map of healthy stiffness takes a minute after each change of the kernels
+    # Maps of healthy stiffness take long: that of the liver a minute after each change of the kernels.
+    _slow = _scene != "phantom_small"
     case(f"PalpateSites-v0 {_scene} random", play_random, "PalpateSites-v0", _scene, 10, budget=8, slow=_slow)
     case(f"PalpateSites-v0 {_scene} greedy", play_greedy, _scene, 10, slow=_slow)
 case(
@@ -393,10 +398,19 @@ case(
     "PalpateSites-v0 phantom random, psm_palpator",
     *(play_random, "PalpateSites-v0", "phantom", 3),
     instrument="psm_palpator",
+    slow=True,
 )
 case("Retract-v0 lobe random", play_random, "Retract-v0", "lobe", 40)
 case("Retract-v0 lobe random, plain loop", play_random, "Retract-v0", "lobe", 40, loop="python", slow=True)
-case("Retract-v0 lobe random, psm_retractor", play_random, "Retract-v0", "lobe", 40, instrument="psm_retractor")
+case(
+    "Retract-v0 lobe random, psm_retractor",
+    play_random,
+    "Retract-v0",
+    "lobe",
+    40,
+    instrument="psm_retractor",
+    slow=True,
+)
 case("Retract-v0 lobe oracle", play_oracle, "Retract-v0", "lobe", slow=True)
 case("Retract-v0 lobe oracle, psm_retractor", play_oracle, "Retract-v0", "lobe", instrument="psm_retractor", slow=True)
 case("BimanualRetract-v0 lobe random", play_random, "BimanualRetract-v0", "lobe", 40)
@@ -419,7 +433,15 @@ case(
     memory=True,
     level="standard",
 )
-case("Palpate-v0 phantom vector, psm_palpator", play_vector, "Palpate-v0", "phantom", 12, instrument="psm_palpator")
+case(
+    "Palpate-v0 phantom vector, psm_palpator",
+    play_vector,
+    "Palpate-v0",
+    "phantom",
+    12,
+    instrument="psm_palpator",
+    slow=True,
+)
 case("Palpate-v0 liver vector", play_vector, "Palpate-v0", "liver", 12, slow=True)
 case("PalpateSites-v0 phantom_small vector", play_vector, "PalpateSites-v0", "phantom_small", 7, budget=4)
 case(

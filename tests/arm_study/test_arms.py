@@ -114,6 +114,7 @@ def test_mujoco_agrees_with_what_is_reported(found, phantom):
             assert report.organ_clearance[row] == pytest.approx(gaps.min(), abs=5e-5)
 
 
+@pytest.mark.slow
 def test_run_repeats_to_the_byte(found, phantom):
     """Same arguments, same bytes, of every array and of the summary; another seed, other points."""
     targets = [InnerTarget((0.03, 0.03, 0.015), "deep"), InnerTarget((0.03, 0.03, -2.0), "far")]

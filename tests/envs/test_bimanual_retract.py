@@ -109,16 +109,8 @@ def test_the_weights_put_every_failure_below_every_full_episode():
         assert -HIDDEN_SHARE * w["visible"] - w["near"] + EPISODE_STEPS * w["soft_force"] - gains - w[failure] > 0.5
 
 
-@pytest.mark.parametrize(
-    "harm",
-    [
-        {"collision": 9.0},
-        *(
-            pytest.param(one, marks=pytest.mark.slow)
-            for one in ({"force": 9.0}, {"force_peak": 9.0}, {"fault": "told so"})
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("harm", [{"collision": 9.0}, {"force": 9.0}, {"force_peak": 9.0}, {"fault": "told so"}])
 def test_no_failed_episode_returns_more_than_the_worst_full_one(told, harm):
     start = {"visible": HIDDEN_SHARE, "grasped": 0.0, "near": 1.0, "touched": 0.0}
     told.task._reached = dict(start)

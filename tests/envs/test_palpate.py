@@ -195,6 +195,7 @@ def test_force_reading_is_noisy_biased_and_flags_saturation(env):
     assert observation[8] == np.float32(2.0)
 
 
+@pytest.mark.slow
 def test_workspace_edge_is_flagged_and_stops_the_tip(env):
     env.reset(seed=8)
     for _ in range(80):

@@ -102,6 +102,7 @@ def test_a_press_tells_where_the_instrument_was_held_back(monkeypatch):
 # ---- the chart ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_charts_hold_the_sites_that_keep_the_margin():
     for name, extent, side in (("phantom", 0.04, 13), ("phantom_small", 0.03, 13), ("phantom_wide", 0.1, 25)):
         scene = make_scene(name)

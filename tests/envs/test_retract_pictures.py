@@ -116,6 +116,7 @@ def test_the_checker_accepts_pictures():
     env.close()
 
 
+@pytest.mark.slow
 def test_pictures_without_opengl_say_what_is_missing():
     code = """
 import gymnasium as gym, surgsim_env

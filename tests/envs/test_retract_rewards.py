@@ -58,9 +58,8 @@ def worst_full_return(told):
     return told.returned
 
 
-@pytest.mark.parametrize(
-    "failure", ["torn", *(pytest.param(one, marks=pytest.mark.slow) for one in ("hard_force", "fault"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("failure", FAILURES)
 def test_no_failed_episode_returns_more_than_the_worst_full_one(told, failure):
     """The best way to fail: all seen but never for long, grasped, without pressing; then, sooner or later, harm."""
     worst = worst_full_return(told)
@@ -115,6 +114,7 @@ def test_time_runs_out_after_600_steps(told):
 # ---- what ends it -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_step_that_tears_ends_in_its_very_haptic_step(shared_retract):
     """Grasp the edge and pull it away, with tissue that bears less than the grip does."""
     shared_retract.reset(seed=2)

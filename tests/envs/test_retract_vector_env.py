@@ -45,7 +45,7 @@ def action(observation: np.ndarray, goal: np.ndarray, *, grasp: bool, size: int)
     [
         pytest.param("NextStep", None, marks=pytest.mark.slow),
         pytest.param("SameStep", None, marks=pytest.mark.slow),
-        ("SameStep", "psm_retractor"),
+        pytest.param("SameStep", "psm_retractor", marks=pytest.mark.slow),
     ],
 )
 def test_equals_environments_one_after_the_other(mode: str, instrument: str | None):
@@ -122,6 +122,7 @@ def test_lanes_have_rest_shapes_of_their_own_only_where_they_differ():
     assert lobes._groups[0]._own_rest and not phantoms._groups[0]._own_rest  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_a_state_saved_alone_goes_on_in_a_lane():
     envs, single = side_by_side(), gym.make(ID)
     observation, _ = envs.reset(seed=SEED)

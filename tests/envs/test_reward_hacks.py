@@ -80,6 +80,7 @@ def test_a_good_end_pays_more_than_standing_still(name):
 # ---- early declares ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["phantom", "phantom_small"])
 def test_declaring_at_the_likeliest_place_pays_less_than_a_search_that_finds(scene):
     """The best place of all to declare at once without feeling anything, over 150 draws of the lesion.
@@ -221,6 +222,7 @@ def test_a_search_is_paid_more_than_pressing_one_place_again_and_again():
     assert searched > stayed + 0.1
 
 
+@pytest.mark.slow
 def test_a_press_that_ends_in_harm_is_paid_less_than_the_worst_episode(presses, monkeypatch):
     weights = PalpateSitesTask.weights
     # What `found` begins with is lost at most.

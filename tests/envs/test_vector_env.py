@@ -105,6 +105,7 @@ def test_a_fault_leaves_the_neighbours_untouched():
             assert found[1][lane] == expected[1][lane]
 
 
+@pytest.mark.slow
 def test_single_precision_feels_the_same_force():
     """Within 0.5 % of the largest contact force of a press to 4 mm and back."""
     exact, fast = side_by_side(), side_by_side(dtype="float32")

@@ -132,7 +132,8 @@ def tapping(device_mass: float, seconds: float, encoder: float) -> None:
     assert (np.diff(taken[1:]) > 0.0).all()
 
 
-@pytest.mark.parametrize("encoder", [0.0, pytest.param(2e-5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("encoder", [0.0, 2e-5])
 def test_ten_seconds_of_tapping_give_no_energy(encoder):
     tapping(0.05, 10.0, encoder)
 
@@ -181,6 +182,7 @@ def test_contact_at_the_limit_on_other_organs(scene):
     assert np.abs(device.velocity).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_hand_feels_what_the_tissue_gives():
     """At rest the force on the device is the tissue's on the tip: the servo pushes as the coupling says."""
     simulation = touching_simulation()
@@ -229,6 +231,7 @@ def tapped_with_a_cut(settings: HapticSettings) -> tuple[np.ndarray, np.ndarray,
     return np.array(held), np.array(hand), force**2 / (2.0 * loop.held[0].coupling.stiffness)
 
 
+@pytest.mark.slow
 def test_contact_as_shipped_gives_at_most_what_the_spring_holds():
     """Coupling, slew limit, watchdog and slow approach as shipped: K e^2 / 2 = F^2 / 2 K each time that one acts."""
     held, hand, bound = tapped_with_a_cut(HapticSettings())

@@ -182,6 +182,7 @@ def test_a_warning_of_mujoco_lets_go():
     assert not loop.step().fault
 
 
+@pytest.mark.slow
 def test_reset_takes_another_organ():
     loop, device = pressed()
     healthy = loop.simulation.anatomy.organ()

@@ -31,6 +31,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_the_physics_ends_with_a_page_that_was_killed(tmp_path):
     script = tmp_path / "page.py"
     script.write_text(CHILD)
@@ -51,6 +52,7 @@ def _lives(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_a_physics_that_dies_is_said(tmp_path):
     session = Session(make_scene("phantom_small"), pace=PACE)
     page = None

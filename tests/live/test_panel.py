@@ -108,6 +108,7 @@ def report_of(served, monkeypatch, software, rate=None):
         wait_until(lambda: len(attended) > 1)
 
 
+@pytest.mark.slow
 def test_a_browser_without_a_graphics_card_is_drawn_for_plainly_until_its_user_says_otherwise(served, monkeypatch):
     page = served.page
     page._plain, page._tabs.software = None, False

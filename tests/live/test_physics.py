@@ -183,6 +183,7 @@ def test_pause_and_reset(bench):
     assert not bench.ask(End())
 
 
+@pytest.mark.slow
 def test_sliders_make_another_organ(bench):
     forces = []
     for factor in (1.0, 2.0):

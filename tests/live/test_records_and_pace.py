@@ -25,6 +25,7 @@ def write_forever(record: SharedRecord) -> None:
         time.sleep(50e-6)
 
 
+@pytest.mark.slow
 def test_a_reader_never_sees_half_a_record():
     record = SharedRecord(PAIR)
     writer = multiprocessing.get_context("spawn").Process(target=write_forever, args=(record,), daemon=True)

@@ -52,6 +52,7 @@ def test_installed_wheel_finds_its_scenes(wheel, make_environment, tmp_path, cle
     assert [f"{name}.toml" for name in known] == shipped
 
 
+@pytest.mark.slow
 def test_editable_install_sees_an_edit_at_once(
     make_environment: Callable[[Path], Environment], tmp_path: Path, clean_environ: dict[str, str]
 ):

@@ -83,6 +83,7 @@ def test_surfaces_that_cross_are_joined_when_mended(tmp_path, refusal):
     assert read_mesh(tmp_path / "a.vtu").volumes.sum() == pytest.approx(union, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_largest_surface_is_kept(tmp_path, capsys):
     both = trimesh.util.concatenate(
         [trimesh.creation.icosphere(3, 30.0), trimesh.creation.icosphere(2, 5.0).apply_translation([60.0, 0.0, 0.0])]

@@ -104,6 +104,7 @@ def test_an_edge_s_thickness_is_the_wedge_s(folder):
     assert found == pytest.approx(1e-3 * (WEDGE_EDGE + WEDGE_SLOPE * 1e3 * OVERLAP_LEAST), abs=2 * VOXEL)
 
 
+@pytest.mark.slow
 def test_the_edge_s_level_side_is_below(folder):
     rim = find_rim(read_mesh(folder / "patient.vtu"), np.array([0.0, -1.0, 0.0]))
     assert isinstance(rim, Rim)

@@ -173,6 +173,7 @@ def test_vector_environments_give_a_frame_for_each(mode):
     assert len(stage._stages) == held
 
 
+@pytest.mark.slow
 @needs_opengl
 def test_works_in_other_processes():
     """Workers that are started anew draw by themselves; a fork of a process that has drawn says why it cannot."""

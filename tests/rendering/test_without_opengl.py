@@ -75,6 +75,7 @@ def test_missing_driver_names_the_packages(opengl, tmp_path):
     assert said.startswith("NoGLError no OpenGL through EGL") and PACKAGES in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", ["disabled", "off"])
 def test_opengl_switched_off_is_said(value):
     said = run(DRAW, MUJOCO_GL=value)

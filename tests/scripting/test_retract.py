@@ -190,6 +190,7 @@ def test_steps_of_one_arm_leave_the_other_where_it_is():
         run_script(env, [OfArm(Hold(0.1), "middle")])
 
 
+@pytest.mark.slow
 def test_command_retracts_and_writes(tmp_path, capsys):
     assert main(["retract", "--seed", "1", "--out", str(tmp_path)]) == 0
     assert "retracted in" in capsys.readouterr().out

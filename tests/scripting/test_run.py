@@ -23,6 +23,7 @@ def press():
     return [PressUntil(0.2, 0.015, sensed=True), Hold(0.1), Lift(0.008)]
 
 
+@pytest.mark.slow
 def test_a_seed_resets_and_repeats_to_the_bit():
     env, other = gym.make("SurgSim/Palpate-v0"), gym.make("SurgSim/Palpate-v0").unwrapped
     first = run_script(env, press(), seed=5)
@@ -35,6 +36,7 @@ def test_a_seed_resets_and_repeats_to_the_bit():
     assert run_script(env, press(), seed=6).observation.tobytes() != first.observation.tobytes()
 
 
+@pytest.mark.slow
 def test_actions_of_a_trace_replayed_without_recording_give_its_observations():
     env = gym.make("SurgSim/Palpate-v0")
     trace = run_script(env, press(), seed=5)

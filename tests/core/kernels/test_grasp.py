@@ -14,6 +14,7 @@ def hanging() -> HangingStrip:
     return strip
 
 
+@pytest.mark.slow
 def test_jaw_carries_the_load_and_the_strip_stretches_by_it(hanging: HangingStrip):
     """Reaction = weight below and between the pads, to 0.1 %; strain = F / (E A), to 10 %, below 3 %; pads balance."""
     resting = hanging.gauge_length
@@ -32,6 +33,7 @@ def test_strip_slips_at_two_mu_n():
     assert load == pytest.approx(2.0 * 0.25 * held, rel=0.05)
 
 
+@pytest.mark.slow
 def test_open_jaw_leaves_nothing(hanging: HangingStrip):
     """No force, no memory of contact or stretch; afterwards the strip floats without strain."""
     hanging.run(0.3, gravity=5.0)

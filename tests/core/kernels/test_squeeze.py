@@ -53,6 +53,7 @@ def added_tension(added: NDArray) -> float:
     return -float((added * slope).sum() / (slope * slope).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.05, 0.2, 0.5, 0.59])
 def test_one_tets_pressure_is_that_of_the_steps_end(ratio: float):
     """dp = dt p' dJ/dt with the velocities that it leads to itself, along dV/dx."""
@@ -94,6 +95,7 @@ def test_presses_go_far_beyond_the_hard_limit_at_the_scenes_substeps(site: str):
     assert end.force[:-1].max() > 2.4
 
 
+@pytest.mark.slow
 def test_what_the_organ_balances_at_does_not_depend_on_the_step():
     """A press held till all is at rest, some tets squeezed: the same force with three and with nine substeps."""
     forces = []

@@ -165,6 +165,7 @@ def test_what_cannot_be_filled_is_refused(labels, spacing, cell_size, names, wor
         mesh_segmentation(labels, spacing, cell_size=cell_size, region_names=names)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.3, 0.7), st.tuples(*[st.sampled_from((0.001, 0.002, 0.004))] * 3))
 def test_any_blob_becomes_a_sound_mesh_or_a_clear_error(seed, share, spacing):

@@ -228,6 +228,7 @@ def test_the_same_organ_settles_once(monkeypatch):
 # ---- lanes --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_lanes_rest_as_their_organs_do_alone():
     """Eight organs of their own moduli on bed and wall, pressed and let go: to the bit, float64."""
     wall = Support("wall", "box", position=(0.03, 0.0, 0.0), rotation=(0.9, 0.0, 0.1, 0.0), size=(0.01, 0.03, 0.03))

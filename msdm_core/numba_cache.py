@@ -1,38 +1,52 @@
-"""A folder for numba's compiled code where an installation offers none; importing this module provides it.
+"""Where numba keeps the compiled kernels, and what happens where that place or its content is damaged.
 
 numba keeps what `@njit(cache=True)` compiled in the first of three places that can be written: `NUMBA_CACHE_DIR`, the
 `__pycache__` beside the source, the user's cache folder. Where none can (a read-only installation, an account
 without a home), decorating raises "no locator available" and the package could not even be imported. There, and
 only there, a private folder under the temporary one is named instead. It must happen before `kernels` is imported.
+
+A cache is pickled code, which runs when it is read: a folder that others may write to is never used.
+
+Kernels decorated in `kernel_cache` have a cache that heals (`HealingCache`): a file that is damaged is dropped with a
+warning, and its function compiled again; where there is no room to write, functions are compiled and not kept. Files
+carry a checksum, as a flipped bit in machine code would run unnoticed.
 """
 
 import atexit
+import functools
 import hashlib
+import io
 import os
 import shutil
 import stat
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from numba.core import config
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+from numba.core.registry import CPUDispatcher
+from numba.core.target_extension import dispatcher_registry, target_registry
 from numba.misc.appdirs import AppDirs
 
 KERNEL_FILES = "*kernels.py"
 FOLDER_PREFIX = "surgsim-kernels-"
 STALE_AGE = 7 * 24 * 3600.0  # [s]
+# The last bytes of a file of the cache, followed by the SHA-256 of those before; unpickling does not read them.
+CHECKSUM_MARK = b"surgsim-sha256:"
+CHECKSUM_LENGTH = len(CHECKSUM_MARK) + hashlib.sha256().digest_size
 
 
 def provide_cache_folder(source_folder: Path) -> Path | None:
     """Make sure that numba can cache functions whose source lies in `source_folder`.
 
     Returns:
-        The temporary folder that numba was given, None where numba finds a place by itself.
-
-    Raises:
-        OSError: no folder at all can be written, the temporary one included.
+        The temporary folder that numba was given, None where numba finds a place by itself, or where no folder at all
+        can be written, which is warned of: compiled functions are not kept then.
     """
     places = _places(source_folder)
     if any(_can_write(place) for place in places):
@@ -41,10 +55,13 @@ def provide_cache_folder(source_folder: Path) -> Path | None:
         folder = _private_temporary_folder()
     except OSError as error:
         tried = ", ".join(str(place) for place in places)
-        raise OSError(
+        warnings.warn(
             f"no folder can be written for numba's compiled code: tried {tried} and the temporary folder ({error}); "
-            "set NUMBA_CACHE_DIR to one that can"
-        ) from error
+            "every start compiles for minutes: set NUMBA_CACHE_DIR to one that can",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return None
     config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
     return folder
 
@@ -59,17 +76,211 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
     files = sorted(file for folder in source_folders for file in folder.rglob(KERNEL_FILES))
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
     before: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
-    place = next(place for place in _places(source_folders[0]) if _can_write(place))
-    _remove_stale(place, keep=f"{FOLDER_PREFIX}{digest}")
-    folder = place / f"{FOLDER_PREFIX}{digest}"
-    if folder.is_dir():
-        # In use: another package whose folder lies here too must not take it for stale.
-        os.utime(folder)
-    config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
+    folder = _kernel_folder(source_folders[0], f"{FOLDER_PREFIX}{digest}")
+    if folder is not None:
+        _remove_stale(folder.parent, keep=folder.name)
+        config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
+    cpu = target_registry["cpu"]
+    dispatcher = dispatcher_registry[cpu]
+    _register(cpu, UncachedDispatcher if folder is None else HealingDispatcher)
     try:
         yield
     finally:
+        _register(cpu, dispatcher)
         config.CACHE_DIR = before  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _register(target: Any, dispatcher: Any) -> None:
+    """Let numba's decorators make dispatchers of this class; the registry takes a new one only when it has none."""
+    del dispatcher_registry[target]
+    dispatcher_registry[target] = dispatcher
+
+
+def _kernel_folder(source_folder: Path, name: str) -> Path | None:
+    """The folder of this name in the first place that can be written and where nobody else can write to it."""
+    for place in _places(source_folder):
+        if _can_write(place) and _is_private(place / name, source_folder):
+            # A disk may have room for the file that was tried, and none for a folder.
+            with suppress(OSError):
+                return _in_use(place / name)
+    try:
+        return _in_use(_private_temporary_folder() / name)
+    except OSError:
+        # `provide_cache_folder` has said so.
+        return None
+
+
+def _in_use(folder: Path) -> Path:
+    """Make a folder that only its owner may enter; one that is there is renewed, so that nobody takes it for stale."""
+    folder.mkdir(mode=0o700, exist_ok=True)
+    with suppress(OSError):
+        os.utime(folder)
+    return folder
+
+
+def _is_private(folder: Path, source_folder: Path) -> bool:
+    """Whether a folder and those in it are absent, or of who runs this, of root or of the source's owner, alone.
+
+    A group may write where it is that of who runs this: with the umask 002 of many systems it has no other member.
+    """
+    if not hasattr(os, "geteuid"):
+        return True
+    owners = {os.geteuid(), 0, source_folder.stat().st_uid}
+    with suppress(FileNotFoundError):
+        for path in (folder, *(folder.iterdir() if folder.is_dir() else ())):
+            found = path.lstat()
+            shared = found.st_mode & 0o002 or (found.st_mode & 0o020 and found.st_gid != os.getegid())
+            if found.st_uid not in owners or shared or not stat.S_ISDIR(folder.lstat().st_mode):
+                warnings.warn(
+                    f"{folder} is not used for numba's compiled code, which would run what others may have written "
+                    f"there ({path.name} belongs to user {found.st_uid}, mode {stat.filemode(found.st_mode)}): remove "
+                    "it, or set NUMBA_CACHE_DIR to a folder of your own",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+                return False
+    return True
+
+
+# ---- a cache that heals ---------------------------------------------------------------------------------------------
+
+
+class CheckedCacheFile(IndexDataCacheFile):
+    """numba's index and data files of a function; a damaged one is dropped with a warning and counts as absent.
+
+    Files that numba wrote by itself have no checksum: of those, damage is noticed only where unpickling fails.
+    """
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        # Files that could not be removed: the index is read once more before it is written.
+        self._stuck: set[str] = set()
+
+    def drop_data(self, key: Any, error: Exception) -> None:
+        """Drop the data file of an index entry, from which no compiled function could be made."""
+        name = self._load_index().get(key)
+        if name is not None:
+            self._drop(self._data_path(name), error)
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            _verify(self._index_path)
+            overloads = super()._load_index()
+            if not isinstance(overloads, dict) or not all(isinstance(name, str) for name in overloads.values()):
+                raise ValueError("it holds no index")
+        except FileNotFoundError:
+            return {}
+        except Exception as error:  # unpickling damaged bytes may raise anything
+            self._drop(self._index_path, error)
+            return {}
+        return overloads
+
+    def _load_data(self, name: str) -> Any:
+        path = self._data_path(name)
+        try:
+            _verify(path)
+            return super()._load_data(name)
+        except FileNotFoundError:
+            raise
+        except Exception as error:
+            self._drop(path, error)
+            # numba compiles again where a file of the index is absent.
+            raise FileNotFoundError(path) from error
+
+    def _drop(self, path: str, error: Exception) -> None:
+        """Remove a damaged file, or an empty folder in its place, and warn of it."""
+        outcome = "it is dropped and its function compiled again"
+        try:
+            os.rmdir(path) if os.path.isdir(path) else os.unlink(path)
+        except FileNotFoundError:
+            pass  # another process was faster
+        except OSError as why:
+            if path in self._stuck:
+                return
+            self._stuck.add(path)
+            outcome = f"its function is compiled again at each start, as it cannot be removed ({why.strerror})"
+        said = " ".join(str(error).split()) or "nothing said"
+        warnings.warn(
+            f"{path} of numba's cache is damaged ({type(error).__name__}: {said}): {outcome}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
+        with super()._open_for_write(filepath) as file:
+            yield (content := io.BytesIO())
+            file.write(content.getvalue() + CHECKSUM_MARK + hashlib.sha256(content.getvalue()).digest())
+
+
+class HealingCache(FunctionCache):
+    """numba's cache of a function, which outlives damaged files and a place without room."""
+
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)
+        self._cache_file = CheckedCacheFile(
+            cache_path=self._cache_path,
+            filename_base=self._impl.filename_base,
+            source_stamp=self._impl.locator.get_source_stamp(),
+        )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled function of a signature; None where it is to be compiled."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # what was unpickled is no compiled function
+            self._cache_file.drop_data(self._index_key(sig, target_context.codegen()), error)
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled function, or warn once that there is no room."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            self.disable()
+            _warn_of_no_room(str(Path(self._cache_path).parents[1]), error.strerror or str(error))
+
+
+class HealingDispatcher(CPUDispatcher):
+    """A compiled function with a `HealingCache`."""
+
+    def enable_caching(self) -> None:
+        """Keep what is compiled; called by numba's decorators for `cache=True`."""
+        try:
+            self._cache = HealingCache(self.py_func)
+        except (OSError, RuntimeError) as error:
+            # The folder was there a moment ago; numba finds no other.
+            self._cache = NullCache()
+            _warn_of_no_room(str(Path(config.CACHE_DIR).parent), str(error))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class UncachedDispatcher(CPUDispatcher):
+    """A compiled function that is not kept, although it was declared with `cache=True`."""
+
+    def enable_caching(self) -> None:
+        """Keep nothing."""
+
+
+def _verify(path: str) -> None:
+    """Raise ValueError where a file's bytes are not those that its checksum was computed from."""
+    content = Path(path).read_bytes()
+    body, end = content[:-CHECKSUM_LENGTH], content[-CHECKSUM_LENGTH:]
+    if end.startswith(CHECKSUM_MARK) and hashlib.sha256(body).digest() != end[len(CHECKSUM_MARK) :]:
+        raise ValueError("its checksum is wrong")
+
+
+@functools.cache
+def _warn_of_no_room(place: str, reason: str) -> None:
+    """Warn once of a place, not for each of the functions."""
+    warnings.warn(
+        f"numba's compiled code cannot be kept in {place} ({reason}): every start compiles for minutes; make room, or "
+        "set NUMBA_CACHE_DIR to a folder that has some",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+
+# ---- places ---------------------------------------------------------------------------------------------------------
 
 
 def _places(source_folder: Path) -> list[Path]:
@@ -84,8 +295,10 @@ def _places(source_folder: Path) -> list[Path]:
 def _remove_stale(place: Path, *, keep: str) -> None:
     """Remove folders of earlier texts that nobody has used for STALE_AGE."""
     for folder in place.glob(f"{FOLDER_PREFIX}*"):
-        if folder.name != keep and time.time() - folder.stat().st_mtime > STALE_AGE:
-            shutil.rmtree(folder, ignore_errors=True)
+        # Another process may remove it at the same time.
+        with suppress(FileNotFoundError):
+            if folder.name != keep and time.time() - folder.stat().st_mtime > STALE_AGE:
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def _can_write(folder: Path) -> bool:

@@ -118,15 +118,3 @@ def test_a_writable_installation_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     assert numba_cache.provide_cache_folder(tmp_path) is None
     assert numba.config.CACHE_DIR == ""
-
-
-def test_nowhere_to_write_says_what_to_do(monkeypatch, tmp_path):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
-    monkeypatch.setattr(numba_cache, "_can_write", lambda folder: False)
-
-    def full() -> Path:
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(numba_cache, "_private_temporary_folder", full)
-    with pytest.raises(OSError, match="set NUMBA_CACHE_DIR"):
-        numba_cache.provide_cache_folder(tmp_path)

@@ -1,15 +1,26 @@
-"""Compiled code is taken from disk, and made anew when any compiled file has changed, not only the function's own."""
+"""Compiled code is taken from disk, and made anew when a compiled file has changed or one of the cache is damaged."""
 
+import importlib.util
 import os
+import pickle
 import shutil
 import subprocess
 import sys
 import time
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numba
+import pytest
+from numba.core.registry import CPUDispatcher
+from numba.core.target_extension import dispatcher_registry, target_registry
 
 import msdm_core
 import surgsim_env
 from msdm_core import numba_cache
+from msdm_core.kernels.tissue_kernels import set_node_tension
 
 USE = """
 import msdm_core
@@ -87,3 +98,187 @@ def test_folders_of_old_texts_are_removed_in_time(tmp_path):
         os.utime(folder, (time.time() - 2.0 * numba_cache.STALE_AGE,) * 2)
     numba_cache._remove_stale(tmp_path, keep=new.name)
     assert not old.exists() and new.is_dir()
+
+
+# ---- damage ---------------------------------------------------------------------------------------------------------
+
+TINY = """
+import numba
+
+@numba.njit(cache=True)
+def double(x):
+    return 2.0 * x
+
+@numba.njit(cache=True)
+def half(x):
+    return 0.5 * x
+"""
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch) -> Path:
+    """A folder with a file of two tiny kernels, cached in its `__pycache__`."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    # The next place; the one after it would be the temporary folder.
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    numba_cache._warn_of_no_room.cache_clear()
+    folder = tmp_path / "source"
+    folder.mkdir()
+    (folder / "tiny_kernels.py").write_text(TINY)
+    return folder
+
+
+def executed(folder: Path) -> Any:
+    """The module of the tiny kernels, as a new process imports it."""
+    spec = importlib.util.spec_from_file_location("tiny_kernels", folder / "tiny_kernels.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def started(folder: Path) -> tuple[bool, list[str]]:
+    """Import the kernels and use one: whether it came from the cache, and what was warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with numba_cache.kernel_cache(folder):
+            module = executed(folder)
+        assert module.double(21.0) == 42.0
+    return bool(module.double.stats.cache_hits), [str(warning.message) for warning in caught]
+
+
+def cached(folder: Path, suffix: str) -> Path:
+    (file,) = folder.rglob(f"*double*{suffix}")
+    return file
+
+
+def flipped(content: bytes) -> bytes:
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "emptied": lambda content: b"",
+    "cut": lambda content: content[: len(content) // 2],
+    "zeroed": lambda content: bytes(len(content)),
+    "flipped": flipped,
+    "no pickle": lambda content: b"text",
+    "another pickle": lambda content: pickle.dumps(numba.__version__) + pickle.dumps("text"),
+    "folder": lambda content: b"",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_a_damaged_file_is_dropped_and_made_anew(source: Path, suffix: str, damage: str):
+    assert started(source) == (False, [])
+    assert started(source) == (True, [])
+    file = cached(source, suffix)
+    if damage == "folder":
+        file.unlink()
+        file.mkdir()
+    else:
+        file.write_bytes(DAMAGES[damage](file.read_bytes()))
+    hit, said = started(source)
+    assert not hit
+    assert len(said) == 1 and f"{file} of numba's cache is damaged (" in said[0] and "\n" not in said[0]
+    assert started(source) == (True, []), "it healed"
+
+
+def test_files_have_a_checksum_that_plain_numba_does_not_mind(source: Path):
+    started(source)
+    for suffix in (".nbi", ".nbc"):
+        assert cached(source, suffix).read_bytes()[-numba_cache.CHECKSUM_LENGTH :].startswith(b"surgsim-sha256:")
+    numba.config.CACHE_DIR = str(cached(source, ".nbi").parents[1])
+    plain = executed(source)
+    assert plain.double(21.0) == 42.0 and plain.double.stats.cache_hits
+    # Nor does this mind files without one, as an earlier version left them.
+    shutil.rmtree(cached(source, ".nbi").parent)
+    assert executed(source).double(21.0) == 42.0
+    assert not cached(source, ".nbc").read_bytes()[-numba_cache.CHECKSUM_LENGTH :].startswith(b"surgsim-sha256:")
+    numba.config.CACHE_DIR = ""
+    assert started(source) == (True, [])
+
+
+def test_what_cannot_be_removed_is_not_in_the_way(source: Path):
+    started(source)
+    file = cached(source, ".nbi")
+    file.unlink()
+    (file / "kept").mkdir(parents=True)
+    for _ in range(2):
+        hit, (damaged, no_room) = started(source)
+        assert not hit and "as it cannot be removed (Directory not empty)" in damaged
+        assert "cannot be kept in" in no_room
+        numba_cache._warn_of_no_room.cache_clear()
+
+
+def test_without_room_functions_are_compiled_and_one_warning_says_so(source: Path, monkeypatch):
+    def full(file: Any, name: str, data: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched, warnings.catch_warnings(record=True) as caught:
+        patched.setattr(numba_cache.CheckedCacheFile, "_save_data", full)
+        warnings.simplefilter("always")
+        with numba_cache.kernel_cache(source):
+            module = executed(source)
+        assert (module.double(21.0), module.half(42.0)) == (42.0, 21.0)
+    (said,) = [str(warning.message) for warning in caught]
+    assert "No space left on device" in said and str(source / "__pycache__") in said and "NUMBA_CACHE_DIR" in said
+    # The index names a data file that was never written.
+    assert started(source) == (False, []) and started(source) == (True, [])
+
+
+def test_without_a_folder_functions_are_compiled_and_one_warning_says_so(source: Path, monkeypatch):
+    def full() -> Path:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(numba_cache, "_can_write", lambda folder: False)
+    monkeypatch.setattr(numba_cache, "_private_temporary_folder", full)
+    with pytest.warns(RuntimeWarning, match=r"no folder can be written .*: set NUMBA_CACHE_DIR to one that can"):
+        assert numba_cache.provide_cache_folder(source) is None
+    assert started(source) == (False, []) and started(source) == (False, [])
+    assert not list(source.rglob("*.nbi"))
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_folder_that_others_may_write_to_is_not_used(source: Path, tmp_path: Path, inside: bool):
+    """What lies there is pickled code of anybody; another folder is used, whose content is kept."""
+    started(source)
+    folder = cached(source, ".nbi").parent
+    open_to_all = folder if inside else folder.parent
+    open_to_all.chmod(0o777)
+    for kept in (False, True):
+        hit, (said,) = started(source)
+        assert hit == kept and f"{folder.parent} is not used" in said and "drwxrwxrwx" in said
+    assert list((tmp_path / "home").rglob("*double*.nbi"))
+
+
+def test_the_kernels_have_a_cache_that_heals_and_others_are_left_alone():
+    """Fails where numba's internals move: the registry, the dispatcher's `_cache`, the two kinds of files."""
+    assert type(set_node_tension) is numba_cache.HealingDispatcher
+    assert type(set_node_tension._cache) is numba_cache.HealingCache
+    assert type(set_node_tension._cache._cache_file) is numba_cache.CheckedCacheFile
+    assert dispatcher_registry[target_registry["cpu"]] is CPUDispatcher
+    with pytest.raises(KeyboardInterrupt), numba_cache.kernel_cache(Path(__file__).parent):
+        raise KeyboardInterrupt
+    assert dispatcher_registry[target_registry["cpu"]] is CPUDispatcher
+    shutil.rmtree(Path(__file__).parent / "__pycache__", ignore_errors=True)
+
+
+def test_a_cache_that_another_process_removes_meanwhile_is_no_error(source: Path, monkeypatch):
+    (stale := source / f"{numba_cache.FOLDER_PREFIX}gone").symlink_to(source / "nowhere")
+    numba_cache._remove_stale(source, keep="another")
+    stale.unlink()
+    started(source)
+    file = cached(source, ".nbc")
+    verify = numba_cache._verify
+
+    def overtaken(path: str) -> None:
+        verify(path)
+        if path == str(file):
+            file.unlink()
+            raise ValueError("damaged")
+
+    monkeypatch.setattr(numba_cache, "_verify", overtaken)
+    hit, (said,) = started(source)
+    assert not hit and "it is dropped" in said

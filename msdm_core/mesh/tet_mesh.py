@@ -211,10 +211,12 @@ def _checked_tets(tets: ArrayLike, node_count: int) -> IntArray:
 
 
 def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
-    volumes = tet_volumes(points, tets)
-    edge_lengths = np.linalg.norm(points[tets[:, TET_EDGES[:, 0]]] - points[tets[:, TET_EDGES[:, 1]]], axis=2)
-    ratios = np.abs(volumes) / edge_lengths.max(axis=1) ** 3
-    flat = np.flatnonzero(ratios <= DEGENERATE_VOLUME_RATIO)
+    # The powers of coordinates above 1e100 overflow: such a tet has no ratio and is refused.
+    with np.errstate(over="ignore", invalid="ignore"):
+        volumes = tet_volumes(points, tets)
+        edge_lengths = np.linalg.norm(points[tets[:, TET_EDGES[:, 0]]] - points[tets[:, TET_EDGES[:, 1]]], axis=2)
+        ratios = np.abs(volumes) / edge_lengths.max(axis=1) ** 3
+    flat = np.flatnonzero(~(ratios > DEGENERATE_VOLUME_RATIO))
     if flat.size:
         tet = int(flat[0])
         raise MeshError(

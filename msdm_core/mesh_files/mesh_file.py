@@ -57,13 +57,18 @@ def checked_file(path: str | Path, suffixes: Iterable[str], advice: str) -> Path
 def parsed(file: Path, parse: Callable[[str], Parsed], advice: str) -> Parsed:
     """What `parse` makes of the file, its exits, prints and errors of any type turned into one MeshError.
 
+    A number that does not fit its type is an error, too: numpy would make another one of it, with a warning.
+
     Raises:
-        MeshError: names the file and the parser's own reason.
+        MeshError: names the file and the parser's own reason; one that `parse` raises is passed on.
     """
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return parse(str(file))
+            with np.errstate(over="raise", invalid="raise"):
+                return parse(str(file))
+    except MeshError:
+        raise
     # A parser that meets a malformed file raises anything from KeyError to zlib.error, or SystemExit (meshio).
     except (Exception, SystemExit) as error:
         reasons = [" ".join(said.getvalue().split()), f"{type(error).__name__} {error}".strip()]

@@ -150,7 +150,7 @@ def _source(file: Path, wanted: Sequence[int]) -> LabelSource:
 def _there(source: LabelSource) -> str:
     values: set[int] = set()
     for _, run in source.runs():
-        values |= set(np.unique(run)[:100].astype(np.int64).tolist())
+        values |= {int(value) for value in np.unique(run)[:100].tolist()}
     values.discard(0)
     known = sorted(values)
     more = ", ..." if len(known) > 20 else ""

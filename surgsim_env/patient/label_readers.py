@@ -1,7 +1,11 @@
 """Readers of label images, NIfTI, NRRD, MetaImage and DICOM: shape, geometry in the patient, and voxels in runs."""
 
+import contextlib
 import io
 import logging
+import os
+import re
+import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -44,6 +48,11 @@ COPIES = {".nrrd": 1, ".mha": 1, ".dcm": 2}
 # Only so much of a library's message is quoted [characters].
 REASON_LENGTH = 200
 READERS = {".nrrd": "NrrdImageIO", ".mha": "MetaImageIO", ".dcm": "GDCMImageIO"}
+# MetaImage's reader has room for so many axes, and checks it too late.
+META_AXES_MOST = 10
+# Entries of the headers of NRRD and MetaImage, "name: value" and "name = value", within so many bytes.
+TEXT_HEADER_BYTES = 100_000
+TEXT_ENTRY = re.compile(r"^([A-Za-z_ ]{1,40})[=:]([^\n]*)$", re.MULTILINE)
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 # Frame positions may be off the grid by this share of the slice step, or of 1 mm where slices are thinner.
@@ -78,7 +87,9 @@ class ImageGeometry:
         """
         if not (np.isfinite(matrix).all() and np.isfinite(origin).all()):
             raise MeshError(f"{file}: the header's affine has numbers that are not finite: export the image again")
-        spacing = np.linalg.norm(matrix, axis=0)
+        # Of numbers above 1e154 it is infinite, and refused.
+        with np.errstate(over="ignore"):
+            spacing = np.linalg.norm(matrix, axis=0)
         low, high = SPACING_RANGE
         if not ((spacing >= low) & (spacing <= high)).all():
             shown = " x ".join(f"{one * 1e3:.4g}" for one in spacing)
@@ -169,7 +180,7 @@ def checked_whole(values: NDArray, file: Path) -> NDArray:
     checked_kind(values.dtype, file)
     if values.dtype.kind != "f":
         return values
-    wrong = values != np.rint(values)
+    wrong = (values != np.rint(values)) | ~np.isfinite(values)
     if wrong.any():
         raise MeshError(
             f"{file}: the image holds {float(values[wrong][0]):g}, which is no whole number: labels are; is this the "
@@ -209,8 +220,10 @@ def open_nifti(file: Path) -> LabelSource:
     if not int(header["sform_code"]) and not int(header["qform_code"]):
         notes.append("the header states no orientation: left and right, front and back may be swapped")
     affine = np.asarray(parsed(file, lambda _: header.get_best_affine(), ADVICE), dtype=np.float64)
-    affine = affine * METRES.get(unit, 1e-3)
-    geometry = ImageGeometry.from_matrix(RAS_TO_LPS @ affine[:3, :3], RAS_TO_LPS @ affine[:3, 3], file)
+    # What is or becomes infinite is refused with the geometry.
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix, origin = np.hsplit(RAS_TO_LPS @ (affine[:3] * METRES.get(unit, 1e-3)), [3])
+    geometry = ImageGeometry.from_matrix(matrix, origin[:, 0], file)
 
     runs = partial(_runs, file, shape, dtype, offset, scaling)
     return LabelSource(file, shape, geometry, runs, tuple(notes))
@@ -287,6 +300,8 @@ def open_itk(file: Path) -> LabelSource:
     except ImportError:
         raise MeshError(f"{file}: reading {file.suffix} needs SimpleITK: pip install 'surgsim[patient]'") from None
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
+    if file.suffix.lower() != ".dcm":
+        _check_text_header(file)
     reader: Any = SimpleITK.ImageFileReader()
     reader.SetImageIO(READERS[file.suffix.lower()])
     reader.SetFileName(str(file))
@@ -300,7 +315,9 @@ def open_itk(file: Path) -> LabelSource:
     _check_memory(file, shape, width)
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
-    matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
+    # What becomes infinite is refused with the geometry.
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
     geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * 1e-3, file)
     notes = _stated_space(file)
 
@@ -312,6 +329,25 @@ def open_itk(file: Path) -> LabelSource:
             yield first, values[first : first + RUN_VOXELS]
 
     return LabelSource(file, shape, geometry, runs, notes)
+
+
+def _check_text_header(file: Path) -> None:
+    """Refuse entries of an NRRD or MetaImage header with which ITK's readers crash, hang or take memory without end."""
+    with file.open("rb") as stream:
+        head = stream.read(TEXT_HEADER_BYTES).decode("latin-1")
+    entries = [(match[1].strip().lower(), match[2].strip()) for match in TEXT_ENTRY.finditer(head)]
+    for name, value in entries:
+        wrong = ""
+        if name == "ndims" and not (value.isdecimal() and 1 <= int(value) <= META_AXES_MOST):
+            wrong = f"a whole number from 1 to {META_AXES_MOST}"
+        elif name == "compresseddatasize" and not (value.isdecimal() and int(value) <= file.stat().st_size):
+            wrong = f"at most the file's {file.stat().st_size} bytes"
+        # The readers use it as a format of C, which may say anything.
+        elif name in ("elementdatafile", "data file", "datafile") and ("%" in value or value.startswith("LIST")):
+            wrong = "LOCAL or the name of one file"
+        if wrong:
+            shown = value if len(value) <= 40 else f"{value[:40]}..."
+            raise MeshError(f"{file}: its header's {name} is {shown!r}; the rule is {wrong}: {ADVICE}")
 
 
 def _check_memory(file: Path, shape: tuple[int, int, int], width: int) -> None:
@@ -328,11 +364,31 @@ def _check_memory(file: Path, shape: tuple[int, int, int], width: int) -> None:
 
 def _asked(file: Path, question: Callable[[], Any]) -> Any:
     """The result of a call to SimpleITK; its error messages without the positions in its own sources."""
-    try:
-        return parsed(file, lambda _: question(), ADVICE)
-    except MeshError as error:
-        lines = [line.strip() for line in str(error.__cause__).splitlines() if line.strip()]
-        raise MeshError(f"{file}: cannot be parsed: {' '.join(lines)[-REASON_LENGTH:]}: {ADVICE}") from None
+    with _printed_in_c() as printed:
+        try:
+            return parsed(file, lambda _: question(), ADVICE)
+        except MeshError as error:
+            lines = [line.strip() for line in str(error.__cause__).splitlines() if line.strip()]
+            reason = " ".join([*lines, *printed().split()])[-REASON_LENGTH:]
+            raise MeshError(f"{file}: cannot be parsed: {reason}: {ADVICE}") from None
+
+
+@contextlib.contextmanager
+def _printed_in_c() -> Iterator[Callable[[], str]]:
+    """Keep what C++ code prints to standard error (MetaImage's reader does) off it; the function gives it."""
+    before = os.dup(2)
+    with tempfile.TemporaryFile() as said:
+
+        def text() -> str:
+            said.seek(0)
+            return said.read().decode(errors="replace")
+
+        os.dup2(said.fileno(), 2)
+        try:
+            yield text
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
 
 
 def _stated_space(file: Path) -> tuple[str, ...]:
@@ -365,13 +421,10 @@ def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
         raise MeshError(f"{file}: has more than {IMAGE_BYTES_MOST / 1e9:g} GB: crop it to the organ")
     parsed(file, lambda _: _check_deflated(file), ADVICE)
     data: Any = parsed(file, pydicom.dcmread, ADVICE)
-    if str(data.get("SOPClassUID", "")) not in CLASSES:
+    # pydicom converts an element when it is asked for, with warnings and errors of any type.
+    if parsed(file, lambda _: str(data.get("SOPClassUID", "")), ADVICE) not in CLASSES:
         return None
-    try:
-        return _source(file, data, wanted)
-    except (AttributeError, KeyError, IndexError, TypeError) as error:
-        reason = " ".join(str(error).split())[:REASON_LENGTH]
-        raise MeshError(f"{file}: is no complete DICOM segmentation ({reason}): {ADVICE}") from None
+    return parsed(file, lambda _: _complete_source(file, data, wanted), ADVICE)
 
 
 def _check_deflated(file: Path) -> None:
@@ -392,6 +445,14 @@ def _check_deflated(file: Path) -> None:
             if unpacked > IMAGE_BYTES_MOST:
                 raise ValueError(f"its deflated data are more than {IMAGE_BYTES_MOST / 1e9:g} GB: crop it to the organ")
             waiting = inflate.unconsumed_tail or stream.read(RUN_VOXELS)
+
+
+def _complete_source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
+    try:
+        return _source(file, data, wanted)
+    except (AttributeError, KeyError, IndexError, TypeError) as error:
+        reason = " ".join(str(error).split())[:REASON_LENGTH]
+        raise MeshError(f"{file}: is no complete DICOM segmentation ({reason}): {ADVICE}") from None
 
 
 def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
@@ -416,7 +477,8 @@ def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
     numbers = [int(_group(data, one, "SegmentIdentificationSequence").ReferencedSegmentNumber) for one in identified]
 
     def runs() -> Iterator[tuple[int, NDArray]]:
-        pixels = parsed(file, lambda _: np.atleast_3d(data.pixel_array), ADVICE).reshape(len(frames), rows, columns)
+        layers = (len(frames), rows, columns)
+        pixels = parsed(file, lambda _: np.atleast_3d(data.pixel_array).reshape(layers), ADVICE)
         for place in range(shape[2]):
             layer = np.zeros((columns, rows, 1), dtype=np.int64)
             here = np.flatnonzero(slices == place)

@@ -18,8 +18,8 @@ Table = TypeVar("Table")
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 # Whole numbers of a JSON document lie below this, so that a float holds each.
 WHOLE_MOST = 2**53
-# Characters of a wrong value that a message shows.
-SHOWN = 60
+# Characters of a wrong value, and of a reason, that a message shows.
+SHOWN, REASON_LENGTH = 60, 600
 
 
 class _EntryError(dacite.DaciteFieldError):
@@ -104,7 +104,9 @@ def fill(kind: type[Table], table: dict[str, Any], where: str, *, finite: bool =
         known = sorted({one.name for part in dataclasses_in(kind) for one in fields(part)})
         raise ValueError(f"{where}: entry {entry!r} is unknown there{nearest(entry, known)}") from None
     except (dacite.DaciteError, OrganError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{where}: {error}") from None
+        # dacite shows a wrong value in full, however long it is.
+        said = str(error)
+        raise ValueError(f"{where}: {said[:REASON_LENGTH]}{'...' if len(said) > REASON_LENGTH else ''}") from None
 
 
 def dataclasses_in(kind: Any) -> Iterator[Any]:

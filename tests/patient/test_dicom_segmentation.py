@@ -105,3 +105,17 @@ def test_a_deflated_segmentation_is_read_up_to_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr("surgsim_env.patient.label_readers.IMAGE_BYTES_MOST", 2 * file.stat().st_size)
     with pytest.raises(MeshError, match=r"its deflated data are more than .* crop it to the organ"):
         read_label_image(file, both)
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_element_that_pydicom_cannot_convert_is_one_error(tmp_path, capfd):
+    """Elements are converted when they are asked for: an unknown kind raises, a value against the rules warns."""
+    file, _ = segmentation(tmp_path)
+    data = file.read_bytes()
+    place = data.index(b"\x62\x00\x02\x00SQ")
+    file.write_bytes(data[: place + 4] + b"SP" + data[place + 6 :])
+    with pytest.raises(
+        MeshError, match=r"seg\.dcm: cannot be parsed: NotImplementedError Unknown Value Representation"
+    ):
+        read_label_image(file, BOTH)
+    assert capfd.readouterr() == ("", "")

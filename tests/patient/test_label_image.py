@@ -274,6 +274,55 @@ def test_what_decoding_takes_is_refused_by_the_header(tmp_path):
     refused(tmp_path / "a.nrrd", "voxels of 4 bytes, which take 5 GB to read; at most 1.6 GB of this format")
 
 
+META = "ObjectType = Image|NDims = 3|BinaryData = True|DimSize = 2 2 2|ElementType = MET_UCHAR|ElementDataFile = LOCAL"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("NDims = 3", "NDims = 65536", "its header's ndims is '65536'; the rule is a whole number from 1 to 10"),
+        ("NDims = 3", "NDims = -1", "ndims is '-1'"),
+        ("DimSize", "CompressedData = True|CompressedDataSize = 1000000000000|DimSize", "at most the file's 1.. bytes"),
+        ("LOCAL", "a%d%s%n.raw 0 1 1", "elementdatafile is 'a%d%s%n.raw 0 1 1'; the rule is LOCAL or the name of one"),
+        ("LOCAL", "LIST", "elementdatafile is 'LIST'"),
+    ],
+)
+def test_a_header_that_itk_s_reader_does_not_survive(old, new, words, tmp_path):
+    """It ends the process, hangs, takes the memory that is stated, or reads what was there before."""
+    assert old in META
+    (tmp_path / "a.mha").write_bytes(META.replace(old, new).replace("|", "\n").encode() + b"\n" + bytes(8))
+    refused(tmp_path / "a.mha", words)
+
+
+def test_what_a_reader_in_c_prints_is_in_the_error(tmp_path, capfd):
+    (tmp_path / "a.mha").write_bytes(META.replace("|", "\n").encode() + b"\n" + bytes(5))
+    refused(tmp_path / "a.mha", "data not read completely ideal = 8 : actual = 5")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_without_end_are_refused_without_a_warning(tmp_path):
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    data = bytearray(plain(tmp_path / "a.nii").read_bytes())
+    data[280:284] = struct.pack("<f", -np.inf)  # srow_x[0]
+    (tmp_path / "a.nii").write_bytes(data)
+    refused(tmp_path / "a.nii", "affine has numbers that are not finite")
+    spacing = "ElementSpacing = 1e308 1 1|TransformMatrix = 1e9 0 0 0 1 0 0 0 1|DimSize"
+    (tmp_path / "a.mha").write_bytes(META.replace("DimSize", spacing).replace("|", "\n").encode() + b"\n" + bytes(8))
+    refused(tmp_path / "a.mha", "affine has numbers that are not finite")
+    nibabel.save(nibabel.Nifti2Image(labels_on(affine, shape), affine), tmp_path / "second.nii")
+    data = bytearray((tmp_path / "second.nii").read_bytes())
+    data[480:488] = struct.pack("<d", 1e308)  # srow_z[2]
+    (tmp_path / "second.nii").write_bytes(data)
+    refused(tmp_path / "second.nii", "voxels are .* x inf mm")
+    labels = labels_on(affine, shape).astype(np.float32)
+    labels[0, 0, 0] = np.inf
+    refused(write_nifti(tmp_path / "b.nii", labels, affine), "holds inf, which is no whole number")
+    labels[0, 0, 0] = 1e30
+    file = write_nifti(tmp_path / "c.nii", labels, affine)
+    refused(file, r"there are labels 1, 2, 1000000015\d+", parse_labels("liver=5"))
+
+
 @pytest.mark.parametrize("slope", [1.0, 2.0])
 @pytest.mark.parametrize("kind", [[("R", "u1"), ("G", "u1"), ("B", "u1")], np.complex64])
 def test_colours_and_complex_numbers_are_no_labels(kind, slope, tmp_path):

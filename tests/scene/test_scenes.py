@@ -199,3 +199,12 @@ def test_every_draw_finds_room_and_keeps_its_ranges(name):
         cover = anatomy.surface_distance(np.array(lesion.centre)) - lesion.radius
         assert draw.radius[0] <= lesion.radius <= draw.radius[1]
         assert draw.cover[0] - 1.01e-4 <= cover <= draw.cover[1] + 1.01e-4
+
+
+def test_a_long_wrong_value_is_not_shown_in_full(tmp_path):
+    text = (scenes_folder() / "organs" / "phantom_small.toml").read_text()
+    assert "\nsize = [" in text
+    (tmp_path / "mine.toml").write_text(text.replace("\nsize = [", f"\nsize = [{'0.01, ' * 2000}"))
+    with pytest.raises(ValueError, match=r"^scene 'mine': .*mesh\.block\.size.*\.\.\.$") as caught:
+        make_scene(tmp_path / "mine.toml")
+    assert len(str(caught.value)) < 700

@@ -7,6 +7,7 @@ from msdm_core.errors import MeshError
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
 from msdm_core.mesh_files.surface_io import read_surface
+from msdm_core.meshing.lattice_meshing import box_mesh
 from tests.core.mesh_files.made_files import POINTS, TETS, every_format, written
 
 
@@ -228,3 +229,23 @@ def test_a_mesh_of_loose_bad_tets_is_refused(anatomy_folder):
 def test_the_gmsh_1_liver_is_told_how_to_convert(anatomy_folder):
     with pytest.raises(MeshError, match=r"sofa_liver_gmsh1.msh: is a gmsh 1 file .*-format msh22"):
         read_mesh(anatomy_folder / "sofa_liver_gmsh1.msh", length_unit="cm")
+
+
+def test_a_number_that_does_not_fit_its_type_is_refused(tmp_path):
+    """numpy would make another one of it, here -2147483648 of a vertex's number in a medit file."""
+    write_mesh(tmp_path / "a.mesh", box_mesh((0.02, 0.01, 0.01), (2, 1, 1)))
+    lines = (tmp_path / "a.mesh").read_text().splitlines()
+    first = lines.index("Vertices") + 2
+    lines[first] = " ".join([*lines[first].split()[:3], "1e308"])
+    (tmp_path / "a.mesh").write_text("\n".join(lines))
+    with pytest.raises(MeshError, match=r"a\.mesh: cannot be parsed: .*invalid value encountered in cast"):
+        read_mesh(tmp_path / "a.mesh")
+
+
+@pytest.mark.filterwarnings("error")
+def test_coordinates_whose_powers_overflow_are_refused():
+    """No ratio of volume and edge is left."""
+    mesh = box_mesh((0.02, 0.01, 0.01), (2, 1, 1))
+    points = mesh.points * 1e150
+    with pytest.raises(MeshError, match=r"tet 0 \(of \d+\) is degenerate: volume / longest edge\^3 = nan"):
+        TetMesh(points, mesh.tets)

@@ -904,10 +904,12 @@ class Worker:
 
     def read(self, kind: str, seed: int) -> Outcome:
         """What becomes of an input; a process that ends, takes too long or too much is a finding."""
-        mutation, begin, most, fault = "not known", time.perf_counter(), 0.0, ""
-        self.pipe.send((kind, seed))
+        mutation, begin, most, fault, sent = "not known", time.perf_counter(), 0.0, "", False
         while not fault:
             try:
+                if not sent:
+                    self.pipe.send((kind, seed))
+                    sent = True
                 if self.pipe.poll(0.1):
                     got = self.pipe.recv()
                     if isinstance(got, Outcome):

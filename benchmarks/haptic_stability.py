@@ -21,6 +21,7 @@ from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.settings import ForceLimits, HapticSettings, WatchdogTimes
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.tip_drive import tip_drives
+from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
@@ -123,8 +124,8 @@ def main() -> None:
     axes.minorticks_off()
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.legend(handles=promised + failing, fontsize=8, ncols=2, loc="upper left", frameon=False)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.out)
+    with output_folder(options.out.parent) as files:
+        figure.savefig(files / options.out.name)
 
 
 if __name__ == "__main__":

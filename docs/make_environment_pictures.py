@@ -13,6 +13,7 @@ from PIL import Image
 
 import surgsim_env  # noqa: F401  (registers the environments)
 from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scripting import oracle_script, run_script
 
 IMAGES = Path(__file__).parent / "images"
@@ -81,7 +82,7 @@ def film_presses(path: Path, *, seed: int) -> None:
     write(frames, path, PRESS_SHOWN_MS)
 
 
-def draw_tutorial(name: str) -> None:
+def draw_tutorial(name: str, path: Path) -> None:
     """What the tutorial on one's own organ or robot shows, by its own code."""
     text = (Path(__file__).parent / "tutorials" / f"own_{name}.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
@@ -91,7 +92,7 @@ def draw_tutorial(name: str) -> None:
                 Path(title).write_text(code, encoding="utf-8")
             else:
                 exec(code, names)
-    Image.fromarray(names["picture"]).save(IMAGES / f"tutorial_{name}.png", optimize=True)
+    Image.fromarray(names["picture"]).save(path, optimize=True)
 
 
 def main(names: list[str]) -> None:
@@ -103,11 +104,12 @@ def main(names: list[str]) -> None:
             "SurgSim/BimanualRetract-v0", path, "overview", "endoscope", seed=4, every=4
         ),
     }
-    for name in names or [*films, *TUTORIALS]:
-        if name in TUTORIALS:
-            draw_tutorial(name)
-        else:
-            films[name](IMAGES / f"env_{name}.webp")
+    with output_folder(IMAGES) as images:
+        for name in names or [*films, *TUTORIALS]:
+            if name in TUTORIALS:
+                draw_tutorial(name, images / f"tutorial_{name}.png")
+            else:
+                films[name](images / f"env_{name}.webp")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from surgsim_env.palpation.figures import write_organ_picture
 from surgsim_env.palpation.job import run_palpation
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.renderer import OrganRenderer
+from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scripting import Hold, Lift, MoveTo, PressUntil, oracle_script, run_script
@@ -74,12 +75,12 @@ def write_retraction(path: Path) -> None:
 
 
 def main() -> None:
-    IMAGES.mkdir(exist_ok=True)
-    write_trace(IMAGES / "trace.png")
-    write_views(IMAGES / "views.png")
-    write_retraction(IMAGES / "retraction.png")
-    palpation = run_palpation(load_anatomy(make_scene("liver")), console=Console())
-    write_organ_picture(palpation, IMAGES / "palpation.png")
+    with output_folder(IMAGES) as images:
+        write_trace(images / "trace.png")
+        write_views(images / "views.png")
+        write_retraction(images / "retraction.png")
+        palpation = run_palpation(load_anatomy(make_scene("liver")), console=Console())
+        write_organ_picture(palpation, images / "palpation.png")
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ from surgsim_env.palpation.surface_drawing import (
 from surgsim_env.rendering.cameras import Camera
 from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
 from surgsim_env.reports.html_page import Picture
+from surgsim_env.reports.output_folder import AnyFolder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -117,7 +118,7 @@ class ArmMaps:
         if self._tried[self._patches.normals @ back.towards > 0.0].mean() >= BEHIND_LEAST:
             self._views.append(("from behind", back))
 
-    def write_all(self, folder: Path) -> list[Picture]:
+    def write_all(self, folder: AnyFolder) -> list[Picture]:
         """Write all maps into a folder: reach, each quantity, and the arms' distances."""
         written = [self._write_reach(folder)]
         # The two errors are checks of the method and the same everywhere: the table suffices.
@@ -126,7 +127,7 @@ class ArmMaps:
         written.append(self._write_distances(folder))
         return written
 
-    def _write_reach(self, folder: Path) -> Picture:
+    def _write_reach(self, folder: AnyFolder) -> Picture:
         from matplotlib.colors import to_rgb
         from matplotlib.figure import Figure
         from matplotlib.lines import Line2D
@@ -155,7 +156,7 @@ class ArmMaps:
         save_png(figure, folder / "map_reach.png")
         return Picture.of_file(folder / "map_reach.png", "Who reaches what", f"The organ's parts: {', '.join(labels)}.")
 
-    def _write_quantity(self, folder: Path, quantity: Quantity) -> Picture:
+    def _write_quantity(self, folder: AnyFolder, quantity: Quantity) -> Picture:
         one = self.evaluation
         panels = [
             (f"{side} arm", arm.reachable, values_of(arm, quantity), _misses(reason_counts(arm)))
@@ -175,7 +176,7 @@ class ArmMaps:
         title = quantity.title[0].upper() + quantity.title[1:]
         return Picture.of_file(folder / name, title, f"{text}. Grey: not reached. In the colours, {sense}.")
 
-    def _write_distances(self, folder: Path) -> Picture:
+    def _write_distances(self, folder: AnyFolder) -> Picture:
         panels = []
         for field, title, _ in DISTANCES:
             values = getattr(self.evaluation, field)
@@ -404,7 +405,7 @@ def _fittings(evaluation: ArmsEvaluation, port_colour: str, *, inside: float) ->
 
 
 def write_pictures(
-    evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], folder: Path, *, name: str = "arms"
+    evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], folder: AnyFolder, *, name: str = "arms"
 ) -> list[Picture]:
     """Write a picture of the arms as capsules, which needs no OpenGL, and those that the evaluation contains."""
     given = write_given_pictures(evaluation.pictures, folder, name=name)
@@ -430,7 +431,7 @@ def write_pictures(
     return [Picture.of_file(path, "The arms and the endoscope over the organ", description), *given]
 
 
-def write_given_pictures(pictures: Mapping[str, NDArray[np.uint8]], folder: Path, *, name: str) -> list[Picture]:
+def write_given_pictures(pictures: Mapping[str, NDArray[np.uint8]], folder: AnyFolder, *, name: str) -> list[Picture]:
     """Write RGB images by caption as PNG files, numbered from 1."""
     from matplotlib.image import imsave
 

@@ -66,6 +66,7 @@ from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.palpation.job import package_version, plain_json
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.reports.html_page import Picture, render_page
+from surgsim_env.reports.output_folder import AnyFolder
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.arm_description import ArmDescription
 from surgsim_env.scene.load import make_scene
@@ -74,6 +75,12 @@ from surgsim_env.scene.model import Scene
 # Places from which each point is chosen.
 PLACES_PER_POINT = 12
 REPORT_NAME, POINTS_NAME, SUMMARY_NAME = "report.html", "points.csv", "summary.json"
+# Every file that a study can write; which pictures there are depends on the arms, the episodes and OpenGL.
+RESULT_NAMES = (
+    *(REPORT_NAME, POINTS_NAME, SUMMARY_NAME, "arms.png", "map_reach.png", "map_arm_distance.png"),
+    *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
+    *(f"{name}_{number}.png" for name in ("arms", "episode") for number in range(1, 100)),
+)
 Rows = list[tuple[str, ...]]
 
 
@@ -325,8 +332,8 @@ class StudyPlan:
 
 
 def run_study(
-    setups: Sequence[ArmSetup], anatomy: Anatomy, plan: StudyPlan, folder: Path, console: Console
-) -> ArmsEvaluation:
+    setups: Sequence[ArmSetup], anatomy: Anatomy, plan: StudyPlan, folder: AnyFolder, console: Console
+) -> list[str]:
     """Evaluate the setups, rank them if there are several, and write report, points, heat maps, pictures and summary.
 
     Args:
@@ -337,7 +344,7 @@ def run_study(
         console: for progress and results.
 
     Returns:
-        The evaluation of the first setup.
+        The names of the files.
     """
     found = [evaluate(setup, anatomy, plan, console, pictures=number == 0) for number, setup in enumerate(setups)]
     first = found[0]
@@ -373,9 +380,7 @@ def run_study(
             f"smallest tip force {number_text(one.force, 1.0, 2, 'N')}"
         )
         console.print(f"{one.place}. {one.name}: {figures}; {one.reasons}", highlight=False)
-    names = ",".join((REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps, *ends))))
-    console.print(f"written: {folder}/{{{names}}}", highlight=False, soft_wrap=True)
-    return first
+    return [REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps, *ends))]
 
 
 def evaluate(setup: ArmSetup, anatomy: Anatomy, plan: StudyPlan, console: Console, *, pictures: bool) -> ArmsEvaluation:

@@ -8,6 +8,8 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
+from surgsim_env.reports.output_folder import OutputFolder
+
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
 REPORT_NAME = "benchmarks.md"
 # Written by hand; kept in the folder of the report, and appended to it.
@@ -128,10 +130,9 @@ def report_text(sections: Sequence[Section], machine: str, *, quick: bool, notes
     return "\n".join(part for part in parts if part).rstrip() + "\n"
 
 
-def write_report(sections: Sequence[Section], machine: str, folder: Path, *, quick: bool) -> Path:
-    """Write the report into a folder, with the notes of that folder at its end; returns its path."""
-    kept = folder / NOTES_NAME
+def write_report(sections: Sequence[Section], machine: str, folder: OutputFolder, *, quick: bool) -> None:
+    """Write the report into a folder, with the notes that lie there at its end."""
+    kept = folder.path / NOTES_NAME
     notes = kept.read_text(encoding="utf-8") if kept.is_file() else ""
-    path = folder / REPORT_NAME
-    path.write_text(report_text(sections, machine, quick=quick, notes=notes), encoding="utf-8")
-    return path
+    text = report_text(sections, machine, quick=quick, notes=notes)
+    (folder / REPORT_NAME).write_text(text, encoding="utf-8")

@@ -9,9 +9,9 @@ from typing import Any
 from rich.console import Console
 
 from surgsim_env.arm_study.ports import Ports, default_ports, read_ports
-from surgsim_env.arm_study.study import POINTS_NAME, REPORT_NAME, SUMMARY_NAME, ArmSetup, StudyPlan, run_study
-from surgsim_env.cli.values import writable_folder
+from surgsim_env.arm_study.study import RESULT_NAMES, ArmSetup, StudyPlan, run_study
 from surgsim_env.instruments.arm.arm import load_arm
+from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.arm_description import ArmDescription, read_description
 from surgsim_env.scene.load import make_scene, read_toml
@@ -71,12 +71,12 @@ class Arms:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
         anatomy = load_anatomy(make_scene(self.scene))
         setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
-        # Checked before the work, which takes minutes.
-        folder = writable_folder(self.out, (REPORT_NAME, POINTS_NAME, SUMMARY_NAME))
         plan = StudyPlan(
             self.points, self.seed, self.episodes, (self.left, self.right), _inputs(self), self.command_line
         )
-        run_study(setups, anatomy, plan, folder, console)
+        with output_folder(self.out, RESULT_NAMES) as files:
+            written = run_study(setups, anatomy, plan, files, console)
+        console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0
 
 

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
-from surgsim_env.cli.values import MaybePath, report_folder, writable_folder
+from surgsim_env.cli.values import MaybePath, report_folder
+from surgsim_env.reports.output_folder import output_folder
 
 
 @dataclass(frozen=True)
@@ -23,19 +24,21 @@ class Bench:
         """Measure every part, print its figures at once, write the report; returns 0, also if peers are absent.
 
         Raises:
-            ValueError: the folder cannot be written (checked before the work).
+            OSError: the folder cannot be written (checked before the work).
         """
         from surgsim_env.bench import control, haptic, measurement, report, side_by_side, start, substeps
 
-        folder = writable_folder(report_folder(self.out, "benchmarks", quick=self.quick), [report.REPORT_NAME])
-        before = report.load()
-        sections: list[report.Section] = []
-        # In the order of the report.
-        for part in (substeps, haptic, control, side_by_side, start):
-            section = part.measure(measurement.QUICK if self.quick else measurement.FULL)
-            sections.append(section)
-            for line in section.lines():
-                console.print(line, highlight=False, soft_wrap=True, markup=False)
-        path = report.write_report(sections, report.describe(before), folder, quick=self.quick)
+        folder = report_folder(self.out, "benchmarks", quick=self.quick)
+        with output_folder(folder, [report.REPORT_NAME]) as files:
+            before = report.load()
+            sections: list[report.Section] = []
+            # In the order of the report.
+            for part in (substeps, haptic, control, side_by_side, start):
+                section = part.measure(measurement.QUICK if self.quick else measurement.FULL)
+                sections.append(section)
+                for line in section.lines():
+                    console.print(line, highlight=False, soft_wrap=True, markup=False)
+            report.write_report(sections, report.describe(before), files, quick=self.quick)
+        path = folder / report.REPORT_NAME
         console.print(f"written: {path}", highlight=False, soft_wrap=True)
         return 0

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from surgsim_env.cli.values import writable_folder
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.device import DeviceDynamics
@@ -22,6 +21,7 @@ from surgsim_env.haptics.settings import ForceLimits, HapticSettings
 from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.haptics.udp import PORT, UdpDevice
 from surgsim_env.instruments.arm.arm_instrument import parked_place
+from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, pair_names
 
@@ -129,14 +129,42 @@ class Haptics:
 @contextmanager
 def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | TrajectoryDevice]:
     """The device that the options choose, closed at the end."""
+    dynamics = _dynamics(command)
     if command.trajectory is not None:
-        yield TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
+        try:
+            device = TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
+        except OSError as error:
+            raise ValueError(
+                f"--trajectory {command.trajectory}: cannot be read ({error.strerror}); give a CSV file with columns "
+                "time, x, y, z"
+            ) from None
+        yield device
         return
-    dynamics = None
-    if command.device_damping is not None:
-        dynamics = DeviceDynamics(command.device_damping, command.device_mass, command.device_delay)
     with closing(UdpDevice(command.port, dynamics=dynamics)) as device:
         yield device
+
+
+def _dynamics(command: Haptics) -> DeviceDynamics | None:
+    """Of a device that pushes back; its options are checked whether or not a device uses them."""
+    for option, value, or_zero in (
+        ("damping", command.device_damping, False),
+        ("mass", command.device_mass, False),
+        ("delay", command.device_delay, True),
+    ):
+        if value is not None and not (math.isfinite(value) and (value > 0.0 or (or_zero and value == 0.0))):
+            without = "; leave it away for a device without force" if option == "damping" else ""
+            raise ValueError(
+                f"--device-{option} is {value:g}; it must be finite and {'not negative' if or_zero else 'above 0'}"
+                f"{without}"
+            )
+    if command.device_damping is None:
+        return None
+    if command.trajectory is not None:
+        raise ValueError(
+            f"--device-damping is {command.device_damping:g}, but a --trajectory is no device that pushes back; give "
+            "only one of both"
+        )
+    return DeviceDynamics(command.device_damping, command.device_mass, command.device_delay)
 
 
 def _settings(command: Haptics) -> HapticSettings:
@@ -150,14 +178,26 @@ def _settings(command: Haptics) -> HapticSettings:
 
 @contextmanager
 def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
-    """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing."""
+    """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing.
+
+    Ctrl-C is how a run ends that has no end of its own: what was written until then is kept.
+    """
     if folder is None:
         yield lambda told: None
         return
-    with (writable_folder(folder, [TELEMETRY_NAME]) / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file:
+    stopped: KeyboardInterrupt | None = None
+    with (
+        output_folder(folder, [TELEMETRY_NAME]) as files,
+        (files / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
-        yield lambda told: writer.writerow(_row(told))
+        try:
+            yield lambda told: writer.writerow(_row(told))
+        except KeyboardInterrupt as error:
+            stopped = error
+    if stopped is not None:
+        raise stopped
 
 
 def _row(told: HapticTelemetry) -> list[float | int]:

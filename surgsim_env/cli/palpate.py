@@ -15,7 +15,6 @@ from surgsim_env.cli.values import (
     numbers_of,
     unit_of,
     vector_of,
-    writable_folder,
 )
 from surgsim_env.palpation.figures import write_stiffness_map
 from surgsim_env.palpation.job import (
@@ -29,6 +28,7 @@ from surgsim_env.palpation.job import (
     write_summary,
 )
 from surgsim_env.palpation.surface_scene import SurfaceOptions, load_stable_anatomy, surface_scene, with_options
+from surgsim_env.reports.output_folder import OutputFolder, output_folder
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Ball, Scene, Vector
@@ -107,25 +107,31 @@ class Palpate:
         _check(self)
         # Checked before an organ is made, which takes a minute.
         around, asked = _around(self), _asked_lesions(self)
+        # Without a cell size, an organ is made in proportion to its size, as `surgsim organ` makes it.
+        file = self.segmentation or (self.surface if self.cell_size is None else None)
+        if file is None:
+            scene = _scene(self, console)
+            default = Path("runs") / f"palpate-{scene.name}"
+        else:
+            scene, default = None, Path("runs") / f"palpate-{_stem(file)}"
         names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
-        scene, folder = _scene(self, names, console)
-        anatomy = load_anatomy(scene)
-        lesions = anatomy.demonstration_lesions()
-        if asked:
-            lesions = [anatomy.lesion_at(*one, f"lesion {number}") for number, one in enumerate(asked, start=1)]
-        anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-        # Checked before the work, which takes minutes.
-        folder = folder or writable_folder(self.out or _free_folder(scene.name), names)
-        found = run_palpation(
-            anatomy, lesions=lesions, around=around, seed=self.seed, workers=self.workers, console=console
-        )
-        write_csv(found, folder / CSV_NAME)
-        write_summary(found, folder / SUMMARY_NAME, vars(self))
-        write_stiffness_map(found, folder / PICTURE_NAME)
+        with output_folder(self.out or default, names, numbered=self.out is None) as files:
+            if file is not None:
+                scene = _patient_scene(self, file, files, console)
+            assert scene is not None
+            anatomy = load_anatomy(scene)
+            lesions = anatomy.demonstration_lesions()
+            if asked:
+                lesions = [anatomy.lesion_at(*one, f"lesion {number}") for number, one in enumerate(asked, start=1)]
+            anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
+            found = run_palpation(
+                anatomy, lesions=lesions, around=around, seed=self.seed, workers=self.workers, console=console
+            )
+            write_csv(found, files / CSV_NAME)
+            write_summary(found, files / SUMMARY_NAME, vars(self))
+            write_stiffness_map(found, files / PICTURE_NAME)
         print_report(found, console)
-        console.print(
-            f"written: {folder}/{{{CSV_NAME},{SUMMARY_NAME},{PICTURE_NAME}}}", highlight=False, soft_wrap=True
-        )
+        console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
         return 0
 
 
@@ -168,24 +174,19 @@ def _asked_lesions(command: Palpate) -> list[tuple[Vector, float, float]]:
     return asked
 
 
-def _scene(command: Palpate, names: tuple[str, ...], console: Console) -> tuple[Scene, Path | None]:
-    """The scene, and the folder where the organ was written if one was made."""
-    # Without a cell size, an organ is made in proportion to its size, as `surgsim organ` makes it.
-    file = command.segmentation or (command.surface if command.cell_size is None else None)
-    if file is not None:
-        folder = writable_folder(command.out or _free_folder(_stem(file)), names)
-        return _patient_scene(command, file, folder, console), folder
-    if command.surface is None:
-        scene = load_scene(command.organ) if command.organ else make_scene(command.scene or "liver")
-        return with_options(scene, command.options), None
-    return _surface_scene(command, command.surface, console), None
+def _scene(command: Palpate, console: Console) -> Scene:
+    """The scene of a file or a name, or of a surface with a cell size."""
+    if command.surface is not None:
+        return _surface_scene(command, command.surface, console)
+    scene = load_scene(command.organ) if command.organ else make_scene(command.scene or "liver")
+    return with_options(scene, command.options)
 
 
-def _patient_scene(command: Palpate, file: Path, folder: Path, console: Console) -> Scene:
-    """Make an organ from a file, write it to a folder, and read its scene."""
-    from surgsim_env.patient.make_patient import check_targets, make_patient, print_patient, write_patient
+def _patient_scene(command: Palpate, file: Path, files: OutputFolder, console: Console) -> Scene:
+    """Make an organ from a file, write it among the results, and read its scene."""
+    from surgsim_env.patient.make_patient import check_targets, make_patient, print_patient, write_organ
 
-    out = folder / f"{_stem(file)}.vtu"
+    out = files.path / f"{_stem(file)}.vtu"
     check_targets(out)
     found = make_patient(
         (file,),
@@ -196,8 +197,8 @@ def _patient_scene(command: Palpate, file: Path, folder: Path, console: Console)
         options=command.options,
     )
     print_patient(found, console)
-    write_patient(found, out, command.command_line)
-    return load_scene(out.with_suffix(".toml"))
+    write_organ(found, files, out.name, command.command_line)
+    return load_scene(files / out.with_suffix(".toml").name)
 
 
 def _surface_scene(command: Palpate, file: Path, console: Console) -> Scene:
@@ -218,10 +219,3 @@ def _surface_scene(command: Palpate, file: Path, console: Console) -> Scene:
 
 def _stem(file: Path) -> str:
     return file.name.split(".")[0]
-
-
-def _free_folder(scene: str) -> Path:
-    number = 1
-    while (folder := Path("runs") / f"palpate-{scene}-{number}").exists():
-        number += 1
-    return folder

@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from surgsim_env.cli.values import MaybeText, writable_folder
+from surgsim_env.cli.values import MaybeText
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.rendering.gl import NoGLError
+from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scripting.oracle import oracle_script
 from surgsim_env.scripting.run import ScriptError, run_script
 from surgsim_env.scripting.trace import Trace
 
 TRACE_NAME, PLOT_NAME, PICTURE_NAME, SUMMARY_NAME = "trace.csv", "forces.png", "retraction.png", "summary.json"
+NAMES = (TRACE_NAME, PLOT_NAME, PICTURE_NAME, SUMMARY_NAME)
 # Cameras of the picture.
 VIEWS = ("overview", "endoscope")
 
@@ -56,27 +58,27 @@ class Retract:
         env_id = "SurgSim/BimanualRetract-v0" if self.bimanual else "SurgSim/Retract-v0"
         settings: dict[str, Any] = {} if self.instrument is None else {"instrument": self.instrument}
         env = gym.make(env_id, scene=self.scene, **settings)
-        folder = writable_folder(self.out, (TRACE_NAME, PLOT_NAME, PICTURE_NAME, SUMMARY_NAME))
-        env.reset(seed=self.seed)
-        before = _pictures(env, console)
-        try:
-            trace = run_script(env, oracle_script(env))
-        except ScriptError as error:
-            trace = error.trace
-        written = [path.name for path in trace.to_csv(folder / TRACE_NAME)] + [PLOT_NAME, SUMMARY_NAME]
-        trace.plot(folder / PLOT_NAME)
-        if before is not None:
-            after = _pictures(env, console)
-            rows = [before] if after is None else [before, after]
-            Image.fromarray(np.concatenate(rows, axis=0)).save(folder / PICTURE_NAME)
-            written.append(PICTURE_NAME)
-        ran = {"environment": env_id, "scene": self.scene, "instrument": self.instrument, "seed": self.seed}
-        summary = {**ran, **_summary(trace)}
-        (folder / SUMMARY_NAME).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        with output_folder(self.out, NAMES) as files:
+            env.reset(seed=self.seed)
+            before = _pictures(env, console)
+            try:
+                trace = run_script(env, oracle_script(env))
+            except ScriptError as error:
+                trace = error.trace
+            written = [path.name for path in trace.to_csv(files / TRACE_NAME)] + [PLOT_NAME, SUMMARY_NAME]
+            trace.plot(files / PLOT_NAME)
+            if before is not None:
+                after = _pictures(env, console)
+                rows = [before] if after is None else [before, after]
+                Image.fromarray(np.concatenate(rows, axis=0)).save(files / PICTURE_NAME)
+                written.append(PICTURE_NAME)
+            ran = {"environment": env_id, "scene": self.scene, "instrument": self.instrument, "seed": self.seed}
+            summary = {**ran, **_summary(trace)}
+            (files / SUMMARY_NAME).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         env.close()
         success = bool(summary["success"])
         console.print(_verdict(trace, success), highlight=False)
-        console.print(f"written: {folder}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
+        console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0 if success else 1
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from rich.console import Console
 
 from surgsim_env.cli.values import MaybePath, report_folder
+from surgsim_env.reports.output_folder import output_folder
 
 
 @dataclass(frozen=True)
@@ -20,12 +21,18 @@ class Validate:
     """Folder for validation.md and images/. Default: docs/ of a checkout; runs/validation elsewhere or with --quick."""
 
     def run(self, console: Console) -> int:
-        """Run the cases, print and write the report; returns the exit status."""
-        from surgsim_env.validation import suite
-        from surgsim_env.validation.report import print_report, write_report
+        """Run the cases, print and write the report; returns the exit status.
 
-        validation = suite.run_cases(quick=self.quick, console=console)
-        print_report(validation, console)
-        path = write_report(validation, report_folder(self.out, "validation", quick=self.quick))
-        console.print(f"written: {path}", highlight=False, soft_wrap=True)
+        Raises:
+            OSError: the folder cannot be written (checked before the work).
+        """
+        from surgsim_env.validation import suite
+        from surgsim_env.validation.report import REPORT_NAME, print_report, write_report
+
+        folder = report_folder(self.out, "validation", quick=self.quick)
+        with output_folder(folder, [REPORT_NAME]) as files:
+            validation = suite.run_cases(quick=self.quick, console=console)
+            print_report(validation, console)
+            write_report(validation, files)
+        console.print(f"written: {folder / REPORT_NAME}", highlight=False, soft_wrap=True)
         return 0 if validation.passed else 1

@@ -1,7 +1,6 @@
-"""Types of command-line options, values of options that are text, and folders for results."""
+"""Types of command-line options, values of options that are text, and default folders of reports."""
 
 import shlex
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -60,19 +59,6 @@ def command_text(words: Sequence[str], options: Mapping[str, object]) -> str:
             joined = str(one).startswith("-")
             words += [option] if one is True else [f"{option}={one}"] if joined else [option, str(one)]
     return shlex.join(words)
-
-
-def writable_folder(folder: Path, names: Sequence[str]) -> Path:
-    """The folder, created if necessary, after a check that files of these names can be written in it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise ValueError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
-    for name in names:
-        if (folder / name).is_dir():
-            raise ValueError(f"--out {folder}: {name} is a folder there; choose another place or remove it")
-    return folder
 
 
 def report_folder(folder: Path | None, name: str, *, quick: bool) -> Path:

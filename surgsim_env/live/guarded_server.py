@@ -270,7 +270,8 @@ class GuardedServer:
                 self._refused = False
 
             def connection_made(self, transport: Any) -> None:
-                super().connection_made(_OpenTransport(transport))
+                opened: Any = _OpenTransport(transport)
+                super().connection_made(opened)
 
             def data_received(self, data: bytes) -> None:
                 for start in range(0, len(data), BYTES_AT_ONCE):

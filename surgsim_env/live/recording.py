@@ -1,6 +1,5 @@
 """Recordings as CSV files: one row a haptic step, readable by `surgsim_env.haptics.trajectory`."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 
 from surgsim_env.haptics.trajectory import Motion, motion_columns, read_motion
 from surgsim_env.live.exchange_records import RECORDING_MOST, recording_type
+from surgsim_env.reports.output_folder import output_folder
 
 # Tolerance on the spacing of rows, as a share of the haptic step.
 STEP_TOLERANCE = 0.01
@@ -33,16 +33,14 @@ def write_recording(steps: NDArray[Any], folder: Path) -> str:
         parts += [steps["hand"][:, arm], steps["buttons"][:, arm, None], steps["tip"][:, arm], steps["force"][:, arm]]
     table = np.concatenate(parts, axis=1)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        path = _free(folder)
-        unfinished = path.with_suffix(".part")
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
-            file.write(",".join(columns(arm_count)) + "\n")
-            np.savetxt(file, table, fmt="%.9g", delimiter=",")
-        os.replace(unfinished, path)
+        with output_folder(folder) as files:
+            with (files / "recording.csv").open("w", newline="", encoding="utf-8") as file:
+                file.write(",".join(columns(arm_count)) + "\n")
+                np.savetxt(file, table, fmt="%.9g", delimiter=",")
+            name = files.number("recording.csv")
     except OSError as error:
         return f"the recording was not written: {error}"
-    return f"{len(steps)} steps written to {path.name}"
+    return f"{len(steps)} steps written to {name}"
 
 
 def read_recording(path: Path, arm_count: int, haptic_step: float) -> NDArray[Any]:
@@ -91,10 +89,3 @@ def _resampled(path: Path, motion: Motion, haptic_step: float) -> Motion:
 def _mark(arm: int) -> str:
     """Suffix of the names of an arm's columns."""
     return "" if arm == 0 else f"_{arm + 1}"
-
-
-def _free(folder: Path) -> Path:
-    number = 1
-    while (path := folder / f"recording-{number}.csv").exists():
-        number += 1
-    return path

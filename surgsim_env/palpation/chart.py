@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import tempfile
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import SitePress, press_in_lanes, press_phases
+from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
@@ -301,10 +301,7 @@ def _folder() -> Path | None:
 def _keep(path: Path, grid: FloatArray) -> None:
     """Write the map atomically; a folder that is not writable is ignored."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix="part-") as folder:
-            part = Path(folder, path.name)
-            np.save(part, grid, allow_pickle=False)
-            os.replace(part, path)
+        with output_folder(path.parent) as files:
+            np.save(files / path.name, grid, allow_pickle=False)
     except OSError:
         return

@@ -1,9 +1,6 @@
 """A patient's organ from files: mesh and scene made, summary printed, mesh, scenes and report written."""
 
 import math
-import os
-import shutil
-import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,6 +29,7 @@ from surgsim_env.patient.patient_scene import (
 )
 from surgsim_env.patient.report import MARK, report_page
 from surgsim_env.patient.retract_scene import BED_GAP, BED_INSIDE, MODULUS_SPREAD, RetractScene, find_retraction
+from surgsim_env.reports.output_folder import OutputFolder, output_folder
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import share_text, warn_of_coarse_cells
@@ -119,55 +117,58 @@ def write_patient(
     Returns:
         The paths of the files.
     """
+    turned = _retract_file(out)
+    lifted = turned.with_suffix(".toml")
+    # Left by an earlier run for an organ that is now replaced.
+    older = [turned.name, lifted.name] if lifted.exists() and _begins(lifted, FIRST_LINE) else []
+    with output_folder(out.parent, older) as files:
+        names = write_organ(found, files, out.name, command, retraction)
+    return [out.with_name(name) for name in names]
+
+
+def write_organ(
+    found: PatientScene,
+    files: OutputFolder,
+    name: str,
+    command: str,
+    retraction: RetractScene | str | None = None,
+) -> list[str]:
+    """Write what `write_patient` does, among the results of a command.
+
+    Args:
+        found: the organ with its scene.
+        files: the results.
+        name: of the mesh.
+        command: see `write_patient`.
+        retraction: see `write_patient`.
+
+    Returns:
+        The names of the files.
+    """
     from msdm_core.mesh_files.mesh_io import write_mesh
 
-    text, scene_file = scene_text(found), out.with_suffix(".toml")
-    page = report_page(found, text, scene_file.name, command, retraction)
-    targets, turned = [out, scene_file, out.with_name(REPORT_NAME)], _retract_file(out)
-    lifted = turned.with_suffix(".toml")
+    scene_file = Path(name).with_suffix(".toml").name
+    text = scene_text(found)
+    page = report_page(found, text, scene_file, command, retraction)
+    write_mesh(files / name, found.patient.mesh)
+    (files / scene_file).write_text(text, encoding="utf-8", newline="\n")
+    # What a page cannot show, such as bytes of a file's name that are not UTF-8, becomes a question mark.
+    (files / REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
+    load_scene(files / scene_file)
+    written = [name, scene_file, REPORT_NAME]
     if isinstance(retraction, RetractScene):
-        targets += [turned, lifted]
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".surgsim-part-") as part:
-        write_mesh(Path(part, out.name), found.patient.mesh)
-        Path(part, scene_file.name).write_text(text, encoding="utf-8", newline="\n")
-        # What a page cannot show, such as bytes of a file's name that are not UTF-8, becomes a question mark.
-        Path(part, REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
-        load_scene(Path(part, scene_file.name))
-        if isinstance(retraction, RetractScene):
-            write_mesh(Path(part, turned.name), retraction.anatomy.mesh)
-            Path(part, lifted.name).write_text(retract_text(found, retraction), encoding="utf-8", newline="\n")
-            load_scene(Path(part, lifted.name))
-        _replace(targets, Path(part))
-    if not isinstance(retraction, RetractScene) and lifted.exists() and _begins(lifted, FIRST_LINE):
-        # Left by an earlier run for an organ that is now replaced.
-        turned.unlink(missing_ok=True)
-        lifted.unlink()
-    return targets
+        turned = _retract_file(Path(name)).name
+        lifted = Path(turned).with_suffix(".toml").name
+        write_mesh(files / turned, retraction.anatomy.mesh)
+        (files / lifted).write_text(retract_text(found, retraction), encoding="utf-8", newline="\n")
+        load_scene(files / lifted)
+        written += [turned, lifted]
+    return written
 
 
 def _retract_file(out: Path) -> Path:
     """Path of the mesh of a retraction scene, beside the organ's."""
     return out.with_name(f"{out.stem}_retract{out.suffix}")
-
-
-def _replace(targets: Sequence[Path], part: Path) -> None:
-    """Move new files from a folder to their targets; if one cannot be moved, all targets are restored."""
-    for target in targets:
-        if target.exists():
-            shutil.copy2(target, part / f"before-{target.name}")
-    placed = []
-    try:
-        for target in targets:
-            os.replace(part / target.name, target)
-            placed.append(target)
-    except BaseException:
-        for target in placed:
-            before = part / f"before-{target.name}"
-            if before.exists():
-                os.replace(before, target)
-            else:
-                target.unlink()
-        raise
 
 
 def check_targets(out: Path) -> None:
@@ -224,7 +225,8 @@ def convert_tets(
         file.name, mesh, organ, material=material, volume_error=None, cell=cell, touch=touch, more={}, console=console
     )
     if out is not None:
-        write_mesh(out, mesh)
+        with output_folder(out.parent) as files:
+            write_mesh(files / out.name, mesh)
         console.print(f"written: {out}", highlight=False, soft_wrap=True)
 
 

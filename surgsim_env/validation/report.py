@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from surgsim_env.reports.output_folder import OutputFolder
 from surgsim_env.validation.row import Curve, Row
 from surgsim_env.validation.suite import Validation
 
@@ -82,10 +83,8 @@ def print_report(validation: Validation, console: Console) -> None:
     console.print(summary(validation), highlight=False)
 
 
-def write_report(validation: Validation, folder: Path) -> Path:
-    """Write `validation.md` and images/validation_*.png into a folder; the report's path."""
-    images = folder / "images"
-    images.mkdir(parents=True, exist_ok=True)
+def write_report(validation: Validation, folder: OutputFolder) -> None:
+    """Write `validation.md` and images/validation_*.png into a folder."""
     lines = [INTRODUCTION.format(quick=" --quick" if validation.quick else ""), summary(validation) + ".\n"]
     lines += ["| " + " | ".join((*HEADINGS, "note")) + " |", "|" + "---|" * (len(HEADINGS) + 1)]
     for row in validation.rows:
@@ -93,14 +92,12 @@ def write_report(validation: Validation, folder: Path) -> Path:
         lines.append("| " + " | ".join(text.replace("|", "\\|") for text in texts) + " |")
     for figure in dict.fromkeys(curve.figure for curve in validation.curves):
         name = f"validation_{figure}.png"
-        write_plot([curve for curve in validation.curves if curve.figure == figure], images / name)
+        write_plot([curve for curve in validation.curves if curve.figure == figure], folder / f"images/{name}")
         lines.append(f"\n![{figure.replace('_', ' ')}](images/{name})")
     for drawing in validation.drawings:
-        drawing.draw(images / f"{drawing.name}.png")
+        drawing.draw(folder / f"images/{drawing.name}.png")
         lines.append(f"\n{drawing.caption}\n\n![{drawing.name.replace('_', ' ')}](images/{drawing.name}.png)")
-    path = folder / REPORT_NAME
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    (folder / REPORT_NAME).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_plot(curves: list[Curve], path: Path) -> None:

@@ -72,17 +72,52 @@ def test_bridge_feels_the_organ(monkeypatch, capsys):
         (["--seconds", "nan"], "--seconds is nan; it must be finite and above 0"),
         (["--damping", "1"], "--damping needs --stiffness"),
         (["--device-damping", "0.5", "--stiffness", "2000"], "is stiffer than 800 N/m"),
-        (["--device-damping", "-1"], "device damping is -1.0 N s/m"),
+        (
+            ["--device-damping", "-1"],
+            "--device-damping is -1; it must be finite and above 0; leave it away for a device without force",
+        ),
+        (["--device-damping", "-1", "--trajectory", "nowhere.csv"], "--device-damping is -1; it must be"),
+        (["--device-damping", "nan"], "--device-damping is nan; it must be finite and above 0"),
+        (["--device-damping", "1", "--trajectory", "nowhere.csv"], "give only one of both"),
+        (["--device-mass", "0"], "--device-mass is 0; it must be finite and above 0"),
+        (["--device-delay", "-0.001"], "--device-delay is -0.001; it must be finite and not negative"),
         (["--force-largest", "30"], "is 30 N; the instrument's servo can exert 20 N"),
-        (["--trajectory", "nowhere.csv"], "nowhere.csv"),
+        (
+            ["--trajectory", "nowhere.csv"],
+            "error: --trajectory nowhere.csv: cannot be read (No such file or directory); give a CSV file with columns "
+            "time, x, y, z",
+        ),
+        (["--trajectory", "."], "--trajectory .: cannot be read (Is a directory)"),
         (["--port", "70000"], "port is 70000"),
     ],
 )
 def test_bad_input_is_one_line(more, words, capsys):
-    arguments = ["haptics", *([] if "--scene" in more else ["--scene", "phantom_small"]), *more]
+    # Input that is accepted runs for ten steps.
+    arguments = ["haptics", "--scene", "phantom_small", "--port", "0", "--seconds", "0.01", *more]
     assert main(arguments) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1 and "Traceback" not in said
+
+
+def test_ctrl_c_keeps_the_steps_until_then_whole(tmp_path, monkeypatch, capsys):
+    """It is how a run ends that has no end of its own."""
+
+    class Interrupted(Pacer):
+        def done(self, period) -> None:
+            super().done(period)
+            if self.steps == 25:
+                raise KeyboardInterrupt
+            self.steps += 1
+
+        steps = 1
+
+    monkeypatch.setattr("surgsim_env.cli.haptics.Pacer", Interrupted)
+    out = tmp_path / "out"
+    assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == 130
+    assert [path.name for path in out.iterdir()] == ["telemetry.csv"]
+    with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    assert len(rows) == 26 and {len(row) for row in rows} == {len(rows[0])}
 
 
 @pytest.mark.parametrize(

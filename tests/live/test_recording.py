@@ -31,6 +31,36 @@ def test_what_is_written_is_read(tmp_path, arm_count):
         np.testing.assert_allclose(read[name], steps[name], rtol=1e-8)
 
 
+def test_a_recording_that_finds_no_space_leaves_nothing_and_is_named(tmp_path, monkeypatch):
+    def full(file, *_, **__):
+        file.write("0,0,")
+        raise OSError(28, "No space left on device")
+
+    write_recording(made_steps(), tmp_path)
+    monkeypatch.setattr("surgsim_env.live.recording.np.savetxt", full)
+    told = write_recording(made_steps(), tmp_path)
+    assert (
+        told.startswith("the recording was not written: --out") and "recording.csv cannot be written (No space" in told
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["recording-1.csv"]
+
+
+def test_two_sessions_with_one_folder_take_no_number_twice(tmp_path, monkeypatch):
+    """The second is written while the first is."""
+    save, others = np.savetxt, []
+
+    def meanwhile(file, table, **given):
+        if not others:
+            others.append("")
+            others[0] = write_recording(made_steps(count=20), tmp_path)
+        save(file, table, **given)
+
+    monkeypatch.setattr("surgsim_env.live.recording.np.savetxt", meanwhile)
+    assert write_recording(made_steps(count=30), tmp_path) == "30 steps written to recording-2.csv"
+    assert others == ["20 steps written to recording-1.csv"]
+    assert [len(read_recording(tmp_path / f"recording-{number}.csv", 1, STEP)) for number in (1, 2)] == [20, 30]
+
+
 def test_the_haptic_package_plays_it(tmp_path):
     steps = made_steps()
     write_recording(steps, tmp_path)

@@ -1,12 +1,9 @@
 """What `surgsim organ` refuses, and that it then leaves an output folder as it was."""
 
-import os
-
 import pytest
 import trimesh
 
 from surgsim_env.cli.main import main
-from surgsim_env.patient.make_patient import _replace
 from tests.patient.scans import LABELS, scan
 from tests.patient.surfaces import ball
 
@@ -31,33 +28,6 @@ def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, ref
     for _ in range(2):
         assert main([str(one) for one in given]) == 0
     assert {path.name for path in out.iterdir()} == {"a.vtu", "a.toml", "report.html"}
-
-
-@pytest.mark.parametrize("there", [[], ["a.vtu", "a.toml", "report.html"], ["a.toml"]])
-@pytest.mark.parametrize("failing", [1, 2, 3])
-def test_three_files_are_replaced_or_none(there, failing, tmp_path, monkeypatch):
-    part, out = tmp_path / "part", tmp_path / "out"
-    part.mkdir()
-    out.mkdir()
-    names = ["a.vtu", "a.toml", "report.html"]
-    for name in names:
-        (part / name).write_text("new", encoding="utf-8")
-    for name in there:
-        (out / name).write_text(f"old {name}", encoding="utf-8")
-    real, calls = os.replace, []
-
-    def replace(source, target):
-        calls.append(target)
-        if len(calls) == failing:
-            raise PermissionError(13, "in use", str(target))
-        real(source, target)
-
-    monkeypatch.setattr("surgsim_env.patient.make_patient.os.replace", replace)
-    with pytest.raises(PermissionError):
-        _replace([out / name for name in names], part)
-    assert {path.name: path.read_text(encoding="utf-8") for path in out.iterdir()} == {
-        name: f"old {name}" for name in there
-    }
 
 
 @pytest.mark.parametrize(

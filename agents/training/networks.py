@@ -333,7 +333,7 @@ def load_weights(networks: BasePolicy, weights: dict[str, torch.Tensor], where: 
             ("type", given.dtype, wanted.dtype),
         ):
             if found != right:
-                raise ValueError(f"{where}: tensor {name} has {what} {found}; the description needs {right}")
+                raise ValueError(f"{where}: tensor {name} has {what} {shortened(found)}; the description needs {right}")
         if given.is_floating_point() and not bool(torch.isfinite(given).all()):
             at = tuple(torch.nonzero(~torch.isfinite(given))[0].tolist())
             raise ValueError(f"{where}: tensor {name} holds {given[at].item()} at {at}; every number must be finite")

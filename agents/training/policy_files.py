@@ -9,7 +9,6 @@ pickles from it.
 import argparse
 import hashlib
 import json
-import math
 import warnings
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -40,6 +39,8 @@ from surgsim_env.scene.load import fill
 # Defaults of VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8
 CUT = 10.0
+# Of a normalisation; and the range of a chart's lengths [m].
+LARGEST, LENGTHS = 1e30, (1e-6, 1e3)
 # Sizes beyond which a file is not read [bytes].
 MOST_WEIGHT_BYTES, MOST_TEXT_BYTES = 400_000_000, 20_000_000
 
@@ -287,7 +288,9 @@ def _read_weights(path: Path, description: PolicyDescription) -> BasePolicy:
     try:
         weights = safetensors.torch.load(content)
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise ValueError(f"policy {path} is not a file of safetensors: {' '.join(str(error).split())}") from None
+        # It shows a wrong value in full, however long it is.
+        said = " ".join(str(error).split())[:200]
+        raise ValueError(f"policy {path} is not a file of safetensors: {said}") from None
     load_weights(networks, weights, f"policy {path}")
     return networks
 
@@ -318,9 +321,12 @@ def _check_preprocessing(description: PolicyDescription, networks: BasePolicy, d
     raw = shape[0] if len(shape) == 1 else 0
     facts = description.belief
     if facts is not None:
-        numbers = (*facts.extent, facts.tip_radius, facts.noise)
-        if len(facts.extent) != 2 or not all(map(math.isfinite, numbers)) or min(numbers[:-1]) <= 0.0:
-            raise ValueError(f"{where}: belief is {facts}; the rule is two extents, all positive and finite")
+        lengths, (least, most) = (*facts.extent, facts.tip_radius), LENGTHS
+        if len(lengths) != 3 or not all(least <= one <= most for one in lengths) or not 0.0 <= facts.noise <= most:
+            raise ValueError(
+                f"{where}: belief is {facts}; the rule is two extents and a tip_radius from {least} to {most}, and a "
+                f"noise from 0 to {most}"
+            )
         count = facts.site_count**2
         if facts.site_count < 2 or shape != (3 * count + 1,) or getattr(actions, "n", 0) != count:
             raise ValueError(
@@ -340,9 +346,10 @@ def _check_preprocessing(description: PolicyDescription, networks: BasePolicy, d
         if shape != (len(values),):
             raise ValueError(f"{where}: {name} has {len(values)} entries; the networks read {shape}")
         for index, value in enumerate(values):
-            if not math.isfinite(value) or (name == "observation_variance" and value < 0.0):
+            if not abs(value) <= LARGEST or (name == "observation_variance" and value < 0.0):
                 raise ValueError(
-                    f"{where}: {name}[{index}] is {value}; the rule is a finite number, for a variance at least 0"
+                    f"{where}: {name}[{index}] is {value}; the rule is a number up to {LARGEST}, at least 0 for a "
+                    "variance"
                 )
 
 

@@ -136,6 +136,13 @@ def test_networks_without_a_name_are_refused_before_training_ends():
     with pytest.raises(ValueError, match=r"activation_fn is .* which has no name .* known are tanh, relu, elu"):
         describe(ppo(activation_fn=Own), None, env_id="x")
 
+    class OwnPolicy(SitePolicy):
+        """A policy that no table has."""
+
+    model = stable_baselines3.PPO(OwnPolicy, Sites(), **ROLLOUT)
+    with pytest.raises(ValueError, match=r"the policy OwnPolicy has no name .* known are MlpPolicy, .*SitePolicy"):
+        describe(model, None, env_id="x")
+
 
 def test_another_suffix_is_refused(tmp_path: Path):
     policy = made("PPO")
@@ -189,6 +196,11 @@ WRONG_ENTRIES = {
     "nan": (
         set_entry("observation_mean", to=[float("nan")] * 10),
         r"observation_mean\[0\] is nan; the rule is",
+    ),
+    "large": (set_entry("observation_mean", to=[1e308] * 10), r"observation_mean\[0\] is 1e\+308; the rule is"),
+    "noise": (
+        set_entry("belief", to={"extent": [1, 1], "site_count": 5, "tip_radius": 1, "noise": 1e308}),
+        r"belief is SiteFacts\(.*noise=1e\+308.*; the rule is two extents",
     ),
     "variance": (set_entry("observation_variance", to=[-1.0] * 10), r"observation_variance\[0\] is -1\.0; the rule is"),
     "half": (set_entry("observation_variance", to=None), r"observation_mean and observation_variance go together"),
@@ -257,6 +269,14 @@ WRONG_WEIGHTS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "zeros": (lambda content: bytes(1000), "is not a file of safetensors|tensor"),
     "header": (lambda content: (10**15).to_bytes(8, "little") + content[8:], "is not a file of safetensors"),
     "nan": (changed_tensor(put("log_std", float("nan"))), r"tensor log_std holds nan at \(0,\); every number must be"),
+    "long shape": (
+        changed_tensor(lambda tensors: tensors.update(log_std=torch.zeros([1] * 2000))),
+        r"tensor log_std has shape \(1, 1, .*\.\.\.; the description needs",
+    ),
+    "long word": (
+        lambda content: (3010).to_bytes(8, "little") + b'{"a":"' + b"x" * 3000 + b'"}  ',
+        "is not a file of safetensors: .{1,200}$",
+    ),
     "missing": (changed_tensor(lambda tensors: tensors.pop("log_std")), "tensor log_std is missing"),
     "more": (changed_tensor(lambda tensors: tensors.update(x=torch.zeros(1))), "tensor 'x' is unknown"),
     "type": (
@@ -273,7 +293,7 @@ def test_wrong_weights_are_refused_in_one_line(shipped: Path, tmp_path: Path, na
     signed(path, change(path.read_bytes()))
     with pytest.raises(ValueError, match=message) as refused:
         load_policy(path)
-    assert "\n" not in str(refused.value) and "p.safetensors" in str(refused.value)
+    assert "\n" not in str(refused.value) and "p.safetensors" in str(refused.value) and len(str(refused.value)) < 700
 
 
 def test_a_flipped_bit_of_the_weights_is_noticed(shipped: Path, tmp_path: Path):

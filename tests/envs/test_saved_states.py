@@ -130,6 +130,8 @@ BREAKS = [
     ("step", lambda array: array * 0 + 2**62, "step is 4611686018427387904 .*; the rule is 0 <= step <"),
     ("pull_peak", lambda array: array * 0 - 0.1, "pull_peak is -0.1 to -0.1; the rule is 0 <= pull_peak < inf"),
     ("instrument", lambda array: changed(array, np.nan), r"instrument\[\d+\] is nan; without a fault it must be"),
+    # The last twelve are the servo's: three joints' commands, flags of their limits, lower and upper limits.
+    ("instrument", lambda array: np.concatenate([array[:-9], [0.5], array[-8:]]), "is 0.5, which no such instrument"),
     ("fault", lambda array: np.array(0.0), "fault is of type float64; it must be text"),
     ("task", lambda array: np.array("1"), "task: '1' is no JSON object"),
     ("task", lambda array: np.array("{}"), 'task: missing value for field "drawn"'),
@@ -144,6 +146,7 @@ BREAKS = [
     ("task", lambda array: told(array, memory=None), "task: the episode has no memory, and this .* made with one"),
     ("task", lambda array: told(array, memory=[[1.0], [1.0]]), r"memory: sums of shapes \(1,\) and \(1,\); they must"),
     ("task", lambda array: drawn(array, background=-1.0), "drawn: background is -1; it must be finite and above 0"),
+    ("task", lambda array: drawn(array, background=1e4), "substeps of .* ms are too long for this organ"),
     ("task", lambda array: drawn(array, lesions=[]), r"task: drawn.lesions is empty"),
     ("task", lambda array: drawn(array, lesions=[[9.0, 9.0, 9.0, 0.01, 1e4]]), "lies inside the organ"),
     ("task", lambda array: drawn(array, lesions=[[1.0] * 5] * 101), "lesions has 101 entries; at most 100"),

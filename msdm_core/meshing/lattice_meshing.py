@@ -28,6 +28,7 @@ from msdm_core.meshing.grading import (
 from msdm_core.meshing.stuffing import lattice_around, stuff
 
 STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
+SIDE_RANGE = (1e-9, 1e9)  # of a block [m], so that nothing overflows
 TETS_PER_CELL = 12
 TET_LIMIT = 2_000_000
 GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB while meshing
@@ -77,8 +78,11 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
 
 def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Array]:
     lengths, counts = np.asarray(size, dtype=np.float64), np.asarray(cells)
-    if lengths.shape != (3,) or not (np.isfinite(lengths) & (lengths > 0)).all():
-        raise ValueError(f"size is {lengths.tolist()}; the rule is three positive lengths in metres")
+    shortest, longest = SIDE_RANGE
+    if lengths.shape != (3,) or not ((lengths >= shortest) & (lengths <= longest)).all():
+        raise ValueError(
+            f"size is {lengths.tolist()}; the rule is three positive lengths in metres, {shortest:g} to {longest:g}"
+        )
     if counts.shape != (3,) or not (np.isfinite(counts) & (counts >= 1) & (counts == np.floor(counts))).all():
         raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1")
     if TETS_PER_CELL * float(np.prod(counts.astype(np.float64))) > TET_LIMIT:

@@ -12,7 +12,7 @@ from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
 from surgsim_env.instruments.tool_bodies import add_supports, make_servo
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import pair_names, scenes_folder
-from surgsim_env.scene.model import Scene
+from surgsim_env.scene.model import CARTESIAN, Scene
 
 SLIDES = ("x", "y", "z")
 FINGERS = ("finger_upper", "finger_lower")
@@ -135,16 +135,17 @@ class Grasper(Instrument):
 
 
 def read_model(name: str) -> mujoco.MjSpec:
-    """Read the model of a Cartesian instrument, an MJCF file in scenes/instruments.
+    """Read the model of a Cartesian instrument, one of CARTESIAN in scenes/instruments.
 
     Raises:
-        ValueError: no such file (lists those there are).
+        ValueError: another name (lists those there are).
     """
-    path = scenes_folder() / "instruments" / name
-    if not path.is_file():
-        known = ", ".join(sorted(item.name for item in path.parent.glob("*.xml")))
-        raise ValueError(f"instrument {name!r} is unknown; the instruments are {known}")
-    return mujoco.MjSpec.from_file(str(path))
+    known = sorted(f"{one}.xml" for one in CARTESIAN)
+    if name not in known:
+        raise ValueError(
+            f"instrument {name!r} is unknown; the instruments are {', '.join(known)}, and arms by name or TOML file"
+        )
+    return mujoco.MjSpec.from_file(str(scenes_folder() / "instruments" / name))
 
 
 def _compile_probe(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco.MjModel:

@@ -15,6 +15,9 @@ from msdm_core.organ.support import Support, SupportLaw
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
 
+# Instruments and places in an organ are smaller and nearer than this [m]: MuJoCo's numbers stay far from overflow.
+LENGTH_LARGEST = 100.0
+
 
 def require_number(
     what: str, value: float, least: float, unit: str, *, above: bool = False, most: float = math.inf
@@ -195,7 +198,7 @@ class SceneInstrument:
     tip_direction: Vector | None = None
 
     def __post_init__(self) -> None:
-        require_number("instrument.tip_radius", self.tip_radius, 0.0, "m", above=True)
+        require_number("instrument.tip_radius", self.tip_radius, 0.0, "m", above=True, most=LENGTH_LARGEST)
         for name in ("approach", "tip_direction"):
             value = getattr(self, name)
             if value is not None:
@@ -382,6 +385,12 @@ class FixedLesion:
     radius: float
     cover: float
     modulus_ratio: float
+
+    def __post_init__(self) -> None:
+        if not all(abs(value) <= LENGTH_LARGEST for value in self.below):
+            raise ValueError(
+                f"demonstration {self.name!r}: below is {self.below}; the rule is a point within {LENGTH_LARGEST:g} m"
+            )
 
 
 @dataclass(frozen=True)

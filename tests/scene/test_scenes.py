@@ -103,6 +103,15 @@ def test_too_few_substeps_are_refused_with_the_number_needed():
         ({"timing__substep_count": 0}, "timing.substep_count is 0; it must be finite and at least 1"),
         ({"timing__haptic_step": 0.0}, "timing.haptic_step is 0 s"),
         ({"instrument__tip_radius": 0.0}, "instrument.tip_radius is 0 m"),
+        ({"instrument__tip_radius": 1e18}, r"instrument.tip_radius is 1e\+18 m; .* at most 100"),
+        (
+            {
+                "demonstration": [
+                    {"name": "a", "below": [math.nan, 0, 0], "radius": 0.005, "cover": 0, "modulus_ratio": 4}
+                ]
+            },
+            r"demonstration 'a': below is \(nan, 0.0, 0.0\); the rule is a point within 100 m",
+        ),
         ({"material__youngs_moduls": 3.0}, "'youngs_moduls' is unknown there; did you mean 'youngs_modulus'"),
         ({"mesh__block__cells": [12.5, 12, 6]}, "12.5 is not a whole number"),
         ({"lesion__radius": [0.006, math.inf]}, "finite"),
@@ -183,10 +192,11 @@ def test_a_scene_file_of_ones_own_is_read(tmp_path):
         make_scene(str(path))
 
 
-def test_instrument_that_is_not_there_lists_those_that_are():
+@pytest.mark.parametrize("model", ["scalpel.xml", "psm_palpator.xml", "/tmp/scalpel.xml"])
+def test_instrument_that_is_not_there_lists_those_that_are(model):
     scene = make_scene("phantom")
-    anatomy = load_anatomy(replace(scene, instrument=replace(scene.instrument, model="scalpel.xml")))
-    with pytest.raises(ValueError, match=r"'scalpel.xml' is unknown; the instruments are grasper.xml, probe.xml"):
+    anatomy = load_anatomy(replace(scene, instrument=replace(scene.instrument, model=model)))
+    with pytest.raises(ValueError, match=rf"'{model}' is unknown; the instruments are grasper.xml, probe.xml"):
         Simulation(anatomy)
 
 

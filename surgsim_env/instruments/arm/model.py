@@ -14,7 +14,7 @@ from surgsim_env.instruments.arm.model_limits import check_model, read_spec, rea
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription
 from surgsim_env.scene.load import nearest
-from surgsim_env.scene.model import Port, frame_into
+from surgsim_env.scene.model import LENGTH_LARGEST, Port, frame_into
 
 # Groups of geoms: visual only, outer links for clearances; geoms of CONTACT_GROUP are felt by tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
@@ -40,6 +40,7 @@ def compile_arm(
         model = spec.compile()
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
+    _check_lengths(model, where)
     _check_joints(model, description, where)
     return model
 
@@ -181,6 +182,23 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
     frame = world.add_frame(pos=np.array(port.point) - rotation @ np.array(trocar.point), quat=quaternion)
     for part in rooted:
         part.set_frame(frame)
+
+
+def _check_lengths(model: mujoco.MjModel, where: str) -> None:
+    """Check that outer shapes and bodies are no larger and no farther than LENGTH_LARGEST; MuJoCo takes any number."""
+    outer, every = np.isin(model.geom_group, (CONTACT_GROUP, LINK_GROUP)), np.ones(model.nbody, dtype=bool)
+    for kind, entry, values, checked in (
+        ("geom", "size", model.geom_size, outer),
+        ("geom", "pos", model.geom_pos, outer),
+        ("body", "pos", model.body_pos, every),
+    ):
+        wrong = np.flatnonzero(checked & ~(np.abs(values) <= LENGTH_LARGEST).all(axis=1))
+        if wrong.size:
+            name = getattr(model, kind)(wrong[0]).name or f"number {wrong[0]}"
+            raise ValueError(
+                f"{where}: {entry} of {kind} {name!r} is {values[wrong[0]].tolist()} m; the rule is at most "
+                f"{LENGTH_LARGEST:g} m: is the model in metres?"
+            )
 
 
 def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> None:

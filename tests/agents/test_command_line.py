@@ -48,8 +48,10 @@ def without_extras(monkeypatch) -> Iterator[None]:
         del sys.modules[name]
     monkeypatch.setattr(sys, "meta_path", [Absent(), *sys.meta_path])
     yield
+    # Other packages that were imported meanwhile stay: half of matplotlib twice is no matplotlib.
     for name in set(sys.modules) - set(before):
-        del sys.modules[name]
+        if name.startswith(NEEDING):
+            del sys.modules[name]
     sys.modules.update(before)
     for name, module in ours.items():
         parent, _, leaf = name.rpartition(".")

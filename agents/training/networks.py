@@ -32,6 +32,8 @@ NOT_DESCRIBED = {"observation_space", "action_space", "lr_schedule", "optimizer_
 MOST_WEIGHTS = 50_000_000
 MOST_LAYERS = 64
 MOST_ENTRIES = 100_000
+# Products of larger weights overflow, and actions are no numbers.
+LARGEST_WEIGHT = 1e6
 NUMBERS = ("float32", "float64", "int64", "int32", "int8", "uint8")
 
 
@@ -337,6 +339,11 @@ def load_weights(networks: BasePolicy, weights: dict[str, torch.Tensor], where: 
         if given.is_floating_point() and not bool(torch.isfinite(given).all()):
             at = tuple(torch.nonzero(~torch.isfinite(given))[0].tolist())
             raise ValueError(f"{where}: tensor {name} holds {given[at].item()} at {at}; every number must be finite")
+        if given.is_floating_point() and given.numel() and float(given.abs().max()) > LARGEST_WEIGHT:
+            at = tuple(torch.nonzero(given.abs() > LARGEST_WEIGHT)[0].tolist())
+            raise ValueError(
+                f"{where}: tensor {name} holds {given[at].item():g} at {at}; the rule is at most {LARGEST_WEIGHT:g}"
+            )
         if not given.is_floating_point() and given.ndim and not torch.equal(given, wanted):
             at = tuple(torch.nonzero(given != wanted)[0].tolist())
             raise ValueError(

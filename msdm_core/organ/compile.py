@@ -39,6 +39,8 @@ from msdm_core.organ.stability import own_step
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
 
+# A hundred times the Earth's [m/s^2]; no organ settles under more, and forces overflow.
+GRAVITY_LARGEST = 1000.0
 # How many settled organs are remembered, the most recently used.
 REMEMBERED = 32
 # Forces balance when their magnitudes sum to less than this share of the weight of the organ.
@@ -250,8 +252,10 @@ def _check_extent(mesh: TetMesh) -> None:
 
 def _checked_gravity(gravity: tuple[float, float, float]) -> FloatArray:
     vector = np.array(gravity, dtype=np.float64)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise OrganError(f"gravity is {gravity}; it must be three finite numbers, such as (0, 0, -9.81) m/s^2")
+    if vector.shape != (3,) or not (np.abs(vector) <= GRAVITY_LARGEST).all():
+        raise OrganError(
+            f"gravity is {gravity}; it must be three finite numbers up to {GRAVITY_LARGEST:g} m/s^2, as (0, 0, -9.81)"
+        )
     return vector
 
 

@@ -277,6 +277,10 @@ WRONG_WEIGHTS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
         lambda content: (3010).to_bytes(8, "little") + b'{"a":"' + b"x" * 3000 + b'"}  ',
         "is not a file of safetensors: .{1,200}$",
     ),
+    "large": (
+        changed_tensor(put("log_std", 1e30)),
+        r"tensor log_std holds 1e\+30 at \(0,\); the rule is at most 1e\+06",
+    ),
     "missing": (changed_tensor(lambda tensors: tensors.pop("log_std")), "tensor log_std is missing"),
     "more": (changed_tensor(lambda tensors: tensors.update(x=torch.zeros(1))), "tensor 'x' is unknown"),
     "type": (

@@ -274,7 +274,7 @@ def test_an_organ_of_impossible_size_is_refused(scale: float):
         compile_organ(OrganSpec(TetMesh(BLOCK.points * scale, BLOCK.tets), HEALTHY))
 
 
-@pytest.mark.parametrize("gravity", [-9.81, (0.0, 0.0), (0.0, 0.0, np.nan), (0.0, 0.0, np.inf)])
+@pytest.mark.parametrize("gravity", [-9.81, (0.0, 0.0), (0.0, 0.0, np.nan), (0.0, 0.0, np.inf), (0.0, 1e308, 0.0)])
 def test_gravity_is_three_finite_numbers(gravity):
     with pytest.raises(OrganError, match=r"gravity is .* three finite numbers"):
         compile_organ(OrganSpec(box_mesh((0.02, 0.02, 0.02), (2, 2, 2)), Material(5e3, 1e3), gravity=gravity))

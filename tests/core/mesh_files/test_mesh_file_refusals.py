@@ -249,3 +249,22 @@ def test_coordinates_whose_powers_overflow_are_refused():
     points = mesh.points * 1e150
     with pytest.raises(MeshError, match=r"tet 0 \(of \d+\) is degenerate: volume / longest edge\^3 = nan"):
         TetMesh(points, mesh.tets)
+
+
+def test_a_node_s_number_that_would_take_all_memory_is_refused(tmp_path):
+    """meshio makes a table up to the largest one: 16 GB here."""
+    mesh = box_mesh((0.02, 0.01, 0.01), (2, 1, 1))
+    write_mesh(tmp_path / "a.msh", mesh)
+    lines = (tmp_path / "a.msh").read_text().split("\n")
+    first = lines.index("$Nodes") + 3
+    assert lines[first] == "1"
+    lines[first] = "2147483648"
+    (tmp_path / "a.msh").write_text("\n".join(lines))
+    with pytest.raises(MeshError, match=r"a\.msh: numbers a node 2147483648; the rule is at most 50000000: renumber"):
+        read_mesh(tmp_path / "a.msh")
+    write_mesh(tmp_path / "b.msh", mesh, file_format="gmsh22")
+    data = (tmp_path / "b.msh").read_bytes()
+    start = data.index(b"\n", data.index(b"$Nodes\n") + 7) + 1
+    (tmp_path / "b.msh").write_bytes(data[:start] + (2**31 - 1).to_bytes(4, "little") + data[start + 4 :])
+    with pytest.raises(MeshError, match=r"b\.msh: numbers a node 2147483647"):
+        read_mesh(tmp_path / "b.msh")

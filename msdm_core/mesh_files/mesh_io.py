@@ -44,7 +44,7 @@ REGION_KEYS = ("region", "gmsh:physical", "medit:ref")
 _CONVERT = "convert it, for instance: meshio convert IN OUT.vtu, or gmsh IN -save -format msh22 -o OUT.msh"
 _VOLUME_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 _GMSH_TETRA = 4
-# Largest number of a node in a gmsh file.
+# Largest number and count of nodes and elements in a gmsh file.
 TAG_LARGEST = 50_000_000
 
 RegionNames = tuple[tuple[int, str], ...]
@@ -175,11 +175,12 @@ def _check_header(file: Path, file_format: str, data: bytes) -> None:
 
 
 def _check_tags(file: Path, data: bytes) -> None:
-    """Refuse gmsh's numbers of nodes above TAG_LARGEST: meshio makes a table as long as the largest."""
+    """Refuse gmsh's numbers and counts of nodes and elements above TAG_LARGEST: meshio makes room for as many."""
     section = data.partition(b"$Nodes")[2].partition(b"$EndNodes")[0]
     version, binary = re.match(rb"\s*([\d.]*)\s*(\d?)", data.partition(b"$MeshFormat")[2]).groups()  # type: ignore[union-attr]
     if binary != b"1":
         # Coordinates have a point, an exponent, or fewer digits.
+        section += data.partition(b"$Elements")[2].partition(b"$EndElements")[0]
         tags = [int(one) for one in re.findall(rb"(?<![\w.+-])\d{8,20}(?![\w.])", section)]
     elif version.startswith(b"2"):
         records = section.lstrip().partition(b"\n")[2]
@@ -189,7 +190,8 @@ def _check_tags(file: Path, data: bytes) -> None:
         tags = []
     if max(tags, default=0) > TAG_LARGEST:
         raise MeshError(
-            f"{file}: numbers a node {max(tags)}; the rule is at most {TAG_LARGEST}: renumber it (gmsh IN -save -o OUT)"
+            f"{file}: numbers or counts {max(tags)} nodes or elements; the rule is at most {TAG_LARGEST}: renumber "
+            "them (gmsh IN -save -o OUT)"
         )
 
 

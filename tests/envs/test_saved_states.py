@@ -124,6 +124,7 @@ BREAKS = [
     ("organ_node_position", lambda array: array.astype(str), "organ_node_position is of type <U32; it must be float64"),
     ("organ_node_position", lambda array: array[:10], r"has shape \(10, 3\); it must be \(\d+, 3\)"),
     ("organ_node_velocity", lambda array: changed(array, np.inf), r"organ_node_velocity\[\d+, \d\] is inf; without a"),
+    ("rest_position", lambda array: changed(array, -1e308), r"is -1e\+308; without a fault it must be .* 1e\+100"),
     ("organ_contact_engaged", lambda array: changed(array, 2), r"organ_contact_engaged is 0 to 2; the rule is 0 <="),
     ("organ_contact_passed", lambda array: array - 1, "organ_contact_passed is -1 to -1; the rule is 0 <="),
     ("step", lambda array: array * 0 - 1, "step is -1 to -1; the rule is 0 <= step <"),

@@ -111,7 +111,8 @@ def opengl() -> Finding:
     context.make_current()
     from OpenGL import GL
 
-    return Finding("OpenGL", "ok", GL.glGetString(GL.GL_RENDERER).decode())
+    renderer = GL.glGetString(GL.GL_RENDERER)
+    return Finding("OpenGL", "ok", renderer.decode() if renderer else "a renderer without a name")
 
 
 def cache() -> Finding:

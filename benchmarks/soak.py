@@ -72,8 +72,10 @@ FAULTS = {
 }
 # Entries of `info` that name an end which is no fault.
 ENDS = ("success", "hard_limit", "torn", "collided", "declared")
-# Share of the time until memory counts, how much a process may gain from then on [bytes], in a soak of so long [s].
-WARM_UP, GROWTH_MOST, GROWTH_TIME = 0.2, 20e6, 1800.0
+# Runs until the kinds of environments of a seed repeat: by then all that is kept by scene or kernel is there.
+KINDS = 60
+# How much memory a process may gain from then on [bytes].
+GROWTH_MOST = 20e6
 
 
 # ---- actions ---------------------------------------------------------------------------------------------------------
@@ -132,8 +134,8 @@ class Run:
 
     @classmethod
     def drawn(cls, seed: int, number: int, *, quick: bool = False) -> "Run":
-        """Run `number` of a seed."""
-        rng = np.random.default_rng((seed, number))
+        """Run `number` of a seed: the environments of run `number` - KINDS with other actions."""
+        rng = np.random.default_rng((seed, number % KINDS))
         env_id = str(rng.choice(list(CASES)))
         settings = {name: values[rng.integers(len(values))] for name, values in CASES[env_id].items()}
         if quick and "scene" in settings:
@@ -141,7 +143,8 @@ class Run:
         width, dtype = WIDTHS[rng.integers(QUICK_WIDTHS if quick else len(WIDTHS))]
         if gym.spec(env_id).vector_entry_point is None:
             width, dtype = WIDTHS[0]
-        return cls(seed, number, env_id, settings, width, dtype, str(rng.choice(list(ACTORS))))
+        actor = np.random.default_rng((seed, number)).choice(list(ACTORS))
+        return cls(seed, number, env_id, settings, width, dtype, str(actor))
 
     @property
     def name(self) -> str:
@@ -320,18 +323,19 @@ def work(soak: Soak, first: int, pipe: Connection) -> None:
 
 @dataclass
 class Worker:
-    """A process, its runs, and the memory that it held after each: time since the soak's start [s], [bytes]."""
+    """A process, its present run, and the memory that it held after each run [bytes], by the run's number."""
 
     process: Any
     pipe: Connection
     run: Run | None = None
-    memory: list[tuple[float, float]] = field(default_factory=list)
+    memory: dict[int, float] = field(default_factory=dict)
     over: bool = False
 
-    def growth(self, warm: float) -> float:
-        """Memory of the last runs over that of the first after `warm` seconds, medians of five [bytes]."""
-        held = [memory for when, memory in self.memory if when >= warm]
-        return float(np.median(held[-5:]) - np.median(held[:5])) if len(held) >= 10 else 0.0
+    def growth(self) -> float | None:
+        """Memory of the last runs over that of the first after KINDS runs, medians [bytes]; None for too few runs."""
+        held = [memory for number, memory in self.memory.items() if number >= KINDS]
+        some = min(len(held) // 2, KINDS)
+        return float(np.median(held[-some:]) - np.median(held[:some])) if some >= 5 else None
 
 
 def start(soak: Soak, first: int) -> Worker:
@@ -377,7 +381,7 @@ def play_all(soak: Soak, console: Console) -> int:
                     worker.run = message
                 else:
                     assert worker.run is not None
-                    worker.memory.append((time.time() - begin, message.memory))
+                    worker.memory[worker.run.number] = message.memory
                     add(totals.setdefault(worker.run.env_id, Outcome()), message)
                     for one in message.findings:
                         find(one)
@@ -385,15 +389,12 @@ def play_all(soak: Soak, console: Console) -> int:
                 done = sum(total.substeps for total in totals.values())
                 left = max(soak.deadline - time.time(), 0.0)
                 status.update(f"{runs} runs, {done:.3g} substeps, {len(findings)} findings, {left:.0f} s left")
-    whole = soak.deadline - begin
     memory = []
     for number, worker in enumerate(ended):
-        held = worker.memory[-1][1] if worker.memory else 0.0
-        growth = worker.growth(WARM_UP * whole)
-        memory.append(
-            f"{held / 1e6:.0f} MB at the end, {growth / 1e6:+.1f} MB since the first {WARM_UP:.0%} of the time"
-        )
-        if whole >= GROWTH_TIME and growth > GROWTH_MOST:
+        held, growth = list(worker.memory.values()), worker.growth()
+        gained = "too few runs to compare" if growth is None else f"{growth / 1e6:+.1f} MB since the kinds repeat"
+        memory.append(f"{held[-1] / 1e6 if held else 0.0:.0f} MB at the end, {gained}")
+        if growth is not None and growth > GROWTH_MOST:
             find(f"process {number} gained {growth / 1e6:.1f} MB; the rule is {GROWTH_MOST / 1e6:.0f} MB")
     show(totals, console)
     runs = sum(len(worker.memory) for worker in ended)

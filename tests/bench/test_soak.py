@@ -86,6 +86,13 @@ def test_a_reset_that_is_not_clean_is_found(few_steps, monkeypatch):
     assert "does not give the first state" in soak.play(RUN).findings[0]
 
 
-def test_memory_is_compared_after_warming_up():
-    worker = soak.Worker(None, None, memory=[(float(second), 1e6 * second) for second in range(20)])
-    assert worker.growth(0.0) == pytest.approx(15e6) and worker.growth(8.0) == pytest.approx(7e6)
+def test_kinds_of_environments_repeat_with_other_actions():
+    first, again = ([soak.Run.drawn(3, number) for number in range(start, start + 40)] for start in (0, soak.KINDS))
+    kinds = [[(run.env_id, run.settings, run.width, run.dtype) for run in runs] for runs in (first, again)]
+    assert kinds[0] == kinds[1] and [run.actor for run in first] != [run.actor for run in again]
+
+
+def test_memory_is_compared_once_kinds_repeat():
+    worker = soak.Worker(None, None, memory={number: 1e6 * max(number - 60, 0) for number in range(0, 100, 2)})
+    assert worker.growth() == pytest.approx(20e6)
+    assert soak.Worker(None, None, memory=dict.fromkeys(range(69), 1e6)).growth() is None

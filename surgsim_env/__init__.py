@@ -105,7 +105,8 @@ def __getattr__(name: str) -> Any:
         if name not in _EXTRAS:
             raise
         missing = (error.name or "").partition(".")[0]
-        raise ImportError(f"surgsim_env.{name} needs {missing}: pip install 'surgsim[{_EXTRAS[name]}]'") from None
+        text = f"surgsim_env.{name} needs {missing}: pip install 'surgsim[{_EXTRAS[name]}]'"
+        raise ImportError(text, name=missing) from None
     return getattr(module, name)
 
 

@@ -51,7 +51,7 @@ def resolved(name: str) -> object:
         for attribute in parts[count:]:
             try:
                 there = hasattr(found, attribute)
-            except ModuleNotFoundError as error:
+            except ImportError as error:
                 # A name that is imported when it is used, from an extra that is not installed.
                 return error.name
             # A dataclass's field without a default is no attribute of the class.

@@ -172,6 +172,7 @@ def played(request):
     return env, float(trace.reward.sum())
 
 
+@pytest.mark.slow
 def test_no_cheat_is_paid_like_an_honest_episode(played):
     env, honest = played
     idle = EPISODE_STEPS * env.unwrapped.task.weights["time"]

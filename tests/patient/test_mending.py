@@ -55,6 +55,7 @@ def test_surfaces_one_file_a_region(tmp_path, capsys):
     assert "nothing is known" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_broken_surface_is_mended_only_when_asked(tmp_path, refusal, capsys):
     broken = ball(tmp_path / "liver.stl", drop=6)
     given = ["organ", broken, "--length-unit", "mm", "--cell-size", "0.008"]

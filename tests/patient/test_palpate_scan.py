@@ -14,6 +14,7 @@ from surgsim_env.cli.main import main
 from tests.patient.scans import LABELS, LESIONS, MIDDLE, scan
 
 
+@pytest.mark.slow
 def test_palpate_goes_from_a_scan_to_a_map_in_one_command(tmp_path, capsys):
     file = scan(tmp_path / "ct.nii.gz", spacing=(2.0, 2.0, 2.0))
     out = tmp_path / "out"

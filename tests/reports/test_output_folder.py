@@ -148,8 +148,13 @@ def test_ctrl_c_while_a_set_is_put_in_its_place_waits_until_it_is(tmp_path, monk
     with output_folder(tmp_path) as files:
         write(files, "old")
     monkeypatch.setattr(module.os, "rename", rename)
-    with pytest.raises(KeyboardInterrupt), output_folder(tmp_path, NAMES) as files:
-        write(files, "new")
+    # A process that was started in the background ignores Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), output_folder(tmp_path, NAMES) as files:
+            write(files, "new")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert content(tmp_path) == dict.fromkeys(NAMES, "new")
 
 

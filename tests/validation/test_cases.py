@@ -9,11 +9,12 @@ from surgsim_env.validation import suite
 from surgsim_env.validation.elements import has_fem
 from surgsim_env.validation.row import Case, Row, bounded, compare
 
-# Cases of a quick run that take two seconds or more each.
+# Cases of a quick run that take more than a second each.
 LONG = {
     *("passivity, bounces", "fitted springs, torsion", "cosine load", "capsule, pulled", "on supports", "deep presses"),
     *("contrast, coarse", "fitted springs, tension", "fitted springs, cantilever", "grasped strip"),
     *("flat punch", "cantilever", "clamped torsion", "graded prism", "lesion anywhere", "capsule, curved"),
+    *("Eshelby, coarse", "energy", "fitted springs, rod", "capsule, faces", "bar in tension", "passivity, presses"),
 }
 PARAMETERS = [
     pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow or case.name in LONG else [])

@@ -48,6 +48,7 @@ def run(folder: Path, use: str = USE) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_an_edit_in_another_file_is_seen(tmp_path):
     """`set_node_tension` stands in one file; the equation it calls, in another, is the one that changes."""
     package = tmp_path / "msdm_core"

@@ -16,6 +16,9 @@ from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, TetMesh
 # At least this share of a lesion must lie inside the organ.
 LESION_SHARE_INSIDE = 0.5
 
+# Smallest radius of a lesion, and largest radius and coordinate [m]: beyond any organ, and quotients do not overflow.
+SMALLEST, FARTHEST = 1e-6, 1e6
+
 # Points per tet edge of the barycentric lattice that samples a tet cut by a lesion's surface: 165 points.
 SAMPLES_PER_EDGE = 9
 
@@ -156,10 +159,12 @@ class Lesion:
                 f"{self.name}: radius is {self.radius}; it is one number, an ellipsoid takes radii=(a, b, c)"
             )
         axes = self.half_axes
-        if len(self.centre) != 3 or not np.isfinite(self.centre).all():
-            raise OrganError(f"{self.name}: centre is {self.centre}; it must be three finite numbers in metres")
-        if axes.shape != (3,) or not (np.isfinite(axes).all() and (axes > 0.0).all()):
-            raise OrganError(f"{self.name}: {self._size_text}; it must be finite and above 0")
+        if len(self.centre) != 3 or not (np.abs(self.centre) <= FARTHEST).all():
+            raise OrganError(
+                f"{self.name}: centre is {self.centre}; it must be three finite numbers in metres, up to {FARTHEST:g}"
+            )
+        if axes.shape != (3,) or not ((axes >= SMALLEST) & (axes <= FARTHEST)).all():
+            raise OrganError(f"{self.name}: {self._size_text}; it must be from {SMALLEST:g} to {FARTHEST:g}")
 
     @property
     def _size_text(self) -> str:

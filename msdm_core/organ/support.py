@@ -133,12 +133,17 @@ def support_fields(
         anchored: the nodes held fixed, shape (n_node,); supports do not act on them.
 
     Raises:
-        OrganError: two supports of one name, or one too small for the organ's cells to feel.
+        OrganError: two supports of one name, one too small for the organ's cells to feel, or no surface to touch.
     """
     names = [support.name for support in supports]
     for name in names:
         if names.count(name) > 1:
             raise OrganError(f"two supports are named {name!r}; names must differ: rename one")
+    if supports and not len(surface):
+        raise OrganError(
+            f"support {names[0]!r} touches nothing: the anchors hold the whole surface; anchor fewer nodes, or give no "
+            "supports"
+        )
     if supports:
         _check_sizes(supports, surface_cell(mesh, surface))
     corners = mesh.points[surface]

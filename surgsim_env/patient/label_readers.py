@@ -180,7 +180,9 @@ def checked_whole(values: NDArray, file: Path) -> NDArray:
     checked_kind(values.dtype, file)
     if values.dtype.kind != "f":
         return values
-    wrong = (values != np.rint(values)) | ~np.isfinite(values)
+    # numpy warns of a NaN of another kind than its own; all are wrong here.
+    with np.errstate(invalid="ignore"):
+        wrong = (values != np.rint(values)) | ~np.isfinite(values)
     if wrong.any():
         raise MeshError(
             f"{file}: the image holds {float(values[wrong][0]):g}, which is no whole number: labels are; is this the "

@@ -258,6 +258,10 @@ def substeps_needed(haptic_step: float, stable_step: float) -> int:
     return math.ceil(haptic_step / (STABLE_STEP_SHARE * stable_step))
 
 
+# Most substeps of a haptic step, and haptic steps of a control step: more would take minutes.
+STEPS_MOST = 10_000
+
+
 @dataclass(frozen=True)
 class Timing:
     """Time steps: haptic_step [s], organ substeps per haptic step, haptic steps per control step.
@@ -272,8 +276,8 @@ class Timing:
 
     def __post_init__(self) -> None:
         require_number("timing.haptic_step", self.haptic_step, 0.0, "s", above=True)
-        require_number("timing.substep_count", self.substep_count, 1, "")
-        require_number("timing.haptic_steps_per_control", self.haptic_steps_per_control, 1, "")
+        require_number("timing.substep_count", self.substep_count, 1, "", most=STEPS_MOST)
+        require_number("timing.haptic_steps_per_control", self.haptic_steps_per_control, 1, "", most=STEPS_MOST)
 
     @property
     def control_step(self) -> float:

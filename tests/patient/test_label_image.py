@@ -3,6 +3,7 @@
 import gzip
 import struct
 import tracemalloc
+import warnings
 
 import nibabel
 import numpy as np
@@ -318,6 +319,10 @@ def test_numbers_without_end_are_refused_without_a_warning(tmp_path):
     labels = labels_on(affine, shape).astype(np.float32)
     labels[0, 0, 0] = np.inf
     refused(write_nifti(tmp_path / "b.nii", labels, affine), "holds inf, which is no whole number")
+    labels.view(np.uint32)[0, 0, 0] = 0x7F800001  # a NaN of the kind that numpy warns of
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        refused(write_nifti(tmp_path / "n.nii", labels, affine), "holds nan, which is no whole number")
     labels[0, 0, 0] = 1e30
     file = write_nifti(tmp_path / "c.nii", labels, affine)
     refused(file, r"there are labels 1, 2, 1000000015\d+", parse_labels("liver=5"))

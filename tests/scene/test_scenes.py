@@ -101,6 +101,7 @@ def test_too_few_substeps_are_refused_with_the_number_needed():
         ({"sensor__noise": -0.005}, "sensor.noise is -0.005 N"),
         ({"sensor__range": 0.0}, "sensor.range is 0 N"),
         ({"timing__substep_count": 0}, "timing.substep_count is 0; it must be finite and at least 1"),
+        ({"timing__substep_count": 1_000_000_000}, "timing.substep_count is 1e.09; it must .* at most 10000"),
         ({"timing__haptic_step": 0.0}, "timing.haptic_step is 0 s"),
         ({"instrument__tip_radius": 0.0}, "instrument.tip_radius is 0 m"),
         ({"instrument__tip_radius": 1e18}, r"instrument.tip_radius is 1e\+18 m; .* at most 100"),

@@ -18,10 +18,11 @@ CELL = 0.005
 LAW = SupportLaw(1e7, 0.0)
 
 
-def organ(*supports: Support, law: SupportLaw = LAW) -> OrganModel:
-    return compile_organ(
-        OrganSpec(box_mesh((0.02, 0.01, 0.01), (4, 2, 2)), oracle.TISSUE, supports=supports, support_law=law)
-    )
+def organ(*supports: Support, law: SupportLaw = LAW, anchors: object = ()) -> OrganModel:
+    mesh = box_mesh((0.02, 0.01, 0.01), (4, 2, 2))
+    if anchors == "all":
+        anchors = np.arange(mesh.node_count)
+    return compile_organ(OrganSpec(mesh, oracle.TISSUE, supports=supports, support_law=law, anchors=anchors))
 
 
 def outline(support: Support, random: np.random.Generator, count: int = 20000) -> np.ndarray:
@@ -173,6 +174,8 @@ def test_what_an_organ_cannot_rest_on_is_refused():
     organ(Support("roll", "capsule", size=(0.0051, 0.001)))
     with pytest.raises(OrganError, match="two supports are named 'floor'"):
         organ(Support("floor", "plane"), Support("floor", "plane"))
+    with pytest.raises(OrganError, match="support 'floor' touches nothing: the anchors hold the whole surface"):
+        organ(Support("floor", "plane"), anchors="all")
     with pytest.raises(OrganError, match="stiffness is 0 "):
         SupportLaw(0.0)
     with pytest.raises(OrganError, match="damping is -1 "):

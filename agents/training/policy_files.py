@@ -39,6 +39,8 @@ from surgsim_env.scene.load import fill
 # Defaults of VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8
 CUT = 10.0
+# Most control steps of a decision; the longest episode has fewer.
+REPEAT_MOST = 10_000
 # Of a normalisation; and the range of a chart's lengths [m].
 LARGEST, LENGTHS = 1e30, (1e-6, 1e3)
 # Sizes beyond which a file is not read [bytes].
@@ -257,8 +259,8 @@ def read_description(file: Path) -> PolicyDescription:
     except ValueError as error:
         said = " ".join(str(error).split())
         raise ValueError(said if len(said) <= 400 else f"{said[:400]}...") from None
-    if description.action_repeat < 1:
-        raise ValueError(f"policy {file}: action_repeat is {description.action_repeat}; it must be at least 1")
+    if not 1 <= description.action_repeat <= REPEAT_MOST:
+        raise ValueError(f"policy {file}: action_repeat is {description.action_repeat}; it must be 1 to {REPEAT_MOST}")
     return description
 
 

@@ -205,7 +205,8 @@ WRONG_ENTRIES = {
     "variance": (set_entry("observation_variance", to=[-1.0] * 10), r"observation_variance\[0\] is -1\.0; the rule is"),
     "half": (set_entry("observation_variance", to=None), r"observation_mean and observation_variance go together"),
     "force": (set_entry("force_entries", to=[10]), r"force_entries\[0\] is 10; the observation has entries 0 to 9"),
-    "repeat": (set_entry("action_repeat", to=0), r"action_repeat is 0; it must be at least 1"),
+    "repeat": (set_entry("action_repeat", to=0), r"action_repeat is 0; it must be 1 to 10000"),
+    "repeats": (set_entry("action_repeat", to=2**64), r"action_repeat is 18446744073709551616; it must be 1 to 10000"),
     "belief": (
         set_entry("belief", to={"extent": [1, 1], "site_count": 10**6, "tip_radius": 1, "noise": 1}),
         r"belief\.site_count is 1000000, for n of which",

@@ -93,6 +93,10 @@ TOO_MUCH = {
         mjcf(world='<body name="nan"><geom name="tip" size="0.1 nan"/></body>'),
         r"<geom name='tip' size='0\.1 nan'> is not a number; write one",
     ),
+    "too large": (
+        mjcf(world='<body pos="0 -1e308 0"><geom name="1e308" size="inf"/></body>'),
+        r"<body pos='0 -1e308 0'> is too large a number; at most 1e\+100",
+    ),
     "encoding": (
         '<?xml version="1.0" encoding="big5"?><mujoco/>',
         r"encoding that cannot be read .*: save it as UTF",

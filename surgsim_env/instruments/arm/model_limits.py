@@ -111,8 +111,18 @@ FILES = ("file", "filename", "fileright", "fileleft", "fileup", "filedown", "fil
 NOT_PLAIN = (*FILES, "nsample", "actdim", "gaintype", "biastype", "dyntype")
 # Attributes that hold a name, which may be "nan".
 NAMES = ("name", "objname", "refname", *FILES)
+# Largest finite number of an attribute: products of larger ones overflow.
+NUMBER_MOST = 1e100
 # Signature of PNG files; width and height follow at byte 16.
 PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def _overflows(word: str) -> bool:
+    """Whether a word is a finite number whose products are not."""
+    try:
+        return NUMBER_MOST < abs(float(word)) < math.inf
+    except ValueError:
+        return False
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -260,6 +270,8 @@ class _Count:
         # MuJoCo prints a warning and compiles it into something.
         if attribute not in NAMES and {"nan", "+nan", "-nan"} & set(value.lower().split()):
             raise ValueError(f"{what} is not a number; write one")
+        if attribute not in NAMES and any(map(_overflows, value.split())):
+            raise ValueError(f"{what} is too large a number; at most {NUMBER_MOST:g} is possible: write a smaller one")
         if attribute == "user":
             _check(len(value.split()), USER_NUMBERS, what)
         limit = ATTRIBUTE_LIMITS.get((tag, attribute)) or ATTRIBUTE_LIMITS.get(("", attribute))

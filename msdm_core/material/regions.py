@@ -16,6 +16,9 @@ from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, TetMesh
 # At least this share of a lesion must lie inside the organ.
 LESION_SHARE_INSIDE = 0.5
 
+# Largest rate [1/s] and time [s] of damping: beyond any tissue, and no stable step rounds to 0.
+DAMPING_MOST = 1e6
+
 # Smallest radius of a lesion, and largest radius and coordinate [m]: beyond any organ, and quotients do not overflow.
 SMALLEST, FARTHEST = 1e-6, 1e6
 
@@ -84,8 +87,10 @@ class Damping:
     def __post_init__(self) -> None:
         for name, unit in (("alpha", "1/s"), ("beta", "s")):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise OrganError(f"damping: {name} is {value} {unit}; it must be finite and at least 0")
+            if not 0.0 <= value <= DAMPING_MOST:
+                raise OrganError(
+                    f"damping: {name} is {value} {unit}; it must be at least 0 and at most {DAMPING_MOST:g}"
+                )
 
     def ratio(self, frequency: float) -> float:
         """Damping ratio zeta = alpha / (2 w) + beta w / 2 of a mode of the given frequency [Hz], w = 2 pi f."""

@@ -460,7 +460,7 @@ def _complete_source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSourc
 def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
     kind = str(data.SegmentationType)
     if kind not in ("BINARY", "LABELMAP"):
-        raise MeshError(f"{file}: its segments are {kind}; the rule is BINARY or LABELMAP: export it so")
+        raise MeshError(f"{file}: its segments are {kind:.80}; the rule is BINARY or LABELMAP: export it so")
     segments = {int(one.SegmentNumber): str(one.SegmentLabel) for one in data.SegmentSequence}
     missing = [number for number in wanted if number not in segments]
     if missing:

@@ -30,8 +30,8 @@ def require_number(
 
 
 def require_direction(what: str, values: Vector) -> None:
-    """Raise a ValueError for a direction that is zero or not finite."""
-    if not 0.0 < math.hypot(*values) < math.inf:
+    """Raise a ValueError for a direction that is zero or not finite, or whose square would be."""
+    if not 1e-100 <= math.hypot(*values) <= 1e100:
         raise ValueError(f"{what} is {values}; it must be a direction such as [0, 0, -1]")
 
 

@@ -117,6 +117,7 @@ def test_too_few_substeps_are_refused_with_the_number_needed():
         ({"mesh__block__cells": [12.5, 12, 6]}, "12.5 is not a whole number"),
         ({"lesion__radius": [0.006, math.inf]}, "finite"),
         ({"instrument__approach": [0.0, 0.0, 0.0]}, "it must be a direction"),
+        ({"instrument__approach": [1e308, 0.0, -1.0]}, "it must be a direction"),
         ({"palpation__press_depth": -0.001}, "palpation.press_depth is -0.001 m"),
         ({"palpation__site_spacing": 0.0}, "palpation.site_spacing is 0 m"),
         ({"anchors": [{"name": "nothing"}]}, "give one of a box, a ball"),

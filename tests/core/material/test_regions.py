@@ -7,7 +7,7 @@ import pytest
 
 from msdm_core.errors import MeshError, OrganError
 from msdm_core.material.lumping import lump_mass
-from msdm_core.material.regions import Capsule, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
+from msdm_core.material.regions import Capsule, Damping, Lesion, Material, boundary_layer, lesion_fraction, mixed_moduli
 from msdm_core.material.stiffness import spring_network
 from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
@@ -78,6 +78,11 @@ def test_capsule_refuses(arguments: tuple[float, ...], message: str):
 def test_lesion_refuses(fields: dict, message: str):
     with pytest.raises(OrganError, match=message):
         Lesion(**{"material": HARD, "name": "node", **fields})
+
+
+def test_damping_beyond_any_tissue_is_refused():
+    with pytest.raises(OrganError, match=r"damping: beta is 4294967295.0 s; it must be at least 0 and at most 1e\+06"):
+        Damping(0.0, 4294967295.0)
 
 
 def test_lesion_outside_the_organ_is_refused():

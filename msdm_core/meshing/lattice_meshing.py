@@ -83,8 +83,10 @@ def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Ar
         raise ValueError(
             f"size is {lengths.tolist()}; the rule is three positive lengths in metres, {shortest:g} to {longest:g}"
         )
-    if counts.shape != (3,) or not (np.isfinite(counts) & (counts >= 1) & (counts == np.floor(counts))).all():
-        raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1")
+    # Numbers that no 64 bits hold make an array of objects.
+    known = counts.shape == (3,) and counts.dtype.kind in "iuf"
+    if not known or not (np.isfinite(counts) & (counts >= 1) & (counts == np.floor(counts))).all():
+        raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1, of 64 bits")
     if TETS_PER_CELL * float(np.prod(counts.astype(np.float64))) > TET_LIMIT:
         raise ValueError(f"cells is {counts.tolist()}; that is more than {TET_LIMIT} tets: choose fewer cells")
     return lengths, counts.astype(np.int64)

@@ -93,6 +93,7 @@ def test_stretched_cells_are_warned_of_and_cubes_are_not():
         ((0.1, 0.1, 1e308), (1, 1, 1), r"three positive lengths in metres, 1e-09 to 1e\+09"),
         ((0.1, 0.1, 0.1), (1, 0, 1), r"cells is \[1, 0, 1\].*at least 1"),
         ((0.1, 0.1, 0.1), (1, 1.5, 1), "whole numbers"),
+        ((0.1, 0.1, 0.1), (1, -(2**64), 1), "whole numbers of at least 1, of 64 bits"),
         ((0.1, 0.1, 0.1), (1000, 1000, 1000), "fewer cells"),
     ],
 )

@@ -194,7 +194,7 @@ def test_a_scene_file_of_ones_own_is_read(tmp_path):
         make_scene(str(path))
 
 
-@pytest.mark.parametrize("model", ["scalpel.xml", "psm_palpator.xml", "/tmp/scalpel.xml"])
+@pytest.mark.parametrize("model", ["scalpel.xml", "psm_palpator.xml", "/elsewhere/scalpel.xml"])
 def test_instrument_that_is_not_there_lists_those_that_are(model):
     scene = make_scene("phantom")
     anatomy = load_anatomy(replace(scene, instrument=replace(scene.instrument, model=model)))

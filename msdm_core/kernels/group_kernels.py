@@ -9,7 +9,11 @@ from numba import njit
 
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
+    STEEP_SHARE,
+    beyond_onset,
+    excess_scale,
     six_volumes,
+    spring_length,
     spring_scale,
     tet_gradients,
     tet_scale,
@@ -25,6 +29,7 @@ from msdm_core.kernels.vector_kernels import (
     load_row,
     pack,
     spread_like,
+    store_full,
     store_row,
 )
 
@@ -98,12 +103,35 @@ def _push(force, items, item, a, b, c, d):
     store_row(force, at_d, load_row(force, at_d) + d)
 
 
+@njit(forceinline=True, error_model="numpy")
+def _give_way(arm_tension, arm, elastic, fade):
+    """Let one arm of eight springs give way to their elastic tension over l0 [N/m]; returns its tension lost."""
+    before = load_full(arm_tension, arm)
+    after = before + (elastic - before) * fade
+    store_full(arm_tension, arm, after)
+    return after
+
+
+@njit(forceinline=True, error_model="numpy")
+def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
+    """`tissue_kernels.fade_arms` of eight springs."""
+    second, third = springs + first, 2 * springs + first
+    total = load_full(arm_modulus, first) * _give_way(arm_tension, first, elastic, fade[0])
+    total = total + load_full(arm_modulus, second) * _give_way(arm_tension, second, elastic, fade[1])
+    total = total + load_full(arm_modulus, third) * _give_way(arm_tension, third, elastic, fade[2])
+    store_full(relief, first, total)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_groups(position, force, nodes, stiffness, rest_length, begin):
+def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count):
     """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
 
-    Returns the first spring that is in no whole group.
+    Returns the first spring that is in no whole group, and how many entries `law.steep` has.
     """
+    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
+    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
+    springs = nodes.shape[0]
     whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
     for first in range(begin, whole, GROUP):
         r0, r1 = _edge(position, nodes, first, 1), _edge(position, nodes, first + 1, 1)
@@ -111,7 +139,20 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin):
         r4, r5 = _edge(position, nodes, first + 4, 1), _edge(position, nodes, first + 5, 1)
         r6, r7 = _edge(position, nodes, first + 6, 1), _edge(position, nodes, first + 7, 1)
         x, y, z = _columns(r0, r1, r2, r3, r4, r5, r6, r7)
-        scale = spring_scale(x, y, z, load_full(stiffness, first), load_full(rest_length, first))
+        rest, length = load_full(rest_length, first), spring_length(x, y, z)
+        share = rest / length
+        scale = spring_scale(share, load_full(stiffness, first))
+        if stiffens:
+            beyond = beyond_onset(length, rest, load_full(growth, first), load_full(onset, first))
+            if any_below(beyond * -1.0, 0.0):
+                scale = scale + excess_scale(length, rest, share, beyond, load_full(excess, first))
+                if any_below(beyond * -1.0, -STEEP_SHARE):
+                    steep[steep_count] = first
+                    steep_count += 1
+        if relaxes:
+            if fades:
+                _fade_arms(arm_modulus, arm_tension, relief, springs, first, scale / share, fade)
+            scale = scale * load_full(gain, first) - load_full(relief, first) * share
         _pull(force, nodes, first, r0 * _at_0(scale))
         _pull(force, nodes, first + 1, r1 * _at_1(scale))
         _pull(force, nodes, first + 2, r2 * _at_2(scale))
@@ -120,7 +161,7 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin):
         _pull(force, nodes, first + 5, r5 * _at_5(scale))
         _pull(force, nodes, first + 6, r6 * _at_6(scale))
         _pull(force, nodes, first + 7, r7 * _at_7(scale))
-    return whole
+    return whole, steep_count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -151,12 +192,18 @@ def sum_volume_groups(position, total, tets):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_tet_groups(
-    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed
+    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed, law,
+    steep_count,
 ):  # fmt: skip
     """Forces of whole groups of tets; arguments as in `tissue_kernels.add_tet_forces`.
 
-    Returns the first tet that is in no whole group, and how many groups have a squeezed tet.
+    Returns the first tet that is in no whole group, how many groups have a squeezed tet, and how many entries
+    `law.steep` has.
     """
+    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
+    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
+    springs = stiffness.shape[0]
     whole = tets.shape[0] // GROUP * GROUP
     count = 0
     lowest = spread_like(inverse_volume, low[0])
@@ -177,7 +224,20 @@ def add_tet_groups(
             corner_mean((), tension, tets, first + 6), corner_mean((), tension, tets, first + 7),
         )  # fmt: skip
         scale = tet_scale(ratio, load_full(bulk, first), load_full(averaged_bulk, first), averaged)
-        pull = spring_scale(bx, by, bz, load_full(stiffness, first), load_full(rest_length, first))
+        rest, length = load_full(rest_length, first), spring_length(bx, by, bz)
+        share = rest / length
+        pull = spring_scale(share, load_full(stiffness, first))
+        if stiffens:
+            beyond = beyond_onset(length, rest, load_full(growth, first), load_full(onset, first))
+            if any_below(beyond * -1.0, 0.0):
+                pull = pull + excess_scale(length, rest, share, beyond, load_full(excess, first))
+                if any_below(beyond * -1.0, -STEEP_SHARE):
+                    steep[steep_count] = first
+                    steep_count += 1
+        if relaxes:
+            if fades:
+                _fade_arms(arm_modulus, arm_tension, relief, springs, first, pull / share, fade)
+            pull = pull * load_full(gain, first) - load_full(relief, first) * share
         gbx, gby, gbz = scale * gbx - pull * bx, scale * gby - pull * by, scale * gbz - pull * bz
         gcx, gcy, gcz = scale * gcx, scale * gcy, scale * gcz
         gdx, gdy, gdz = scale * gdx, scale * gdy, scale * gdz
@@ -199,7 +259,7 @@ def add_tet_groups(
     _keep(low, _at_5(lowest))
     _keep(low, _at_6(lowest))
     _keep(low, _at_7(lowest))
-    return whole, count
+    return whole, count, steep_count
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -1,8 +1,16 @@
-"""Tets compressed far below their rest volume: their steep pressure, integrated implicitly."""
+"""What would limit the step where tissue is strained far, integrated implicitly: squeezed tets and steep springs."""
 
 from numba import njit
 
-from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, tet_shape, volume_ratio
+from msdm_core.kernels.element_kernels import (
+    SQUEEZED_RATIO,
+    STEEP_SHARE,
+    beyond_onset,
+    spring_length,
+    steep_stiffness,
+    tet_shape,
+    volume_ratio,
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,6 +61,52 @@ def hold_squeezed(
                 node = corners[corner]
                 for axis in range(3):
                     force[node, axis] -= more * (1.0 / 6.0) * gradients[corner][axis]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def hold_steep(
+    position, velocity, force, inverse_mass, nodes, rest_length, growth, onset, excess, gain, relaxes, tet_count, steep,
+    count, width, dt,
+):  # fmt: skip
+    """Make what stiffening adds to the tangent of steep springs implicit: tension T + dt K dl/dt at the step's end.
+
+    K = k (c - 1) v^2 (1 + sum g_i) would limit the step. The tissue kernel has applied T; this one adds the rest to
+    each spring strained beyond STEEP_SHARE in turn, from the masses of its nodes and all forces so far: half of K in
+    order and half in reverse, which holds a bar of steep springs at twice to three times the step of one pass. A spring
+    at rest gets no force, so the static equilibrium does not depend on dt.
+
+    In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), nodes (n_spring, 2), rest_length [m],
+         growth [1/m], onset, excess [N/m], gain (n_spring,) as in `OrganModel`, relaxes, tet_count: springs that come
+         with a tet, steep: the first of each `width` springs in a row among which one is steep, count: entries of
+         `steep`, width, dt [s]
+    Out: force, added to [N] (n_node, 3)
+    """
+    for turn in range(2 * count):
+        entry = turn if turn < count else 2 * count - 1 - turn
+        begin = steep[entry]
+        end = min(begin + width, tet_count if begin < tet_count else nodes.shape[0])
+        for place in range(end - begin):
+            spring = begin + place if turn < count else end - 1 - place
+            i, j = nodes[spring, 0], nodes[spring, 1]
+            x, y, z = _edge(position, i, j)
+            rest, length = rest_length[spring], spring_length(x, y, z)
+            beyond = beyond_onset(length, rest, growth[spring], onset[spring])
+            if not beyond > STEEP_SHARE:
+                continue
+            x, y, z = x / length, y / length, z / length
+            rate_i, rate_j = dt * inverse_mass[i], dt * inverse_mass[j]
+            speed = (
+                x * (velocity[j, 0] + rate_j * force[j, 0] - velocity[i, 0] - rate_i * force[i, 0])
+                + y * (velocity[j, 1] + rate_j * force[j, 1] - velocity[i, 1] - rate_i * force[i, 1])
+                + z * (velocity[j, 2] + rate_j * force[j, 2] - velocity[i, 2] - rate_i * force[i, 2])
+            )
+            stiffness = steep_stiffness(beyond, rest, growth[spring], excess[spring]) * (0.5 * dt)
+            if relaxes:
+                stiffness *= gain[spring]
+            more = stiffness * speed / (1.0 + stiffness * (rate_i + rate_j))
+            for axis, part in enumerate((x, y, z)):
+                force[i, axis] += more * part
+                force[j, axis] -= more * part
 
 
 @njit(forceinline=True, error_model="numpy")

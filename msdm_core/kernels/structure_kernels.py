@@ -34,6 +34,14 @@ class OrganModel(NamedTuple):
         spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
         spring_stiffness: [N/m]                                                  (n_spring,)
         spring_rest_length: [m]                                                  (n_spring,)
+        stiffens: whether any spring stiffens with strain                        scalar
+        spring_growth: 1 / (l0 (e1 - e0)), 0 where it is linear (`Stiffening`) [1/m] (n_spring,), (0,) if none stiffens
+        spring_onset: e0 / (e1 - e0)                                             likewise
+        spring_excess: k (c - 1) (e1 - e0) [N/m]                                 likewise
+        relaxes: whether any spring has Maxwell arms                             scalar
+        spring_gain: tension at once over that at equilibrium, 1 + sum g_i       (n_spring,), (0,) if none relaxes
+        spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring,), likewise
+        arm_time: tau_i of all springs, inf for an arm that is not used [s]      (3,)
         tet_nodes: corners of each tet                                           (n_tet, 4)
         tet_rest_volume: [m^3]                                                   (n_tet,)
         tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,)
@@ -68,6 +76,14 @@ class OrganModel(NamedTuple):
     spring_nodes: NDArray[np.int32]
     spring_stiffness: FloatArray
     spring_rest_length: FloatArray
+    stiffens: bool
+    spring_growth: FloatArray
+    spring_onset: FloatArray
+    spring_excess: FloatArray
+    relaxes: bool
+    spring_gain: FloatArray
+    spring_arm_modulus: FloatArray
+    arm_time: FloatArray
     tet_nodes: NDArray[np.int32]
     tet_rest_volume: FloatArray
     tet_inverse_volume: FloatArray
@@ -112,6 +128,9 @@ class OrganState(NamedTuple):
         row_velocity: scratch: likewise                                          (n_node, 4)
         row_force: scratch: likewise                                             (n_node, 4)
         squeezed_tets: scratch: where tets are squeezed below SQUEEZED_RATIO     (n_tet,)
+        steep_springs: scratch: where springs are strained beyond STEEP_SHARE    (n_spring,), (0,) if none stiffens
+        spring_arm_tension: what each arm has given way to, over l0, arm by arm [N/m] (3 * n_spring,), (0,) without arms
+        spring_relief: sum_i g_i times that [N/m]                                (n_spring,), (0,) without arms
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
@@ -133,6 +152,9 @@ class OrganState(NamedTuple):
     row_velocity: FloatArray
     row_force: FloatArray
     squeezed_tets: NDArray[np.int32]
+    steep_springs: NDArray[np.int32]
+    spring_arm_tension: FloatArray
+    spring_relief: FloatArray
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
@@ -148,7 +170,8 @@ class OrganState(NamedTuple):
 
 # Written anew in every call: need not be saved.
 SCRATCH_FIELDS = (
-    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets", "contact_candidates"),
+    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets", "steep_springs"),
+    "contact_candidates",
     *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept"),
 )
 
@@ -166,6 +189,10 @@ class LaneModel(NamedTuple):
         spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
         spring_stiffness: [N/m]                                                  (n_spring, n_lane)
         spring_rest_length: [m]                                                  (n_spring,) or own
+        stiffens, relaxes, arm_time: as in OrganModel
+        spring_growth: as in OrganModel [1/m]                                    (n_spring, n_lane), (0, n_lane) if none
+        spring_onset, spring_excess, spring_gain: as in OrganModel               likewise
+        spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring, n_lane), likewise
         tet_nodes: corners of each tet                                           (n_tet, 4)
         tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,) or own
         tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet, n_lane)
@@ -192,6 +219,14 @@ class LaneModel(NamedTuple):
     spring_nodes: NDArray[np.int32]
     spring_stiffness: LaneArray
     spring_rest_length: FloatArray
+    stiffens: bool
+    spring_growth: LaneArray
+    spring_onset: LaneArray
+    spring_excess: LaneArray
+    relaxes: bool
+    spring_gain: LaneArray
+    spring_arm_modulus: LaneArray
+    arm_time: FloatArray
     tet_nodes: NDArray[np.int32]
     tet_inverse_volume: FloatArray
     tet_bulk: LaneArray
@@ -236,6 +271,9 @@ class LaneState(NamedTuple):
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
+        steep_springs: scratch: springs that a lane has strained beyond STEEP_SHARE (n_spring,), (0,) if none stiffens
+        spring_arm_tension: as in OrganState [N/m]                               (3 * n_spring, n_lane)
+        spring_relief: as in OrganState [N/m]                                    (n_spring, n_lane)
         kept_force: scratch: node_force of the lanes that do not move [N]        (n_node, 3, n_lane)
         moving: scratch: 1 where a lane moves, else 0                            (1, n_lane)
         finite_sum: scratch: finite where a lane's positions and velocities are  (1, n_lane)
@@ -256,6 +294,9 @@ class LaneState(NamedTuple):
     support_stretch: FloatArray
     node_tension: LaneArray
     squeezed_tets: NDArray[np.int32]
+    steep_springs: NDArray[np.int32]
+    spring_arm_tension: LaneArray
+    spring_relief: LaneArray
     kept_force: LaneArray
     moving: LaneArray
     finite_sum: LaneArray
@@ -320,6 +361,32 @@ class ContactLaw(NamedTuple):
     damping: float
     friction: float
     tangential_stiffness: float
+
+
+class SpringLaw(NamedTuple):
+    """How springs depart from linear ones in one substep: fields of model and state, and what the arms lose.
+
+    Fields:
+        stiffens, growth, onset, excess: `stiffens`, `spring_growth`, `spring_onset` and `spring_excess` of the model
+        relaxes, gain, arm_modulus: `relaxes`, `spring_gain` and `spring_arm_modulus` of the model
+        arm_tension, relief: `spring_arm_tension` and `spring_relief` of the state
+        fades: whether the arms give way in this substep
+        fade: share of its tension that each arm then loses
+        steep: `steep_springs` of the state
+    """
+
+    stiffens: bool
+    growth: LaneArray
+    onset: LaneArray
+    excess: LaneArray
+    relaxes: bool
+    gain: LaneArray
+    arm_modulus: LaneArray
+    arm_tension: LaneArray
+    relief: LaneArray
+    fades: bool
+    fade: tuple[float, float, float]
+    steep: NDArray[np.int32]
 
 
 class _Surface(NamedTuple):
@@ -491,6 +558,7 @@ def in_rows(lanes, state):
     return OrganState(
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
         state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
+        state.steep_springs, state.spring_arm_tension, state.spring_relief,
         state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
         state.support_stretch, state.volume_ratio_smallest,
         state.lane_fault, state.moving, state.finite_sum, state.candidate_count, state.contact_kept,

@@ -11,13 +11,15 @@ import math
 from numba import njit
 
 from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, stretch_by_lag
+from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
-from msdm_core.kernels.squeeze_kernels import hold_squeezed
+from msdm_core.kernels.squeeze_kernels import hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
     FAULT_INVERTED_TET,
     FAULT_NONE,
     FAULT_NOT_FINITE,
+    SpringLaw,
     column_of,
     entry_of,
     in_rows,
@@ -42,6 +44,9 @@ from msdm_core.kernels.tissue_kernels import (
     put_back,
     set_gravity,
 )
+
+# How often the Maxwell arms of springs give way [s]: their shortest time is as long, and usually much longer.
+FADE_INTERVAL = 1e-3
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -119,27 +124,44 @@ def _averages(lanes, averages_volume):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _evaluate(model, state):
-    """Gravity, springs and volume term into the force of all lanes; returns how many entries `squeezed_tets` has."""
+def _evaluate(model, state, fades, fade_duration):
+    """Gravity, springs and volume term into the force of all lanes.
+
+    In: fades: whether the arms of springs give way, for fade_duration [s]
+    Returns how many entries `squeezed_tets` and `steep_springs` have.
+    """
+    fade = (0.0, 0.0, 0.0)
+    if fades:
+        time = model.arm_time
+        fade = (
+            faded_share(fade_duration, time[0]), faded_share(fade_duration, time[1]),
+            faded_share(fade_duration, time[2]),
+        )  # fmt: skip
+    law = SpringLaw(
+        model.stiffens, model.spring_growth, model.spring_onset, model.spring_excess,
+        model.relaxes, model.spring_gain, model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief,
+        fades, fade, state.steep_springs,
+    )  # fmt: skip
     lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
     position, velocity, force, tension = state.node_position, state.node_velocity, state.node_force, state.node_tension
     set_gravity(lanes, force, model.node_mass, model.gravity)
-    add_spring_forces(
-        lanes, position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0]
-    )
+    steep_count = add_spring_forces(
+        lanes, position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0],
+        law, state.moving,
+    )  # fmt: skip
     if beta > 0.0:
         add_spring_damping(lanes, position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
     tension[:] = 0.0
     if _averages(lanes, model.averages_volume):
         average_volumes(lanes, position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
-    squeezed_count = add_tet_forces(
+    squeezed_count, steep_count = add_tet_forces(
         lanes, position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
         model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
-        state.squeezed_tets,
+        state.squeezed_tets, law, steep_count,
     )  # fmt: skip
     if beta > 0.0:
         add_volume_damping(lanes, position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
-    return squeezed_count
+    return squeezed_count, steep_count
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -225,8 +247,8 @@ def _begin(lanes, model, state, shapes, response, duration):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, reference, wrench):
-    """Supports, contact, guard and squeezed tets, lane by lane; returns how many lanes move.
+def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, steep_count, reference, wrench):
+    """Supports, contact, guard, steep springs and squeezed tets, lane by lane; returns how many lanes move.
 
     An inverted tet stops its lane before anything moves: the state shows which tet it was.
     """
@@ -245,7 +267,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, refer
             stretch = part_of(lanes, state.support_stretch, lane)
             add_support_forces(supports_of(lanes, model, lane), position, velocity, force, stretch, dt)
         count = state.candidate_count[lane]
-        if count == 0 and squeezed_count == 0:
+        if count == 0 and squeezed_count == 0 and steep_count == 0:
             continue
         surface, moved = surface_of(lanes, model, lane), shapes_of(lanes, shapes, lane)
         about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
@@ -253,6 +275,14 @@ def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, refer
         answer = response_of(lanes, response, lane)
         if not guard_axes(surface, touched, moved, law, answer, dt, count, about, push):
             state.contact_kept[lane] = 0
+        if steep_count > 0:
+            hold_steep(
+                position, velocity, force, surface.node_inverse_mass, model.spring_nodes,
+                column_of(model.spring_rest_length, lane), column_of(model.spring_growth, lane),
+                column_of(model.spring_onset, lane), column_of(model.spring_excess, lane),
+                column_of(model.spring_gain, lane), model.relaxes, model.tet_nodes.shape[0],
+                state.steep_springs, steep_count, group_width(lanes), dt,
+            )  # fmt: skip
         hold_squeezed(
             position, velocity, force, surface.node_inverse_mass, model.tet_nodes,
             column_of(model.tet_inverse_volume, lane), column_of(model.tet_averaged_bulk, lane),
@@ -319,9 +349,14 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
     _load_rows(lanes, state)
     rows = in_rows(lanes, state)
     _begin(lanes, model, rows, shapes, response, dt * substep_count)
+    fade_every = max(1, int(FADE_INTERVAL / dt + 0.5))
+    faded = 0
     for substep in range(substep_count):
-        squeezed_count = _evaluate(model, rows)
-        if _touch(lanes, model, rows, shapes, law, response, dt, squeezed_count, reference, wrench) == 0:
+        fades = model.relaxes and (substep + 1 == substep_count or substep + 1 - faded == fade_every)
+        squeezed_count, steep_count = _evaluate(model, rows, fades, (substep + 1 - faded) * dt)
+        if fades:
+            faded = substep + 1
+        if _touch(lanes, model, rows, shapes, law, response, dt, squeezed_count, steep_count, reference, wrench) == 0:
             break
         integrate(
             lanes, rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay,
@@ -344,5 +379,5 @@ def evaluate_forces(model, state):
     """
     lanes = lanes_of(model)
     _load_rows(lanes, state)
-    _evaluate(model, in_rows(lanes, state))
+    _evaluate(model, in_rows(lanes, state), False, 0.0)
     _store_force(lanes, state)

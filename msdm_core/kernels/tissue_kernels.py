@@ -9,9 +9,13 @@ from numba import njit
 
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
+    STEEP_SHARE,
+    beyond_onset,
+    excess_scale,
     node_tension,
     six_rates,
     spring_drag,
+    spring_length,
     spring_scale,
     tet_scale,
     tet_shape,
@@ -104,26 +108,80 @@ def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin):
-    """`add_spring_groups` for an organ alone; returns the first spring that is left over."""
+def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, steep_count):
+    """`add_spring_groups` for an organ alone; returns the first spring that is left over and the entries of `steep`."""
     if len(lanes) == 0:
-        return add_spring_groups(position, force, nodes, stiffness, rest_length, begin)
-    return begin
+        return add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count)
+    return begin, steep_count
+
+
+@njit(forceinline=True, error_model="numpy")
+def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
+    """Let one arm give way to the elastic tension over l0 of its spring [N/m]; returns what it has given way to."""
+    before = load_item(lanes, arm_tension, arm)
+    after = before + (elastic - before) * fade
+    store_item(lanes, arm_tension, arm, where_moving(lanes, moving, after, before))
+    return after
+
+
+@njit(forceinline=True, error_model="numpy")
+def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic, fade, moving):
+    """Let the Maxwell arms of a spring give way to its elastic tension for some time: z_i <- z_i + fade_i (T_e - z_i).
+
+    The arm's own tension is g_i (T_e - z_i); all tensions are over l0. For a constant strain z_i nears T_e as
+    1 - exp(-t / tau_i), and the energy stored in an arm only falls while it gives way.
+
+    In:  arm_modulus g_i (3 * n_spring,), springs: n_spring, elastic T_e / l0 [N/m], fade: share for each arm, moving
+    Out: arm_tension z_i / l0 [N/m] (3 * n_spring,), relief: sum_i g_i z_i / l0 [N/m] (n_spring,)
+    """
+    second, third = springs + spring, 2 * springs + spring
+    total = load_item(lanes, arm_modulus, spring) * _give_way(lanes, arm_tension, spring, elastic, fade[0], moving)
+    total = total + load_item(lanes, arm_modulus, second) * _give_way(
+        lanes, arm_tension, second, elastic, fade[1], moving
+    )
+    total = total + load_item(lanes, arm_modulus, third) * _give_way(
+        lanes, arm_tension, third, elastic, fade[2], moving
+    )
+    store_item(lanes, relief, spring, where_moving(lanes, moving, total, load_item(lanes, relief, spring)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, begin):
-    """Springs from number `begin` on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1).
+def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, begin, law, moving):
+    """Springs from number `begin` on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their law.
 
-    In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin
-    Out: force, added to [N] (n_node, 4)
+    In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin, law:
+         `SpringLaw`, moving: 1 where an organ moves (1,)
+    Out: force, added to [N] (n_node, 4), law: arm_tension, relief, steep: the first of each `group_width` springs among
+         which one is strained beyond STEEP_SHARE
+    Returns how many entries `law.steep` has.
     """
-    first = _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin)
+    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
+    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
+    first, steep_count = _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, 0)
+    width = group_width(lanes)
     for spring in range(first, nodes.shape[0]):
         x, y, z = difference(lanes, position, nodes, spring, 1)
-        length = load_shared(lanes, position, rest_length, spring)
-        scale = spring_scale(x, y, z, load_item(lanes, stiffness, spring), length)
+        rest, length = load_shared(lanes, position, rest_length, spring), spring_length(x, y, z)
+        share = rest / length
+        scale = spring_scale(share, load_item(lanes, stiffness, spring))
+        if stiffens:
+            beyond = beyond_onset(length, rest, load_item(lanes, growth, spring), load_item(lanes, onset, spring))
+            if any_below(beyond * -1.0, 0.0):
+                scale = scale + excess_scale(length, rest, share, beyond, load_item(lanes, excess, spring))
+                if any_below(beyond * -1.0, -STEEP_SHARE):
+                    entry = begin + (spring - begin) // width * width
+                    if steep_count == 0 or steep[steep_count - 1] != entry:
+                        steep[steep_count] = entry
+                        steep_count += 1
+        if relaxes:
+            if fades:
+                fade_arms(
+                    lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], spring, scale / share, fade, moving
+                )
+            scale = scale * load_item(lanes, gain, spring) - load_item(lanes, relief, spring) * share
         _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
+    return steep_count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -194,20 +252,22 @@ def _push_corners(lanes, force, tets, tet, scale, g, pull, edge):
 
 @njit(forceinline=True, error_model="numpy")
 def _add_groups_of_tets(
-    lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed
+    lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed,
+    law, steep_count,
 ):  # fmt: skip
-    """`add_tet_groups` for an organ alone; returns the first tet that is left over and the entries of `squeezed`."""
+    """`add_tet_groups` for an organ alone; returns the first tet left over, the entries of `squeezed` and `steep`."""
     if len(lanes) == 0:
         return add_tet_groups(
-            position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed
-        )
-    return 0, 0
+            position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed,
+            law, steep_count,
+        )  # fmt: skip
+    return 0, 0, steep_count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_tet_forces(
     lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving,
-    squeezed,
+    squeezed, law, steep_count,
 ):  # fmt: skip
     """Volume terms: a tet pulls its corners with its tension times dV/dx; spring t comes with tet t, its first edge.
 
@@ -215,14 +275,19 @@ def add_tet_forces(
     mean tension of the volumes averaged at its corners comes on top.
 
     In:  position [m] (n_node, 4), tension [Pa] (n_node,), tets (n_tet, 4), inverse_volume [1/m^3], bulk, averaged_bulk
-         [Pa] (n_tet,), stiffness [N/m], rest_length [m] (n_spring,), moving: 1 where an organ moves (1,)
+         [Pa] (n_tet,), stiffness [N/m], rest_length [m] (n_spring,), moving: 1 where an organ moves (1,), law:
+         `SpringLaw`, steep_count: entries of `law.steep` so far
     Out: force, added to [N] (n_node, 4), low: the smallest V / V0 seen, its value before included (1,),
-         squeezed: the first of each `group_width` tets among which one is below SQUEEZED_RATIO (n_tet,)
-    Returns how many entries `squeezed` has.
+         squeezed: the first of each `group_width` tets among which one is below SQUEEZED_RATIO (n_tet,), law: as in
+         `add_spring_forces`
+    Returns how many entries `squeezed` and `law.steep` have.
     """
-    first, count = _add_groups_of_tets(
+    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
+    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
+    first, count, steep_count = _add_groups_of_tets(
         lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low,
-        squeezed,
+        squeezed, law, steep_count,
     )  # fmt: skip
     width = group_width(lanes)
     lowest = load_item(lanes, low, 0)
@@ -238,11 +303,25 @@ def add_tet_forces(
                 count += 1
         averaged = corner_mean(lanes, tension, tets, tet)
         scale = tet_scale(ratio, load_item(lanes, bulk, tet), load_item(lanes, averaged_bulk, tet), averaged)
-        length = load_shared(lanes, position, rest_length, tet)
-        pull = spring_scale(edge[0], edge[1], edge[2], load_item(lanes, stiffness, tet), length)
+        rest, length = load_shared(lanes, position, rest_length, tet), spring_length(edge[0], edge[1], edge[2])
+        share = rest / length
+        pull = spring_scale(share, load_item(lanes, stiffness, tet))
+        if stiffens:
+            beyond = beyond_onset(length, rest, load_item(lanes, growth, tet), load_item(lanes, onset, tet))
+            if any_below(beyond * -1.0, 0.0):
+                pull = pull + excess_scale(length, rest, share, beyond, load_item(lanes, excess, tet))
+                if any_below(beyond * -1.0, -STEEP_SHARE):
+                    entry = tet // width * width
+                    if steep_count == 0 or steep[steep_count - 1] != entry:
+                        steep[steep_count] = entry
+                        steep_count += 1
+        if relaxes:
+            if fades:
+                fade_arms(lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], tet, pull / share, fade, moving)
+            pull = pull * load_item(lanes, gain, tet) - load_item(lanes, relief, tet) * share
         _push_corners(lanes, force, tets, tet, scale, gradients, pull, edge)
     store_item(lanes, low, 0, where_moving(lanes, moving, lowest, load_item(lanes, low, 0)))
-    return count
+    return count, steep_count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

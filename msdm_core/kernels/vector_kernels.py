@@ -227,6 +227,8 @@ load_row = _define_load(lambda _: 4, lambda _: 4)
 # The `index`-th vector of an array that is made of them.
 store_lanes = _define_store(lambda width: width)
 store_row = _define_store(lambda _: 4)
+# What `load_full` reads.
+store_full = _define_store(lambda _: 1)
 
 
 @intrinsic

@@ -33,10 +33,13 @@ from msdm_core.organ.compile import rest_state, support_shape
 from msdm_core.organ.stepping import unyielding
 
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
+ARM_FIELDS = ("spring_arm_tension", "spring_relief")
 CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch")
 
 # Of an organ's arrays, those that each lane has of its own; all others are shared.
 OWN_FIELDS = ("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk")
+# Likewise, of the springs' law; empty where no spring stiffens or relaxes.
+LAW_FIELDS = ("spring_growth", "spring_onset", "spring_excess", "spring_gain", "spring_arm_modulus")
 OWN_NUMBERS = ("averages_volume", "stable_step")
 # Fields that follow from the rest shape, shared or each lane's own; and the rows of surface and supports, which depend
 # on the anchors too and of which lanes may have different numbers.
@@ -46,7 +49,8 @@ COUNTS = ("surface_count", "support_count")
 ALWAYS_SHARED = tuple(
     name
     for name in LaneModel._fields
-    if name not in (*OWN_FIELDS, *OWN_NUMBERS, *REST_FIELDS, *ROW_FIELDS, *COUNTS, "node_rest_position", "lanes")
+    if name
+    not in (*OWN_FIELDS, *LAW_FIELDS, *OWN_NUMBERS, *REST_FIELDS, *ROW_FIELDS, *COUNTS, "node_rest_position", "lanes")
 )
 SHARED_REST = (*REST_FIELDS, *ROW_FIELDS, "node_rest_position")
 
@@ -72,7 +76,7 @@ def stack_organs(
             f"{len(organs)} organs for the {count} lanes of {np.dtype(dtype)}: stack them in several groups"
         )
     first = organs[0]
-    own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in OWN_FIELDS}
+    own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in (*OWN_FIELDS, *LAW_FIELDS)}
     numbers = {"averages_volume": np.zeros(count, dtype=np.bool_), "stable_step": np.zeros(count)}
     shared = {name: getattr(first, name) for name in (*ALWAYS_SHARED, "node_rest_position")}
     if own_rest:
@@ -161,7 +165,7 @@ def _equal(a: Any, b: Any) -> bool:
 def _write_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
     # Writable for this moment only: a kernel that writes to the model does not compile.
     own = has_own_rest(model)
-    for name in (*OWN_FIELDS, *OWN_NUMBERS, *(REST_FIELDS if own else ())):
+    for name in (*OWN_FIELDS, *LAW_FIELDS, *OWN_NUMBERS, *(REST_FIELDS if own else ())):
         _write(getattr(model, name), (..., lane), getattr(organ, name))
     for name in ROW_FIELDS if own else ():
         rows = getattr(organ, name)
@@ -226,6 +230,8 @@ def lanes_of(
         support_stretch=np.zeros((count, support_nodes, supports, 3)),
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
+        steep_springs=np.zeros(len(first.spring_growth), dtype=np.int32),
+        **{name: aligned_zeros((len(getattr(states[0], name)), count), dtype) for name in ARM_FIELDS},
         moving=aligned_zeros((1, count), dtype),
         finite_sum=aligned_zeros((1, count), dtype),
         candidate_count=np.zeros(count, dtype=np.int32),
@@ -259,6 +265,8 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
         )
     for name in NODE_FIELDS:
         getattr(state, name)[:, :, lane] = getattr(organ, name)
+    for name in ARM_FIELDS:
+        getattr(state, name)[:, lane] = getattr(organ, name)
     for name in CONTACT_FIELDS:
         values = getattr(organ, name)
         getattr(state, name)[lane][tuple(slice(length) for length in values.shape)] = values
@@ -279,6 +287,8 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
     points = np.s_[:, : surface * QUADRATURE_COUNT]
     return OrganState(
         **{name: np.array(getattr(state, name)[:, :, lane], dtype=np.float64, order="C") for name in NODE_FIELDS},
+        **{name: getattr(state, name)[:, lane].astype(np.float64) for name in ARM_FIELDS},
+        steep_springs=np.zeros_like(state.steep_springs),
         contact_engaged=state.contact_engaged[lane][points].copy(),
         contact_stretch=state.contact_stretch[lane][points].copy(),
         contact_passed=state.contact_passed[lane].copy(),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import OrganError
+from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, TetMesh
 
 # At least this share of a lesion must lie inside the organ.
@@ -28,12 +29,14 @@ SAMPLES_PER_EDGE = 9
 
 @dataclass(frozen=True)
 class Material:
-    """A linear, isotropic tissue.
+    """An isotropic tissue: linear and elastic, unless it stiffens or relaxes.
 
     Args:
-        youngs_modulus: E [Pa], above 0.
+        youngs_modulus: E at rest and in equilibrium [Pa], above 0.
         density: [kg/m^3], above 0.
         poisson_ratio: nu, at least 1/4 (springs alone give 1/4; the volume term adds to it) and below 1/2.
+        stiffening: how its springs stiffen with strain, or None.
+        relaxation: how their tension relaxes, or None.
 
     Raises:
         OrganError: names the field, its value and its range.
@@ -42,6 +45,8 @@ class Material:
     youngs_modulus: float
     density: float
     poisson_ratio: float = 0.25
+    stiffening: Stiffening | None = None
+    relaxation: Relaxation | None = None
 
     def __post_init__(self) -> None:
         for name in ("youngs_modulus", "density"):

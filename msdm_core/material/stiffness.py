@@ -40,6 +40,25 @@ def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "llo
     bad = np.flatnonzero(~(np.isfinite(modulus) & (modulus > 0.0)))
     if bad.size:
         raise OrganError(f"youngs_modulus of tet {bad[0]} is {modulus[bad[0]]} Pa; it must be finite and above 0")
+    return mesh.edges, _summed(mesh, modulus, rule)
+
+
+def spring_sum(mesh: TetMesh, youngs_modulus: FloatArray, amount: FloatArray, *, rule: str = "lloyd") -> FloatArray:
+    """An amount of each tet summed at the springs, weighted by the stiffness that the tet adds to each.
+
+    Args:
+        mesh: the organ's tets.
+        youngs_modulus: E of each tet [Pa], shape (n_tet,).
+        amount: of each tet, shape (n_tet,).
+        rule: as in `spring_network`.
+
+    Returns:
+        Sum over tets of k_ij,t times the amount, in N/m times its unit, in the order of `mesh.edges`, (n_spring,).
+    """
+    return _summed(mesh, youngs_modulus * amount, rule)
+
+
+def _summed(mesh: TetMesh, modulus: FloatArray, rule: str) -> FloatArray:
     if rule == "lloyd":
         share = np.repeat(lloyd_share(mesh, modulus), 6)
     elif rule == "fitted":
@@ -47,7 +66,7 @@ def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "llo
     else:
         share = _van_gelder_shares(mesh, modulus)
     stiffness = np.bincount(mesh.tet_edges.ravel(), share, len(mesh.edges)).astype(np.float64)
-    return mesh.edges, stiffness * spring_fit(mesh).edge_factor if rule == "fitted" else stiffness
+    return stiffness * spring_fit(mesh).edge_factor if rule == "fitted" else stiffness
 
 
 def _van_gelder_shares(mesh: TetMesh, modulus: FloatArray) -> FloatArray:

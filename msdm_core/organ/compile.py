@@ -7,8 +7,8 @@ import hashlib
 import math
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,10 +31,12 @@ from msdm_core.material.regions import (
     mixed_moduli,
     nodal_average,
 )
-from msdm_core.material.stiffness import membrane_stiffness, spring_network
+from msdm_core.material.stiffness import membrane_stiffness, spring_network, spring_sum
+from msdm_core.material.tissue_law import ARM_COUNT, Stiffening
 from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
+from msdm_core.organ.measure import spring_tensions
 from msdm_core.organ.stability import own_step
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
@@ -92,7 +94,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     """
     mesh = spec.mesh
     _check_extent(mesh)
-    spring_modulus, bulk, density = _tet_properties(spec)
+    spring_modulus, bulk, density, law = _tet_properties(spec)
     averaged_bulk = averaged_volume_modulus(spring_modulus, bulk)
     node_volume, node_bulk = nodal_average(mesh, averaged_bulk)
     nodes, stiffness = spring_network(mesh, spring_modulus, rule=spec.stiffness_rule)
@@ -100,6 +102,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         stiffness = stiffness + membrane_stiffness(mesh, spec.capsule.youngs_modulus, spec.capsule.thickness)
     mass = lump_mass(mesh, density, scheme=spec.mass_scheme)
     order = spring_order(mesh)
+    spring_law = _spring_law(spec, law, spring_modulus, stiffness, order.springs)
     nodes, stiffness = nodes[order.springs], stiffness[order.springs]
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
@@ -112,6 +115,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         spring_nodes=_read_only(nodes),
         spring_stiffness=_read_only(stiffness),
         spring_rest_length=_read_only(np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
+        **spring_law,
         tet_nodes=_read_only(order.tet_nodes),
         tet_rest_volume=_read_only(mesh.volumes),
         tet_inverse_volume=_read_only(1.0 / mesh.volumes),
@@ -160,6 +164,9 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         row_velocity=aligned_zeros((len(model.node_mass), 4)),
         row_force=aligned_zeros((len(model.node_mass), 4)),
         squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
+        steep_springs=np.zeros(len(model.spring_growth), dtype=np.int32),
+        spring_arm_tension=np.zeros_like(model.spring_arm_modulus),
+        spring_relief=np.zeros_like(model.spring_gain),
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
         contact_stretch=np.zeros((shape_count, point_count, 3)),
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
@@ -190,6 +197,7 @@ def _settle(model: OrganModel, state: OrganState) -> None:
     if len(_settled) > REMEMBERED:
         _settled.popitem(last=False)
     state.node_position[:], state.support_stretch[:] = settled
+    relax_arms(model, state)
     state.node_velocity[:] = 0.0
     state.node_force[:] = 0.0
     # The smallest volume ratio on the way to equilibrium does not count.
@@ -211,7 +219,8 @@ def _relax(model: OrganModel, state: OrganState) -> None:
 
     alpha = 2 w, w^2 = -(u . f) / (u . M u) (Rayleigh's quotient of the displacement u, f the forces without gravity).
     """
-    relaxed = model._replace(alpha=0.0, beta=0.0)
+    # Without Maxwell arms, whose tension is 0 in equilibrium.
+    relaxed = model._replace(alpha=0.0, beta=0.0, relaxes=False)
     free = model.node_inverse_mass > 0.0
     mass = model.node_mass[:, None]
     weight = float(np.linalg.norm(model.gravity) * model.node_mass.sum())
@@ -259,9 +268,99 @@ def _checked_gravity(gravity: tuple[float, float, float]) -> FloatArray:
     return vector
 
 
-def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Modulus for the springs [Pa], modulus of the volume term [Pa] and density [kg/m^3] of each tet."""
+@dataclass(frozen=True)
+class _TetLaw:
+    """How the tissue of each tet stiffens and relaxes.
+
+    Fields:
+        rise: c - 1, 0 where it is linear                                        (n_tet,)
+        onset, width: e0 and e1 - e0, times the rise                             (n_tet,)
+        arm_modulus: g_i                                                         (3, n_tet)
+    """
+
+    rise: FloatArray
+    onset: FloatArray
+    width: FloatArray
+    arm_modulus: FloatArray
+
+    @classmethod
+    def linear(cls, count: int) -> "_TetLaw":
+        """No law on any of `count` tets."""
+        return cls(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((ARM_COUNT, count)))
+
+    def mix(self, material: Material, fraction: FloatArray | float, members: Any = slice(None)) -> None:
+        """Fill a share of the volume of some tets with a material, in place; what depends on the rise is its mean."""
+        stiffening = material.stiffening or Stiffening(0.0, 1.0, 1.0)
+        rise = stiffening.tangent_cap - 1.0
+        for array, value in (
+            (self.rise, rise),
+            (self.onset, rise * stiffening.onset_strain),
+            (self.width, rise * stiffening.width),
+        ):
+            array[members] += fraction * (value - array[members])
+        moduli = np.zeros((ARM_COUNT, 1))
+        if material.relaxation is not None:
+            moduli[: len(material.relaxation.times), 0] = material.relaxation.relative_moduli
+        self.arm_modulus[:, members] += fraction * (moduli - self.arm_modulus[:, members])
+
+
+def _spring_law(
+    spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, stiffness: FloatArray, springs: NDArray[np.intp]
+) -> dict[str, Any]:
+    """The model's fields of stiffening and relaxation, springs in the kernels' order; means of the tets of a spring."""
     mesh = spec.mesh
+
+    def at_springs(amount: FloatArray) -> FloatArray:
+        return spring_sum(mesh, spring_modulus, amount, rule=spec.stiffness_rule)[springs]
+
+    none = _read_only(np.zeros(0))
+    fields: dict[str, Any] = dict.fromkeys(("spring_growth", "spring_onset", "spring_excess"), none)
+    fields |= {"spring_gain": none, "spring_arm_modulus": none, "arm_time": _read_only(_arm_times(spec))}
+    fields["stiffens"], fields["relaxes"] = bool(law.rise.any()), bool(law.arm_modulus.any())
+    if fields["stiffens"]:
+        rise, onset, width = at_springs(law.rise), at_springs(law.onset), at_springs(law.width)
+        rises = rise > 0.0
+        length = np.linalg.norm(mesh.points[mesh.edges[:, 0]] - mesh.points[mesh.edges[:, 1]], axis=1)[springs]
+        width_inverse = np.divide(rise, width, out=np.zeros_like(rise), where=rises)
+        fields["spring_growth"] = _read_only(width_inverse / length)
+        fields["spring_onset"] = _read_only(np.divide(onset, width, out=np.zeros_like(rise), where=rises))
+        fields["spring_excess"] = _read_only(width)
+    if fields["relaxes"]:
+        moduli = np.stack([at_springs(arm) for arm in law.arm_modulus]) / stiffness[springs]
+        fields["spring_gain"] = _read_only(1.0 + moduli.sum(axis=0))
+        fields["spring_arm_modulus"] = _read_only(moduli.ravel())
+    return fields
+
+
+def _arm_times(spec: OrganSpec) -> FloatArray:
+    """Times of the Maxwell arms of all materials [s], inf where there is none, (3,)."""
+    materials = [*_materials_by_tag(spec).values(), *(cast(Material, lesion.material) for lesion in spec.lesions)]
+    known = {material.relaxation.times for material in materials if material.relaxation is not None}
+    if len(known) > 1:
+        raise OrganError(
+            f"the materials of one organ relax with the times {' and '.join(map(str, sorted(known)))} s; they must "
+            "share their times: give each material all of them, with a relative modulus of 0 where it has none"
+        )
+    times = np.full(ARM_COUNT, np.inf)
+    for chosen in known:
+        times[: len(chosen)] = chosen
+    return times
+
+
+def relax_arms(model: OrganModel, state: OrganState) -> None:
+    """Let the Maxwell arms of all springs relax fully at the present positions, in place: a held organ after long."""
+    if not model.relaxes:
+        return
+    ends = state.node_position[model.spring_nodes]
+    tension = spring_tensions(model, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)) / model.spring_rest_length
+    state.spring_arm_tension[:] = np.tile(tension, ARM_COUNT)
+    state.spring_relief[:] = (model.spring_arm_modulus.reshape(ARM_COUNT, -1) * tension).sum(axis=0)
+
+
+def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray, _TetLaw]:
+    """Modulus for the springs [Pa], modulus of the volume term [Pa], density [kg/m^3] and law of each tet."""
+    mesh = spec.mesh
+    law = _TetLaw.linear(mesh.tet_count)
     spring_modulus = np.empty(mesh.tet_count)
     bulk = np.empty(mesh.tet_count)
     density = np.empty(mesh.tet_count)
@@ -271,8 +370,9 @@ def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray
         spring_modulus[members] = material.spring_modulus
         bulk[members] = material.volume_modulus
         density[members] = material.density
+        law.mix(material, 1.0, members)
         if layer is not None:
-            stroma = Material(cast(Capsule, spec.capsule).youngs_modulus, material.density, material.poisson_ratio)
+            stroma = replace(material, youngs_modulus=cast(Capsule, spec.capsule).youngs_modulus)
             in_layer = layer if tag is None else layer & (mesh.region == tag)
             spring_modulus[in_layer] = stroma.spring_modulus
             bulk[in_layer] = stroma.volume_modulus
@@ -281,7 +381,8 @@ def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray
         fraction = lesion_fraction(mesh, lesion)
         spring_modulus, bulk = mixed_moduli(spring_modulus, bulk, material, fraction)
         density += fraction * (material.density - density)
-    return spring_modulus, bulk, density
+        law.mix(material, fraction)
+    return spring_modulus, bulk, density, law
 
 
 def _materials_by_tag(spec: OrganSpec) -> dict[int | None, Material]:

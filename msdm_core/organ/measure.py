@@ -27,15 +27,15 @@ def kinetic_energy(model: OrganModel, state: OrganState) -> float:
 def potential_energy(model: OrganModel, state: OrganState) -> float:
     """Energy of springs, volume term and gravity, zero at the undeformed position [J].
 
-    U = sum_s k_s (l_s - l0_s)^2 / 2 + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
+    U = sum_s U_s(l_s) + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
         + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) - sum_i m_i g . (x_i - X_i)
-    where a is a volume averaged at a node, K'_t the share averaged and the fourth sum over tets below
-    s = SQUEEZED_RATIO (infinite for one that is inside out). A resting tool's `contact_energy` is not in it, nor
-    what supports store.
+    where U_s is the energy of a spring, k (l - l0)^2 / 2 if it is linear, with that of its Maxwell arms, a is a volume
+    averaged at a node, K'_t the share averaged and the fourth sum over tets below s = SQUEEZED_RATIO (infinite for one
+    that is inside out). A resting tool's `contact_energy` is not in it, nor what supports store.
     """
     ends = state.node_position[model.spring_nodes]
-    stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length
-    springs = 0.5 * float(model.spring_stiffness @ stretch**2)
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    springs = float(spring_energies(model, length).sum()) + arm_energy(model, state, length)
     ratio = volume_ratios(model, state)
     volume = 0.5 * float((model.tet_bulk * model.tet_rest_volume) @ (ratio - 1.0) ** 2)
     squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_averaged_bulk > 0.0))
@@ -48,6 +48,62 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     volume += 0.5 * float((model.node_bulk * model.node_rest_volume) @ (averaged - 1.0) ** 2)
     lift = (state.node_position - model.node_rest_position) @ model.gravity
     return springs + volume - float(model.node_mass @ lift)
+
+
+def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:
+    """Tension of each spring at some lengths [m] (n_spring,) without its Maxwell arms [N], (n_spring,)."""
+    change = length - model.spring_rest_length
+    tension = model.spring_stiffness * change
+    if not model.stiffens:
+        return tension
+    beyond = np.maximum(np.abs(change) * model.spring_growth - model.spring_onset, 0.0)
+    ramp = np.minimum(beyond, 1.0)
+    excess = model.spring_excess * model.spring_rest_length * (ramp**3 / 3.0 + (beyond - ramp))
+    return tension + np.sign(change) * excess
+
+
+def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
+    """Integral of `spring_tensions` from the rest length to some lengths [m] (n_spring,) [J], (n_spring,)."""
+    change = length - model.spring_rest_length
+    energy = 0.5 * model.spring_stiffness * change**2
+    if not model.stiffens:
+        return energy
+    beyond = np.maximum(np.abs(change) * model.spring_growth - model.spring_onset, 0.0)
+    ramp = np.minimum(beyond, 1.0)
+    over = beyond - ramp
+    scale = np.divide(
+        model.spring_excess * model.spring_rest_length,
+        model.spring_growth,
+        out=np.zeros_like(energy),
+        where=model.spring_growth > 0.0,
+    )
+    return energy + scale * (ramp**4 / 12.0 + over / 3.0 + 0.5 * over**2)
+
+
+def arm_energy(model: OrganModel, state: OrganState, length: FloatArray) -> float:
+    """Energy that the Maxwell arms of all springs store at some lengths [m] (n_spring,) [J].
+
+    An arm of tension g (T - z), which has given way to the tension z, stores g (U(l) - U(l_z) - z (l - l_z)) with the
+    energy U and tension T of the elastic spring and T(l_z) = z: what it returns where the spring goes back to l_z at
+    once. While it gives way at a constant length, that energy only falls.
+    """
+    if not model.relaxes:
+        return 0.0
+    rest = model.spring_rest_length
+    energy, total = spring_energies(model, length), 0.0
+    for modulus, given in zip(
+        model.spring_arm_modulus.reshape(3, -1), state.spring_arm_tension.reshape(3, -1) * rest, strict=True
+    ):
+        # Bisection: a linear spring would have to go further for the same tension.
+        furthest = given / model.spring_stiffness
+        low, high = rest + np.minimum(furthest, 0.0), rest + np.maximum(furthest, 0.0)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            above = spring_tensions(model, middle) > given
+            low, high = np.where(above, low, middle), np.where(above, middle, high)
+        reached = 0.5 * (low + high)
+        total += float(modulus @ (energy - spring_energies(model, reached) - given * (length - reached)))
+    return total
 
 
 def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> float:

@@ -1,0 +1,327 @@
+"""Springs that stiffen and relax: kernels against the law written in numpy, closed forms, lanes, energy and step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, OrganModel, OrganState
+from msdm_core.lanes.lanes import (
+    advance_lanes,
+    get_lane,
+    lane_responses,
+    lanes_of,
+    put_lane,
+    stack_organs,
+    stack_shapes,
+)
+from msdm_core.material.regions import Damping, Lesion, Material
+from msdm_core.material.tissue_law import Relaxation, Stiffening
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, relax_arms, rest_state
+from msdm_core.organ.measure import internal_forces, kinetic_energy, potential_energy
+from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
+
+LIVER = Stiffening(onset_strain=0.03, cap_strain=0.12, tangent_cap=20.0)
+ARMS = Relaxation(relative_moduli=(0.3, 0.2, 0.4), times=(0.05, 0.5, 5.0))
+SIZE = (0.04, 0.04, 0.024)
+CELLS = (5, 5, 3)
+
+
+def block(
+    stiffening: Stiffening | None = None,
+    relaxation: Relaxation | None = None,
+    *,
+    poisson_ratio: float = 0.45,
+    youngs_modulus: float = 5000.0,
+    damping: float = 0.0,
+    held: str = "bottom",
+    lesions: tuple[Lesion, ...] = (),
+) -> OrganModel:
+    mesh = box_mesh(SIZE, CELLS)
+    anchors = {
+        "bottom": np.flatnonzero(mesh.points[:, 2] < 1e-9),
+        "all": np.arange(mesh.node_count),
+        "none": np.zeros(0, dtype=int),
+    }[held]
+    material = Material(youngs_modulus, 1060.0, poisson_ratio, stiffening, relaxation)
+    return compile_organ(OrganSpec(mesh, material, anchors=anchors, damping=Damping(damping), lesions=lesions))
+
+
+def strained(model: OrganModel, size: float, seed: int = 0) -> OrganState:
+    """A state of random homogeneous and local strain of about `size`."""
+    rng = np.random.default_rng(seed)
+    state = blank_state(model)
+    span = float(np.linalg.norm(np.diff(model.node_rest_position[model.spring_nodes], axis=1), axis=2).mean())
+    state.node_position[:] = model.node_rest_position @ (np.eye(3) + size * rng.uniform(-1.0, 1.0, (3, 3)))
+    state.node_position[:] += 0.3 * size * span * rng.uniform(-1.0, 1.0, model.node_rest_position.shape)
+    return state
+
+
+def spring_forces(model: OrganModel, state: OrganState, law: Stiffening, gain: float) -> FloatArray:
+    """Forces of springs of one material, the tension from `Stiffening.tension`."""
+    ends = state.node_position[model.spring_nodes]
+    span = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(span, axis=1)
+    rest = model.spring_rest_length
+    tension = gain * model.spring_stiffness * rest * law.tension(length / rest - 1.0)
+    pull = span * (tension / length)[:, None]
+    force = np.zeros_like(state.node_position)
+    np.add.at(force, model.spring_nodes[:, 0], pull)
+    np.add.at(force, model.spring_nodes[:, 1], -pull)
+    return force
+
+
+@pytest.mark.parametrize("relaxation", [None, ARMS])
+@pytest.mark.parametrize("size", [0.02, 0.1, 0.3])
+def test_forces_are_those_of_the_law(size: float, relaxation: Relaxation | None):
+    model, linear = block(LIVER, relaxation), block()
+    state = strained(model, size)
+    gain = 1.0 if relaxation is None else relaxation.instantaneous
+    volume = internal_forces(linear, strained(linear, size)) - spring_forces(
+        linear, state, Stiffening(0.0, 1.0, 1.0), 1.0
+    )
+    expected = spring_forces(model, state, LIVER, gain) + volume
+    np.testing.assert_allclose(internal_forces(model, state), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_tangent_is_the_slope_of_the_tension():
+    strain = np.linspace(-0.3, 0.3, 6001)
+    slope = np.gradient(LIVER.tension(strain), strain)
+    np.testing.assert_allclose(slope[1:-1], LIVER.tangent(strain)[1:-1], rtol=0, atol=2e-3 * LIVER.tangent_cap)
+    assert LIVER.tension(0.02) == 0.02
+    assert LIVER.tangent(0.2) == LIVER.tangent_cap
+
+
+def test_below_the_onset_all_bits_are_those_of_linear_springs():
+    linear, model = block(), block(Stiffening(0.25, 0.5, 80.0))
+    states = [strained(organ, 0.03) for organ in (linear, model)]
+    for organ, state in zip((linear, model), states, strict=True):
+        advance(organ, state, dt=0.8 * stable_dt(model), substep_count=40)
+    np.testing.assert_array_equal(states[0].node_position, states[1].node_position)
+    assert np.abs(states[0].node_position - linear.node_rest_position).max() > 1e-4
+
+
+@pytest.mark.parametrize("step", [1e-3, 1e-2])
+def test_tension_after_a_step_of_strain_follows_the_closed_form(step: float):
+    # Nodes are held, so that any step is stable; without a volume term all of the force relaxes.
+    model = block(LIVER, ARMS, poisson_ratio=0.25, held="all")
+    state = strained(model, 0.05)
+    elastic = spring_forces(model, state, LIVER, 1.0)
+    elapsed = 0.0
+    for time in (0.01, 0.05, 0.2, 1.0, 5.0, 20.0, 100.0):
+        count = round((time - elapsed) / step)
+        advance_organ(model, state, NO_SHAPES, NO_CONTACT, step, count, np.zeros((0, 6)))
+        elapsed = time
+        measured = float((internal_forces(model, state) * elastic).sum() / (elastic * elastic).sum())
+        assert measured == pytest.approx(ARMS.remaining(time), rel=5e-4), time
+
+
+def test_equilibrium_is_that_without_arms():
+    model, elastic = block(LIVER, ARMS), block(LIVER)
+    state = strained(model, 0.05)
+    relax_arms(model, state)
+    np.testing.assert_allclose(
+        internal_forces(model, state), internal_forces(elastic, strained(elastic, 0.05)), rtol=0, atol=1e-12
+    )
+
+
+def saved(state: OrganState) -> dict[str, np.ndarray]:
+    return {name: getattr(state, name).copy() for name in OrganState._fields if name not in SCRATCH_FIELDS}
+
+
+def test_a_restored_state_goes_on_to_the_bit():
+    model = block(LIVER, ARMS, damping=20.0)
+    state = strained(model, 0.05)
+    dt = 0.5 * stable_dt(model)
+    advance(model, state, dt=dt, substep_count=30)
+    kept = saved(state)
+    advance(model, state, dt=dt, substep_count=30)
+    other = blank_state(model)
+    for name, value in kept.items():
+        getattr(other, name)[...] = value
+    advance(model, other, dt=dt, substep_count=30)
+    for name, value in saved(state).items():
+        np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+    assert state.spring_relief.any()
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_lanes_move_as_organs_alone(dtype: type):
+    lesion = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, LIVER, ARMS))
+    weak = Relaxation((0.1, 0.0, 0.2), ARMS.times)
+    organs = [
+        block(LIVER, ARMS),
+        block(Stiffening(0.05, 0.3, 20.0), weak, youngs_modulus=8000.0),
+        block(LIVER, ARMS, lesions=(lesion,)),
+    ]
+    states = [strained(organ, 0.05, seed) for seed, organ in enumerate(organs)]
+    lanes = stack_organs(organs, dtype=dtype)
+    together = lanes_of(states, organs[0], dtype=dtype)
+    count = len(together.lane_fault)
+    shapes = stack_shapes([NO_SHAPES] * 3, lanes=count)
+    dt = 0.5 * min(stable_dt(organ) for organ in organs)
+    for _ in range(3):
+        advance_lanes(
+            lanes, together, shapes, NO_CONTACT, dt, 11, np.zeros((count, 0, 6)), lane_responses(0, lanes=count)
+        )
+        for organ, state in zip(organs, states, strict=True):
+            advance(organ, state, dt=dt, substep_count=11)
+    for lane, state in enumerate(states):
+        copy = get_lane(together, lane)
+        for name, value in saved(state).items():
+            if dtype is np.float64:
+                np.testing.assert_array_equal(getattr(copy, name), value, err_msg=name)
+            else:
+                scale = max(float(np.abs(value).max(initial=0.0)), 1e-12)
+                np.testing.assert_allclose(getattr(copy, name), value, rtol=0, atol=2e-3 * scale, err_msg=name)
+    assert states[0].steep_springs.any()
+    put_lane(together, 1, states[0])
+    np.testing.assert_array_equal(
+        get_lane(together, 1).spring_relief.astype(dtype), states[0].spring_relief.astype(dtype)
+    )
+
+
+def test_organs_with_and_without_a_law_do_not_share_lanes():
+    with pytest.raises(OrganError, match="another stiffens"):
+        stack_organs([block(LIVER), block()])
+    with pytest.raises(OrganError, match="another arm_time"):
+        stack_organs([block(None, ARMS), block(None, Relaxation((0.3,), (1.0,)))])
+
+
+@pytest.mark.parametrize("relaxation", [None, ARMS])
+@pytest.mark.parametrize("stiffening", [None, LIVER])
+def test_a_free_organ_gains_no_energy(stiffening: Stiffening | None, relaxation: Relaxation | None):
+    model = block(stiffening, relaxation, held="none")
+    state = strained(model, 0.06)
+    dt = 0.2 * stable_dt(model)
+    begin = highest = potential_energy(model, state)
+    momentum = model.node_mass @ state.node_velocity
+    for _ in range(60):
+        advance(model, state, dt=dt, substep_count=25)
+        highest = max(highest, kinetic_energy(model, state) + potential_energy(model, state))
+    # The symplectic scheme conserves a perturbed energy: its error is of the order of (w dt)^2.
+    assert highest < 1.05 * begin
+    np.testing.assert_allclose(model.node_mass @ state.node_velocity, momentum, atol=1e-12)
+    if relaxation is not None:
+        assert kinetic_energy(model, state) + potential_energy(model, state) < 0.9 * begin
+
+
+def test_arms_dissipate_at_a_constant_strain():
+    model = block(LIVER, ARMS, held="all")
+    state = strained(model, 0.06)
+    energies = [potential_energy(model, state)]
+    for _ in range(20):
+        advance_organ(model, state, NO_SHAPES, NO_CONTACT, 5e-3, 40, np.zeros((0, 6)))
+        energies.append(potential_energy(model, state))
+    assert (np.diff(energies) < 0.0).all()
+    elastic = block(LIVER, held="all")
+    relax_arms(model, state)
+    assert potential_energy(model, state) == pytest.approx(potential_energy(elastic, state), rel=1e-9)
+
+
+@pytest.mark.parametrize("relaxation", [None, ARMS])
+@pytest.mark.parametrize("stretch", [1.3, 0.8])
+@pytest.mark.parametrize("cap", [20.0, 60.0])
+def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxation: Relaxation | None):
+    """A bar strained far beyond the cap comes to rest at 0.9 of the stable step, at the same forces as with a tenth."""
+    model = block(replace(LIVER, tangent_cap=cap), relaxation, damping=300.0)
+    top = model.node_rest_position[:, 2] > SIZE[2] - 1e-9
+    inverse_mass = np.where(top, 0.0, model.node_inverse_mass)
+    inverse_mass.setflags(write=False)
+    model = model._replace(node_inverse_mass=inverse_mass)
+    forces = []
+    for share in (0.9, 0.09):
+        state = blank_state(model)
+        state.node_position[:, 2] *= stretch
+        dt = share * stable_dt(model)
+        advance(model, state, dt=dt, substep_count=round(0.3 / dt))
+        # What is left with arms is creep.
+        assert np.abs(state.node_velocity).max() < 1e-3
+        relax_arms(model, state)
+        forces.append(internal_forces(model, state)[top, 2].sum())
+    length = np.linalg.norm(np.diff(state.node_position[model.spring_nodes], axis=1)[:, 0], axis=1)
+    assert np.abs(length / model.spring_rest_length - 1.0).max() > LIVER.cap_strain
+    assert forces[0] == pytest.approx(forces[1], rel=5e-3)
+
+
+@pytest.mark.parametrize("stiffening", [None, LIVER])
+def test_the_stable_step_counts_arms_and_stiffening(stiffening: Stiffening | None):
+    """Noise below the onset strain: bounded at 0.95 of the stable step, unbounded at 1.1 of it."""
+    model = block(stiffening, ARMS, held="none")
+    assert stable_dt(model) < stable_dt(block(held="none"))
+    growths = []
+    for share in (0.95, 1.1):
+        state = strained(model, 1e-6)
+        fault = advance_organ(model, state, NO_SHAPES, NO_CONTACT, share * stable_dt(model), 400, np.zeros((0, 6)))
+        moved = np.abs(state.node_position - model.node_rest_position).max()
+        growths.append(np.inf if fault != FAULT_NONE else moved)
+    assert growths[0] < 1e-5 < growths[1]
+
+
+def test_a_tet_cut_by_a_lesion_has_the_mean_of_both_laws():
+    stiff = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, LIVER))
+    model, healthy = block(lesions=(stiff,)), block(LIVER, lesions=(stiff,))
+    stiffens = model.spring_excess > 0.0
+    assert model.stiffens and stiffens.any() and not stiffens.all()
+    # The onset and the width are those of the only law there is.
+    np.testing.assert_allclose(model.spring_onset[stiffens], LIVER.onset_strain / LIVER.width)
+    np.testing.assert_allclose((model.spring_growth * model.spring_rest_length)[stiffens], 1.0 / LIVER.width)
+    assert (model.spring_excess <= healthy.spring_excess * (1.0 + 1e-12)).all()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((-0.1, 0.2, 10.0), "onset_strain is -0.1"),
+        ((0.1, 0.1, 10.0), "cap_strain is 0.1; it must be above onset_strain 0.1"),
+        ((0.1, 0.1005, 10.0), "at least 0.001 above"),
+        ((0.1, float("nan"), 10.0), "cap_strain is nan"),
+        ((0.1, 0.2, 0.5), "tangent_cap is 0.5"),
+        ((0.1, 0.2, 101.0), "tangent_cap is 101"),
+    ],
+)
+def test_a_law_out_of_range_is_refused(values: tuple[float, float, float], message: str):
+    with pytest.raises(OrganError, match=message):
+        Stiffening(*values)
+
+
+@pytest.mark.parametrize(
+    ("moduli", "times", "message"),
+    [
+        ((), (), "0 relative_moduli and 0 times"),
+        ((0.1,) * 4, (1.0, 2.0, 3.0, 4.0), "1 to 3"),
+        ((0.1, 0.1), (1.0,), "2 relative_moduli and 1 times"),
+        ((-0.1,), (1.0,), "modulus is -0.1"),
+        ((0.1, 0.1), (2.0, 1.0), "increase"),
+        ((0.1,), (1e-4,), "between 0.001"),
+        ((0.1,), (float("nan"),), "between 0.001"),
+    ],
+)
+def test_arms_out_of_range_are_refused(moduli: tuple[float, ...], times: tuple[float, ...], message: str):
+    with pytest.raises(OrganError, match=message):
+        Relaxation(moduli, times)
+
+
+def test_materials_with_other_times_are_refused():
+    lesion = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, None, Relaxation((0.3,), (1.0,))))
+    with pytest.raises(OrganError, match="share their times"):
+        block(None, ARMS, lesions=(lesion,))
+
+
+def test_an_organ_under_gravity_settles_with_its_arms_relaxed():
+    mesh = box_mesh(SIZE, CELLS)
+    bottom = np.flatnonzero(mesh.points[:, 2] < 1e-9)
+    states = [
+        rest_state(
+            compile_organ(
+                OrganSpec(mesh, Material(2000.0, 1060.0, 0.45, LIVER, arms), anchors=bottom, gravity=(0.0, 0.0, -9.81))
+            )
+        )
+        for arms in (None, ARMS)
+    ]
+    np.testing.assert_allclose(states[0].node_position, states[1].node_position, rtol=0, atol=1e-12)
+    assert states[1].spring_relief.any()

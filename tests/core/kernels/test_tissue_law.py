@@ -224,7 +224,7 @@ def test_arms_dissipate_at_a_constant_strain():
 
 
 @pytest.mark.parametrize("relaxation", [None, ARMS])
-@pytest.mark.parametrize("stretch", [1.3, 0.8])
+@pytest.mark.parametrize("stretch", [1.2, 0.85])
 @pytest.mark.parametrize("cap", [20.0, 60.0])
 def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxation: Relaxation | None):
     """A bar strained far beyond the cap comes to rest at 0.9 of the stable step, at the same forces as with a tenth."""
@@ -251,7 +251,7 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
 @pytest.mark.parametrize("stiffening", [None, LIVER])
 def test_the_stable_step_counts_arms_and_stiffening(stiffening: Stiffening | None):
     """Noise below the onset strain: bounded at 0.95 of the stable step, unbounded at 1.1 of it."""
-    model = block(stiffening, ARMS, held="none")
+    model = block(stiffening and replace(stiffening, tangent_cap=10.0), ARMS, held="none")
     assert stable_dt(model) < stable_dt(block(held="none"))
     growths = []
     for share in (0.95, 1.1):

@@ -48,11 +48,10 @@ def beyond_onset(length, rest_length, growth, onset):
 
 @njit(forceinline=True, error_model="numpy")
 def excess_scale(length, rest_length, share, beyond, excess):
-    """Force over length that stiffening adds to a spring, sign(e) k (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) l0 / l.
+    """Force over length and stiffness that stiffening adds, sign(e) (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) l0 / l.
 
     In: length l, rest_length l0 [m], share l0 / l, beyond u, of which v is the part within 0 and 1, excess
-        k (c - 1) (e1 - e0) [N/m]
-    Returns [N/m].
+        (c - 1) (e1 - e0)
     """
     over = beyond - below_zero(beyond)
     ramp = 1.0 + below_zero(over - 1.0)
@@ -62,7 +61,7 @@ def excess_scale(length, rest_length, share, beyond, excess):
 
 @njit(forceinline=True, error_model="numpy")
 def steep_stiffness(beyond, rest_length, growth, excess):
-    """Tangent that stiffening adds to a spring, k (c - 1) v^2 [N/m]; arguments as in `excess_scale`, numbers only."""
+    """Tangent over stiffness that stiffening adds to a spring, (c - 1) v^2; arguments as in `excess_scale`, numbers."""
     ramp = min(max(beyond, 0.0), 1.0)
     return excess * growth * rest_length * ramp * ramp
 

@@ -141,11 +141,12 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
         x, y, z = _columns(r0, r1, r2, r3, r4, r5, r6, r7)
         rest, length = load_full(rest_length, first), spring_length(x, y, z)
         share = rest / length
-        scale = spring_scale(share, load_full(stiffness, first))
+        rigidity = load_full(stiffness, first)
+        scale = spring_scale(share, rigidity)
         if stiffens:
             beyond = beyond_onset(length, rest, load_full(growth, first), load_full(onset, first))
             if any_below(beyond * -1.0, 0.0):
-                scale = scale + excess_scale(length, rest, share, beyond, load_full(excess, first))
+                scale = scale + rigidity * excess_scale(length, rest, share, beyond, load_full(excess, first))
                 if any_below(beyond * -1.0, -STEEP_SHARE):
                     steep[steep_count] = first
                     steep_count += 1
@@ -226,11 +227,12 @@ def add_tet_groups(
         scale = tet_scale(ratio, load_full(bulk, first), load_full(averaged_bulk, first), averaged)
         rest, length = load_full(rest_length, first), spring_length(bx, by, bz)
         share = rest / length
-        pull = spring_scale(share, load_full(stiffness, first))
+        rigidity = load_full(stiffness, first)
+        pull = spring_scale(share, rigidity)
         if stiffens:
             beyond = beyond_onset(length, rest, load_full(growth, first), load_full(onset, first))
             if any_below(beyond * -1.0, 0.0):
-                pull = pull + excess_scale(length, rest, share, beyond, load_full(excess, first))
+                pull = pull + rigidity * excess_scale(length, rest, share, beyond, load_full(excess, first))
                 if any_below(beyond * -1.0, -STEEP_SHARE):
                     steep[steep_count] = first
                     steep_count += 1

@@ -65,8 +65,8 @@ def hold_squeezed(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def hold_steep(
-    position, velocity, force, inverse_mass, nodes, rest_length, growth, onset, excess, gain, relaxes, tet_count, steep,
-    count, width, dt,
+    position, velocity, force, inverse_mass, nodes, stiffness, rest_length, growth, onset, excess, gain, relaxes,
+    tet_count, steep, count, width, dt,
 ):  # fmt: skip
     """Make what stiffening adds to the tangent of steep springs implicit: tension T + dt K dl/dt at the step's end.
 
@@ -75,10 +75,10 @@ def hold_steep(
     order and half in reverse, which holds a bar of steep springs at twice to three times the step of one pass. A spring
     at rest gets no force, so the static equilibrium does not depend on dt.
 
-    In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), nodes (n_spring, 2), rest_length [m],
-         growth [1/m], onset, excess [N/m], gain (n_spring,) as in `OrganModel`, relaxes, tet_count: springs that come
-         with a tet, steep: the first of each `width` springs in a row among which one is steep, count: entries of
-         `steep`, width, dt [s]
+    In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), nodes (n_spring, 2), stiffness [N/m],
+         rest_length [m], growth [1/m], onset, excess, gain (n_spring,) as in `OrganModel`, relaxes, tet_count: springs
+         that come with a tet, steep: the first of each `width` springs in a row among which one is steep, count:
+         entries of `steep`, width, dt [s]
     Out: force, added to [N] (n_node, 3)
     """
     for turn in range(2 * count):
@@ -100,10 +100,10 @@ def hold_steep(
                 + y * (velocity[j, 1] + rate_j * force[j, 1] - velocity[i, 1] - rate_i * force[i, 1])
                 + z * (velocity[j, 2] + rate_j * force[j, 2] - velocity[i, 2] - rate_i * force[i, 2])
             )
-            stiffness = steep_stiffness(beyond, rest, growth[spring], excess[spring]) * (0.5 * dt)
+            tangent = stiffness[spring] * steep_stiffness(beyond, rest, growth[spring], excess[spring]) * (0.5 * dt)
             if relaxes:
-                stiffness *= gain[spring]
-            more = stiffness * speed / (1.0 + stiffness * (rate_i + rate_j))
+                tangent *= gain[spring]
+            more = tangent * speed / (1.0 + tangent * (rate_i + rate_j))
             for axis, part in enumerate((x, y, z)):
                 force[i, axis] += more * part
                 force[j, axis] -= more * part

@@ -35,9 +35,9 @@ class OrganModel(NamedTuple):
         spring_stiffness: [N/m]                                                  (n_spring,)
         spring_rest_length: [m]                                                  (n_spring,)
         stiffens: whether any spring stiffens with strain                        scalar
-        spring_growth: 1 / (l0 (e1 - e0)), 0 where it is linear (`Stiffening`) [1/m] (n_spring,), (0,) if none stiffens
+        spring_growth: 1 / (l0 (e1 - e0)), of its `Stiffening` [1/m]             (n_spring,), (0,) if none stiffens
         spring_onset: e0 / (e1 - e0)                                             likewise
-        spring_excess: k (c - 1) (e1 - e0) [N/m]                                 likewise
+        spring_excess: (c - 1) (e1 - e0)                                         likewise
         relaxes: whether any spring has Maxwell arms                             scalar
         spring_gain: tension at once over that at equilibrium, 1 + sum g_i       (n_spring,), (0,) if none relaxes
         spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring,), likewise
@@ -189,10 +189,8 @@ class LaneModel(NamedTuple):
         spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
         spring_stiffness: [N/m]                                                  (n_spring, n_lane)
         spring_rest_length: [m]                                                  (n_spring,) or own
-        stiffens, relaxes, arm_time: as in OrganModel
-        spring_growth: as in OrganModel [1/m]                                    (n_spring, n_lane), (0, n_lane) if none
-        spring_onset, spring_excess, spring_gain: as in OrganModel               likewise
-        spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring, n_lane), likewise
+        stiffens, spring_onset, spring_excess, relaxes, spring_gain, spring_arm_modulus, arm_time: as in OrganModel
+        spring_growth: as in OrganModel [1/m]                                    (n_spring,) or own, (0,) if none
         tet_nodes: corners of each tet                                           (n_tet, 4)
         tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,) or own
         tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet, n_lane)
@@ -220,12 +218,12 @@ class LaneModel(NamedTuple):
     spring_stiffness: LaneArray
     spring_rest_length: FloatArray
     stiffens: bool
-    spring_growth: LaneArray
-    spring_onset: LaneArray
-    spring_excess: LaneArray
+    spring_growth: FloatArray
+    spring_onset: FloatArray
+    spring_excess: FloatArray
     relaxes: bool
-    spring_gain: LaneArray
-    spring_arm_modulus: LaneArray
+    spring_gain: FloatArray
+    spring_arm_modulus: FloatArray
     arm_time: FloatArray
     tet_nodes: NDArray[np.int32]
     tet_inverse_volume: FloatArray
@@ -376,12 +374,12 @@ class SpringLaw(NamedTuple):
     """
 
     stiffens: bool
-    growth: LaneArray
-    onset: LaneArray
-    excess: LaneArray
+    growth: FloatArray
+    onset: FloatArray
+    excess: FloatArray
     relaxes: bool
-    gain: LaneArray
-    arm_modulus: LaneArray
+    gain: FloatArray
+    arm_modulus: FloatArray
     arm_tension: LaneArray
     relief: LaneArray
     fades: bool

@@ -278,9 +278,9 @@ def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, steep
         if steep_count > 0:
             hold_steep(
                 position, velocity, force, surface.node_inverse_mass, model.spring_nodes,
-                column_of(model.spring_rest_length, lane), column_of(model.spring_growth, lane),
-                column_of(model.spring_onset, lane), column_of(model.spring_excess, lane),
-                column_of(model.spring_gain, lane), model.relaxes, model.tet_nodes.shape[0],
+                column_of(model.spring_stiffness, lane), column_of(model.spring_rest_length, lane),
+                column_of(model.spring_growth, lane), model.spring_onset, model.spring_excess, model.spring_gain,
+                model.relaxes, model.tet_nodes.shape[0],
                 state.steep_springs, steep_count, group_width(lanes), dt,
             )  # fmt: skip
         hold_squeezed(

@@ -135,11 +135,13 @@ def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic,
     Out: arm_tension z_i / l0 [N/m] (3 * n_spring,), relief: sum_i g_i z_i / l0 [N/m] (n_spring,)
     """
     second, third = springs + spring, 2 * springs + spring
-    total = load_item(lanes, arm_modulus, spring) * _give_way(lanes, arm_tension, spring, elastic, fade[0], moving)
-    total = total + load_item(lanes, arm_modulus, second) * _give_way(
+    total = load_shared(lanes, arm_tension, arm_modulus, spring) * _give_way(
+        lanes, arm_tension, spring, elastic, fade[0], moving
+    )
+    total = total + load_shared(lanes, arm_tension, arm_modulus, second) * _give_way(
         lanes, arm_tension, second, elastic, fade[1], moving
     )
-    total = total + load_item(lanes, arm_modulus, third) * _give_way(
+    total = total + load_shared(lanes, arm_tension, arm_modulus, third) * _give_way(
         lanes, arm_tension, third, elastic, fade[2], moving
     )
     store_item(lanes, relief, spring, where_moving(lanes, moving, total, load_item(lanes, relief, spring)))
@@ -164,11 +166,15 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
         x, y, z = difference(lanes, position, nodes, spring, 1)
         rest, length = load_shared(lanes, position, rest_length, spring), spring_length(x, y, z)
         share = rest / length
-        scale = spring_scale(share, load_item(lanes, stiffness, spring))
+        rigidity = load_item(lanes, stiffness, spring)
+        scale = spring_scale(share, rigidity)
         if stiffens:
-            beyond = beyond_onset(length, rest, load_item(lanes, growth, spring), load_item(lanes, onset, spring))
+            beyond = beyond_onset(
+                length, rest, load_shared(lanes, position, growth, spring), load_shared(lanes, position, onset, spring)
+            )
             if any_below(beyond * -1.0, 0.0):
-                scale = scale + excess_scale(length, rest, share, beyond, load_item(lanes, excess, spring))
+                more = load_shared(lanes, position, excess, spring)
+                scale = scale + rigidity * excess_scale(length, rest, share, beyond, more)
                 if any_below(beyond * -1.0, -STEEP_SHARE):
                     entry = begin + (spring - begin) // width * width
                     if steep_count == 0 or steep[steep_count - 1] != entry:
@@ -179,7 +185,7 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
                 fade_arms(
                     lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], spring, scale / share, fade, moving
                 )
-            scale = scale * load_item(lanes, gain, spring) - load_item(lanes, relief, spring) * share
+            scale = scale * load_shared(lanes, position, gain, spring) - load_item(lanes, relief, spring) * share
         _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
     return steep_count
 
@@ -305,11 +311,15 @@ def add_tet_forces(
         scale = tet_scale(ratio, load_item(lanes, bulk, tet), load_item(lanes, averaged_bulk, tet), averaged)
         rest, length = load_shared(lanes, position, rest_length, tet), spring_length(edge[0], edge[1], edge[2])
         share = rest / length
-        pull = spring_scale(share, load_item(lanes, stiffness, tet))
+        rigidity = load_item(lanes, stiffness, tet)
+        pull = spring_scale(share, rigidity)
         if stiffens:
-            beyond = beyond_onset(length, rest, load_item(lanes, growth, tet), load_item(lanes, onset, tet))
+            beyond = beyond_onset(
+                length, rest, load_shared(lanes, position, growth, tet), load_shared(lanes, position, onset, tet)
+            )
             if any_below(beyond * -1.0, 0.0):
-                pull = pull + excess_scale(length, rest, share, beyond, load_item(lanes, excess, tet))
+                more = load_shared(lanes, position, excess, tet)
+                pull = pull + rigidity * excess_scale(length, rest, share, beyond, more)
                 if any_below(beyond * -1.0, -STEEP_SHARE):
                     entry = tet // width * width
                     if steep_count == 0 or steep[steep_count - 1] != entry:
@@ -318,7 +328,7 @@ def add_tet_forces(
         if relaxes:
             if fades:
                 fade_arms(lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], tet, pull / share, fade, moving)
-            pull = pull * load_item(lanes, gain, tet) - load_item(lanes, relief, tet) * share
+            pull = pull * load_shared(lanes, position, gain, tet) - load_item(lanes, relief, tet) * share
         _push_corners(lanes, force, tets, tet, scale, gradients, pull, edge)
     store_item(lanes, low, 0, where_moving(lanes, moving, lowest, load_item(lanes, low, 0)))
     return count, steep_count

@@ -1,7 +1,8 @@
 """Organs of one mesh side by side: eight float64 or sixteen float32 advance at once, each as it would alone.
 
 Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, supports,
-damping and gravity are shared. With `own_rest` organs of the same tets may also differ in their rest shape and in what
+damping, gravity and the laws by which springs stiffen
+and relax are shared. With `own_rest` organs of the same tets may also differ in their rest shape and in what
 is anchored, for a few hundredths of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves
 it, whoever its neighbours.
 """
@@ -38,19 +39,16 @@ CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "suppo
 
 # Of an organ's arrays, those that each lane has of its own; all others are shared.
 OWN_FIELDS = ("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk")
-# Likewise, of the springs' law; empty where no spring stiffens or relaxes.
-LAW_FIELDS = ("spring_growth", "spring_onset", "spring_excess", "spring_gain", "spring_arm_modulus")
 OWN_NUMBERS = ("averages_volume", "stable_step")
 # Fields that follow from the rest shape, shared or each lane's own; and the rows of surface and supports, which depend
 # on the anchors too and of which lanes may have different numbers.
-REST_FIELDS = ("spring_rest_length", "tet_inverse_volume", "node_inverse_volume")
+REST_FIELDS = ("spring_rest_length", "spring_growth", "tet_inverse_volume", "node_inverse_volume")
 ROW_FIELDS = ("surface_triangles", "surface_rest_area", "support_nodes", "support_area")
 COUNTS = ("surface_count", "support_count")
 ALWAYS_SHARED = tuple(
     name
     for name in LaneModel._fields
-    if name
-    not in (*OWN_FIELDS, *LAW_FIELDS, *OWN_NUMBERS, *REST_FIELDS, *ROW_FIELDS, *COUNTS, "node_rest_position", "lanes")
+    if name not in (*OWN_FIELDS, *OWN_NUMBERS, *REST_FIELDS, *ROW_FIELDS, *COUNTS, "node_rest_position", "lanes")
 )
 SHARED_REST = (*REST_FIELDS, *ROW_FIELDS, "node_rest_position")
 
@@ -76,7 +74,7 @@ def stack_organs(
             f"{len(organs)} organs for the {count} lanes of {np.dtype(dtype)}: stack them in several groups"
         )
     first = organs[0]
-    own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in (*OWN_FIELDS, *LAW_FIELDS)}
+    own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in OWN_FIELDS}
     numbers = {"averages_volume": np.zeros(count, dtype=np.bool_), "stable_step": np.zeros(count)}
     shared = {name: getattr(first, name) for name in (*ALWAYS_SHARED, "node_rest_position")}
     if own_rest:
@@ -165,7 +163,7 @@ def _equal(a: Any, b: Any) -> bool:
 def _write_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
     # Writable for this moment only: a kernel that writes to the model does not compile.
     own = has_own_rest(model)
-    for name in (*OWN_FIELDS, *LAW_FIELDS, *OWN_NUMBERS, *(REST_FIELDS if own else ())):
+    for name in (*OWN_FIELDS, *OWN_NUMBERS, *(REST_FIELDS if own else ())):
         _write(getattr(model, name), (..., lane), getattr(organ, name))
     for name in ROW_FIELDS if own else ():
         rows = getattr(organ, name)

@@ -102,7 +102,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         stiffness = stiffness + membrane_stiffness(mesh, spec.capsule.youngs_modulus, spec.capsule.thickness)
     mass = lump_mass(mesh, density, scheme=spec.mass_scheme)
     order = spring_order(mesh)
-    spring_law = _spring_law(spec, law, spring_modulus, stiffness, order.springs)
+    spring_law = _spring_law(spec, law, spring_modulus, order.springs)
     nodes, stiffness = nodes[order.springs], stiffness[order.springs]
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
@@ -304,29 +304,38 @@ class _TetLaw:
         self.arm_modulus[:, members] += fraction * (moduli - self.arm_modulus[:, members])
 
 
-def _spring_law(
-    spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, stiffness: FloatArray, springs: NDArray[np.intp]
-) -> dict[str, Any]:
-    """The model's fields of stiffening and relaxation, springs in the kernels' order; means of the tets of a spring."""
+def _spring_law(spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, springs: NDArray[np.intp]) -> dict[str, Any]:
+    """The model's fields of stiffening and relaxation, springs in the kernels' order.
+
+    A spring has means of its tets, weighted by the stiffness that each adds to it. Organs side by side share these
+    fields: an amount that is the same in all tets has the same bits in all springs, whatever their moduli.
+    """
     mesh = spec.mesh
 
-    def at_springs(amount: FloatArray) -> FloatArray:
-        return spring_sum(mesh, spring_modulus, amount, rule=spec.stiffness_rule)[springs]
+    def mean(amount: FloatArray, weight: FloatArray) -> FloatArray:
+        """Of each spring; that of the first tet with a weight where no tet of the spring has one."""
+        first = float(amount[np.argmax(weight > 0.0)])
+        total = spring_sum(mesh, spring_modulus, weight, rule=spec.stiffness_rule)
+        differing = spring_sum(mesh, spring_modulus, weight * (amount - first), rule=spec.stiffness_rule)
+        return first + np.divide(differing, total, out=np.zeros_like(total), where=total > 0.0)[springs]
 
     none = _read_only(np.zeros(0))
     fields: dict[str, Any] = dict.fromkeys(("spring_growth", "spring_onset", "spring_excess"), none)
     fields |= {"spring_gain": none, "spring_arm_modulus": none, "arm_time": _read_only(_arm_times(spec))}
     fields["stiffens"], fields["relaxes"] = bool(law.rise.any()), bool(law.arm_modulus.any())
+    everywhere = np.ones(mesh.tet_count)
     if fields["stiffens"]:
-        rise, onset, width = at_springs(law.rise), at_springs(law.onset), at_springs(law.width)
-        rises = rise > 0.0
+        rises = law.rise > 0.0
+        onset, width = (
+            mean(np.divide(amount, law.rise, out=np.zeros_like(amount), where=rises), law.rise)
+            for amount in (law.onset, law.width)
+        )
         length = np.linalg.norm(mesh.points[mesh.edges[:, 0]] - mesh.points[mesh.edges[:, 1]], axis=1)[springs]
-        width_inverse = np.divide(rise, width, out=np.zeros_like(rise), where=rises)
-        fields["spring_growth"] = _read_only(width_inverse / length)
-        fields["spring_onset"] = _read_only(np.divide(onset, width, out=np.zeros_like(rise), where=rises))
-        fields["spring_excess"] = _read_only(width)
+        fields["spring_growth"] = _read_only(1.0 / (length * width))
+        fields["spring_onset"] = _read_only(onset / width)
+        fields["spring_excess"] = _read_only(mean(law.rise, everywhere) * width)
     if fields["relaxes"]:
-        moduli = np.stack([at_springs(arm) for arm in law.arm_modulus]) / stiffness[springs]
+        moduli = np.stack([mean(arm, everywhere) for arm in law.arm_modulus])
         fields["spring_gain"] = _read_only(1.0 + moduli.sum(axis=0))
         fields["spring_arm_modulus"] = _read_only(moduli.ravel())
     return fields

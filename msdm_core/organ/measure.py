@@ -58,8 +58,8 @@ def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:
         return tension
     beyond = np.maximum(np.abs(change) * model.spring_growth - model.spring_onset, 0.0)
     ramp = np.minimum(beyond, 1.0)
-    excess = model.spring_excess * model.spring_rest_length * (ramp**3 / 3.0 + (beyond - ramp))
-    return tension + np.sign(change) * excess
+    excess = model.spring_excess * (ramp**3 / 3.0 + (beyond - ramp))
+    return tension + np.sign(change) * model.spring_stiffness * model.spring_rest_length * excess
 
 
 def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
@@ -72,7 +72,7 @@ def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
     ramp = np.minimum(beyond, 1.0)
     over = beyond - ramp
     scale = np.divide(
-        model.spring_excess * model.spring_rest_length,
+        model.spring_stiffness * model.spring_rest_length * model.spring_excess,
         model.spring_growth,
         out=np.zeros_like(energy),
         where=model.spring_growth > 0.0,

@@ -47,8 +47,7 @@ def explicit_stiffness(model: OrganModel) -> FloatArray:
     stiffness = model.spring_stiffness
     if model.stiffens:
         rise = model.spring_excess * model.spring_growth * model.spring_rest_length
-        cap = 1.0 + rise / stiffness
-        stiffness = (stiffness + STEEP_SHARE**2 * rise) * np.maximum(cap / HELD_TANGENT, 1.0)
+        stiffness = stiffness * (1.0 + STEEP_SHARE**2 * rise) * np.maximum((1.0 + rise) / HELD_TANGENT, 1.0)
     return stiffness * model.spring_gain if model.relaxes else stiffness
 
 

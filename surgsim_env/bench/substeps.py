@@ -1,6 +1,7 @@
-"""Time of one substep of an organ against its number of nodes: springs, volume term and integration."""
+"""Time of one substep of an organ: against its number of nodes, and with springs that stiffen and relax."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from statistics import median
 
@@ -10,6 +11,7 @@ from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel
 from msdm_core.kernels.vector_kernels import lane_counts
 from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Material
+from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
@@ -24,21 +26,39 @@ slightly sheared so that no force is zero. Microseconds of processor time per su
 turn in each round. "Abreast" are organs side by side in lanes. A node or spring update is one node or spring in one
 substep."""
 
+# The block of phantom's size whose springs stiffen and relax, and how it is timed: Maxwell arms give way once a
+# millisecond, so that all laws need the same step.
+LAW_CELLS = (12, 12, 6)
+LAW_SHEAR, LAW_STEP = 0.1, 0.00025
+TISSUE = Material(5000.0, 1060.0, 0.45)
+STIFFENING = Stiffening(onset_strain=0.05, cap_strain=0.2, tangent_cap=20.0)
+ARMS = Relaxation(relative_moduli=(0.3, 0.3, 0.3), times=(0.05, 0.5, 5.0))
+LAWS = {
+    "linear, elastic": TISSUE,
+    "stiffening": replace(TISSUE, stiffening=STIFFENING),
+    "relaxation": replace(TISSUE, relaxation=ARMS),
+    "both": replace(TISSUE, stiffening=STIFFENING, relaxation=ARMS),
+}
+LAW_METHOD = """One block of 2047 nodes as above, with the laws of tissue: stiffening from a strain of 0.05 to 0.2 up to
+20 times the tangent, three Maxwell arms. Sheared by 0.1, which strains a part of the springs beyond the onset; the same
+step of 0.25 ms for all, processor time per substep and organ, all laws in turn in each round. Ratios are to linear,
+elastic springs."""
+
 Substep = Callable[[], float]
 
 
-def block(cells: Cells) -> OrganModel:
+def block(cells: Cells, material: Material = TISSUE) -> OrganModel:
     """A block of cubic cells, its bottom held."""
     mesh = box_mesh(np.array(cells) * CELL, cells)
     anchors = np.flatnonzero(mesh.points[:, 2] < 1e-9)
-    return compile_organ(OrganSpec(mesh, Material(5000.0, 1060.0, 0.45), anchors=anchors, damping=Damping(alpha=25.0)))
+    return compile_organ(OrganSpec(mesh, material, anchors=anchors, damping=Damping(alpha=25.0)))
 
 
-def single(model: OrganModel) -> Substep:
-    """Seconds of one substep of one organ, float64."""
+def single(model: OrganModel, *, shear: float = 0.01, dt: float | None = None) -> Substep:
+    """Seconds of one substep of one organ, float64, sheared; dt [s] is half of the stable step unless it is given."""
     state = rest_state(model)
-    state.node_position[:, 0] += 0.01 * state.node_position[:, 2]
-    dt = 0.5 * model.stable_step
+    state.node_position[:, 0] += shear * state.node_position[:, 2]
+    dt = 0.5 * model.stable_step if dt is None else dt
     wrench = np.zeros((0, 6))
 
     def advance(count: int) -> None:
@@ -49,13 +69,14 @@ def single(model: OrganModel) -> Substep:
     return lambda: seconds_per_call(advance)
 
 
-def abreast(model: OrganModel, dtype: type = np.float64) -> Substep:
-    """Seconds of one substep of each of many organs side by side in vector registers."""
+def abreast(model: OrganModel, dtype: type = np.float64, *, shear: float = 0.01, dt: float | None = None) -> Substep:
+    """Seconds of one substep of each of many organs side by side in vector registers; otherwise as `single`."""
     lanes = lane_counts(dtype)[0]
     organs = stack_organs([model] * lanes, dtype=dtype)
     state = rest_lanes([model] * lanes, dtype=dtype)
-    state.node_position[:, 0] += 0.01 * state.node_position[:, 2]
-    shapes, wrench, dt = stack_shapes([NO_SHAPES] * lanes, lanes), np.zeros((lanes, 0, 6)), 0.5 * model.stable_step
+    state.node_position[:, 0] += shear * state.node_position[:, 2]
+    shapes, wrench = stack_shapes([NO_SHAPES] * lanes, lanes), np.zeros((lanes, 0, 6))
+    dt = 0.5 * model.stable_step if dt is None else dt
 
     def advance(count: int) -> None:
         if (advance_lanes(organs, state, shapes, NO_CONTACT, dt, count, wrench) != FAULT_NONE).any():
@@ -66,7 +87,7 @@ def abreast(model: OrganModel, dtype: type = np.float64) -> Substep:
 
 
 # Ways of stepping, one column each.
-WAYS: dict[str, Callable[[OrganModel], Substep]] = {
+WAYS: dict[str, Callable[..., Substep]] = {
     "single": single,
     "8 abreast": abreast,
     "16 abreast, float32": partial(abreast, dtype=np.float32),
@@ -84,6 +105,26 @@ def measure(effort: Effort) -> Section:
             section.figures.extend(_figures(way, name, model, times[f"{way} {name}"]))
         costs = {len(model.node_mass): median(times[f"{way} {name}"]) for name, model in models.items()}
         section.figures.extend(_growth(way, costs))
+    return section
+
+
+def measure_laws(effort: Effort) -> Section:
+    """The cost of a substep with each of LAWS, for every way."""
+    section = Section("tissue_law", "Substep cost with laws of tissue", LAW_METHOD)
+    models = {name: block(LAW_CELLS, material) for name, material in LAWS.items()}
+    runs = {
+        f"{way} {name}": make(model, shear=LAW_SHEAR, dt=LAW_STEP)
+        for way, make in WAYS.items()
+        for name, model in models.items()
+    }
+    times = interleaved(runs, effort.substep_rounds)
+    for way in WAYS:
+        linear = median(times[f"{way} {next(iter(LAWS))}"])
+        for name in LAWS:
+            values = times[f"{way} {name}"]
+            note = f"{way}: {spread([1e6 * one for one in values])}"
+            section.figures.append(Figure(name, way, 1e6 * median(values), "us", note))
+            section.figures.append(Figure(name, f"ratio, {way}", median(values) / linear, "1"))
     return section
 
 

@@ -33,8 +33,12 @@ class Bench:
             before = report.load()
             sections: list[report.Section] = []
             # In the order of the report.
-            for part in (substeps, haptic, control, side_by_side, start):
-                section = part.measure(measurement.QUICK if self.quick else measurement.FULL)
+            parts = (
+                *(substeps.measure, substeps.measure_laws, haptic.measure),
+                *(control.measure, side_by_side.measure, start.measure),
+            )
+            for measure in parts:
+                section = measure(measurement.QUICK if self.quick else measurement.FULL)
                 sections.append(section)
                 for line in section.lines():
                     console.print(line, highlight=False, soft_wrap=True, markup=False)

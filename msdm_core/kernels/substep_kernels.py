@@ -10,7 +10,7 @@ import math
 
 from numba import njit
 
-from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, stretch_by_lag
+from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
 from msdm_core.kernels.guard_kernels import guard_axes
 from msdm_core.kernels.squeeze_kernels import hold_squeezed
 from msdm_core.kernels.structure_kernels import (
@@ -225,7 +225,7 @@ def _begin(lanes, model, state, shapes, response, duration):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, reference, wrench):
+def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count, reference, wrench):
     """Supports, contact, guard and squeezed tets, lane by lane; returns how many lanes move.
 
     An inverted tet stops its lane before anything moves: the state shows which tet it was.
@@ -249,7 +249,8 @@ def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, refer
             continue
         surface, moved = surface_of(lanes, model, lane), shapes_of(lanes, shapes, lane)
         about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
-        add_contact_forces(surface, touched, moved, law, dt, count, about, push)
+        points = add_contact_forces(surface, touched, moved, law, dt, count, about, push)
+        hold_contact(surface, touched, moved, law, dt, decay, points, about, push)
         answer = response_of(lanes, response, lane)
         if not guard_axes(surface, touched, moved, law, answer, dt, count, about, push):
             state.contact_kept[lane] = 0
@@ -321,7 +322,7 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
     _begin(lanes, model, rows, shapes, response, dt * substep_count)
     for substep in range(substep_count):
         squeezed_count = _evaluate(model, rows)
-        if _touch(lanes, model, rows, shapes, law, response, dt, squeezed_count, reference, wrench) == 0:
+        if _touch(lanes, model, rows, shapes, law, response, dt, decay, squeezed_count, reference, wrench) == 0:
             break
         integrate(
             lanes, rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay,

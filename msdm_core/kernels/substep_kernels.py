@@ -250,10 +250,10 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
         surface, moved = surface_of(lanes, model, lane), shapes_of(lanes, shapes, lane)
         about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
         points = add_contact_forces(surface, touched, moved, law, dt, count, about, push)
-        hold_contact(surface, touched, moved, law, dt, decay, points, about, push)
         answer = response_of(lanes, response, lane)
         if not guard_axes(surface, touched, moved, law, answer, dt, count, about, push):
             state.contact_kept[lane] = 0
+        hold_contact(surface, touched, moved, law, dt, decay, points, about, push)
         hold_squeezed(
             position, velocity, force, surface.node_inverse_mass, model.tet_nodes,
             column_of(model.tet_inverse_volume, lane), column_of(model.tet_averaged_bulk, lane),

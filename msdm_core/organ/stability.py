@@ -66,29 +66,31 @@ def contact_node_area(model: OrganModel) -> FloatArray:
     return np.bincount(model.surface_triangles.ravel(), thirds, len(model.node_mass)).astype(np.float64)
 
 
-def contact_hold(model: OrganModel, contact: ContactLaw, dt: float) -> float:
-    """Most that contact holds a node with in a substep over its mass: h = dt max(k_p dt + c_p, k_t dt) A / m.
+def contact_hold(model: OrganModel, contact: ContactLaw, dt: float) -> tuple[float, float]:
+    """Most that contact holds a node with in a substep over its mass, and the share of it that is stiffness.
 
-    A is a third of the area of each triangle around the node; k_t counts where there is friction. Faces that meet in
-    an edge or a corner count together, whatever their directions.
+    h = dt max(k_p dt + c_p, k_t dt) A / m, where A is a third of the area of each triangle around the node and k_t
+    counts where there is friction. Faces that meet in an edge or a corner count together, whatever their directions.
     """
     across = contact.tangential_stiffness if contact.friction > 0.0 else 0.0
-    held = dt * max(contact.stiffness * dt + contact.damping, across * dt)
-    return held * float((contact_node_area(model) * model.node_inverse_mass).max())
+    held = max(contact.stiffness * dt + contact.damping, across * dt)
+    share = max(contact.stiffness, across) * dt / held if held > 0.0 else 0.0
+    return dt * held * float((contact_node_area(model) * model.node_inverse_mass).max()), share
 
 
-def contact_excess(hold: float) -> float:
+def contact_excess(hold: float, share: float = 1.0) -> float:
     """What implicit contact leaves of a hold h for the step to bear, of a limit of 4; 0 for h up to 7.
 
-    Contact that holds a motion with k <= h (over its mass, times dt^2, as all here) is applied as it is at the start of
-    the substep; the sweeps of `contact_kernels.hold_contact` then leave v (1 + k R) / (1 + k) of a velocity v, where
-    R = prod (1 - w_j (1 + k) / (1 + h)) over the factors w_j of the sweeps. This is a mass of Q = (1 + k) / (1 + k R),
-    with which symplectic Euler is stable where k and what the organ itself holds with, t, are k + t <= 2 (1 + Q).
-    So t must stay below 4 less the largest k - 2 (Q - 1). As R >= 0, Q never is below 0.
+    A motion that contact holds with k <= h (over its mass, times dt^2, as all here) gets its stiffness, a share of k,
+    as it is at the start of the substep; the sweeps of `contact_kernels.hold_contact` then leave v (1 + k R) / (1 + k)
+    of a velocity v, where R = prod (1 - w_j (1 + k) / (1 + h)) over the factors w_j of the sweeps. That is a mass of
+    Q = (1 + k) / (1 + k R), with which symplectic Euler is stable where this stiffness and what the organ itself holds
+    with, t, are share k + t <= 2 (1 + Q). So t must stay below 4 less the largest share k - 2 (Q - 1). Damping alone
+    (share 0) asks for nothing.
     """
     held = hold * np.linspace(0.0, 1.0, 1001)
     left = np.prod([1.0 - factor * (1.0 + held) / (1.0 + hold) for factor in SWEEPS], axis=0)
-    return max(0.0, float((held - 2.0 * ((1.0 + held) / (1.0 + held * left) - 1.0)).max()))
+    return max(0.0, float((share * held - 2.0 * ((1.0 + held) / (1.0 + held * left) - 1.0)).max()))
 
 
 def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) -> float:
@@ -117,9 +119,9 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     2 (1 + e^(-alpha dt)). The guard of the shapes' axes is implicit and counts
     nothing; beta damps the organ alone.
     """
-    if contact is None or not np.any(model.node_inverse_mass):
-        return model.stable_step
     own = model.stable_step
+    if contact is None or not math.isfinite(own) or not np.any(model.node_inverse_mass):
+        return own
     damped = model.beta > 0.0 or (len(model.support_kind) > 0 and model.support_damping > 0.0)
     power = 1 if damped else 2
 
@@ -127,20 +129,9 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
         return 2.0 * (1.0 + math.exp(-model.alpha * dt))
 
     def margin(dt: float) -> float:
-        # Without springs an organ takes nothing of the limit.
-        taken = limit(own) * (dt / own) ** power if math.isfinite(own) else 0.0
-        return limit(dt) - taken - contact_excess(contact_hold(model, contact, dt))
+        return limit(dt) - limit(own) * (dt / own) ** power - contact_excess(*contact_hold(model, contact, dt))
 
-    if math.isfinite(own) and contact_excess(contact_hold(model, contact, own)) == 0.0:
-        return own
-    ceiling = own
-    if not math.isfinite(own):
-        ceiling = 1.0
-        while margin(ceiling) > 0.0 and math.isfinite(ceiling):
-            ceiling *= 2.0
-        if not math.isfinite(ceiling):
-            return math.inf
-    return float(brentq(margin, 0.0, ceiling, xtol=1e-12))  # pyright: ignore
+    return own if margin(own) >= 0.0 else float(brentq(margin, 0.0, own, xtol=1e-12))  # pyright: ignore
 
 
 def own_step(model: OrganModel) -> float:

@@ -14,34 +14,44 @@ from scipy.sparse.linalg import splu
 
 from msdm_core.mesh.tet_mesh import FloatArray
 
-# Pressure per penetration that stands for a rigid ball [N/m^3]: 5 kPa make 2.5 um.
-RIGID = 2e9
-# Largest step of the depth [m], Newton's tolerance on the residual over the ball's force, and its most iterations.
-DEPTH_STEP = 5e-4
+# Pressure per penetration that stands for a rigid ball [N/m^3]: 5 kPa make 5 um.
+RIGID = 1e9
+# Largest step of the depth [m], Newton's tolerance on the residual over the ball's force, its most
+# iterations, how often its step is halved, and how many iterations may raise the residual.
+DEPTH_STEP = 2.5e-4
 TOLERANCE = 1e-6
-ITERATIONS = 40
+ITERATIONS = 60
 HALVINGS = 6
+WILD = 6
 
 Modulus = Callable[[FloatArray, FloatArray], FloatArray]
 
 
-def neo_hookean(gradient: NDArray, hoop: NDArray, shear: NDArray, lame: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """First Piola stress P and hoop stress [Pa] of W = mu (I1 - 3 - 2 ln J) / 2 + lambda (J - 1)^2 / 2, and J.
+def neo_hookean(gradient: NDArray, shear: NDArray, lame: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """First Piola stress [Pa], its slope [Pa] and J of W = mu (I1 - 3 - 2 ln J) / 2 + lambda (J - 1)^2 / 2.
 
     Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), 6.4.3, with (J - 1)^2 in place of
-    (ln J)^2, as the volume term of the organ has it.
+    (ln J)^2, as the volume term of the organ has it. With G = J F^-T: P = mu (F - G / J) + lambda (J - 1) G.
 
     Args:
-        gradient: in-plane deformation gradient F (2, 2, ...).
-        hoop: stretch around the axis (...).
+        gradient: F_rr, F_rz, F_zr, F_zz and the stretch around the axis (5, ...).
         shear: mu [Pa] (...).
         lame: lambda [Pa] (...).
     """
-    flat = gradient[0, 0] * gradient[1, 1] - gradient[0, 1] * gradient[1, 0]
+    rr, rz, zr, zz, hoop = gradient
+    flat = rr * zz - rz * zr
     ratio = flat * hoop
-    inverse = np.array([[gradient[1, 1], -gradient[1, 0]], [-gradient[0, 1], gradient[0, 0]]]) / flat
-    volume = lame * (ratio - 1.0) * ratio - shear
-    return shear * gradient + volume * inverse, shear * hoop + volume / hoop, ratio
+    cofactor = np.array([zz * hoop, -zr * hoop, -rz * hoop, rr * hoop, flat])
+    volume = lame * (ratio - 1.0) - shear / ratio
+    stress = shear * gradient + volume * cofactor
+    tangent = (lame + shear / ratio**2) * _outer(cofactor, cofactor)
+    for part in range(5):
+        tangent[part, part] += shear
+    # dG / dF: the second derivatives of J.
+    for one, other, slope in ((0, 3, hoop), (1, 2, -hoop), (0, 4, zz), (1, 4, -zr), (2, 4, -rz), (3, 4, rr)):
+        tangent[one, other] += volume * slope
+        tangent[other, one] += volume * slope
+    return stress, tangent, ratio
 
 
 def layer_mesh(radius: float, depth: float, fine: float, reach: tuple[float, float]) -> Any:
@@ -89,8 +99,10 @@ class PressedLayer:
         r, z = self._basis.global_coordinates().value
         shear = modulus(r, z) / (2.0 * (1.0 + poisson_ratio))
         self._moduli = shear, 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
+        self._weight = 2.0 * np.pi * r * self._basis.dx
+        self._rates = _rates(self._basis, r)
+        self._top_rates = _rates(self._top, self._top.global_coordinates().value[0])
         self._membrane = membrane / (1.0 - membrane_ratio**2), membrane_ratio
-        self._displacement = np.zeros(self._basis.N)
 
     def forces(self, radius: float, depths: Sequence[float], contact_stiffness: float = RIGID) -> list[float]:
         """Force of the ball at each of some rising depths of its lowest point below the surface at rest [N].
@@ -114,122 +126,116 @@ class PressedLayer:
                 displacement, reached = after, target
             _, push = self._contact(displacement, radius, reached, contact_stiffness)
             found.append(float(push[self._up].sum()))
-        self._displacement = displacement
         return found
 
     def _balanced(self, start: FloatArray, radius: float, depth: float, stiffness: float) -> FloatArray | None:
         """Displacement in equilibrium [m] from a start, by Newton's method; None where it does not converge."""
         u, free = start.copy(), self._free
-        for _ in range(ITERATIONS):
-            matrix, force = self._solid(u)
-            held, push = self._contact(u, radius, depth, stiffness)
+        matrix, force, push = self._forces(u, radius, depth, stiffness)
+        for iteration in range(ITERATIONS):
             residual = (force + push)[free]
             size = float(np.abs(residual).sum())
-            if not np.isfinite(size):
-                return None
-            if size <= TOLERANCE * float(np.abs(push).sum()) and size < 1e-3:
+            if size <= TOLERANCE * float(np.abs(push).sum()):
                 return u
-            change = splu(csc_array(matrix + held)[free][:, free].tocsc()).solve(-residual)
-            share = 1.0
+            # Nearly symmetric as it is: an ordering for that takes a third of the time.
+            factors = splu(matrix[free][:, free].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            change = factors.solve(-residual)
+            # A long step may end in another equilibrium, with a crease in the surface.
+            share = min(1.0, DEPTH_STEP / float(np.abs(change).max()))
             for _ in range(HALVINGS):
                 trial = u.copy()
                 trial[free] += share * change
                 if self._smallest_ratio(trial) > 0.0:
-                    break
+                    matrix, force, push = self._forces(trial, radius, depth, stiffness)
+                    # The first steps may go uphill; later ones must not, or points go in and out of contact for ever.
+                    if iteration < WILD or float(np.abs((force + push)[free]).sum()) < size:
+                        break
                 share *= 0.5
             else:
                 return None
             u = trial
         return None
 
-    def _smallest_ratio(self, u: FloatArray) -> float:
-        gradient, hoop = self._strained(self._basis.interpolate(u), self._basis.global_coordinates().value[0])
-        return float(neo_hookean(gradient, hoop, *self._moduli)[2].min())
+    def _forces(self, u: FloatArray, radius: float, depth: float, stiffness: float) -> tuple[Any, FloatArray, FloatArray]:
+        """Tangent stiffness of solid and contact [N/m], and the forces of each [N], at a displacement."""
+        matrix, force = self._solid(u)
+        held, push = self._contact(u, radius, depth, stiffness)
+        return csc_array(matrix + held), force, push
 
-    @staticmethod
-    def _strained(u: Any, r: NDArray) -> tuple[NDArray, NDArray]:
-        """In-plane deformation gradient and hoop stretch of a displacement."""
-        gradient = np.array(u.grad)
-        gradient[0, 0] += 1.0
-        gradient[1, 1] += 1.0
-        return gradient, 1.0 + np.array(u)[0] / r
+    def _smallest_ratio(self, u: FloatArray) -> float:
+        return float(neo_hookean(self._strained(u), *self._moduli)[2].min())
+
+    def _strained(self, u: FloatArray) -> NDArray:
+        """Deformation gradient of a displacement: F_rr, F_rz, F_zr, F_zz and the stretch around the axis (5, n, m)."""
+        return np.array([1.0, 0.0, 0.0, 1.0, 1.0])[:, None, None] + np.einsum(
+            "inea,ie->nea", self._rates[:, :5], u[self._basis.element_dofs], optimize=True
+        )
 
     def _solid(self, u: FloatArray) -> tuple[Any, FloatArray]:
         """Tangent stiffness [N/m] and forces of the solid and its membrane [N] at a displacement."""
-        from skfem import BilinearForm, LinearForm
-
-        before, r = self._basis.interpolate(u), self._basis.global_coordinates().value[0]
-        shear, lame = self._moduli
-        gradient, hoop = self._strained(before, r)
-        stress, around, ratio = neo_hookean(gradient, hoop, shear, lame)
-        flat = ratio / hoop
-        inverse = np.array([[gradient[1, 1], -gradient[1, 0]], [-gradient[0, 1], gradient[0, 0]]]) / flat
-        volume, slope = lame * (ratio - 1.0) * ratio - shear, lame * (2.0 * ratio - 1.0) * ratio
-        weight = 2.0 * np.pi * r
-
-        def force(v: Any, w: Any) -> Any:
-            return weight * (np.einsum("ij...,ij...->...", stress, v.grad) + around * v[0] / r)
-
-        def tangent(a: Any, b: Any, w: Any) -> Any:
-            # dP = mu dF + slope (F^-T : dF) F^-T - volume F^-T dF^T F^-T, the hoop direction a third axis of its own.
-            grown = np.einsum("ij...,ij...->...", inverse, a.grad) + a[0] / r / hoop
-            grown_b = np.einsum("ij...,ij...->...", inverse, b.grad) + b[0] / r / hoop
-            twisted = np.einsum("il...,kl...,kj...,ij...->...", inverse, a.grad, inverse, b.grad)
-            twisted = twisted + (a[0] / r / hoop) * (b[0] / r / hoop)
-            plain = np.einsum("ij...,ij...->...", a.grad, b.grad) + a[0] * b[0] / r**2
-            return weight * (shear * plain + slope * grown * grown_b - volume * twisted)
-
-        matrix, vector = BilinearForm(tangent).assemble(self._basis), LinearForm(force).assemble(self._basis)
+        stress, tangent, _ = neo_hookean(self._strained(u), *self._moduli)
+        matrix, vector = _assembled(self._basis, self._rates[:, :5], self._weight, stress, tangent)
         if self._membrane[0] > 0.0:
             more, pull = self._skin(u)
             matrix, vector = matrix + more, vector + pull
         return matrix, vector
+
+    def _top_values(self, u: FloatArray) -> NDArray:
+        """Rates of a displacement on the top: d/dr and d/dz of both parts, u_r / r, u_r, u_z (7, n, m)."""
+        return np.einsum("inea,ie->nea", self._top_rates, u[self._top.element_dofs], optimize=True)
 
     def _skin(self, u: FloatArray) -> tuple[Any, FloatArray]:
         """Tangent stiffness and forces of the membrane: (C / 2) (e_r^2 + e_h^2 + 2 nu e_r e_h) per area, Green strains.
 
         Plane stress, C = E h / (1 - nu^2).
         """
-        from skfem import BilinearForm, LinearForm
-
-        before, r = self._top.interpolate(u), self._top.global_coordinates().value[0]
         size, ratio = self._membrane
-        along = np.array([1.0 + before.grad[0, 0], before.grad[1, 0]])
-        hoop = 1.0 + np.array(before)[0] / r
-        strain, round_strain = 0.5 * (along[0] ** 2 + along[1] ** 2 - 1.0), 0.5 * (hoop**2 - 1.0)
+        rates, r = self._top_values(u), self._top.global_coordinates().value[0]
+        along, slope, hoop = 1.0 + rates[0], rates[2], 1.0 + rates[4]
+        strain, round_strain = 0.5 * (along**2 + slope**2 - 1.0), 0.5 * (hoop**2 - 1.0)
         pull, round_pull = size * (strain + ratio * round_strain), size * (round_strain + ratio * strain)
-        weight = 2.0 * np.pi * r
-
-        def force(v: Any, w: Any) -> Any:
-            rate = along[0] * v.grad[0, 0] + along[1] * v.grad[1, 0]
-            return weight * (pull * rate + round_pull * hoop * v[0] / r)
-
-        def tangent(a: Any, b: Any, w: Any) -> Any:
-            rate, rate_b = (along[0] * one.grad[0, 0] + along[1] * one.grad[1, 0] for one in (a, b))
-            turn, turn_b = hoop * a[0] / r, hoop * b[0] / r
-            stiff = size * (rate * rate_b + turn * turn_b + ratio * (rate * turn_b + turn * rate_b))
-            across = a.grad[0, 0] * b.grad[0, 0] + a.grad[1, 0] * b.grad[1, 0]
-            return weight * (stiff + pull * across + round_pull * a[0] * b[0] / r**2)
-
-        return BilinearForm(tangent).assemble(self._top), LinearForm(force).assemble(self._top)
+        first, second = np.array([along, slope, np.zeros_like(hoop)]), np.array([0.0 * hoop, 0.0 * hoop, hoop])
+        stress = pull * first + round_pull * second
+        tangent = size * (_outer(first, first) + _outer(second, second))
+        tangent += size * ratio * (_outer(first, second) + _outer(second, first))
+        for part, held in enumerate((pull, pull, round_pull)):
+            tangent[part, part] += held
+        weight = 2.0 * np.pi * r * self._top.dx
+        return _assembled(self._top, self._top_rates[:, (0, 2, 4)], weight, stress, tangent)
 
     def _contact(self, u: FloatArray, radius: float, depth: float, stiffness: float) -> tuple[Any, FloatArray]:
         """Tangent stiffness and forces [N] of a ball `depth` below the surface at rest, on the surface, outward."""
-        from skfem import BilinearForm, LinearForm
+        rates, (r, _) = self._top_values(u), self._top.global_coordinates().value
+        place = np.array([r + rates[5], rates[6] - (radius - depth)])
+        distance = np.sqrt((place**2).sum(axis=0))
+        gap, out = np.maximum(radius - distance, 0.0), place / distance
+        across = np.eye(2)[:, :, None, None] - _outer(out, out)
+        tangent = stiffness * ((gap > 0.0) * _outer(out, out) - gap / distance * across)
+        weight = 2.0 * np.pi * r * self._top.dx
+        return _assembled(self._top, self._top_rates[:, 5:], weight, -stiffness * gap * out, tangent)
 
-        before, (r, _) = self._top.interpolate(u), self._top.global_coordinates().value
-        x, z = r + np.array(before)[0], np.array(before)[1] - (radius - depth)
-        distance = np.sqrt(x**2 + z**2)
-        gap = np.maximum(radius - distance, 0.0)
-        out = np.array([x, z]) / distance
-        weight = 2.0 * np.pi * r * stiffness
 
-        def force(v: Any, w: Any) -> Any:
-            return -weight * gap * (out[0] * v[0] + out[1] * v[1])
+def _outer(one: NDArray, other: NDArray) -> NDArray:
+    return one[:, None] * other[None]
 
-        def tangent(a: Any, b: Any, w: Any) -> Any:
-            along = (out[0] * a[0] + out[1] * a[1]) * (out[0] * b[0] + out[1] * b[1])
-            plain = a[0] * b[0] + a[1] * b[1]
-            return weight * ((gap > 0.0) * along - gap / distance * (plain - along))
 
-        return BilinearForm(tangent).assemble(self._top), LinearForm(force).assemble(self._top)
+def _rates(basis: Any, r: NDArray) -> NDArray:
+    """Of each of an element's functions v: d/dr and d/dz of v_r and v_z, v_r / r, v_r, v_z (n_function, 7, n, m)."""
+    found = []
+    for (one,) in basis.basis:
+        value, gradient = np.broadcast_to(np.array(one), (2, *r.shape)), np.broadcast_to(one.grad, (2, 2, *r.shape))
+        found.append([*gradient.reshape(4, *r.shape), value[0] / r, *value])
+    return np.array(found)
+
+
+def _assembled(basis: Any, rates: NDArray, weight: NDArray, stress: NDArray, tangent: NDArray) -> tuple[Any, NDArray]:
+    """Matrix and vector of the sum over places of stress and tangent on the functions' rates (n_function, k, n, m)."""
+    vector, matrix = np.zeros(basis.N), 0.0
+    loaded = np.einsum("inea,nea,ea->ie", rates, stress, weight, optimize=True)
+    np.add.at(vector, basis.element_dofs, loaded)
+    stiff = np.einsum("nkea,jkea->jnea", tangent * weight, rates, optimize=True)
+    matrix = np.einsum("inea,jnea->ije", rates, stiff, optimize=True)
+    count = len(rates)
+    rows = np.repeat(basis.element_dofs[:, None], count, axis=1)
+    columns = np.repeat(basis.element_dofs[None], count, axis=0)
+    return csc_array((matrix.ravel(), (rows.ravel(), columns.ravel())), shape=(basis.N, basis.N)), vector

@@ -254,9 +254,7 @@ def contact_area(tools: ToolBodies, tool: int) -> float:
     return float((np.pi * radius**2 + 2.0 * radius * (length + width) + width * length).sum())
 
 
-def tool_masses(
-    tools: ToolBodies, contact: ContactLaw, surface_area: float, substep_count: int = 2
-) -> list[ToolMass]:
+def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float, substep_count: int = 2) -> list[ToolMass]:
     """Effective and minimum mass of each tool at the tools' current pose.
 
     In the worst case a tool of mass m touches tissue too heavy to move within a haptic step dt: a spring k = k_p A and

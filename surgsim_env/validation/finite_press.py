@@ -156,7 +156,9 @@ class PressedLayer:
             u = trial
         return None
 
-    def _forces(self, u: FloatArray, radius: float, depth: float, stiffness: float) -> tuple[Any, FloatArray, FloatArray]:
+    def _forces(
+        self, u: FloatArray, radius: float, depth: float, stiffness: float
+    ) -> tuple[Any, FloatArray, FloatArray]:
         """Tangent stiffness of solid and contact [N/m], and the forces of each [N], at a displacement."""
         matrix, force = self._solid(u)
         held, push = self._contact(u, radius, depth, stiffness)

@@ -48,11 +48,11 @@ def test_contact_is_stiffer_than_an_explicit_one_could_be():
     assert stable_dt(model, law) > 1.8 * explicit
 
 
-@pytest.mark.parametrize("law", [SMOOTH, SMOOTH._replace(stiffness=1e9)], ids=["1e8", "1e9"])
-def test_a_static_press_does_not_depend_on_the_step(law: ContactLaw):
-    """The same force to 1e-5 at steps of 0.5 to 0.1 ms, at rest to 1e-6 of it."""
-    model, forces = organ(), []
-    for dt in (5e-4, 2.5e-4, 1e-4):
+@pytest.mark.parametrize(("stiffness", "steps"), [(1e8, (5e-4, 2.5e-4, 1e-4)), (1e9, (1.25e-4, 1e-4, 5e-5))])
+def test_a_static_press_does_not_depend_on_the_step(stiffness: float, steps: tuple[float, ...]):
+    """The same force to 1e-5 at steps that differ by a factor of 2.5 and more, at rest to 1e-6 of it."""
+    model, law, forces = organ(), SMOOTH._replace(stiffness=stiffness), []
+    for dt in steps:
         state = rest_state(model, shape_count=1)
         shapes = ball(velocity=(0.0, 0.0, -0.02))
         run(model, state, shapes, law, dt, 0.1)
@@ -90,11 +90,10 @@ def test_momentum_is_exchanged_and_nothing_else():
         centre, wrench = shapes.tool_centre[0].copy(), np.zeros((1, 6))
         assert advance_organ(model, state, shapes, SMOOTH._replace(friction=0.3), 2e-4, 5, wrench) == FAULT_NONE
         force, torque = wrench[0, :3], wrench[0, 3:] + np.cross(centre - pivot, wrench[0, :3])
-        size = 1e-3 * np.abs(wrench[0, :3]).max() + 1e-9
-        np.testing.assert_allclose(momentum(model, state) - before[0], -1e-3 * force, rtol=0, atol=1e-11 * size)
-        np.testing.assert_allclose(
-            _spin(model, state, pivot) - before[1], -1e-3 * torque, rtol=0, atol=1e-12 * size
-        )
+        # 1e-12 of the impulse, and the rounding of the momentum itself.
+        size = 1e-12 * 1e-3 * float(np.abs(wrench[0, :3]).max()) + 1e-17
+        np.testing.assert_allclose(momentum(model, state) - before[0], -1e-3 * force, rtol=0, atol=size)
+        np.testing.assert_allclose(_spin(model, state, pivot) - before[1], -1e-3 * torque, rtol=0, atol=size)
 
 
 def _spin(model: OrganModel, state: OrganState, pivot: NDArray) -> NDArray:
@@ -108,18 +107,24 @@ def test_a_pressure_never_pulls():
     run(model, state, shapes, SMOOTH, 2.5e-4, 0.04)
     shapes.tool_twist[0, 2] = 1.0
     force = run(model, state, shapes, SMOOTH, 2.5e-4, 0.02)[:, 0, 2]
-    assert force.min() == 0.0 and force[0] > 0.0 and force[-1] == 0.0
+    assert force.min() > -1e-15 and force[-1] == 0.0
 
 
 def test_friction_sticks_up_to_the_pressure_that_acts():
-    """Sliding over tissue as contact and step vary: mu N along the motion, 3 % for the flanks of the ball."""
+    """Sliding over a cell: what friction adds to the drag of a smooth ball is mu N, whatever stiffness and step."""
     model = organ()
-    for law, dt in ((ROUGH, 5e-4), (ROUGH._replace(stiffness=1e9, tangential_stiffness=5e8), 2.5e-4)):
-        state, shapes = rest_state(model, shape_count=1), ball(velocity=(0.0, 0.0, -0.02))
-        run(model, state, shapes, law, dt, 0.05)
-        shapes.tool_twist[0, :3] = (0.02, 0.0, 0.0)
-        wrench = run(model, state, shapes, law, dt, 0.25)[-125:, 0]
-        assert -wrench[:, 0].sum() / wrench[:, 2].sum() == pytest.approx(law.friction, rel=0.05)
+    for stiffness, dt in ((1e8, 5e-4), (1e8, 2e-4), (1e9, 1e-4)):
+        drag = []
+        for friction in (0.0, 0.3):
+            law = ROUGH._replace(stiffness=stiffness, tangential_stiffness=0.5 * stiffness, friction=friction)
+            state, shapes = rest_state(model, shape_count=1), ball(velocity=(0.0, 0.0, -0.02))
+            shapes.shape_ends[:, :, 0] -= 0.006
+            shapes.tool_centre[:, 0] -= 0.006
+            run(model, state, shapes, law, dt, 0.05)
+            shapes.tool_twist[0, :3] = (0.02, 0.0, 0.0)
+            wrench = run(model, state, shapes, law, dt, 0.35)[-250:, 0]
+            drag.append(-wrench[:, 0].sum() / wrench[:, 2].sum())
+        assert drag[1] - drag[0] == pytest.approx(0.3, rel=0.05)
 
 
 def test_two_tools_that_pinch_hold_still():

@@ -88,10 +88,10 @@ def test_each_part_shortens_the_step(part: str):
         "alpha with contact": (plain, SOFT._replace(stiffness=2e8)),
         "beta with contact": (plain, SOFT._replace(stiffness=2e8)),
     }[part]
-    assert stable_dt(model, contact) < 0.9 * stable_dt(*without)
+    assert stable_dt(model, contact) < 0.95 * stable_dt(*without)
 
 
-@pytest.mark.parametrize("law", [SOFT._replace(damping=5e4), SOFT._replace(stiffness=1.5e6, friction=50.0)])
+@pytest.mark.parametrize("law", [SOFT._replace(damping=5e4), SOFT._replace(stiffness=1e6, friction=50.0)])
 def test_implicit_contact_asks_for_no_shorter_step(law: ContactLaw):
     """Damping of any size, and stiffness up to a hold of 7: stable at the step of the organ alone."""
     model = organ()

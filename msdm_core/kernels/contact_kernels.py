@@ -23,6 +23,18 @@ QUADRATURE_BARYCENTRIC = np.array(
     ]
 )
 
+# A row of `contact_rows`, one engaged quadrature point: slope of its penetration g with its three corners, norms of
+# those slopes, weighted area, pressure, unit vector e, stretch.
+ROW_SLOPE, ROW_NORM, ROW_AREA, ROW_PRESSURE, ROW_OUT, ROW_STRETCH = 0, 9, 12, 13, 14, 17
+# Then what `hold_contact` needs of it: speed of the tool along the slopes and at the point, 1 / (1 + h) along and
+# across, what it has added to pressure and stretch, and what it adds in one sweep.
+ROW_TOOL, ROW_GIVE, ROW_MORE, ROW_STEP = 20, 24, 26, 30
+ROW_WIDTH = 34
+# A row of `contact_places`: shape, number of the point, nodes of its corners.
+PLACE_WIDTH = 5
+# Factors of the sweeps of `hold_contact`, see there.
+SWEEPS = (1.0, 2.0, 2.0)
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_candidates(model, state, shapes, duration):
@@ -77,54 +89,63 @@ def find_candidates(model, state, shapes, duration):
 
 
 @njit(forceinline=True, error_model="numpy")
-def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
-    """Stretch of a spring across a normal that sticks to a surface and slips above a limit (Coulomb, stick-slip).
+def stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz):
+    """Stretch of a spring across a normal that sticks to a surface: u + dt v, without its part along n.
 
-    u <- u + dt v, without its part along n; then shortened to `longest` = mu p / k_t where it is longer.
-
-    In: u: stretch before [m], v: relative velocity [m/s], dt [s], n: unit normal, longest [m]
+    In: u: stretch before [m], v: relative velocity [m/s], dt [s], n: unit normal
     Returns u [m], three numbers.
     """
     ux += dt * vx
     uy += dt * vy
     uz += dt * vz
     along = ux * nx + uy * ny + uz * nz
-    ux -= along * nx
-    uy -= along * ny
-    uz -= along * nz
+    return ux - along * nx, uy - along * ny, uz - along * nz
+
+
+@njit(forceinline=True, error_model="numpy")
+def slipped(ux, uy, uz, longest):
+    """Factor on a stretch u [m] that slips where it is longer than `longest` = mu p / k_t [m] (Coulomb); at most 1."""
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
-    if length > longest:
-        ux *= longest / length
-        uy *= longest / length
-        uz *= longest / length
-    return ux, uy, uz
+    return longest / length if length > longest else 1.0
+
+
+@njit(forceinline=True, error_model="numpy")
+def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
+    """`stretched`, then shortened to `longest` [m] where it slips."""
+    ux, uy, uz = stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz)
+    kept = slipped(ux, uy, uz, longest)
+    return kept * ux, kept * uy, kept * uz
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
-    """Contact forces of every shape on its candidate triangles, and the reaction on the tools.
+    """Contact forces of every shape on its candidate triangles as they are now, and the reaction on the tools.
 
     Each quadrature point is held off by a penetration that keeps rising with depth. With d from the shape's core to the
     point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2) the half chord, the line through the
     point along n leaves the ball t + s below the point. The energy per area is (k_p / 2) g^2 with g = s (s + t) / r: to
     first order the radial penetration r - |d|, yet growing without bound as the ball sinks below the surface, where a
     radial one falls again and lets the ball tunnel. Forces are its exact gradient, the turning of n with the corners
-    included, so that action and reaction balance, torque too.
+    included, so that action and reaction balance, torque too. Friction pulls with k_t times the stretch.
     A point engages where the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays
     engaged until it parts, so that the far side of a thin organ is never taken for the near one.
+    `hold_contact` must follow: it adds what pressure and friction change until the end of the substep.
 
     Model: model: surface_triangles (n_surface, 3), surface_rest_area [m^2] (n_surface,); law
     In:    state: node_position [m], node_velocity [m/s] (n_node, 3), contact_candidates; shapes, dt [s],
            candidate_count, reference: point of each tool's torque [m] (n_tool, 3)
     Out:   state: node_force, added to [N] (n_node, 3), contact_engaged (n_shape, n_surface * 4), contact_stretch [m]
-           (n_shape, n_surface * 4, 3); wrench, added to [N, N m] (n_tool, 6)
+           (n_shape, n_surface * 4, 3), contact_rows, contact_places; wrench, added to [N, N m] (n_tool, 6)
+    Returns how many points are engaged: rows of contact_rows and contact_places.
     """
     # All branches are in this one body: a function with branches that takes arrays counts references at each call,
     # which took three times as long as the rest.
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
+    rows, places = state.contact_rows, state.contact_places
     surface, rest_area = model.surface_triangles, model.surface_rest_area
     ends, spans, centre, twist = shapes.shape_ends, shapes.shape_span, shapes.tool_centre, shapes.tool_twist
+    count = 0
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
         radius = shapes.shape_radius[shape]
@@ -174,55 +195,215 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                     _release(engaged, stretch_memory, shape, item)
                     continue
                 engaged[shape, item] = 1
-                vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
-                ux, uy, uz = _tool_velocity(twist, centre, tool, x, y, z)
-                vx -= ux
-                vy -= uy
-                vz -= uz
                 # e: unit vector against the ball's own normal where the line along n leaves the ball.
                 ex = (s * nx - rx) / radius
                 ey = (s * ny - ry) / radius
                 ez = (s * nz - rz) / radius
-                load = law.stiffness * depth + law.damping * (ex * vx + ey * vy + ez * vz)
-                if load < 0.0:
-                    load = 0.0
-                scale = -weighted_area * load / (radius * radius)
+                pressure = law.stiffness * s * depth / radius
 
-                # Gradient of g at the point (times r^2 / s): s^2 n - (2 s + t) rho, without the directions in which
-                # the nearest point of the core follows.
+                # Slope of g at the point: (s^2 n - (2 s + t) rho) / (s r), without the directions in which the nearest
+                # point of the core follows.
+                scale = 1.0 / (s * radius)
                 gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
                 gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
                 gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
                 gx, gy, gz = _without_core(ends, spans, shape, px, py, pz, gx, gy, gz)
 
-                # Friction: a tangential spring that turns with the tool and sticks until mu times the pressure, then
-                # slips.
-                ux = stretch_memory[shape, item, 0]
-                uy = stretch_memory[shape, item, 1]
-                uz = stretch_memory[shape, item, 2]
-                vx += twist[tool, 4] * uz - twist[tool, 5] * uy
-                vy += twist[tool, 5] * ux - twist[tool, 3] * uz
-                vz += twist[tool, 3] * uy - twist[tool, 4] * ux
-                longest = friction * load * s / radius / law.tangential_stiffness
-                ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, ex, ey, ez, longest)
-                stretch_memory[shape, item, 0] = ux
-                stretch_memory[shape, item, 1] = uy
-                stretch_memory[shape, item, 2] = uz
-                drag = law.tangential_stiffness * weighted_area
-                gx -= drag * ux
-                gy -= drag * uy
-                gz -= drag * uz
-
-                # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the gradient
+                # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the slope
                 # is along n. rho . grad(lambda_b) = rho . (c x n) / (2 A), for the corner c rho . (n x b) / (2 A).
                 turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
                 turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
                 turn = -scale * depth * depth
                 tb = turn * turn_b
                 tc = turn * turn_c
-                _push_corner(position, force, reference, wrench, tool, a, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
-                _push_corner(position, force, reference, wrench, tool, b, wb, tb, gx, gy, gz, nx, ny, nz)
-                _push_corner(position, force, reference, wrench, tool, c, wc, tc, gx, gy, gz, nx, ny, nz)
+
+                # Friction: a tangential spring that follows the surface and turns with the tool.
+                ux = stretch_memory[shape, item, 0]
+                uy = stretch_memory[shape, item, 1]
+                uz = stretch_memory[shape, item, 2]
+                vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
+                ox, oy, oz = _tool_velocity(twist, centre, tool, x, y, z)
+                vx += twist[tool, 4] * uz - twist[tool, 5] * uy - ox
+                vy += twist[tool, 5] * ux - twist[tool, 3] * uz - oy
+                vz += twist[tool, 3] * uy - twist[tool, 4] * ux - oz
+                longest = friction * pressure / law.tangential_stiffness
+                ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, ex, ey, ez, longest)
+                stretch_memory[shape, item, 0] = ux
+                stretch_memory[shape, item, 1] = uy
+                stretch_memory[shape, item, 2] = uz
+
+                places[count, 0] = shape
+                places[count, 1] = item
+                places[count, 2] = a
+                places[count, 3] = b
+                places[count, 4] = c
+                _put_slope(rows, count, 0, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
+                _put_slope(rows, count, 1, wb, tb, gx, gy, gz, nx, ny, nz)
+                _put_slope(rows, count, 2, wc, tc, gx, gy, gz, nx, ny, nz)
+                steepness = math.sqrt(gx * gx + gy * gy + gz * gz)
+                rows[count, ROW_NORM] = wa * steepness + abs(tb + tc)
+                rows[count, ROW_NORM + 1] = wb * steepness + abs(tb)
+                rows[count, ROW_NORM + 2] = wc * steepness + abs(tc)
+                rows[count, ROW_AREA] = weighted_area
+                rows[count, ROW_PRESSURE] = pressure
+                rows[count, ROW_OUT] = ex
+                rows[count, ROW_OUT + 1] = ey
+                rows[count, ROW_OUT + 2] = ez
+                rows[count, ROW_STRETCH] = ux
+                rows[count, ROW_STRETCH + 1] = uy
+                rows[count, ROW_STRETCH + 2] = uz
+                push = weighted_area * pressure
+                drag = weighted_area * law.tangential_stiffness
+                ux *= drag
+                uy *= drag
+                uz *= drag
+                _push_corner(position, force, reference, wrench, tool, a, rows, count, 0, push, wa, ux, uy, uz)
+                _push_corner(position, force, reference, wrench, tool, b, rows, count, 1, push, wb, ux, uy, uz)
+                _push_corner(position, force, reference, wrench, tool, c, rows, count, 2, push, wc, ux, uy, uz)
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wrench):
+    """Make contact implicit: pressure and friction of each quadrature point at the END of the substep.
+
+    `add_contact_forces` has applied k_p g and k_t u. The pressure at the end has q = (k_p dt + c_p) g' more, the
+    friction k_t dt u', with the rates g', u' of the velocities that follow from all forces. Sweeps over the points
+    approach it: each adds w (q - what was added so far) / (1 + h), w = 1, 2, 2 (`SWEEPS`), and all of them read the
+    forces that the sweep before has left, so that their order does not matter. h is the mean over the corners of
+    H_a / m_a, with H_a = dt sum (k_p dt + c_p) A |dg/dx_a| sum_b |dg/dx_b| over the points around a node (k_t dt A
+    times its weight where that is more): a point has that share of a node's mass which it has of what holds the node
+    (mass splitting, Tonge, Benevolenski and Voroshilov 2012). The velocities then follow as from larger masses, which
+    are symmetric: contact gives no energy, and `stability.contact_excess` bounds what it asks of the step.
+    At rest under balanced forces nothing is added: an equilibrium does not depend on dt.
+    A pressure does not become negative; friction is cut at mu times the pressure that then acts (Coulomb). Tools keep
+    the velocity that they have at the start of the substep.
+
+    Model: model: node_inverse_mass [1/kg] (n_node,); law
+    In:    state: node_position [m], node_velocity [m/s] (n_node, 3), contact_rows and contact_places of
+           `add_contact_forces`, row_count; shapes, dt [s], decay: factor of a substep on velocities, reference: point
+           of each tool's torque [m] (n_tool, 3)
+    Out:   state: node_force, added to [N] (n_node, 3), contact_stretch [m] (n_shape, n_surface * 4, 3), contact_hold:
+           scratch, 0 before and after (n_node,); wrench, added to [N, N m] (n_tool, 6)
+    """
+    position, velocity, force = state.node_position, state.node_velocity, state.node_force
+    inverse_mass, hold, stretch_memory = model.node_inverse_mass, state.contact_hold, state.contact_stretch
+    rows, places = state.contact_rows, state.contact_places
+    centre, twist = shapes.tool_centre, shapes.tool_twist
+    along = law.stiffness * dt + law.damping
+    across = 0.0
+    if law.friction > 0.0:
+        across = law.tangential_stiffness * dt
+    for number in range(row_count):
+        point = places[number, 1] % QUADRATURE_COUNT
+        tool = shapes.shape_tool[places[number, 0]]
+        ux = rows[number, ROW_STRETCH]
+        uy = rows[number, ROW_STRETCH + 1]
+        uz = rows[number, ROW_STRETCH + 2]
+        # The stretch turns with the tool.
+        vx = twist[tool, 5] * uy - twist[tool, 4] * uz
+        vy = twist[tool, 3] * uz - twist[tool, 5] * ux
+        vz = twist[tool, 4] * ux - twist[tool, 3] * uy
+        rate = 0.0
+        total = rows[number, ROW_NORM] + rows[number, ROW_NORM + 1] + rows[number, ROW_NORM + 2]
+        for corner in range(3):
+            node = places[number, 2 + corner]
+            weight = QUADRATURE_BARYCENTRIC[point, corner]
+            share = max(along * total * rows[number, ROW_NORM + corner], across * weight)
+            hold[node] += dt * rows[number, ROW_AREA] * share
+            ox, oy, oz = _tool_velocity(twist, centre, tool, position[node, 0], position[node, 1], position[node, 2])
+            slope = ROW_SLOPE + 3 * corner
+            rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
+            vx += weight * ox
+            vy += weight * oy
+            vz += weight * oz
+        rows[number, ROW_TOOL] = rate
+        rows[number, ROW_TOOL + 1] = vx
+        rows[number, ROW_TOOL + 2] = vy
+        rows[number, ROW_TOOL + 3] = vz
+        for part in range(4):
+            rows[number, ROW_MORE + part] = 0.0
+    for number in range(row_count):
+        point = places[number, 1] % QUADRATURE_COUNT
+        held = 0.0
+        stuck = 0.0
+        total = 0.0
+        for corner in range(3):
+            node = places[number, 2 + corner]
+            share = hold[node] * inverse_mass[node]
+            held += rows[number, ROW_NORM + corner] * share
+            stuck += QUADRATURE_BARYCENTRIC[point, corner] * share
+            total += rows[number, ROW_NORM + corner]
+        # A point whose force has no direction (in the core of a shape) has no rate either.
+        rows[number, ROW_GIVE] = total / (total + held) if total > 0.0 else 0.0
+        rows[number, ROW_GIVE + 1] = 1.0 / (1.0 + stuck)
+    for sweep in range(len(SWEEPS)):
+        for number in range(row_count):
+            shape = places[number, 0]
+            item = places[number, 1]
+            point = item % QUADRATURE_COUNT
+            rate = -rows[number, ROW_TOOL]
+            vx = -rows[number, ROW_TOOL + 1]
+            vy = -rows[number, ROW_TOOL + 2]
+            vz = -rows[number, ROW_TOOL + 3]
+            for corner in range(3):
+                node = places[number, 2 + corner]
+                weight = QUADRATURE_BARYCENTRIC[point, corner]
+                gain = dt * inverse_mass[node]
+                ox = decay * velocity[node, 0] + gain * force[node, 0]
+                oy = decay * velocity[node, 1] + gain * force[node, 1]
+                oz = decay * velocity[node, 2] + gain * force[node, 2]
+                slope = ROW_SLOPE + 3 * corner
+                rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
+                vx += weight * ox
+                vy += weight * oy
+                vz += weight * oz
+            pressure = rows[number, ROW_PRESSURE]
+            before = rows[number, ROW_MORE]
+            more = before + SWEEPS[sweep] * rows[number, ROW_GIVE] * (along * rate - before)
+            more = max(more, -pressure)
+            rows[number, ROW_MORE] = more
+            rows[number, ROW_STEP] = more - before
+            # The stretch of the last sweep, and from there on to that of the velocities.
+            ux = rows[number, ROW_STRETCH] + rows[number, ROW_MORE + 1]
+            uy = rows[number, ROW_STRETCH + 1] + rows[number, ROW_MORE + 2]
+            uz = rows[number, ROW_STRETCH + 2] + rows[number, ROW_MORE + 3]
+            give = SWEEPS[sweep] * rows[number, ROW_GIVE + 1]
+            qx, qy, qz = stretched(
+                ux, uy, uz, dt * vx - rows[number, ROW_MORE + 1], dt * vy - rows[number, ROW_MORE + 2],
+                dt * vz - rows[number, ROW_MORE + 3], give,
+                rows[number, ROW_OUT], rows[number, ROW_OUT + 1], rows[number, ROW_OUT + 2],
+            )  # fmt: skip
+            longest = law.friction * shapes.shape_friction[shape] * (pressure + more) / law.tangential_stiffness
+            kept = slipped(qx, qy, qz, longest)
+            qx *= kept
+            qy *= kept
+            qz *= kept
+            rows[number, ROW_STEP + 1] = qx - ux
+            rows[number, ROW_STEP + 2] = qy - uy
+            rows[number, ROW_STEP + 3] = qz - uz
+            for part in range(1, 4):
+                rows[number, ROW_MORE + part] += rows[number, ROW_STEP + part]
+            if kept < 1.0 and sweep == len(SWEEPS) - 1:
+                stretch_memory[shape, item, 0] = qx
+                stretch_memory[shape, item, 1] = qy
+                stretch_memory[shape, item, 2] = qz
+        for number in range(row_count):
+            point = places[number, 1] % QUADRATURE_COUNT
+            tool = shapes.shape_tool[places[number, 0]]
+            push = rows[number, ROW_AREA] * rows[number, ROW_STEP]
+            drag = rows[number, ROW_AREA] * law.tangential_stiffness
+            ux = drag * rows[number, ROW_STEP + 1]
+            uy = drag * rows[number, ROW_STEP + 2]
+            uz = drag * rows[number, ROW_STEP + 3]
+            for corner in range(3):
+                node = places[number, 2 + corner]
+                weight = QUADRATURE_BARYCENTRIC[point, corner]
+                _push_corner(
+                    position, force, reference, wrench, tool, node, rows, number, corner, push, weight, ux, uy, uz
+                )
+                hold[node] = 0.0
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -339,11 +520,19 @@ def _release(engaged, stretch_memory, shape, item):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _push_corner(position, force, reference, wrench, tool, node, weight, along_n, gx, gy, gz, nx, ny, nz):
-    """One corner's share of a point's force, weight g + along_n n, and the reaction to it."""
-    fx = weight * gx + along_n * nx
-    fy = weight * gy + along_n * ny
-    fz = weight * gz + along_n * nz
+def _put_slope(rows, number, corner, weight, along_n, gx, gy, gz, nx, ny, nz):
+    """Write the slope of a point's penetration with one corner into its row, weight g + along_n n."""
+    rows[number, ROW_SLOPE + 3 * corner] = weight * gx + along_n * nx
+    rows[number, ROW_SLOPE + 3 * corner + 1] = weight * gy + along_n * ny
+    rows[number, ROW_SLOPE + 3 * corner + 2] = weight * gz + along_n * nz
+
+
+@njit(forceinline=True, error_model="numpy")
+def _push_corner(position, force, reference, wrench, tool, node, rows, number, corner, push, weight, ux, uy, uz):
+    """One corner's share of a point's force, -push dg/dx - weight u [N], and the reaction to it."""
+    fx = -push * rows[number, ROW_SLOPE + 3 * corner] - weight * ux
+    fy = -push * rows[number, ROW_SLOPE + 3 * corner + 1] - weight * uy
+    fz = -push * rows[number, ROW_SLOPE + 3 * corner + 2] - weight * uz
     force[node, 0] += fx
     force[node, 1] += fy
     force[node, 2] += fz

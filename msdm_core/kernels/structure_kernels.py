@@ -134,6 +134,9 @@ class OrganState(NamedTuple):
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
+        contact_rows: scratch: one a point held off, see contact_kernels         (n_shape * n_surface * 4, ROW_WIDTH)
+        contact_places: scratch: whose they are                                  (n_shape * n_surface * 4, PLACE_WIDTH)
+        contact_hold: scratch: what contact holds a node with, times dt^2 [kg]   (n_node,)
         contact_passed: the shape and the triangle it passed through, after such a fault  (2,)
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_support_node, n_support, 3)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
@@ -158,6 +161,9 @@ class OrganState(NamedTuple):
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
+    contact_rows: FloatArray
+    contact_places: NDArray[np.int32]
+    contact_hold: FloatArray
     contact_passed: NDArray[np.int32]
     support_stretch: FloatArray
     volume_ratio_smallest: FloatArray
@@ -171,7 +177,7 @@ class OrganState(NamedTuple):
 # Written anew in every call: need not be saved.
 SCRATCH_FIELDS = (
     *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets", "steep_springs"),
-    "contact_candidates",
+    *("contact_candidates", "contact_rows", "contact_places", "contact_hold"),
     *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept"),
 )
 
@@ -265,6 +271,7 @@ class LaneState(NamedTuple):
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_lane, n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_lane, n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_lane, n_shape, n_surface)
+        contact_rows, contact_places, contact_hold: scratch of one lane after the other, as in OrganState
         contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
@@ -288,6 +295,9 @@ class LaneState(NamedTuple):
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
+    contact_rows: FloatArray
+    contact_places: NDArray[np.int32]
+    contact_hold: FloatArray
     contact_passed: NDArray[np.int32]
     support_stretch: FloatArray
     node_tension: LaneArray
@@ -419,6 +429,9 @@ class _Touched(NamedTuple):
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
+    contact_rows: FloatArray
+    contact_places: NDArray[np.int32]
+    contact_hold: FloatArray
     contact_passed: NDArray[np.int32]
 
 
@@ -517,12 +530,13 @@ def touched_of(lanes, state, lane):
     if len(lanes) == 0:
         return _Touched(
             state.node_position, state.node_velocity, state.node_force,
-            state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
+            state.contact_engaged, state.contact_stretch, state.contact_candidates,
+            state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         )  # fmt: skip
     return _Touched(
         state.node_position[:, :, lane], state.node_velocity[:, :, lane], state.node_force[:, :, lane],
         state.contact_engaged[lane], state.contact_stretch[lane], state.contact_candidates[lane],
-        state.contact_passed[lane],
+        state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed[lane],
     )  # fmt: skip
 
 
@@ -557,7 +571,8 @@ def in_rows(lanes, state):
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
         state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
         state.steep_springs, state.spring_arm_tension, state.spring_relief,
-        state.contact_engaged, state.contact_stretch, state.contact_candidates, state.contact_passed,
+        state.contact_engaged, state.contact_stretch, state.contact_candidates,
+        state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         state.support_stretch, state.volume_ratio_smallest,
         state.lane_fault, state.moving, state.finite_sum, state.candidate_count, state.contact_kept,
     )  # fmt: skip

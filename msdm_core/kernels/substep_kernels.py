@@ -10,7 +10,7 @@ import math
 
 from numba import njit
 
-from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, stretch_by_lag
+from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
 from msdm_core.kernels.squeeze_kernels import hold_squeezed, hold_steep
@@ -247,7 +247,7 @@ def _begin(lanes, model, state, shapes, response, duration):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, steep_count, reference, wrench):
+def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench):
     """Supports, contact, guard, steep springs and squeezed tets, lane by lane; returns how many lanes move.
 
     An inverted tet stops its lane before anything moves: the state shows which tet it was.
@@ -271,7 +271,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, steep
             continue
         surface, moved = surface_of(lanes, model, lane), shapes_of(lanes, shapes, lane)
         about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
-        add_contact_forces(surface, touched, moved, law, dt, count, about, push)
+        points = add_contact_forces(surface, touched, moved, law, dt, count, about, push)
         answer = response_of(lanes, response, lane)
         if not guard_axes(surface, touched, moved, law, answer, dt, count, about, push):
             state.contact_kept[lane] = 0
@@ -283,6 +283,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, squeezed_count, steep
                 model.relaxes, model.tet_nodes.shape[0],
                 state.steep_springs, steep_count, group_width(lanes), dt,
             )  # fmt: skip
+        hold_contact(surface, touched, moved, law, dt, decay, points, about, push)
         hold_squeezed(
             position, velocity, force, surface.node_inverse_mass, model.tet_nodes,
             column_of(model.tet_inverse_volume, lane), column_of(model.tet_averaged_bulk, lane),
@@ -356,7 +357,10 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
         squeezed_count, steep_count = _evaluate(model, rows, fades, (substep + 1 - faded) * dt)
         if fades:
             faded = substep + 1
-        if _touch(lanes, model, rows, shapes, law, response, dt, squeezed_count, steep_count, reference, wrench) == 0:
+        if (
+            _touch(lanes, model, rows, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench)
+            == 0
+        ):
             break
         integrate(
             lanes, rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay,

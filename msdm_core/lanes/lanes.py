@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
+from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
     LANE_EMPTY,
@@ -224,6 +224,9 @@ def lanes_of(
         contact_engaged=np.zeros((count, shape_count, surface * QUADRATURE_COUNT), dtype=np.uint8),
         contact_stretch=np.zeros((count, shape_count, surface * QUADRATURE_COUNT, 3)),
         contact_candidates=np.zeros((count, shape_count, surface), dtype=np.int32),
+        contact_rows=np.zeros((shape_count * surface * QUADRATURE_COUNT, ROW_WIDTH)),
+        contact_places=np.zeros((shape_count * surface * QUADRATURE_COUNT, PLACE_WIDTH), dtype=np.int32),
+        contact_hold=np.zeros(nodes),
         contact_passed=np.zeros((count, 2), dtype=np.int32),
         support_stretch=np.zeros((count, support_nodes, supports, 3)),
         node_tension=aligned_zeros((nodes, count), dtype),
@@ -295,6 +298,9 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
         node_tension=np.zeros(nodes),
         squeezed_tets=np.zeros_like(state.squeezed_tets),
         contact_candidates=state.contact_candidates[lane, :, :surface].copy(),
+        contact_rows=np.zeros((state.contact_engaged.shape[1] * surface * QUADRATURE_COUNT, ROW_WIDTH)),
+        contact_places=np.zeros((state.contact_engaged.shape[1] * surface * QUADRATURE_COUNT, PLACE_WIDTH), np.int32),
+        contact_hold=np.zeros(nodes),
         volume_ratio_smallest=state.volume_ratio_smallest[:, lane].astype(np.float64),
         lane_fault=state.lane_fault[lane : lane + 1].copy(),
         moving=np.ones(1),

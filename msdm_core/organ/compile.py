@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
+from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneModel, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_support_forces
@@ -170,6 +170,9 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
         contact_stretch=np.zeros((shape_count, point_count, 3)),
         contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
+        contact_rows=np.zeros((shape_count * point_count, ROW_WIDTH)),
+        contact_places=np.zeros((shape_count * point_count, PLACE_WIDTH), dtype=np.int32),
+        contact_hold=np.zeros_like(model.node_mass),
         contact_passed=np.zeros(2, dtype=np.int32),
         support_stretch=np.zeros(support_shape(model)),
         volume_ratio_smallest=np.ones(1),

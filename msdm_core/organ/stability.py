@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from msdm_core.errors import OrganError
+from msdm_core.kernels.contact_kernels import SWEEPS
 from msdm_core.kernels.element_kernels import STEEP_SHARE
 from msdm_core.kernels.linear_kernels import multiply_stiffness
 from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel
@@ -91,26 +92,31 @@ def contact_node_area(model: OrganModel) -> FloatArray:
     return np.bincount(model.surface_triangles.ravel(), thirds, len(model.node_mass)).astype(np.float64)
 
 
-def contact_node_stiffness(model: OrganModel, contact: ContactLaw) -> FloatArray:
-    """The most that contact can hold each node with, in any direction x [N/m], shape (n_node,).
+def contact_hold(model: OrganModel, contact: ContactLaw, dt: float) -> tuple[float, float]:
+    """Most that contact holds a node with in a substep over its mass, and the share of it that is stiffness.
 
-    A patch of normal n, touched along e (the shape's own normal), holds x with k_p (n.e)^2 (e.x)^2 + k_t (1 - (e.x)^2)
-    per area, at most k_t + (k_p - k_t) ((1 + n.x) / 2)^2 for any e. Over the areas A around a node (a third of each
-    triangle; the rows of its contact stiffness sum to that) and for any x this is at most
-    k_t sum A + (k_p - k_t) (sum A + 2 |sum A n| + lambda_max(sum A n n^T)) / 4: k_p A on a plane, less than three times
-    that where three faces meet in a corner.
+    h = dt max(k_p dt + c_p, k_t dt) A / m, where A is a third of the area of each triangle around the node and k_t
+    counts where there is friction. Faces that meet in an edge or a corner count together, whatever their directions.
     """
-    corners = model.node_rest_position[model.surface_triangles]
-    share = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6.0
-    nodes, count = model.surface_triangles.ravel(), len(model.node_mass)
-    outer = np.einsum("ti,tj->tij", share, share) / (model.surface_rest_area / 3.0)[:, None, None]
-    vector, matrix = np.zeros((count, 3)), np.zeros((count, 3, 3))
-    np.add.at(vector, nodes, np.repeat(share, 3, axis=0))
-    np.add.at(matrix, nodes, np.repeat(outer, 3, axis=0))
-    area = contact_node_area(model)
-    facing = 0.25 * (area + 2.0 * np.linalg.norm(vector, axis=1) + np.linalg.eigvalsh(matrix)[:, -1])
     across = contact.tangential_stiffness if contact.friction > 0.0 else 0.0
-    return across * area + max(0.0, contact.stiffness - across) * facing
+    held = max(contact.stiffness * dt + contact.damping, across * dt)
+    share = max(contact.stiffness, across) * dt / held if held > 0.0 else 0.0
+    return dt * held * float((contact_node_area(model) * model.node_inverse_mass).max()), share
+
+
+def contact_excess(hold: float, share: float = 1.0) -> float:
+    """What implicit contact leaves of a hold h for the step to bear, of a limit of 4; 0 for h up to 7.
+
+    A motion that contact holds with k <= h (over its mass, times dt^2, as all here) gets its stiffness, a share of k,
+    as it is at the start of the substep; the sweeps of `contact_kernels.hold_contact` then leave v (1 + k R) / (1 + k)
+    of a velocity v, where R = prod (1 - w_j (1 + k) / (1 + h)) over the factors w_j of the sweeps. That is a mass of
+    Q = (1 + k) / (1 + k R), with which symplectic Euler is stable where this stiffness and what the organ itself holds
+    with, t, are share k + t <= 2 (1 + Q). So t must stay below 4 less the largest share k - 2 (Q - 1). Damping alone
+    (share 0) asks for nothing.
+    """
+    held = hold * np.linspace(0.0, 1.0, 1001)
+    left = np.prod([1.0 - factor * (1.0 + held) / (1.0 + hold) for factor in SWEEPS], axis=0)
+    return max(0.0, float((share * held - 2.0 * ((1.0 + held) / (1.0 + held * left) - 1.0)).max()))
 
 
 def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) -> float:
@@ -133,18 +139,25 @@ def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) 
 def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     """Largest stable step [s]: springs, volume term, alpha, beta, supports, and contact of instruments if given.
 
-    Contact holds each node with `contact_node_stiffness` and drags it with c_p times its area A, supports hold and
-    drag it with `support_hold`, both at once where an instrument presses against a bed; the guard of the shapes' axes
-    needs none, since it is integrated implicitly. Beta damps the organ alone. The step is stable where
-    (K + k_contact) dt^2 + 2 (beta K + c_p A) dt <= 2 (1 + e^(-alpha dt)) M: damping counts as stiffness over dt / 2,
-    taken at a step that is surely stable, as if the stiffest and the most damped mode were the same.
+    Supports hold and drag each node with `support_hold`. Contact is implicit, with its damping and its friction: it
+    costs no more than `contact_excess` of `contact_hold`. The step is stable where what the organ takes of the limit,
+    at most (dt / stable_step)^n of it (n = 2, with beta or damped supports 1), and this excess together stay below
+    2 (1 + e^(-alpha dt)). The guard of the shapes' axes is implicit and counts
+    nothing; beta damps the organ alone.
     """
-    if contact is None:
-        return model.stable_step
-    held, drag = support_hold(model)
-    return _held_step(
-        model, held + contact_node_stiffness(model, contact), drag + contact.damping * contact_node_area(model)
-    )
+    own = model.stable_step
+    if contact is None or not math.isfinite(own) or not np.any(model.node_inverse_mass):
+        return own
+    damped = model.beta > 0.0 or (len(model.support_kind) > 0 and model.support_damping > 0.0)
+    power = 1 if damped else 2
+
+    def limit(dt: float) -> float:
+        return 2.0 * (1.0 + math.exp(-model.alpha * dt))
+
+    def margin(dt: float) -> float:
+        return limit(dt) - limit(own) * (dt / own) ** power - contact_excess(*contact_hold(model, contact, dt))
+
+    return own if margin(own) >= 0.0 else float(brentq(margin, 0.0, own, xtol=1e-12))  # pyright: ignore
 
 
 def own_step(model: OrganModel) -> float:
@@ -190,7 +203,7 @@ LOWERINGS = 20
 def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None) -> OrganModel:
     """The organ with mass added to those nodes that limit the step, so that `step` [s] is stable; itself if it is.
 
-    A node of stiffness k_i (the largest eigenvalue of its own 3 x 3 block of K, with contact) gets the mass
+    A node of stiffness k_i (the largest eigenvalue of its own 3 x 3 block of K) gets the mass
     max(m_i, k_i / w^2), with the largest w, found by bisection to 1 %, for which `stable_dt` reaches the step.
 
     Raises:
@@ -206,12 +219,12 @@ def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None
         raise OrganError(
             f"gravity is {model.gravity.tolist()}: added mass would have weight: leave out mass scaling or gravity"
         )
-    stiffness = _node_stiffness(model, contact)
+    stiffness = _node_stiffness(model)
     free = model.node_inverse_mass > 0.0
     high = float((stiffness * model.node_inverse_mass).max())
 
     def is_stable(trial: OrganModel) -> bool:
-        return (own_step(trial) if contact is None else stable_dt(trial, contact)) >= step
+        return stable_dt(trial, contact) >= step
 
     def with_frequency(square: float) -> OrganModel:
         return _with_mass(model, np.where(free, np.maximum(model.node_mass, stiffness / square), model.node_mass))
@@ -238,20 +251,21 @@ def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None
             f"{share:.0%} to the organ's mass; the rule is at most {ADDED_SHARE_LIMIT:.0%}: use more substeps, softer "
             "lesions or larger cells"
         )
-    return scaled._replace(stable_step=own_step(scaled))
+    return scaled
 
 
 def _with_mass(model: OrganModel, mass: FloatArray) -> OrganModel:
-    """The organ with other masses [kg] (n_node,); its stable step is left to the caller."""
+    """The organ with other masses [kg] (n_node,)."""
     inverse = np.where(model.node_inverse_mass > 0.0, 1.0 / mass, 0.0)
     for array in (mass, inverse):
         array.setflags(write=False)
     added = float((mass - model.node_mass).sum()) + model.added_mass
-    return model._replace(node_mass=mass, node_inverse_mass=inverse, added_mass=added)
+    heavier = model._replace(node_mass=mass, node_inverse_mass=inverse, added_mass=added)
+    return heavier._replace(stable_step=own_step(heavier))
 
 
-def _node_stiffness(model: OrganModel, contact: ContactLaw | None) -> FloatArray:
-    """Stiffness of each node while all others are fixed, with contact and supports [N/m], shape (n_node,)."""
+def _node_stiffness(model: OrganModel) -> FloatArray:
+    """Stiffness of each node while all others are fixed, with supports [N/m], shape (n_node,)."""
     block = np.zeros((len(model.node_mass), 3, 3))
     span = model.node_rest_position[model.spring_nodes]
     along = (span[:, 1] - span[:, 0]) / model.spring_rest_length[:, None]
@@ -266,5 +280,4 @@ def _node_stiffness(model: OrganModel, contact: ContactLaw | None) -> FloatArray
         np.add.at(
             block, model.tet_nodes[:, corner], modulus[:, None, None] * np.einsum("ti,tj->tij", gradient, gradient)
         )
-    held = 0.0 if contact is None else contact_node_stiffness(model, contact)
-    return np.linalg.eigvalsh(block)[:, -1].astype(np.float64) + held + support_hold(model)[0]
+    return np.linalg.eigvalsh(block)[:, -1].astype(np.float64) + support_hold(model)[0]

@@ -14,15 +14,14 @@ from surgsim_env.palpation.press import press
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import BlockMesh, MeshSource
-from surgsim_env.validation.elements import ball_force
-from surgsim_env.validation.punch import reference_layer
+from surgsim_env.validation.finite_press import RIGID, PressedLayer, layer_mesh
+from surgsim_env.validation.punch import DISC, modulus_field
+from surgsim_env.validation.touch import FINE, NEAR
 
 SIZE = (0.06, 0.06, 0.03)  # [m] of the block, x and y around 0, bottom at z = 0
 MODULUS, POISSON, DENSITY = 5000.0, 0.45, 1060.0
 RADIUS, DEPTH = 0.008, 0.004  # [m] of the ball, of the press
 SPEED, HOLD = 0.04, 0.1  # [m/s] on the way in, [s] at depth
-# A contact of this stiffness [N/m^3] is rigid to 0.4 % of the force.
-RIGID = 2e9
 # Where the ball is pressed: over the block's middle, and half a cell of the simulator's own mesh to its side.
 PLACES = (0.0, 0.5)
 
@@ -79,8 +78,9 @@ def step_count(dt: float) -> int:
 
 @lru_cache(maxsize=4)
 def reference_force(contact: float) -> float:
-    """Force of the press by axisymmetric quadratic elements, small strains [N]; ImportError without scikit-fem."""
-    return ball_force(reference_layer(MODULUS, POISSON), RADIUS, DEPTH, contact)
+    """Force of the press by axisymmetric neo-Hookean elements [N]; ImportError without scikit-fem."""
+    body = PressedLayer(layer_mesh(DISC, SIZE[2], FINE, NEAR), modulus_field(MODULUS, None), POISSON)
+    return body.forces(RADIUS, (DEPTH,), contact)[0]
 
 
 def organ_press(cells: Cells) -> Contender:

@@ -122,7 +122,8 @@ class Simulation:
         lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
         self.instrument: Instrument = make_instrument(anatomy, lower, upper)
         healthy = anatomy.organ()
-        check_tool_masses(scene.name, self.instrument, self.contact, float(healthy.surface_rest_area.sum()))
+        surface_area = float(healthy.surface_rest_area.sum())
+        check_tool_masses(scene.name, self.instrument, self.contact, surface_area, self.substep_count)
         self._wrench = np.zeros((self.instrument.tool_count, 6))
         self._step = 0
         self.fault = ""

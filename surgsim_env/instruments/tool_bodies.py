@@ -254,7 +254,7 @@ def contact_area(tools: ToolBodies, tool: int) -> float:
     return float((np.pi * radius**2 + 2.0 * radius * (length + width) + width * length).sum())
 
 
-def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float) -> list[ToolMass]:
+def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float, substep_count: int = 2) -> list[ToolMass]:
     """Effective and minimum mass of each tool at the tools' current pose.
 
     In the worst case a tool of mass m touches tissue too heavy to move within a haptic step dt: a spring k = k_p A and
@@ -268,14 +268,16 @@ def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float) -> 
     where b is the joints' damping, which MuJoCo takes implicitly: m > k dt^2 / 2 without damping, or else
     b > k dt + c - 2 m / dt. (The minimum mass of Brown & Colgate 1998, "Minimum mass for haptic display simulations",
     for this integrator; the damping is Colgate & Schenkel's b > k T / 2, moved from the device to the tool.) As tools
-    here respond within the step, the actual limit is lower, 0.25 to 0.33 k dt^2 depending on the number of substeps,
-    and the bound is safe by a factor of 1.5 to 2. The damping of servos is not counted, because servos saturate, nor is
-    their stiffness.
+    here respond within the step, and pressure is that of a substep's end, the actual limit is lower, 0.12 to
+    0.33 k dt^2 depending on the number of substeps (from 2), and the bound is safe by a factor of 1.5 or more. With a
+    single substep the pressure is that after the whole step at the old twist: m + b dt / 2 >= (1.5 k dt + c) dt / 2.
+    The damping of servos is not counted, because servos saturate, nor is their stiffness.
 
     Args:
         tools: of one model; the derived quantities of its `data` are updated.
         contact: the scene's contact law.
         surface_area: of the organ's touchable surface [m^2].
+        substep_count: of the organ in a haptic step.
     """
     mujoco.mj_forward(tools.model, tools.data)
     tools.read_shapes()
@@ -286,7 +288,8 @@ def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float) -> 
         area = min(contact_area(tools, tool), surface_area)
         stiffness, damping = stiffest * area, contact.damping * area
         mass, damped = (effective_mass(tools, tool, tools.damped_inertia(share * dt)) for share in (0.0, 0.5))
-        least = 0.5 * dt * (stiffness * dt + damping)
+        ahead = 1.5 if substep_count == 1 else 1.0
+        least = 0.5 * dt * (ahead * stiffness * dt + damping)
         found.append(ToolMass(name, stiffness, damping, mass, damped, least, max(0.0, 2.0 * (least - mass) / dt)))
     return found
 
@@ -305,13 +308,15 @@ def effective_mass(tools: ToolBodies, tool: int, inertia: FloatArray) -> float:
     return 1.0 / mobility if mobility > 0.0 else np.inf
 
 
-def check_tool_masses(scene: str, tools: ToolBodies, contact: ContactLaw, surface_area: float) -> None:
+def check_tool_masses(
+    scene: str, tools: ToolBodies, contact: ContactLaw, surface_area: float, substep_count: int = 2
+) -> None:
     """Refuse a tool that is too light for a stable exchange.
 
     Raises:
         OrganError: a tool is too light (names it, its mass, the minimum mass, and the damping that would do instead).
     """
-    for found in tool_masses(tools, contact, surface_area):
+    for found in tool_masses(tools, contact, surface_area, substep_count):
         if found.damped_mass < found.least_mass:
             raise OrganError(
                 f"scene {scene!r}: tool {found.name!r} weighs {found.mass * 1e3:.3g} g at its tip, too little for a "

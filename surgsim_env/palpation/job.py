@@ -32,7 +32,14 @@ from surgsim_env.palpation.contrast_map import (
 from surgsim_env.palpation.press import Press, scan
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import Ball, ForceSensor
-from surgsim_env.scene.palpable_surface import PalpableFace, contact_radius, share_text, tangent_axes
+from surgsim_env.scene.palpable_surface import (
+    PalpableFace,
+    contact_radius,
+    hidden_share,
+    hidden_text,
+    share_text,
+    tangent_axes,
+)
 
 # Errors of the pre-operative model: modulus by up to this share, place of each press by this distance [m].
 MODEL_MODULUS_ERROR = 0.2
@@ -289,6 +296,8 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
             "cell_m": palpation.anatomy.palpable_cell,
             "cell_over_contact_radius": palpation.anatomy.palpable_cell
             / contact_radius(scene.instrument.tip_radius, scene.palpation.press_depth),
+            "contact_stiffness_N_per_m3": scene.contact.stiffness,
+            "contrast_hidden_by_contact": hidden_share(*_touch(palpation)),
             "spacing_m": scene.palpation.site_spacing,
             "substeps_per_haptic_step": scene.timing.substep_count,
             "haptic_step_s": scene.timing.haptic_step,
@@ -374,12 +383,20 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
     scene = palpation.anatomy.scene
     share = share_text(palpation.anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth)
     console.print(f"cell / contact radius {share}")
+    console.print(hidden_text(*_touch(palpation)))
     console.print(
         f"simulated {palpation.simulated_time:.1f} s in {palpation.wall_time:.1f} s: "
         f"{palpation.simulated_time / palpation.wall_time:.2f} times real time"
     )
     for index in np.flatnonzero(~palpation.used).tolist():
         console.print(f"  site {index} ended early: {early_end(palpation, index)}")
+
+
+def _touch(palpation: PalpationResult) -> tuple[float, float, float, float]:
+    """Largest force of a complete press [N], tip radius [m], press depth [m] and contact stiffness [N/m^3]."""
+    scene = palpation.anatomy.scene
+    force = max((one.force for one, used in zip(palpation.presses, palpation.used) if used), default=0.0)
+    return force, scene.instrument.tip_radius, scene.palpation.press_depth, scene.contact.stiffness
 
 
 def verdict(one: ContrastMap) -> str:

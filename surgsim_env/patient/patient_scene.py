@@ -32,6 +32,7 @@ from surgsim_env.scene.model import (
     TissueRegion,
     Vector,
 )
+from surgsim_env.scene.palpable_surface import hertz_force
 
 # As in the scene liver, whose cells are 0.85 of the contact radius sqrt(tip radius x press depth).
 CELL_PER_CONTACT_RADIUS = 0.85
@@ -156,9 +157,8 @@ def _first_scene(
 
 
 def _limits(material: Material, tip: float, depth: float) -> Limits:
-    """Twice and four times a healthy press, F = 4/3 E / (1 - nu^2) sqrt(R d^3) (Hertz 1881)."""
-    stiffness = material.youngs_modulus / (1.0 - material.poisson_ratio**2)
-    press = 4.0 / 3.0 * stiffness * math.sqrt(tip * depth**3)
+    """Twice and four times a healthy press."""
+    press = hertz_force(material, tip, depth)
     return Limits(_digits(SOFT_PER_PRESS * press, 2), _digits(HARD_PER_PRESS * press, 2))
 
 

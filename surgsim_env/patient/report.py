@@ -18,7 +18,7 @@ from surgsim_env.patient.patient_scene import PatientScene
 from surgsim_env.patient.retract_scene import RetractScene, told
 from surgsim_env.rendering.tissue import cut_edges
 from surgsim_env.reports.html_page import Picture, page_start, render_page
-from surgsim_env.scene.palpable_surface import share_text
+from surgsim_env.scene.palpable_surface import hertz_force, hidden_text, share_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -173,6 +173,7 @@ def _palpation(found: PatientScene) -> Rows:
         ("approach", f"{x:g}, {y:g}, {z:g}"),
         ("sites", f"{found.site_count}, {palpation.site_spacing * 1e3:g} mm apart"),
         ("cell / contact radius", share_text(found.anatomy.palpable_cell, tip, depth)),
+        ("contact", hidden_text(2.0 * hertz_force(scene.material, tip, depth), tip, depth, scene.contact.stiffness)),
         ("force limits", f"{scene.limits.soft_force:g} and {scene.limits.hard_force:g} N"),
     ]
 

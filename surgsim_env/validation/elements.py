@@ -1,6 +1,6 @@
 """Reference solutions by quadratic elements of scikit-fem, a development dependency that is imported where it is used.
 
-Hexahedra for blocks; axisymmetric quadrilaterals for presses of a punch or a ball on a bonded layer.
+Hexahedra for blocks; axisymmetric quadrilaterals for the press of a punch on a bonded layer.
 """
 
 from collections.abc import Callable
@@ -131,39 +131,3 @@ def punch_stiffness(body: Elements, radius: float) -> float:
     right = -(stiffness @ displacement)[free]
     displacement[free] = spsolve(stiffness[free][:, free].tocsc(), right)
     return float(displacement @ (stiffness @ displacement))
-
-
-def ball_force(body: Elements, radius: float, depth: float, contact_stiffness: float) -> float:
-    """Force of a frictionless ball pressed in [N], small strains, the contact law of this package.
-
-    Pressure per undeformed area k_p g (s / R), g = s (s + t) / R, where s^2 = R^2 - r^2 and t is the height of the
-    surface over the ball's centre; its points are engaged where s + t > 0 (Newton on the set of these).
-    """
-    from skfem import BilinearForm, FacetBasis, LinearForm
-
-    surface = FacetBasis(
-        body.basis.mesh, body.basis.elem, facets=body.basis.mesh.facets_satisfying(lambda x: np.abs(x[1]) < 1e-12),
-        intorder=5,
-    )  # fmt: skip
-
-    def weight(w: Any) -> Any:
-        chord = np.sqrt(np.maximum(radius**2 - w.x[0] ** 2, 0.0))
-        overlap = chord + w.prev[1] - (radius - depth)
-        touching = (overlap > 0.0) & (chord > 0.0)
-        return 2.0 * np.pi * w.x[0] * contact_stiffness * (chord / radius) ** 2 * touching, chord
-
-    stiff = BilinearForm(lambda u, v, w: weight(w)[0] * u[1] * v[1])
-    push = LinearForm(lambda v, w: weight(w)[0] * (weight(w)[1] - (radius - depth)) * v[1])
-    displacement = np.zeros(len(body.place))
-    free = np.flatnonzero(~body.held)
-    force = 0.0
-    for _ in range(60):
-        before = surface.interpolate(displacement)
-        held_off, load = csc_array(stiff.assemble(surface, prev=before)), push.assemble(surface, prev=before)
-        # The sum of sparse arrays is typed as their base, which has no indexing.
-        whole = csc_array(csc_array(body.stiffness) + held_off)[free][:, free].tocsc()
-        displacement[free] = np.asarray(spsolve(whole, -load[free]))
-        previous, force = force, float((held_off @ displacement + load)[body.axis == 1].sum())
-        if abs(force - previous) <= 1e-6 * abs(force):
-            return force
-    raise ValueError("the reference for the ball did not converge")

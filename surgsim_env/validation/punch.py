@@ -3,7 +3,7 @@
 The layer consists of cells of one size, or is fine in its upper third and coarse below.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -79,6 +79,11 @@ def pressed(mesh: TetMesh, nu: float, hidden: Hidden | None = None) -> float:
 @lru_cache(maxsize=8)
 def reference_layer(modulus: float, nu: float, hidden: Hidden | None = None, radius: float = DISC) -> Elements:
     """The layer in axisymmetric quadratic elements, homogeneous or over a sphere, as a disc of a radius [m]."""
+    return layer(radius, SIZE[2], modulus_field(modulus, hidden), nu)
+
+
+def modulus_field(modulus: float, hidden: Hidden | None) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """Young's modulus [Pa] at places (r, z) of a layer below z = 0, homogeneous or over a sphere."""
 
     def field(r: FloatArray, z: FloatArray) -> FloatArray:
         if hidden is None:
@@ -86,7 +91,7 @@ def reference_layer(modulus: float, nu: float, hidden: Hidden | None = None, rad
         inside = r**2 + (z + hidden.cover + hidden.radius) ** 2 <= hidden.radius**2
         return np.where(inside, hidden.ratio * modulus, modulus)
 
-    return layer(radius, SIZE[2], field, nu)
+    return field
 
 
 @lru_cache(maxsize=32)

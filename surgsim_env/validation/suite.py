@@ -62,6 +62,7 @@ CASES: tuple[Case, ...] = (
         Case(f"touch, contrast, {one.name}, {cells}", partial(touch.contrast, cells, one), slow=True, needs_fem=True)
         for cells, one in touch.CONTRASTS
     ),
+    Case("liver, contrast", touch.liver_contrast, slow=True, needs_fem=True),
     Case("deep presses", touch.deep_presses),
     Case("sliding", friction.sliding, slow=True),
     Case("grasped strip", friction.grasped_strip),

@@ -209,6 +209,8 @@ def test_any_tools_move_the_same(tool):
         contact_engaged=np.zeros((4, state.contact_engaged.shape[1]), dtype=np.uint8),
         contact_stretch=np.zeros((4, *state.contact_stretch.shape[1:])),
         contact_candidates=np.zeros((4, state.contact_candidates.shape[1]), dtype=np.int32),
+        contact_rows=np.zeros((4 * state.contact_engaged.shape[1], state.contact_rows.shape[1])),
+        contact_places=np.zeros((4 * state.contact_engaged.shape[1], state.contact_places.shape[1]), dtype=np.int32),
     )
     reference = type(state)(*(array.copy() for array in state))
     wrench, wanted = np.zeros((tools.tool_count, 6)), np.zeros((tools.tool_count, 6))

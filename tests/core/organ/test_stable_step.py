@@ -24,17 +24,16 @@ def plate() -> ContactShapes:
     return oracle.ball((0.015, 0.01, 0.02 - DEPTH + 1.0), 1.0)
 
 
-# Organ, contact law or none, and how far beyond the product's step it must be unstable. The step with contact takes
-# the stiffest direction of every node, so it lies further below the true limit than that of the organ alone.
+# Organ, contact law or none, and how far beyond the product's step it must be unstable. Contact is implicit and counts
+# little of its stiffness, that of the node which is held most; the true limit lies further beyond.
 PARTS = {
     "springs": (organ(), None, 1.1),
     "volume term": (organ(poisson_ratio=0.49), None, 1.1),
     "alpha": (organ(Damping(alpha=1e4)), None, 1.1),
     "beta": (organ(Damping(alpha=0.0, beta=1e-3)), None, 1.1),
     "contact stiffness": (organ(), SOFT._replace(stiffness=2e8), 3.0),
-    "contact damping": (organ(), SOFT._replace(damping=5e4), 3.0),
     "sticking friction": (organ(), SOFT._replace(stiffness=2e7, friction=50.0, tangential_stiffness=8e8), 3.0),
-    "alpha with contact": (organ(Damping(alpha=1e4)), SOFT._replace(stiffness=2e8), 3.0),
+    "alpha with contact": (organ(Damping(alpha=3e4)), SOFT._replace(stiffness=2e8), 3.0),
     "beta with contact": (organ(Damping(alpha=0.0, beta=1e-2)), SOFT._replace(stiffness=2e8), 3.0),
 }
 
@@ -85,9 +84,16 @@ def test_each_part_shortens_the_step(part: str):
         "alpha": (plain, None),
         "beta": (plain, None),
         "contact stiffness": (plain, SOFT),
-        "contact damping": (plain, SOFT),
         "sticking friction": (plain, SOFT._replace(stiffness=2e7)),
         "alpha with contact": (plain, SOFT._replace(stiffness=2e8)),
         "beta with contact": (plain, SOFT._replace(stiffness=2e8)),
     }[part]
-    assert stable_dt(model, contact) < 0.9 * stable_dt(*without)
+    assert stable_dt(model, contact) < 0.95 * stable_dt(*without)
+
+
+@pytest.mark.parametrize("law", [SOFT._replace(damping=5e4), SOFT._replace(stiffness=1e6, friction=50.0)])
+def test_implicit_contact_asks_for_no_shorter_step(law: ContactLaw):
+    """Damping of any size, and stiffness up to a hold of 7: stable at the step of the organ alone."""
+    model = organ()
+    assert stable_dt(model, law) == model.stable_step
+    assert growth(model, law, 0.95 * model.stable_step) < 30.0

@@ -1,0 +1,208 @@
+"""Isotropic solids at finite strain: the continuum of stiffening springs, Fung's and Ogden's solids, and fits of springs.
+
+Springs in all directions that deform with the continuum are the affine micro-sphere model (Miehe, Göktepe and Lulei
+2004, doi 10.1016/j.jmps.2004.03.011): W = c <psi(l)>, the mean over directions N of the energy psi at the stretch
+l = |F N|, psi'(l) = phi(l - 1). With phi(e) = e it has Lame's lambda = mu = c / 15 at small strain. The springs of a BCC
+lattice have seven directions: the quadrature of degree 5 of that mean. Each node is a centre of symmetry, so that a
+homogeneous deformation of the lattice is affine whatever the law.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+
+from msdm_core.mesh.tet_mesh import FloatArray
+
+SpringLaw = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+# Directions of a quadrature over the sphere: exact to degree 2 DIRECTION_ORDER - 1.
+DIRECTION_ORDER = 12
+
+
+class Solid(Protocol):
+    """A hyperelastic solid."""
+
+    def first_piola(self, gradient: FloatArray) -> FloatArray:
+        """First Piola-Kirchhoff stress [Pa] of deformation gradients F, both (..., 3, 3)."""
+        ...
+
+
+@lru_cache(maxsize=4)
+def sphere_directions(order: int = DIRECTION_ORDER) -> tuple[FloatArray, FloatArray]:
+    """Directions (n, 3) and weights (n,) of a mean over the sphere, one of each pair of opposite directions.
+
+    The product of Gauss's rule along z and even steps around z: exact for polynomials up to degree 2 order - 1.
+    """
+    height, weight = np.polynomial.legendre.leggauss(order)
+    half = height > 0.0
+    height, weight = height[half], weight[half]
+    turn = np.pi * (np.arange(2 * order) + 0.5) / order
+    across = np.sqrt(1.0 - height**2)
+    directions = np.stack(np.broadcast_arrays(
+        across[:, None] * np.cos(turn), across[:, None] * np.sin(turn), height[:, None]), axis=-1)  # fmt: skip
+    return directions.reshape(-1, 3), np.repeat(weight / (2 * order), 2 * order)
+
+
+@lru_cache(maxsize=1)
+def lattice_directions() -> tuple[FloatArray, FloatArray]:
+    """The directions of the springs of a BCC lattice, and their shares of its stiffness by formula (6), 2/15 and 3/20."""
+    diagonals = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]]) / np.sqrt(3.0)
+    return np.vstack([np.eye(3), diagonals]), np.array([2.0 / 15.0] * 3 + [3.0 / 20.0] * 4)
+
+
+def determinant_and_cofactor(gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """J = det F, shape (...), and dJ/dF = J F^-T, shape (..., 3, 3)."""
+    a, b, c = gradient[..., 0, :], gradient[..., 1, :], gradient[..., 2, :]
+    cofactor = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
+    return np.einsum("...j,...j->...", a, cofactor[..., 0, :]), cofactor
+
+
+@dataclass(frozen=True, eq=False)
+class SpringSolid:
+    """Affine springs and a volume term: W = 15 mu <psi(|F N|)> + (K_t / 2) (J - 1)^2.
+
+    Args:
+        shear_modulus: mu at small strain [Pa].
+        volume_modulus: K_t = lambda - mu [Pa].
+        law: tension over stiffness and rest length, phi(e), and its slope, of strains e; phi(e) = e and 1 is linear.
+        directions: N, (n, 3), and their weights (n,); by default the whole sphere.
+    """
+
+    shear_modulus: float
+    volume_modulus: float
+    law: SpringLaw
+    directions: tuple[FloatArray, FloatArray] = sphere_directions()
+
+    def first_piola(self, gradient: FloatArray) -> FloatArray:
+        """P = 15 mu <phi / l (F N) N^T> + K_t (J - 1) dJ/dF [Pa], (..., 3, 3)."""
+        directions, weights = self.directions
+        spans = np.einsum("...ij,aj->...ai", gradient, directions)
+        stretch = np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
+        scale = 15.0 * self.shear_modulus * weights * self.law(stretch - 1.0)[0] / stretch
+        volume, cofactor = determinant_and_cofactor(gradient)
+        springs = np.einsum("...a,...ai,aj->...ij", scale, spans, directions, optimize=True)
+        return springs + (self.volume_modulus * (volume - 1.0))[..., None, None] * cofactor
+
+    def tangent(self, gradient: FloatArray) -> FloatArray:
+        """dP/dF [Pa], (..., 3, 3, 3, 3)."""
+        directions, weights = self.directions
+        spans = np.einsum("...ij,aj->...ai", gradient, directions)
+        stretch = np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
+        tension, slope = self.law(stretch - 1.0)
+        share = 15.0 * self.shear_modulus * weights
+        dyads = np.einsum("...ai,aj->...aij", spans, directions).reshape(*stretch.shape, 9)
+        along = share * (slope - tension / stretch) / stretch**2
+        found = np.einsum("...a,...ax,...ay->...xy", along, dyads, dyads, optimize=True)
+        found = found.reshape(*gradient.shape[:-2], 3, 3, 3, 3)
+        across = np.einsum("...a,aj,al->...jl", share * tension / stretch, directions, directions, optimize=True)
+        found += np.einsum("ik,...jl->...ijkl", np.eye(3), across)
+        return found + volume_tangent(gradient, self.volume_modulus)
+
+
+def volume_tangent(gradient: FloatArray, modulus: float) -> FloatArray:
+    """Second derivative of (K / 2) (J - 1)^2 [Pa], (..., 3, 3, 3, 3).
+
+    K dJ dJ + K (J - 1) d2J, where d2J/dF_ij dF_kl = e_ikm e_jln F_mn, e being the permutation symbol.
+    """
+    volume, cofactor = determinant_and_cofactor(gradient)
+    second = np.einsum("ikm,jln,...mn->...ijkl", _PERMUTATION, _PERMUTATION, gradient, optimize=True)
+    both = np.einsum("...ij,...kl->...ijkl", cofactor, cofactor)
+    return modulus * (both + (volume - 1.0)[..., None, None, None, None] * second)
+
+
+_PERMUTATION = np.zeros((3, 3, 3))
+_PERMUTATION[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+_PERMUTATION[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
+
+
+@dataclass(frozen=True)
+class Demiray:
+    """The isotropic solid of Fung's type, W = mu / (2 b) (exp(b (J^(-2/3) I1 - 3)) - 1) + (K / 2) (J - 1)^2.
+
+    Demiray 1972 (J Biomech 5:309-311) has the incompressible form.
+
+    Args:
+        shear_modulus: mu at small strain [Pa].
+        exponent: b, 0 for a neo-Hookean solid.
+        bulk_modulus: K [Pa].
+    """
+
+    shear_modulus: float
+    exponent: float
+    bulk_modulus: float
+
+    def first_piola(self, gradient: FloatArray) -> FloatArray:
+        """P = mu e^(b (I - 3)) J^(-2/3) (F - I1 / (3 J) dJ/dF) + K (J - 1) dJ/dF [Pa], I = J^(-2/3) I1, (..., 3, 3)."""
+        volume, cofactor = determinant_and_cofactor(gradient)
+        first = np.einsum("...ij,...ij->...", gradient, gradient)
+        part = volume ** (-2.0 / 3.0)
+        scale = self.shear_modulus * np.exp(self.exponent * (part * first - 3.0)) * part
+        pressure = self.bulk_modulus * (volume - 1.0) - scale * first / (3.0 * volume)
+        return scale[..., None, None] * gradient + pressure[..., None, None] * cofactor
+
+
+@dataclass(frozen=True)
+class Ogden:
+    """Ogden's solid of one term, W = (2 mu / a^2) (sum (J^(-1/3) l_i)^a - 3) + (K / 2) (J - 1)^2.
+
+    Ogden 1972 (doi 10.1098/rspa.1972.0026) writes mu_1 = 2 mu / a; l_i are the principal stretches.
+
+    Args:
+        shear_modulus: mu at small strain [Pa].
+        exponent: a, not 0; large ones stiffen, a sign tells tension from compression.
+        bulk_modulus: K [Pa].
+    """
+
+    shear_modulus: float
+    exponent: float
+    bulk_modulus: float
+
+    def first_piola(self, gradient: FloatArray) -> FloatArray:
+        """P = U diag(dW/dl_i) V^T [Pa], F = U diag(l_i) V^T, (..., 3, 3)."""
+        left, stretch, right = np.linalg.svd(gradient)
+        volume = stretch.prod(axis=-1, keepdims=True)
+        powers = (stretch * volume ** (-1.0 / 3.0)) ** self.exponent
+        shape = 2.0 * self.shear_modulus / self.exponent * (powers - powers.mean(axis=-1, keepdims=True))
+        slope = (shape + self.bulk_modulus * (volume - 1.0) * volume) / stretch
+        return np.einsum("...ik,...k,...kj->...ij", left, slope, right)
+
+
+def uniaxial_stress(solid: Solid, stretch: FloatArray) -> FloatArray:
+    """Force over the area at rest [Pa] of a bar with free sides at some stretches l, both (n,).
+
+    The stretch across is where the stress across vanishes (Newton's method).
+
+    Raises:
+        ValueError: no such stretch was found; names the stretch along the bar.
+    """
+    stretch = np.asarray(stretch, dtype=np.float64)
+    across = stretch**-0.45
+    step = 1e-6
+    for _ in range(60):
+        stress = _bar(solid, stretch, across)[..., 1, 1]
+        slope = (_bar(solid, stretch, across + step)[..., 1, 1] - stress) / step
+        change = -stress / slope
+        # Half of the way to nothing at most, so that no bar turns inside out.
+        across = across + np.clip(change, -0.5 * across, 0.5 * across)
+        if np.abs(change).max(initial=0.0) < 1e-12:
+            break
+    else:
+        worst = stretch[int(np.argmax(np.abs(change)))]
+        raise ValueError(f"the bar has no equilibrium at the stretch {worst:g}: use smaller strains or other parameters")
+    return _bar(solid, stretch, across)[..., 0, 0]
+
+
+def _bar(solid: Solid, along: FloatArray, across: FloatArray) -> FloatArray:
+    gradient = np.zeros((*along.shape, 3, 3))
+    gradient[..., 0, 0], gradient[..., 1, 1], gradient[..., 2, 2] = along, across, across
+    return solid.first_piola(gradient)
+
+
+def simple_shear_stress(solid: Solid, amount: FloatArray) -> FloatArray:
+    """Shear stress P_12 [Pa] in simple shear x = X + g Y of some amounts g, both (n,)."""
+    amount = np.asarray(amount, dtype=np.float64)
+    gradient = np.broadcast_to(np.eye(3), (*amount.shape, 3, 3)).copy()
+    gradient[..., 0, 1] = amount
+    return solid.first_piola(gradient)[..., 0, 1]

@@ -1,0 +1,266 @@
+"""Blocks at finite strain: quadratic hexahedra of a hyperelastic solid, and the organ in static equilibrium.
+
+A block with faces square to the axes is pulled, compressed or sheared by its ends z = 0 and z = height. Ends are bonded
+to plates, or slide on them. What the organ is compared with is the solid of `msdm_core.material.continuum`, with a
+spring law that is written down here, apart from that of the kernels.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import spsolve
+
+from msdm_core.kernels.structure_kernels import OrganModel, OrganState
+from msdm_core.kernels.substep_kernels import evaluate_forces
+from msdm_core.material.continuum import SpringLaw
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.organ.compile import rest_state
+from surgsim_env.validation.elements import Cells, Size
+from surgsim_env.validation.statics import averaged_gradient, volume_gradient
+
+Test = Literal["pull", "slide", "shear"]
+# Forces balance to this share of the force on a plate.
+RESIDUAL = 1e-7
+ROUNDS = 80
+
+
+def power_law(onset_strain: float, cap_strain: float, tangent_cap: float, power: int) -> SpringLaw:
+    """Tension phi(e) and slope phi'(e) of a stiffening spring, alike in tension and compression.
+
+    phi' = 1 + (c - 1) x^n, x = (|e| - e_0) / (e_c - e_0) held between 0 and 1: 1 below the onset, c beyond the cap.
+    """
+    width = cap_strain - onset_strain
+
+    def law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+        size = np.abs(strain)
+        share = np.clip((size - onset_strain) / width, 0.0, 1.0)
+        grown = width * share ** (power + 1) / (power + 1) + np.maximum(size - cap_strain, 0.0)
+        return np.sign(strain) * (size + (tangent_cap - 1.0) * grown), 1.0 + (tangent_cap - 1.0) * share**power
+
+    return law
+
+
+def linear_law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Tension and slope of a linear spring, e and 1."""
+    return strain, np.ones_like(strain)
+
+
+class SolidWithTangent(Protocol):
+    """A solid with the derivative of its stress."""
+
+    def first_piola(self, gradient: FloatArray) -> FloatArray:
+        """P [Pa], (..., 3, 3)."""
+        ...
+
+    def tangent(self, gradient: FloatArray) -> FloatArray:
+        """dP/dF [Pa], (..., 3, 3, 3, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Plates:
+    """Rows of a block's displacement that its plates hold, and their displacement per unit of the test.
+
+    Args:
+        held: rows (n,), three a node.
+        direction: displacement of these rows at unit strain [m], (n,).
+        loaded: rows whose forces sum to the force on the upper plate.
+    """
+
+    held: NDArray[np.int64]
+    direction: FloatArray
+    loaded: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, points: FloatArray, test: Test) -> "Plates":
+        """The plates of a block with nodes at `points` [m], (n_node, 3); strain is over its height.
+
+        "pull": bonded ends drawn apart. "slide": ends drawn apart, free to slide. "shear": bonded ends, the upper one
+        moved along x.
+        """
+        height = points[:, 2].max()
+        low, high = np.flatnonzero(points[:, 2] < 1e-9), np.flatnonzero(points[:, 2] > height - 1e-9)
+        ends = np.concatenate([low, high])
+        moved = np.repeat([0.0, height], [len(low), len(high)])
+        if test == "slide":
+            held, direction = 3 * ends + 2, moved
+            # The middle of the block's faces x = 0 and y = 0 slides in its plane: no drift, no turn, nothing bent.
+            middle = points.max(axis=0) / 2.0
+            for axis in (0, 1):
+                plane = np.flatnonzero(np.abs(points[:, axis] - middle[axis]) < 1e-9)
+                held = np.concatenate([held, 3 * plane + axis])
+                direction = np.concatenate([direction, np.zeros(len(plane))])
+            return cls(held, direction, 3 * high + 2)
+        axis = 2 if test == "pull" else 0
+        held = (3 * ends[:, None] + np.arange(3)).ravel()
+        direction = np.zeros((len(ends), 3))
+        direction[:, axis] = moved
+        return cls(held, direction.ravel(), 3 * high + axis)
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticBlock:
+    """The block [0, sx] x [0, sy] x [0, sz] of a solid in quadratic hexahedra at finite strain (total Lagrangian).
+
+    Args:
+        points: of the nodes [m], (n_node, 3).
+        rows: of each element's displacement, (n_element, 81).
+        slopes: d(grad u)/d(rows) at the quadrature points [1/m], (n_element, n_point, 81, 9).
+        weights: volumes of the quadrature points [m^3], (n_element, n_point).
+    """
+
+    points: FloatArray
+    rows: NDArray[np.int64]
+    slopes: FloatArray
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, size: Size, cells: Cells) -> "QuadraticBlock":
+        """The block with some elements along x, y and z."""
+        from skfem import Basis, ElementHex2, ElementVector, MeshHex
+
+        mesh = MeshHex.init_tensor(*(np.linspace(0.0, length, count + 1) for length, count in zip(size, cells)))
+        basis = Basis(mesh, ElementVector(ElementHex2()), intorder=5)
+        slopes = np.array([one[0].grad for one in basis.basis])
+        order, place = _rows_by_node(basis)
+        return cls(
+            place, order[basis.element_dofs.T],
+            np.ascontiguousarray(slopes.reshape(len(slopes), 9, *slopes.shape[3:]).transpose(2, 3, 0, 1)), basis.dx,
+        )  # fmt: skip
+
+    def response(self, solid: SolidWithTangent, displacement: FloatArray) -> tuple[FloatArray, csc_array]:
+        """Forces of the solid on the plates and nodes [N], (3 n_node,), and their derivative [N/m]."""
+        count, points = self.weights.shape
+        gradient = np.eye(3) + np.einsum("epra,er->epa", self.slopes, displacement[self.rows], optimize=True).reshape(
+            count, points, 3, 3
+        )
+        stress = solid.first_piola(gradient).reshape(count, points, 9)
+        force = np.einsum("epra,epa->er", self.slopes, stress * self.weights[..., None], optimize=True)
+        tangent = solid.tangent(gradient).reshape(count, points, 9, 9) * self.weights[..., None, None]
+        blocks = (self.slopes @ tangent @ self.slopes.transpose(0, 1, 3, 2)).sum(axis=1)
+        return _assembled(force, blocks, self.rows, 3 * len(self.points))
+
+    def forces(self, solid: SolidWithTangent, test: Test, strains: tuple[float, ...]) -> list[float]:
+        """Force on the upper plate at strains that follow each other [N]."""
+        plates = Plates.of(self.points, test)
+        displacement = np.zeros(3 * len(self.points))
+        return [
+            _balanced(lambda u: self.response(solid, u), plates, displacement, strain, f"{test} {strain:g}")
+            for strain in strains
+        ]
+
+
+def _rows_by_node(basis: Any) -> tuple[NDArray[np.int64], FloatArray]:
+    """New numbers of scikit-fem's rows, three a node, and the places of these nodes (n_node, 3)."""
+    order = np.empty(basis.N, dtype=np.int64)
+    places: list[FloatArray] = []
+    for dofs in (basis.nodal_dofs, basis.edge_dofs, basis.facet_dofs, basis.interior_dofs):
+        rows = np.asarray(dofs)
+        for first in range(0, len(rows), 3):
+            nodes = len(places) + np.arange(rows.shape[1])
+            places += list(basis.doflocs[:, rows[first]].T)
+            for axis in range(3):
+                order[rows[first + axis]] = 3 * nodes + axis
+    return order, np.array(places)
+
+
+def _assembled(
+    force: FloatArray, blocks: FloatArray, rows: NDArray[np.int64], count: int
+) -> tuple[FloatArray, csc_array]:
+    """Sums of element vectors (n, m) and matrices (n, m, m) at their rows (n, m)."""
+    width = rows.shape[1]
+    total = np.bincount(rows.ravel(), force.ravel(), count).astype(np.float64)
+    left, right = np.repeat(rows, width, axis=1).ravel(), np.tile(rows, (1, width)).ravel()
+    return total, csc_array(coo_array((blocks.ravel(), (left, right)), shape=(count, count)))
+
+
+def _balanced(
+    response: Callable[[FloatArray], tuple[FloatArray, csc_array]],
+    plates: Plates,
+    displacement: FloatArray,
+    strain: float,
+    name: str,
+) -> float:
+    """Bring a displacement in place to equilibrium between plates at a strain (Newton); returns the plate's force [N].
+
+    Raises:
+        ValueError: no equilibrium was found; names the test.
+    """
+    free = np.setdiff1d(np.arange(len(displacement)), plates.held)
+    change = strain * plates.direction - displacement[plates.held]
+    for _ in range(ROUNDS):
+        force, stiffness = response(displacement)
+        rows = stiffness[free]
+        right = -force[free] - rows[:, plates.held] @ change
+        scale = np.abs(force[plates.loaded]).sum()
+        if not np.any(change) and np.abs(force[free]).max() <= RESIDUAL * scale:
+            return float(force[plates.loaded].sum())
+        displacement[free] += spsolve(rows[:, free].tocsc(), right)
+        displacement[plates.held] += change
+        change = np.zeros_like(change)
+    raise ValueError(f"the block did not come to rest: {name}")
+
+
+@dataclass(frozen=True, eq=False)
+class OrganBlock:
+    """A block as an organ: forces by its kernels, statics by Newton's method with springs and volume terms.
+
+    The matrix only leads to the equilibrium; what is in equilibrium are the forces of the kernels.
+
+    Args:
+        mesh: the block.
+        model: its organ, without anchors.
+        slope: phi'(e) of its springs, for the matrix.
+    """
+
+    mesh: TetMesh
+    model: OrganModel
+    slope: Callable[[FloatArray], FloatArray]
+
+    def forces(self, test: Test, strains: tuple[float, ...]) -> list[float]:
+        """Force on the upper plate at strains that follow each other [N]."""
+        plates, state = Plates.of(self.mesh.points, test), rest_state(self.model)
+        displacement = np.zeros(self.mesh.points.size)
+        return [
+            _balanced(lambda u: self.response(state, u), plates, displacement, strain, f"organ, {test} {strain:g}")
+            for strain in strains
+        ]
+
+    def response(self, state: OrganState, displacement: FloatArray) -> tuple[FloatArray, csc_array]:
+        """Minus the kernels' forces [N], (3 n_node,), and the matrix [N/m]."""
+        model = self.model
+        state.node_position[:] = model.node_rest_position + displacement.reshape(-1, 3)
+        state.node_velocity[:] = 0.0
+        evaluate_forces(model, state)
+        return -state.node_force.ravel(), self._matrix(state.node_position)
+
+    def _matrix(self, position: FloatArray) -> csc_array:
+        """Tangent of the springs; volume terms with the gradients of the position."""
+        model, count = self.model, position.size
+        span = position[model.spring_nodes[:, 1]] - position[model.spring_nodes[:, 0]]
+        length = np.linalg.norm(span, axis=1)
+        strain = length / model.spring_rest_length - 1.0
+        slope = self.slope(strain)
+        # Tension over length, from the mean slope: exact for a linear spring, near enough for another one.
+        across = np.maximum(model.spring_stiffness * slope * strain / (1.0 + strain), 0.0)
+        dyads = span[:, :, None] * span[:, None, :] / (length**2)[:, None, None]
+        along = (model.spring_stiffness * slope - across)[:, None, None] * dyads + across[:, None, None] * np.eye(3)
+        blocks = np.concatenate(
+            [np.concatenate([along, -along], axis=2), np.concatenate([-along, along], axis=2)], axis=1
+        )
+        rows = (3 * model.spring_nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(-1, 6)
+        total = _assembled(np.zeros_like(rows, dtype=np.float64), blocks, rows, count)[1]
+        gradient = volume_gradient(position, model.tet_nodes)
+        rows = (3 * model.tet_nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(-1, 12)
+        scale = model.tet_bulk / model.tet_rest_volume
+        blocks = scale[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+        total = total + _assembled(np.zeros_like(rows, dtype=np.float64), blocks, rows, count)[1]
+        if model.node_bulk.any():
+            averaged = averaged_gradient(model.tet_nodes, gradient, count)
+            weighted = averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
+            total = total + averaged.T @ weighted
+        return csc_array(total)

@@ -199,7 +199,7 @@ def _balanced(
         scale = np.abs(force[plates.loaded]).sum()
         if not np.any(change) and np.abs(force[free]).max() <= RESIDUAL * scale:
             return float(force[plates.loaded].sum())
-        displacement[free] += spsolve(rows[:, free].tocsc(), right)
+        displacement[free] += spsolve(rows[:, free].tocsc(), right, permc_spec="MMD_AT_PLUS_A")
         displacement[plates.held] += change
         change = np.zeros_like(change)
     raise ValueError(f"the block did not come to rest: {name}")
@@ -214,12 +214,12 @@ class OrganBlock:
     Args:
         mesh: the block.
         model: its organ, without anchors.
-        slope: phi'(e) of its springs, for the matrix.
+        law: of its springs, for the matrix.
     """
 
     mesh: TetMesh
     model: OrganModel
-    slope: Callable[[FloatArray], FloatArray]
+    law: SpringLaw = linear_law
 
     def forces(self, test: Test, strains: tuple[float, ...]) -> list[float]:
         """Force on the upper plate at strains that follow each other [N]."""
@@ -232,35 +232,63 @@ class OrganBlock:
 
     def response(self, state: OrganState, displacement: FloatArray) -> tuple[FloatArray, csc_array]:
         """Minus the kernels' forces [N], (3 n_node,), and the matrix [N/m]."""
-        model = self.model
-        state.node_position[:] = model.node_rest_position + displacement.reshape(-1, 3)
+        state.node_position[:] = self.model.node_rest_position + displacement.reshape(-1, 3)
         state.node_velocity[:] = 0.0
-        evaluate_forces(model, state)
-        return -state.node_force.ravel(), self._matrix(state.node_position)
+        evaluate_forces(self.model, state)
+        matrix = self._springs(state.node_position) + self._volumes(state.node_position)
+        return -state.node_force.ravel(), csc_array(matrix)
 
-    def _matrix(self, position: FloatArray) -> csc_array:
-        """Tangent of the springs; volume terms with the gradients of the position."""
-        model, count = self.model, position.size
-        span = position[model.spring_nodes[:, 1]] - position[model.spring_nodes[:, 0]]
+    def _springs(self, position: FloatArray) -> csc_array:
+        """Tangent of the springs, k phi' n n^T + k l0 (phi / l) (1 - n n^T) [N/m]."""
+        nodes, rest = self.model.spring_nodes, self.model.spring_rest_length
+        span = position[nodes[:, 1]] - position[nodes[:, 0]]
         length = np.linalg.norm(span, axis=1)
-        strain = length / model.spring_rest_length - 1.0
-        slope = self.slope(strain)
-        # Tension over length, from the mean slope: exact for a linear spring, near enough for another one.
-        across = np.maximum(model.spring_stiffness * slope * strain / (1.0 + strain), 0.0)
+        tension, slope = self.law(length / rest - 1.0)
+        across = (self.model.spring_stiffness * rest * tension / length)[:, None, None]
         dyads = span[:, :, None] * span[:, None, :] / (length**2)[:, None, None]
-        along = (model.spring_stiffness * slope - across)[:, None, None] * dyads + across[:, None, None] * np.eye(3)
-        blocks = np.concatenate(
-            [np.concatenate([along, -along], axis=2), np.concatenate([-along, along], axis=2)], axis=1
-        )
-        rows = (3 * model.spring_nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(-1, 6)
-        total = _assembled(np.zeros_like(rows, dtype=np.float64), blocks, rows, count)[1]
+        along = ((self.model.spring_stiffness * slope)[:, None, None] - across) * dyads + across * np.eye(3)
+        blocks = np.block([[along, -along], [-along, along]])
+        return _assembled(np.zeros((len(nodes), 6)), blocks, _rows(nodes), position.size)[1]
+
+    def _volumes(self, position: FloatArray) -> csc_array:
+        """Tangent of the volume terms, K / V0 dV dV^T + p d2V, p the tension of each tet and of its nodes [N/m]."""
+        model, count = self.model, position.size
         gradient = volume_gradient(position, model.tet_nodes)
-        rows = (3 * model.tet_nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(-1, 12)
+        volume = (gradient * position[model.tet_nodes].reshape(-1, 12)).sum(axis=1) / 3.0
+        tension = model.tet_bulk * (volume / model.tet_rest_volume - 1.0)
+        if model.node_bulk.any():
+            node_volume = np.bincount(model.tet_nodes.ravel(), np.repeat(volume / 4.0, 4), len(position))
+            node_tension = model.node_bulk * (node_volume / model.node_rest_volume - 1.0)
+            tension = tension + node_tension[model.tet_nodes].mean(axis=1)
         scale = model.tet_bulk / model.tet_rest_volume
         blocks = scale[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
-        total = total + _assembled(np.zeros_like(rows, dtype=np.float64), blocks, rows, count)[1]
+        blocks += tension[:, None, None] * _volume_curvature(position[model.tet_nodes])
+        rows = _rows(model.tet_nodes)
+        total = _assembled(np.zeros(rows.shape), blocks, rows, count)[1]
         if model.node_bulk.any():
             averaged = averaged_gradient(model.tet_nodes, gradient, count)
             weighted = averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
             total = total + averaged.T @ weighted
         return csc_array(total)
+
+
+def _rows(nodes: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Rows of the displacement of some nodes, (n, 3 m) for nodes (n, m)."""
+    return (3 * nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(nodes), -1)
+
+
+def _volume_curvature(corners: FloatArray) -> FloatArray:
+    """d2V/dx dx of tets with corners (n, 4, 3) [m], (n, 12, 12).
+
+    6 V = b . (c x d) with edges from the first corner: d(6 V)/db dc = -[d], [d] x = d x x; the first corner's rows are
+    minus the sums of the others'.
+    """
+    b, c, d = (corners[:, one] - corners[:, 0] for one in (1, 2, 3))
+    found = np.zeros((len(corners), 4, 3, 4, 3))
+    for first, second, third, edge in ((1, 2, 3, d), (2, 3, 1, b), (3, 1, 2, c)):
+        turn = np.cross(np.eye(3)[None], edge[:, None, :]) / 6.0
+        found[:, first, :, second, :] = turn.transpose(0, 2, 1)
+        found[:, second, :, first, :] = turn
+    found[:, 0] = -found[:, 1:].sum(axis=1)
+    found[:, :, :, 0] = -found[:, :, :, 1:].sum(axis=3)
+    return found.reshape(-1, 12, 12)

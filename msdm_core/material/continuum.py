@@ -1,10 +1,10 @@
-"""Isotropic solids at finite strain: the continuum of stiffening springs, Fung's and Ogden's solids, and fits of springs.
+"""Solids at finite strain: the continuum of stiffening springs, Fung's and Ogden's, and springs fitted to them.
 
 Springs in all directions that deform with the continuum are the affine micro-sphere model (Miehe, Göktepe and Lulei
 2004, doi 10.1016/j.jmps.2004.03.011): W = c <psi(l)>, the mean over directions N of the energy psi at the stretch
-l = |F N|, psi'(l) = phi(l - 1). With phi(e) = e it has Lame's lambda = mu = c / 15 at small strain. The springs of a BCC
-lattice have seven directions: the quadrature of degree 5 of that mean. Each node is a centre of symmetry, so that a
-homogeneous deformation of the lattice is affine whatever the law.
+l = |F N|, psi'(l) = phi(l - 1). With phi(e) = e it has Lame's lambda = mu = c / 15 at small strain. The springs of a
+BCC lattice have seven directions: the quadrature of degree 5 of that mean. Each node is a centre of symmetry, so that
+a homogeneous deformation of the lattice is affine whatever the law.
 """
 
 from collections.abc import Callable
@@ -13,12 +13,40 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from msdm_core.mesh.tet_mesh import FloatArray
 
 SpringLaw = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 # Directions of a quadrature over the sphere: exact to degree 2 DIRECTION_ORDER - 1.
 DIRECTION_ORDER = 12
+
+
+def linear_law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Tension over stiffness and rest length of a linear spring and its slope: e and 1."""
+    return strain, np.ones_like(strain)
+
+
+def stiffening_law(onset_strain: float, cap_strain: float, tangent_cap: float) -> SpringLaw:
+    """Tension over stiffness and rest length phi(e) of a stiffening spring, and its slope phi'(e).
+
+    phi' = 1 + (c - 1) x^2, x = (|e| - e_0) / (e_c - e_0) held between 0 and 1, alike in tension and compression. This
+    is the law of the kernels, written apart from them.
+
+    Args:
+        onset_strain: e_0, below which the spring is linear.
+        cap_strain: e_c, beyond which the slope is constant.
+        tangent_cap: c, that slope.
+    """
+    width = cap_strain - onset_strain
+
+    def law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+        size = np.abs(strain)
+        share = np.clip((size - onset_strain) / width, 0.0, 1.0)
+        grown = width * share**3 / 3.0 + np.maximum(size - cap_strain, 0.0)
+        return np.sign(strain) * (size + (tangent_cap - 1.0) * grown), 1.0 + (tangent_cap - 1.0) * share**2
+
+    return law
 
 
 class Solid(Protocol):
@@ -47,7 +75,7 @@ def sphere_directions(order: int = DIRECTION_ORDER) -> tuple[FloatArray, FloatAr
 
 @lru_cache(maxsize=1)
 def lattice_directions() -> tuple[FloatArray, FloatArray]:
-    """The directions of the springs of a BCC lattice, and their shares of its stiffness by formula (6), 2/15 and 3/20."""
+    """The directions of the springs of a BCC lattice, and their shares of its stiffness by formula (6)."""
     diagonals = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]]) / np.sqrt(3.0)
     return np.vstack([np.eye(3), diagonals]), np.array([2.0 / 15.0] * 3 + [3.0 / 20.0] * 4)
 
@@ -190,7 +218,9 @@ def uniaxial_stress(solid: Solid, stretch: FloatArray) -> FloatArray:
             break
     else:
         worst = stretch[int(np.argmax(np.abs(change)))]
-        raise ValueError(f"the bar has no equilibrium at the stretch {worst:g}: use smaller strains or other parameters")
+        raise ValueError(
+            f"the bar finds no equilibrium at the stretch {worst:g}: use smaller strains, or other parameters"
+        )
     return _bar(solid, stretch, across)[..., 0, 0]
 
 
@@ -206,3 +236,86 @@ def simple_shear_stress(solid: Solid, amount: FloatArray) -> FloatArray:
     gradient = np.broadcast_to(np.eye(3), (*amount.shape, 3, 3)).copy()
     gradient[..., 0, 1] = amount
     return solid.first_piola(gradient)[..., 0, 1]
+
+
+# The springs of a fit are compared with a solid at so many stretches in tension, in compression, and amounts of shear.
+FIT_POINTS = 10
+
+
+@dataclass(frozen=True)
+class SpringFit:
+    """Stiffening springs fitted to a solid.
+
+    Args:
+        youngs_modulus: at small strain [Pa].
+        onset_strain, cap_strain, tangent_cap: of the springs' law, see `stiffening_law`.
+        tension_error, compression_error, shear_error: largest relative error of the stress in each test.
+    """
+
+    youngs_modulus: float
+    onset_strain: float
+    cap_strain: float
+    tangent_cap: float
+    tension_error: float
+    compression_error: float
+    shear_error: float
+
+
+def fit_springs(
+    solid: Solid,
+    *,
+    strain: float,
+    poisson_ratio: float = 0.45,
+    directions: tuple[FloatArray, FloatArray] | None = None,
+) -> SpringFit:
+    """Modulus and law of stiffening springs whose uniaxial tension, compression and simple shear are those of a solid.
+
+    Least squares of the relative errors of the stress, for stretches 1 - strain to 1 + strain and shear up to strain.
+
+    Args:
+        solid: such as `Demiray` or `Ogden` with published parameters.
+        strain: largest strain of the tests, above 0 and at most 0.5.
+        poisson_ratio: of the springs with their volume term.
+        directions: of the springs; by default all. `lattice_directions()` for tests along the axes of a lattice.
+
+    Raises:
+        ValueError: a strain or ratio out of range, or a solid without equilibrium in these tests.
+    """
+    if not 0.0 < strain <= 0.5:
+        raise ValueError(f"the strain of the fit is {strain:g}; it must be above 0 and at most 0.5")
+    if not 0.25 <= poisson_ratio < 0.5:
+        raise ValueError(f"poisson_ratio is {poisson_ratio:g}; springs with a volume term have 0.25 <= nu < 0.5")
+    added = (4.0 * poisson_ratio - 1.0) / (1.0 - 2.0 * poisson_ratio)
+    amount = strain * np.arange(1, FIT_POINTS + 1) / FIT_POINTS
+    everywhere = sphere_directions() if directions is None else directions
+
+    def stresses(one: Solid) -> FloatArray:
+        return np.array([
+            uniaxial_stress(one, 1.0 + amount), uniaxial_stress(one, 1.0 - amount), simple_shear_stress(one, amount)
+        ])  # fmt: skip
+
+    target = stresses(solid)
+
+    def errors(numbers: FloatArray) -> tuple[float, FloatArray]:
+        onset, width, cap = numbers
+        ratio = stresses(SpringSolid(1.0, added, stiffening_law(onset, onset + width, cap), everywhere)) / target
+        # The modulus that makes the sum of (modulus ratio - 1)^2 smallest.
+        shear_modulus = ratio.sum() / (ratio**2).sum()
+        return shear_modulus, shear_modulus * ratio - 1.0
+
+    starts = [(0.01, 0.5 * strain, 3.0), (0.01, strain, 10.0), (0.25 * strain, 0.5 * strain, 10.0)]
+    bounds = ([0.0, 0.02 * strain, 1.0], [strain, 3.0 * strain, 100.0])
+    tried = [
+        least_squares(lambda x: errors(x)[1].ravel(), one, bounds=bounds, x_scale=(0.1, 0.1, 10.0)) for one in starts
+    ]
+    found = min(tried, key=lambda one: one.cost)
+    shear_modulus, error = errors(found.x)
+    worst = np.abs(error).max(axis=1)
+    onset, width, cap = found.x.tolist()
+    modulus = 2.0 * (1.0 + poisson_ratio) * float(shear_modulus)
+    return SpringFit(modulus, onset, onset + width, cap, *worst.tolist())
+
+
+def bulk_modulus(shear_modulus: float, poisson_ratio: float) -> float:
+    """K = 2 mu (1 + nu) / (3 (1 - 2 nu)) [Pa]."""
+    return shear_modulus * 2.0 * (1.0 + poisson_ratio) / (3.0 * (1.0 - 2.0 * poisson_ratio))

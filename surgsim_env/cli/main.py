@@ -1,4 +1,4 @@
-"""Commands `palpate`, `retract`, `arms`, `organ`, `scenes`, `materials`, `validate`, `bench`, `haptics`, `view`, `doctor`."""
+"""Commands of `surgsim`: how they are chosen, and how their errors and warnings are told."""
 
 import contextlib
 import io

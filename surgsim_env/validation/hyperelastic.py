@@ -1,8 +1,7 @@
 """Blocks at finite strain: quadratic hexahedra of a hyperelastic solid, and the organ in static equilibrium.
 
 A block with faces square to the axes is pulled, compressed or sheared by its ends z = 0 and z = height. Ends are bonded
-to plates, or slide on them. What the organ is compared with is the solid of `msdm_core.material.continuum`, with a
-spring law that is written down here, apart from that of the kernels.
+to plates, or slide on them. The solids are those of `msdm_core.material.continuum`.
 """
 
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from scipy.sparse.linalg import spsolve
 
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
-from msdm_core.material.continuum import SpringLaw
+from msdm_core.material.continuum import SpringLaw, linear_law
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.compile import rest_state
 from surgsim_env.validation.elements import Cells, Size
@@ -26,27 +25,6 @@ Test = Literal["pull", "slide", "shear"]
 # Forces balance to this share of the force on a plate.
 RESIDUAL = 1e-7
 ROUNDS = 80
-
-
-def power_law(onset_strain: float, cap_strain: float, tangent_cap: float, power: int) -> SpringLaw:
-    """Tension phi(e) and slope phi'(e) of a stiffening spring, alike in tension and compression.
-
-    phi' = 1 + (c - 1) x^n, x = (|e| - e_0) / (e_c - e_0) held between 0 and 1: 1 below the onset, c beyond the cap.
-    """
-    width = cap_strain - onset_strain
-
-    def law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
-        size = np.abs(strain)
-        share = np.clip((size - onset_strain) / width, 0.0, 1.0)
-        grown = width * share ** (power + 1) / (power + 1) + np.maximum(size - cap_strain, 0.0)
-        return np.sign(strain) * (size + (tangent_cap - 1.0) * grown), 1.0 + (tangent_cap - 1.0) * share**power
-
-    return law
-
-
-def linear_law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tension and slope of a linear spring, e and 1."""
-    return strain, np.ones_like(strain)
 
 
 class SolidWithTangent(Protocol):
@@ -285,7 +263,7 @@ def _volume_curvature(corners: FloatArray) -> FloatArray:
     """
     b, c, d = (corners[:, one] - corners[:, 0] for one in (1, 2, 3))
     found = np.zeros((len(corners), 4, 3, 4, 3))
-    for first, second, third, edge in ((1, 2, 3, d), (2, 3, 1, b), (3, 1, 2, c)):
+    for first, second, edge in ((1, 2, d), (2, 3, b), (3, 1, c)):
         turn = np.cross(np.eye(3)[None], edge[:, None, :]) / 6.0
         found[:, first, :, second, :] = turn.transpose(0, 2, 1)
         found[:, second, :, first, :] = turn

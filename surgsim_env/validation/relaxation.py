@@ -1,8 +1,9 @@
 """Springs that relax: closed forms of step strain and creep, and exact steps of a quasi-linear viscoelastic body.
 
-Fung's quasi-linear law with Maxwell arms, on the springs alone: T(t) = T_e + sum_i g_i q_i, dq_i/dt = dT_e/dt - q_i / tau_i.
-With r_i = T_e - q_i this is T = (1 + sum g_i) T_e - sum g_i r_i, dr_i/dt = (T_e - r_i) / tau_i. At small strain T_e is K_s u
-and r_i = K_s u_i with displacements u_i of the arms, du_i/dt = (u - u_i) / tau_i; the volume terms K_v u stay elastic.
+Fung's quasi-linear law with Maxwell arms, on the springs alone: T(t) = T_e + sum g_i q_i, dq_i/dt = dT_e/dt - q_i / tau_i.
+With r_i = T_e - q_i this is T = (1 + sum g_i) T_e - sum g_i r_i, dr_i/dt = (T_e - r_i) / tau_i. At small strain T_e is
+K_s u and r_i = K_s u_i with displacements u_i of the arms, du_i/dt = (u - u_i) / tau_i; the volume terms K_v u stay
+elastic.
 """
 
 from dataclasses import dataclass, field

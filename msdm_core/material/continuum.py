@@ -7,7 +7,6 @@ BCC lattice have seven directions: the quadrature of degree 5 of that mean. Each
 a homogeneous deformation of the lattice is affine whatever the law.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
@@ -15,38 +14,11 @@ from typing import Protocol
 import numpy as np
 from scipy.optimize import least_squares
 
+from msdm_core.material.tissue_law import TANGENT_CAP_LARGEST, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 
-SpringLaw = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 # Directions of a quadrature over the sphere: exact to degree 2 DIRECTION_ORDER - 1.
 DIRECTION_ORDER = 12
-
-
-def linear_law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tension over stiffness and rest length of a linear spring and its slope: e and 1."""
-    return strain, np.ones_like(strain)
-
-
-def stiffening_law(onset_strain: float, cap_strain: float, tangent_cap: float) -> SpringLaw:
-    """Tension over stiffness and rest length phi(e) of a stiffening spring, and its slope phi'(e).
-
-    phi' = 1 + (c - 1) x^2, x = (|e| - e_0) / (e_c - e_0) held between 0 and 1, alike in tension and compression. This
-    is the law of the kernels, written apart from them.
-
-    Args:
-        onset_strain: e_0, below which the spring is linear.
-        cap_strain: e_c, beyond which the slope is constant.
-        tangent_cap: c, that slope.
-    """
-    width = cap_strain - onset_strain
-
-    def law(strain: FloatArray) -> tuple[FloatArray, FloatArray]:
-        size = np.abs(strain)
-        share = np.clip((size - onset_strain) / width, 0.0, 1.0)
-        grown = width * share**3 / 3.0 + np.maximum(size - cap_strain, 0.0)
-        return np.sign(strain) * (size + (tangent_cap - 1.0) * grown), 1.0 + (tangent_cap - 1.0) * share**2
-
-    return law
 
 
 class Solid(Protocol):
@@ -94,21 +66,24 @@ class SpringSolid:
     Args:
         shear_modulus: mu at small strain [Pa].
         volume_modulus: K_t = lambda - mu [Pa].
-        law: tension over stiffness and rest length, phi(e), and its slope, of strains e; phi(e) = e and 1 is linear.
+        stiffening: of the springs, phi(e); None: linear, phi(e) = e.
         directions: N, (n, 3), and their weights (n,); by default the whole sphere.
     """
 
     shear_modulus: float
     volume_modulus: float
-    law: SpringLaw
+    stiffening: Stiffening | None = None
     directions: tuple[FloatArray, FloatArray] = sphere_directions()
+
+    def _law(self, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return spring_law(self.stiffening, strain)
 
     def first_piola(self, gradient: FloatArray) -> FloatArray:
         """P = 15 mu <phi / l (F N) N^T> + K_t (J - 1) dJ/dF [Pa], (..., 3, 3)."""
         directions, weights = self.directions
         spans = np.einsum("...ij,aj->...ai", gradient, directions)
         stretch = np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
-        scale = 15.0 * self.shear_modulus * weights * self.law(stretch - 1.0)[0] / stretch
+        scale = 15.0 * self.shear_modulus * weights * self._law(stretch - 1.0)[0] / stretch
         volume, cofactor = determinant_and_cofactor(gradient)
         springs = np.einsum("...a,...ai,aj->...ij", scale, spans, directions, optimize=True)
         return springs + (self.volume_modulus * (volume - 1.0))[..., None, None] * cofactor
@@ -118,7 +93,7 @@ class SpringSolid:
         directions, weights = self.directions
         spans = np.einsum("...ij,aj->...ai", gradient, directions)
         stretch = np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
-        tension, slope = self.law(stretch - 1.0)
+        tension, slope = self._law(stretch - 1.0)
         share = 15.0 * self.shear_modulus * weights
         dyads = np.einsum("...ai,aj->...aij", spans, directions).reshape(*stretch.shape, 9)
         along = share * (slope - tension / stretch) / stretch**2
@@ -127,6 +102,13 @@ class SpringSolid:
         across = np.einsum("...a,aj,al->...jl", share * tension / stretch, directions, directions, optimize=True)
         found += np.einsum("ik,...jl->...ijkl", np.eye(3), across)
         return found + volume_tangent(gradient, self.volume_modulus)
+
+
+def spring_law(stiffening: Stiffening | None, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Tension over stiffness and rest length phi(e) of springs at strains e, and its slope."""
+    if stiffening is None:
+        return strain, np.ones_like(strain)
+    return stiffening.tension(strain), stiffening.tangent(strain)
 
 
 def volume_tangent(gradient: FloatArray, modulus: float) -> FloatArray:
@@ -248,14 +230,12 @@ class SpringFit:
 
     Args:
         youngs_modulus: at small strain [Pa].
-        onset_strain, cap_strain, tangent_cap: of the springs' law, see `stiffening_law`.
+        stiffening: of the springs.
         tension_error, compression_error, shear_error: largest relative error of the stress in each test.
     """
 
     youngs_modulus: float
-    onset_strain: float
-    cap_strain: float
-    tangent_cap: float
+    stiffening: Stiffening
     tension_error: float
     compression_error: float
     shear_error: float
@@ -274,15 +254,15 @@ def fit_springs(
 
     Args:
         solid: such as `Demiray` or `Ogden` with published parameters.
-        strain: largest strain of the tests, above 0 and at most 0.5.
+        strain: largest strain of the tests, from 0.05 to 0.5.
         poisson_ratio: of the springs with their volume term.
         directions: of the springs; by default all. `lattice_directions()` for tests along the axes of a lattice.
 
     Raises:
         ValueError: a strain or ratio out of range, or a solid without equilibrium in these tests.
     """
-    if not 0.0 < strain <= 0.5:
-        raise ValueError(f"the strain of the fit is {strain:g}; it must be above 0 and at most 0.5")
+    if not 0.05 <= strain <= 0.5:
+        raise ValueError(f"the strain of the fit is {strain:g}; it must be from 0.05 to 0.5")
     if not 0.25 <= poisson_ratio < 0.5:
         raise ValueError(f"poisson_ratio is {poisson_ratio:g}; springs with a volume term have 0.25 <= nu < 0.5")
     added = (4.0 * poisson_ratio - 1.0) / (1.0 - 2.0 * poisson_ratio)
@@ -298,13 +278,13 @@ def fit_springs(
 
     def errors(numbers: FloatArray) -> tuple[float, FloatArray]:
         onset, width, cap = numbers
-        ratio = stresses(SpringSolid(1.0, added, stiffening_law(onset, onset + width, cap), everywhere)) / target
+        ratio = stresses(SpringSolid(1.0, added, Stiffening(onset, onset + width, cap), everywhere)) / target
         # The modulus that makes the sum of (modulus ratio - 1)^2 smallest.
         shear_modulus = ratio.sum() / (ratio**2).sum()
         return shear_modulus, shear_modulus * ratio - 1.0
 
     starts = [(0.01, 0.5 * strain, 3.0), (0.01, strain, 10.0), (0.25 * strain, 0.5 * strain, 10.0)]
-    bounds = ([0.0, 0.02 * strain, 1.0], [strain, 3.0 * strain, 100.0])
+    bounds = ([0.0, 0.02 * strain, 1.0], [strain, 3.0 * strain, TANGENT_CAP_LARGEST])
     tried = [
         least_squares(lambda x: errors(x)[1].ravel(), one, bounds=bounds, x_scale=(0.1, 0.1, 10.0)) for one in starts
     ]
@@ -313,7 +293,7 @@ def fit_springs(
     worst = np.abs(error).max(axis=1)
     onset, width, cap = found.x.tolist()
     modulus = 2.0 * (1.0 + poisson_ratio) * float(shear_modulus)
-    return SpringFit(modulus, onset, onset + width, cap, *worst.tolist())
+    return SpringFit(modulus, Stiffening(onset, onset + width, cap), *worst.tolist())
 
 
 def bulk_modulus(shear_modulus: float, poisson_ratio: float) -> float:

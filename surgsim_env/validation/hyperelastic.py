@@ -15,7 +15,8 @@ from scipy.sparse.linalg import spsolve
 
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
-from msdm_core.material.continuum import SpringLaw, linear_law
+from msdm_core.material.continuum import spring_law
+from msdm_core.material.tissue_law import Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.compile import rest_state
 from surgsim_env.validation.elements import Cells, Size
@@ -192,12 +193,12 @@ class OrganBlock:
     Args:
         mesh: the block.
         model: its organ, without anchors.
-        law: of its springs, for the matrix.
+        stiffening: of its springs, for the matrix.
     """
 
     mesh: TetMesh
     model: OrganModel
-    law: SpringLaw = linear_law
+    stiffening: Stiffening | None = None
 
     def forces(self, test: Test, strains: tuple[float, ...]) -> list[float]:
         """Force on the upper plate at strains that follow each other [N]."""
@@ -221,7 +222,7 @@ class OrganBlock:
         nodes, rest = self.model.spring_nodes, self.model.spring_rest_length
         span = position[nodes[:, 1]] - position[nodes[:, 0]]
         length = np.linalg.norm(span, axis=1)
-        tension, slope = self.law(length / rest - 1.0)
+        tension, slope = spring_law(self.stiffening, length / rest - 1.0)
         across = (self.model.spring_stiffness * rest * tension / length)[:, None, None]
         dyads = span[:, :, None] * span[:, None, :] / (length**2)[:, None, None]
         along = ((self.model.spring_stiffness * slope)[:, None, None] - across) * dyads + across * np.eye(3)

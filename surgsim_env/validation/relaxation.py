@@ -1,42 +1,22 @@
 """Springs that relax: closed forms of step strain and creep, and exact steps of a quasi-linear viscoelastic body.
 
-Fung's quasi-linear law with Maxwell arms, on the springs alone: T(t) = T_e + sum g_i q_i, dq_i/dt = dT_e/dt - q_i / tau_i.
+Fung's quasi-linear law with Maxwell arms, on the springs alone: T = T_e + sum g_i q_i, dq_i/dt = dT_e/dt - q_i / tau_i.
 With r_i = T_e - q_i this is T = (1 + sum g_i) T_e - sum g_i r_i, dr_i/dt = (T_e - r_i) / tau_i. At small strain T_e is
 K_s u and r_i = K_s u_i with displacements u_i of the arms, du_i/dt = (u - u_i) / tau_i; the volume terms K_v u stay
 elastic.
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import expm
 from scipy.sparse import csc_array
 
+from msdm_core.material.tissue_law import Relaxation
 from msdm_core.mesh.tet_mesh import FloatArray
 
 
-class Prony(Protocol):
-    """Maxwell arms: moduli g_i over that of the springs, and times tau_i [s]."""
-
-    @property
-    def relative_moduli(self) -> tuple[float, ...]:
-        """The moduli g_i over that of the springs."""
-        ...
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        """The times tau_i [s]."""
-        ...
-
-
-def relaxation_factor(arms: Prony, time: FloatArray) -> FloatArray:
-    """Tension after a step strain over the elastic one, 1 + sum g_i exp(-t / tau_i), of times [s]."""
-    decay = np.exp(-np.asarray(time, dtype=np.float64)[..., None] / np.asarray(arms.times))
-    return 1.0 + decay @ np.asarray(arms.relative_moduli)
-
-
-def loss_tangent(arms: Prony, frequency: float) -> float:
+def loss_tangent(arms: Relaxation, frequency: float) -> float:
     """Loss over storage modulus of the springs at a frequency [Hz].
 
     G* = 1 + sum g_i (i w tau_i) / (1 + i w tau_i), w = 2 pi f.
@@ -46,12 +26,12 @@ def loss_tangent(arms: Prony, frequency: float) -> float:
     return float(modulus.imag / modulus.real)
 
 
-def spring_creep(arms: Prony, time: FloatArray) -> FloatArray:
+def spring_creep(arms: Relaxation, time: FloatArray) -> FloatArray:
     """Strain of springs under a constant load over the final one, of times [s], shape (n,)."""
     return _crept(np.ones((1, 1)), np.zeros((1, 1)), np.ones(1), arms, time)[:, 0]
 
 
-def bar_creep(poisson_ratio: float, arms: Prony, time: FloatArray) -> FloatArray:
+def bar_creep(poisson_ratio: float, arms: Relaxation, time: FloatArray) -> FloatArray:
     """Strain of a bar with free sides under a constant load over the final one, of times [s], shape (n,).
 
     Springs have lambda = mu, their volume term adds K_t = mu (4 nu - 1) / (1 - 2 nu) and stays elastic. In strains
@@ -63,7 +43,7 @@ def bar_creep(poisson_ratio: float, arms: Prony, time: FloatArray) -> FloatArray
     return strain / np.linalg.solve(springs + volume, [1.0, 0.0])[0]
 
 
-def _crept(springs: FloatArray, volume: FloatArray, load: FloatArray, arms: Prony, time: FloatArray) -> FloatArray:
+def _crept(springs: FloatArray, volume: FloatArray, load: FloatArray, arms: Relaxation, time: FloatArray) -> FloatArray:
     """The u(t) with ((1 + sum g) S + V) u - sum g_i S u_i = f, du_i/dt = (u - u_i) / tau_i, u_i = 0 at 0, (n, m)."""
     shares, times = np.asarray(arms.relative_moduli), np.asarray(arms.times)
     width = len(load)
@@ -93,7 +73,7 @@ class ViscoelasticBody:
 
     springs: csc_array
     volume: csc_array
-    arms: Prony
+    arms: Relaxation
     displacement: FloatArray = field(init=False)
     arm_displacement: FloatArray = field(init=False)
 

@@ -1,28 +1,26 @@
 """Closed forms of relaxation and creep, and exact steps of a viscoelastic body, against each other."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import spsolve
 
+from msdm_core.material.tissue_law import Relaxation
 from surgsim_env.validation.relaxation import (
     ViscoelasticBody,
     bar_creep,
     loss_tangent,
-    relaxation_factor,
     spring_creep,
 )
 
-ARMS = SimpleNamespace(relative_moduli=(0.3, 0.3, 0.3), times=(0.05, 0.5, 5.0))
+ARMS = Relaxation(relative_moduli=(0.3, 0.3, 0.3), times=(0.05, 0.5, 5.0))
 TIME = np.array([0.01, 0.1, 1.0, 10.0, 100.0])
 
 
 def test_three_arms_of_0_3_relax_by_a_third_from_0_1_to_10_s():
     # On paper (issue 17): 34 %, and a loss tangent of 0.09 to 0.15 from 0.05 to 5 Hz.
-    early, late = relaxation_factor(ARMS, np.array([0.1, 10.0]))
+    early, late = ARMS.remaining([0.1, 10.0])
     assert 1.0 - late / early == pytest.approx(0.34, abs=0.01)
     tangents = [loss_tangent(ARMS, frequency) for frequency in (0.05, 0.5, 5.0)]
     assert [round(tangent, 2) for tangent in tangents] == [0.15, 0.13, 0.09]
@@ -30,7 +28,7 @@ def test_three_arms_of_0_3_relax_by_a_third_from_0_1_to_10_s():
 
 def test_one_arm_creeps_as_a_standard_solid():
     """u(t) / u_end = 1 - (g / (1 + g)) exp(-t / ((1 + g) tau)) of the standard linear solid."""
-    arm = SimpleNamespace(relative_moduli=(0.8,), times=(2.0,))
+    arm = Relaxation(relative_moduli=(0.8,), times=(2.0,))
     expected = 1.0 - 0.8 / 1.8 * np.exp(-TIME / (1.8 * 2.0))
     np.testing.assert_allclose(spring_creep(arm, TIME), expected, rtol=1e-10)
     # Without a volume term a bar creeps as its springs do.
@@ -75,7 +73,7 @@ def test_a_held_body_relaxes_by_the_closed_form():
         forces.append(stiffness @ still - load)
         one.accept(still, duration)
     elastic, volume = one.springs @ still, one.volume @ still
-    expected = relaxation_factor(ARMS, TIME)[:, None] * elastic + volume
+    expected = ARMS.remaining(TIME)[:, None] * elastic + volume
     np.testing.assert_allclose(forces[1:], expected, rtol=1e-4)
 
 

@@ -7,29 +7,33 @@ from msdm_core.material.continuum import (
     Demiray,
     Ogden,
     SpringSolid,
+    bulk_modulus,
     determinant_and_cofactor,
+    fit_springs,
     lattice_directions,
     simple_shear_stress,
     sphere_directions,
     uniaxial_stress,
 )
+from msdm_core.material.tissue_law import Stiffening
 
 MU, BULK = 2000.0, 9000.0
 
 
-def stiffening(strain):
-    """A law with a quadratic rise of the slope: phi = e + 40 e^3."""
-    return strain + 40.0 * strain**3, 1.0 + 120.0 * strain**2
+class Cubic:
+    """A law with a quadratic rise of the slope, phi = e + 40 e^3."""
 
+    def tension(self, strain):
+        return strain + 40.0 * strain**3
 
-def linear(strain):
-    return strain, np.ones_like(strain)
+    def tangent(self, strain):
+        return 1.0 + 120.0 * strain**2
 
 
 SOLIDS = {
-    "springs": SpringSolid(MU, BULK - 5.0 / 3.0 * MU, linear),
-    "stiffening": SpringSolid(MU, BULK - 5.0 / 3.0 * MU, stiffening),
-    "lattice": SpringSolid(MU, BULK - 5.0 / 3.0 * MU, stiffening, lattice_directions()),
+    "springs": SpringSolid(MU, BULK - 5.0 / 3.0 * MU),
+    "stiffening": SpringSolid(MU, BULK - 5.0 / 3.0 * MU, Cubic()),
+    "lattice": SpringSolid(MU, BULK - 5.0 / 3.0 * MU, Cubic(), lattice_directions()),
     "Demiray": Demiray(MU, 5.0, BULK),
     "neo-Hookean": Demiray(MU, 0.0, BULK),
     "Ogden": Ogden(MU, 8.0, BULK),
@@ -132,3 +136,32 @@ def test_volume_and_its_slope():
     volume, cofactor = determinant_and_cofactor(GRADIENT)
     assert volume == pytest.approx(np.linalg.det(GRADIENT))
     np.testing.assert_allclose(cofactor, volume * np.linalg.inv(GRADIENT).T)
+
+
+def test_a_fit_finds_the_springs_that_the_stress_is_of():
+    law = Stiffening(0.05, 0.25, 8.0)
+    solid = SpringSolid(MU, MU * (4.0 * 0.45 - 1.0) / 0.1, law)
+    found = fit_springs(solid, strain=0.4)
+    assert found.youngs_modulus == pytest.approx(2.9 * MU, rel=1e-3)
+    assert found.stiffening.tangent_cap == pytest.approx(8.0, rel=0.01)
+    assert found.stiffening.onset_strain == pytest.approx(0.05, abs=1e-3)
+    assert found.stiffening.cap_strain == pytest.approx(0.25, abs=1e-3)
+    assert max(found.tension_error, found.compression_error, found.shear_error) < 1e-3
+
+
+def test_springs_fitted_to_fungs_solid_stiffen_with_its_exponent():
+    """How far springs alike in tension and compression can follow it: compression is where they are furthest."""
+    found = [fit_springs(Demiray(MU, b, bulk_modulus(MU, 0.45)), strain=0.2) for b in (3.0, 10.0)]
+    assert all(one.youngs_modulus == pytest.approx(2.9 * MU, rel=0.05) for one in found)
+    stresses = [uniaxial_stress(SpringSolid(MU, 8.0 * MU, one.stiffening), np.array([1.2]))[0] for one in found]
+    assert stresses[1] > 1.2 * stresses[0]
+    for one in found:
+        assert one.shear_error < one.tension_error < one.compression_error < 0.5
+
+
+@pytest.mark.parametrize(
+    ("strain", "ratio", "said"), [(0.01, 0.45, "strain of the fit is 0.01"), (0.3, 0.5, "poisson_ratio is 0.5")]
+)
+def test_fits_out_of_range_are_refused(strain, ratio, said):
+    with pytest.raises(ValueError, match=said):
+        fit_springs(Demiray(MU, 3.0, BULK), strain=strain, poisson_ratio=ratio)

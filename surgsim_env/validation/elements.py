@@ -185,7 +185,7 @@ class BallContact:
             held_off, push = self.engaged(displacement, depth)
             # The sum of sparse arrays is typed as their base, which has no indexing.
             whole = csc_array(stiffness + held_off)[free][:, free].tocsc()
-            displacement[free] = np.asarray(spsolve(whole, (load - push)[free]))
+            displacement[free] = np.asarray(spsolve(whole, (load - push)[free], permc_spec="MMD_AT_PLUS_A"))
             previous, force = force, float((held_off @ displacement + push)[self.vertical].sum())
             if abs(force - previous) <= 1e-6 * abs(force):
                 return force

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from surgsim_env.validation import bars, capsule, dynamics, friction, lattice, paper_tests, punch, touch
+from surgsim_env.validation import bars, capsule, dynamics, friction, lattice, paper_tests, punch, tissue_law, touch
 from surgsim_env.validation.elements import MISSING, has_fem
 from surgsim_env.validation.row import Case, Curve, Drawing, Result, Row
 
@@ -62,6 +62,18 @@ CASES: tuple[Case, ...] = (
         Case(f"touch, contrast, {one.name}, {cells}", partial(touch.contrast, cells, one), slow=True, needs_fem=True)
         for cells, one in touch.CONTRASTS
     ),
+    Case("large strain, linear", partial(tissue_law.large_strain, "slide", 6, None)),
+    Case("large strain, stiffening", partial(tissue_law.large_strain, "slide", 6, tissue_law.STIFFENING)),
+    *(
+        Case(f"large strain, {test}", partial(tissue_law.large_strain, test, 8, law), slow=True, needs_fem=True)
+        for test, law in (("pull", tissue_law.STIFFENING), ("shear", tissue_law.STIFFENING), ("shear", None))
+    ),
+    Case("stiffening in all directions", tissue_law.all_directions),
+    Case("step strain", partial(tissue_law.step_strain, tissue_law.ARMS)),
+    Case("step strain, stiffening", partial(tissue_law.step_strain, tissue_law.ARMS, tissue_law.STIFFENING)),
+    Case("creep", partial(tissue_law.creep, tissue_law.ARMS, 0.25)),
+    Case("creep, nu 0.45", partial(tissue_law.creep, tissue_law.ARMS, 0.45)),
+    Case("press held", partial(tissue_law.held_press, 12), slow=True, needs_fem=True),
     Case("deep presses", touch.deep_presses),
     Case("sliding", friction.sliding, slow=True),
     Case("grasped strip", friction.grasped_strip),

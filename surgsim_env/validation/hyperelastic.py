@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import spsolve
 
+from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.material.continuum import spring_law
@@ -234,12 +235,17 @@ class OrganBlock:
         model, count = self.model, position.size
         gradient = volume_gradient(position, model.tet_nodes)
         volume = (gradient * position[model.tet_nodes].reshape(-1, 12)).sum(axis=1) / 3.0
-        tension = model.tet_bulk * (volume / model.tet_rest_volume - 1.0)
+        ratio = volume / model.tet_rest_volume
+        tension, slope = model.tet_bulk * (ratio - 1.0), model.tet_bulk.copy()
+        squeezed = ratio < SQUEEZED_RATIO
+        share = SQUEEZED_RATIO / ratio[squeezed]
+        tension[squeezed] += model.tet_averaged_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
+        slope[squeezed] += model.tet_averaged_bulk[squeezed] * share**2
         if model.node_bulk.any():
             node_volume = np.bincount(model.tet_nodes.ravel(), np.repeat(volume / 4.0, 4), len(position))
             node_tension = model.node_bulk * (node_volume / model.node_rest_volume - 1.0)
             tension = tension + node_tension[model.tet_nodes].mean(axis=1)
-        scale = model.tet_bulk / model.tet_rest_volume
+        scale = slope / model.tet_rest_volume
         blocks = scale[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
         blocks += tension[:, None, None] * _volume_curvature(position[model.tet_nodes])
         rows = _rows(model.tet_nodes)

@@ -180,36 +180,40 @@ class Ogden:
 
 
 def uniaxial_stress(solid: Solid, stretch: FloatArray) -> FloatArray:
-    """Force over the area at rest [Pa] of a bar with free sides at some stretches l, both (n,).
-
-    The stretch across is where the stress across vanishes (Newton's method).
+    """Force over the area at rest [Pa] of a bar with free sides at some stretches, both (n,).
 
     Raises:
-        ValueError: no such stretch was found; names the stretch along the bar.
+        ValueError: as `stretch_across`.
     """
     stretch = np.asarray(stretch, dtype=np.float64)
-    across = stretch**-0.45
-    step = 1e-6
+    return solid.first_piola(bar_gradient(stretch, stretch_across(solid, stretch)))[..., 0, 0]
+
+
+def stretch_across(solid: Solid, stretch: FloatArray) -> FloatArray:
+    """Stretch across a bar with free sides at some stretches along it, both (n,), by Newton's method.
+
+    Raises:
+        ValueError: no stretch without stress across was found; names the stretch along the bar.
+    """
+    stretch = np.asarray(stretch, dtype=np.float64)
+    across, step = stretch**-0.45, 1e-6
     for _ in range(60):
-        stress = _bar(solid, stretch, across)[..., 1, 1]
-        slope = (_bar(solid, stretch, across + step)[..., 1, 1] - stress) / step
-        change = -stress / slope
+        stress = solid.first_piola(bar_gradient(stretch, across))[..., 1, 1]
+        slope = (solid.first_piola(bar_gradient(stretch, across + step))[..., 1, 1] - stress) / step
         # Half of the way to nothing at most, so that no bar turns inside out.
-        across = across + np.clip(change, -0.5 * across, 0.5 * across)
+        change = np.clip(-stress / slope, -0.5 * across, 0.5 * across)
+        across = across + change
         if np.abs(change).max(initial=0.0) < 1e-12:
-            break
-    else:
-        worst = stretch[int(np.argmax(np.abs(change)))]
-        raise ValueError(
-            f"the bar finds no equilibrium at the stretch {worst:g}: use smaller strains, or other parameters"
-        )
-    return _bar(solid, stretch, across)[..., 0, 0]
+            return across
+    worst = stretch[int(np.argmax(np.abs(change)))]
+    raise ValueError(f"the bar finds no equilibrium at the stretch {worst:g}: use smaller strains, or other parameters")
 
 
-def _bar(solid: Solid, along: FloatArray, across: FloatArray) -> FloatArray:
+def bar_gradient(along: FloatArray, across: FloatArray) -> FloatArray:
+    """Deformation gradients of bars along x with stretches along and across, (n,) each, shape (n, 3, 3)."""
     gradient = np.zeros((*along.shape, 3, 3))
     gradient[..., 0, 0], gradient[..., 1, 1], gradient[..., 2, 2] = along, across, across
-    return solid.first_piola(gradient)
+    return gradient
 
 
 def simple_shear_stress(solid: Solid, amount: FloatArray) -> FloatArray:

@@ -26,6 +26,7 @@ from surgsim_env.validation.statics import averaged_gradient, volume_gradient
 Test = Literal["pull", "slide", "shear"]
 # Forces balance to this share of the force on a plate.
 RESIDUAL = 1e-7
+STRAIN_STEP = 0.02
 ROUNDS, HALVINGS = 40, 8
 
 
@@ -128,10 +129,7 @@ class QuadraticBlock:
         """Force on the upper plate at strains that follow each other [N]."""
         plates = Plates.of(self.points, test)
         displacement = np.zeros(3 * len(self.points))
-        return [
-            _balanced(lambda u: self.response(solid, u), plates, displacement, strain, f"{test} {strain:g}")
-            for strain in strains
-        ]
+        return _forces(lambda u: self.response(solid, u), plates, displacement, strains, test)
 
 
 def _rows_by_node(basis: Any) -> tuple[NDArray[np.int64], FloatArray]:
@@ -156,6 +154,24 @@ def _assembled(
     total = np.bincount(rows.ravel(), force.ravel(), count).astype(np.float64)
     left, right = np.repeat(rows, width, axis=1).ravel(), np.tile(rows, (1, width)).ravel()
     return total, csc_array(coo_array((blocks.ravel(), (left, right)), shape=(count, count)))
+
+
+def _forces(
+    response: Callable[[FloatArray], tuple[FloatArray, csc_array]],
+    plates: Plates,
+    displacement: FloatArray,
+    strains: tuple[float, ...],
+    name: str,
+) -> list[float]:
+    """Force on the loaded plate at strains that follow each other [N], reached by steps of at most STRAIN_STEP."""
+    before, found = 0.0, []
+    for strain in strains:
+        count = max(1, int(np.ceil(abs(strain - before) / STRAIN_STEP - 1e-9)))
+        for one in np.linspace(before, strain, count + 1)[1:]:
+            force = _balanced(response, plates, displacement, float(one), f"{name} {one:g}")
+        found.append(force)
+        before = strain
+    return found
 
 
 def _balanced(
@@ -219,10 +235,7 @@ class OrganBlock:
         """Force on the upper plate at strains that follow each other [N]."""
         plates, state = Plates.of(self.mesh.points, test), rest_state(self.model)
         displacement = np.zeros(self.mesh.points.size)
-        return [
-            _balanced(lambda u: self.response(state, u), plates, displacement, strain, f"organ, {test} {strain:g}")
-            for strain in strains
-        ]
+        return _forces(lambda u: self.response(state, u), plates, displacement, strains, f"organ, {test}")
 
     def response(self, state: OrganState, displacement: FloatArray) -> tuple[FloatArray, csc_array]:
         """Minus the kernels' forces [N], (3 n_node,), and the matrix [N/m]."""

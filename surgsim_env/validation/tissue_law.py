@@ -126,8 +126,8 @@ def large_strain(test: Test, cells: int, stiffening: Stiffening | None, *, eleme
 def ellipticity(stiffening: Stiffening = STIFFENING) -> Iterator[Row]:
     """Compression along an axis at which the continuum of the lattice loses ellipticity, against where the cap begins.
 
-    From there on the acoustic tensor A_ijkl N_j N_l has a negative eigenvalue for a direction N: columns of steep springs
-    under compression buckle, in waves as short as the cells allow.
+    From there on the acoustic tensor A_ijkl N_j N_l has a negative eigenvalue for a direction N: columns of steep
+    springs under compression buckle, in waves as short as the cells allow.
     """
     material = Material(MODULUS, DENSITY, RATIO, stiffening=stiffening)
     normals, found = sphere_directions(24)[0], {}

@@ -21,7 +21,14 @@ from surgsim_env.envs.ids import register, register_task  # noqa: E402
 from surgsim_env.envs.surgical_env import SurgicalEnv  # noqa: E402
 from surgsim_env.instruments.arm.arm import load_arm  # noqa: E402
 from surgsim_env.scene.anatomy import load_anatomy  # noqa: E402
-from surgsim_env.scene.load import list_arms, list_scenes, load_scene, make_scene  # noqa: E402
+from surgsim_env.scene.load import (  # noqa: E402
+    list_arms,
+    list_materials,
+    list_scenes,
+    load_scene,
+    make_material,
+    make_scene,
+)
 from surgsim_env.scene.model import Port, Scene  # noqa: E402
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask  # noqa: E402
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward  # noqa: E402
@@ -74,10 +81,12 @@ __all__ = [
     "VectorEnvForStableBaselines",
     "Verdict",
     "list_arms",
+    "list_materials",
     "list_scenes",
     "load_anatomy",
     "load_arm",
     "load_scene",
+    "make_material",
     "make_scene",
     "register",
     "register_task",

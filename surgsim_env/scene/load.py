@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import dacite
 
 from msdm_core.errors import OrganError
-from surgsim_env.scene.model import CARTESIAN, PAIRS, Scene
+from surgsim_env.scene.model import CARTESIAN, PAIRS, LibraryMaterial, Scene
 
 Table = TypeVar("Table")
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
@@ -222,8 +222,85 @@ def load_scene(path: Path) -> Scene:
 
 
 def scene_from_table(table: dict[str, Any], *, name: str, folder: Path) -> Scene:
-    """A scene from the table of a scene file; paths in it are relative to `folder`."""
+    """A scene from the table of a scene file; paths in it are relative to `folder`.
+
+    A table `material` with a `name` is the library's material of that name, its own entries on top.
+    """
+    table = _with_library_materials(table, f"scene {name!r}", folder)
     return fill(Scene, {**table, "name": name, "folder": folder}, f"scene {name!r}")
+
+
+def list_materials() -> list[str]:
+    """Names of the materials in the library."""
+    return sorted(path.stem for path in (scenes_folder() / "materials").glob("*.toml"))
+
+
+def make_material(name: str | Path, *, folder: Path = Path()) -> LibraryMaterial:
+    """The material of a name (see `list_materials`) or of a TOML file's path, with its source.
+
+    Args:
+        name: of a material in the library, or a path that ends in .toml.
+        folder: to which a path is relative.
+
+    Raises:
+        ValueError: an unknown name (lists the known, suggests the nearest) or a file that breaks the format.
+    """
+    path, table = _material_table(name, folder)
+    return fill(LibraryMaterial, {**table, "name": path.stem}, f"material {path.stem!r}")
+
+
+def _material_table(name: Any, folder: Path) -> tuple[Path, dict[str, Any]]:
+    """Path and contents of a material's file."""
+    if not isinstance(name, str | Path):
+        raise ValueError(f"material name is {name!r}; it must be a material's name or the path of a material file")
+    if str(name).endswith(".toml"):
+        path = folder / name
+    else:
+        known = list_materials()
+        if name not in known:
+            raise ValueError(
+                f"material {str(name)!r} is unknown{nearest(str(name), known, 0.4)}; the materials are "
+                f"{', '.join(known)} (`surgsim materials`), or the path of a material's TOML file"
+            )
+        path = scenes_folder() / "materials" / f"{name}.toml"
+    return path, read_toml(path, "material")
+
+
+def _with_library_materials(table: dict[str, Any], where: str, folder: Path) -> dict[str, Any]:
+    """The table of a scene file with the library's numbers in place of the names of its materials."""
+    table = dict(table)
+    if "material" in table:
+        table["material"] = _with_library_material(table["material"], f"{where}: material", folder)
+    if isinstance(regions := table.get("regions"), list | tuple):
+        table["regions"] = [
+            {**one, "material": _with_library_material(one["material"], f"{where}: regions[{number}].material", folder)}
+            if isinstance(one, dict) and "material" in one
+            else one
+            for number, one in enumerate(regions)
+        ]
+    return table
+
+
+def _with_library_material(entries: Any, where: str, folder: Path) -> Any:
+    """The entries of a table `material`, those of the library under them if it has a `name`."""
+    if not isinstance(entries, dict) or "name" not in entries:
+        return entries
+    try:
+        path, table = _material_table(entries["name"], folder)
+        # All of it is checked, so that a fault of the file is told as one of the file.
+        fill(LibraryMaterial, {**table, "name": path.stem}, f"material {path.stem!r}")
+    except ValueError as error:
+        raise ValueError(f"{where}.name: {error}") from None
+    return _laid_over(table["material"], {key: value for key, value in entries.items() if key != "name"})
+
+
+def _laid_over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Tables merged at every depth, the entries of `above` on top."""
+    both = {**below, **above}
+    for key, value in above.items():
+        if isinstance(value, dict) and isinstance(below.get(key), dict):
+            both[key] = _laid_over(below[key], value)
+    return both
 
 
 def make_retract_scene(name: str | Path) -> Scene:

@@ -129,6 +129,27 @@ class Anchor:
 
 
 @dataclass(frozen=True)
+class LibraryMaterial:
+    """A material of the library (`load.list_materials`), or of a file of the same form.
+
+    Args:
+        name: stem of its file.
+        description: one line.
+        material: its law and density.
+        source: where the numbers come from.
+        condition: specimen, its state and the test.
+        interval: how far the numbers spread.
+    """
+
+    name: str
+    material: Material
+    description: str = ""
+    source: str = "not stated"
+    condition: str = "not stated"
+    interval: str = "not stated"
+
+
+@dataclass(frozen=True)
 class TissueRegion:
     """A region of the mesh with a material of its own.
 

@@ -131,3 +131,62 @@ def punch_stiffness(body: Elements, radius: float) -> float:
     right = -(stiffness @ displacement)[free]
     displacement[free] = spsolve(stiffness[free][:, free].tocsc(), right)
     return float(displacement @ (stiffness @ displacement))
+
+
+class BallContact:
+    """A frictionless ball on the top of a layer, small strains, by the contact law of this package.
+
+    Pressure per undeformed area k_p g (s / R), g = s (s + t) / R, where s^2 = R^2 - r^2 and t is the height of the
+    surface over the ball's centre; its points are engaged where s + t > 0.
+
+    Args:
+        body: the layer.
+        radius: R of the ball [m].
+        stiffness: k_p [N/m^3].
+    """
+
+    def __init__(self, body: Elements, radius: float, stiffness: float) -> None:
+        from skfem import BilinearForm, FacetBasis, LinearForm
+
+        self.surface = FacetBasis(
+            body.basis.mesh, body.basis.elem,
+            facets=body.basis.mesh.facets_satisfying(lambda x: np.abs(x[1]) < 1e-12), intorder=5,
+        )  # fmt: skip
+        self.radius, self.vertical = radius, body.axis == 1
+
+        def weight(w: Any) -> tuple[Any, Any]:
+            chord = np.sqrt(np.maximum(radius**2 - w.x[0] ** 2, 0.0))
+            overlap = chord + w.prev[1] - (radius - w.depth)
+            touching = (overlap > 0.0) & (chord > 0.0)
+            return 2.0 * np.pi * w.x[0] * stiffness * (chord / radius) ** 2 * touching, chord
+
+        self.stiff = BilinearForm(lambda u, v, w: weight(w)[0] * u[1] * v[1])
+        self.push = LinearForm(lambda v, w: weight(w)[0] * (weight(w)[1] - (radius - w.depth)) * v[1])
+
+    def engaged(self, displacement: FloatArray, depth: float) -> tuple[csc_array, FloatArray]:
+        """Stiffness [N/m] and load [N] of the points that a displacement engages: the ball exerts stiffness u + load.
+
+        Both hold for a ball pressed in to `depth` [m].
+        """
+        before = self.surface.interpolate(displacement)
+        stiffness = csc_array(self.stiff.assemble(self.surface, prev=before, depth=depth))
+        return stiffness, self.push.assemble(self.surface, prev=before, depth=depth)
+
+    def pressed(
+        self, stiffness: csc_array, load: FloatArray, held: NDArray[np.bool_], displacement: FloatArray, depth: float
+    ) -> float:
+        """Force of the ball [N] at a depth [m], on a body in equilibrium under a load; fills `displacement`.
+
+        Newton's method on the set of engaged points, from the displacement.
+        """
+        free = np.flatnonzero(~held)
+        force = 0.0
+        for _ in range(60):
+            held_off, push = self.engaged(displacement, depth)
+            # The sum of sparse arrays is typed as their base, which has no indexing.
+            whole = csc_array(stiffness + held_off)[free][:, free].tocsc()
+            displacement[free] = np.asarray(spsolve(whole, (load - push)[free], permc_spec="MMD_AT_PLUS_A"))
+            previous, force = force, float((held_off @ displacement + push)[self.vertical].sum())
+            if abs(force - previous) <= 1e-6 * abs(force):
+                return force
+        raise ValueError("the reference for the ball did not converge")

@@ -43,24 +43,24 @@ def assemble_stiffness(model: OrganModel) -> csr_array:
     direction = span / np.linalg.norm(span, axis=1)[:, None]
     springs = np.concatenate([-direction, direction], axis=1) * np.sqrt(model.spring_stiffness)[:, None]
     matrix = outer_products(model.spring_nodes, springs, count)
-    gradient = _volume_gradient(points, model.tet_nodes)
+    gradient = volume_gradient(points, model.tet_nodes)
     by_tet = gradient * np.sqrt(model.tet_bulk / model.tet_rest_volume)[:, None]
     matrix = matrix + outer_products(model.tet_nodes, by_tet, count)
     if model.node_bulk.any():
-        averaged = _averaged_gradient(model.tet_nodes, gradient, count)
+        averaged = averaged_gradient(model.tet_nodes, gradient, count)
         matrix = matrix + averaged.T @ averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
     assert stiffness_mismatch(model, matrix) < 1e-9, "the kernels hold a term that this assembly does not know"
     return matrix
 
 
-def _volume_gradient(points: FloatArray, tets: NDArray[np.int32]) -> FloatArray:
+def volume_gradient(points: FloatArray, tets: NDArray[np.int32]) -> FloatArray:
     """dV/dx of each tet's corners [m^2], (n_tet, 12)."""
     corners = points[tets[:, TET_FACES]]
     outward = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]) / 2.0
     return (-outward / 3.0).reshape(-1, 12)
 
 
-def _averaged_gradient(tets: NDArray[np.int32], gradient: FloatArray, count: int) -> csr_array:
+def averaged_gradient(tets: NDArray[np.int32], gradient: FloatArray, count: int) -> csr_array:
     """dV/dx of the volume averaged at each node [m^2], (n_node, 3 n_node)."""
     columns = (3 * tets[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(tets), -1)
     rows = np.repeat(tets, columns.shape[1], axis=1)

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from surgsim_env.validation import bars, capsule, dynamics, friction, lattice, paper_tests, punch, touch
+from surgsim_env.validation import bars, capsule, dynamics, friction, lattice, paper_tests, punch, tissue_law, touch
 from surgsim_env.validation.elements import MISSING, has_fem
 from surgsim_env.validation.row import Case, Curve, Drawing, Result, Row
 
@@ -63,6 +63,23 @@ CASES: tuple[Case, ...] = (
         for cells, one in touch.CONTRASTS
     ),
     Case("liver, contrast", touch.liver_contrast, slow=True, needs_fem=True),
+    Case("large strain, linear", partial(tissue_law.large_strain, "slide", 6, None)),
+    *(
+        Case(
+            f"large strain, {test}",
+            partial(tissue_law.large_strain, test, cells, tissue_law.STIFFENING),
+            slow=True,
+            needs_fem=True,
+        )
+        for test, cells in (("pull", 12), ("shear", 16))
+    ),
+    Case("stiffening in all directions", tissue_law.all_directions),
+    Case("stiffening, ellipticity", tissue_law.ellipticity),
+    Case("step strain", partial(tissue_law.step_strain, tissue_law.ARMS)),
+    Case("step strain, stiffening", partial(tissue_law.step_strain, tissue_law.ARMS, tissue_law.STIFFENING)),
+    Case("creep", partial(tissue_law.creep, tissue_law.ARMS, 0.25)),
+    Case("creep, nu 0.45", partial(tissue_law.creep, tissue_law.ARMS, 0.45)),
+    Case("press held", partial(tissue_law.held_press, 12), slow=True, needs_fem=True),
     Case("deep presses", touch.deep_presses),
     Case("sliding", friction.sliding, slow=True),
     Case("grasped strip", friction.grasped_strip),

@@ -1,4 +1,4 @@
-"""Commands `palpate`, `retract`, `arms`, `organ`, `scenes`, `validate`, `bench`, `haptics`, `view`, `doctor`."""
+"""Commands palpate, retract, arms, organ, scenes, identify, validate, bench, haptics, view, doctor."""
 
 import contextlib
 import io
@@ -14,6 +14,7 @@ from surgsim_env.cli.arms import Arms
 from surgsim_env.cli.bench import Bench
 from surgsim_env.cli.doctor import Doctor
 from surgsim_env.cli.haptics import Haptics
+from surgsim_env.cli.identify import Identify
 from surgsim_env.cli.organ import Organ
 from surgsim_env.cli.palpate import Palpate
 from surgsim_env.cli.retract import Retract
@@ -24,7 +25,7 @@ from surgsim_env.cli.view import View
 # Options whose value is a list of numbers, which may begin with a minus.
 NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around")
 
-Command = Palpate | Retract | Organ | Scenes | Arms | Validate | Bench | Haptics | View | Doctor
+Command = Palpate | Retract | Organ | Scenes | Arms | Identify | Validate | Bench | Haptics | View | Doctor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

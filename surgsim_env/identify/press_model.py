@@ -5,9 +5,10 @@ modulus where thickness, Poisson's ratio and law are the same, so that one run p
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msdm_core.material.tissue_law import Stiffening
 from scipy.interpolate import PchipInterpolator
 
 from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel
@@ -69,7 +70,10 @@ class PressShape:
 
     def material(self, youngs_modulus: float, poisson_ratio: float) -> Material:
         """The tissue with a modulus [Pa]."""
-        return Material(youngs_modulus, DENSITY, poisson_ratio)
+        law = None
+        if self.tangent_cap > 1.0:
+            law = Stiffening(float(self.onset_strain), float(self.cap_strain), float(self.tangent_cap))
+        return Material(youngs_modulus, DENSITY, poisson_ratio, stiffening=law)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +109,7 @@ def press_block(shape: PressShape, setting: PressSetting, *, cells_to_radius: fl
     law = ContactLaw(CONTACT_STIFFNESS * MODULUS, 0.0, 0.0, 0.0)
     model = _even_mass(model, law, top, setting)
     dt = 0.9 * stable_dt(model, law)
-    # Slowest shear mode of the bonded block, w = pi / (2 h) sqrt(G / rho), with the mass that it has: damped critically.
+    # The slowest shear mode of the bonded block, w = pi / (2 h) sqrt(G / rho), is damped critically.
     density = float(model.node_mass.sum() / model.tet_rest_volume.sum())
     shear = MODULUS / (2.0 * (1.0 + setting.poisson_ratio))
     omega = 0.5 * math.pi / shape.thickness * math.sqrt(shear / density)
@@ -172,4 +176,6 @@ def _even_mass(model: OrganModel, law: ContactLaw, top: FloatArray, setting: Pre
     areas = np.ascontiguousarray(model.surface_rest_area[reachable])
     for array in (triangles, areas):
         array.setflags(write=False)
-    return model._replace(node_mass=mass, node_inverse_mass=inverse, surface_triangles=triangles, surface_rest_area=areas)
+    return model._replace(
+        node_mass=mass, node_inverse_mass=inverse, surface_triangles=triangles, surface_rest_area=areas
+    )

@@ -33,8 +33,10 @@ LOOKED_AT = 768
 TRAINING_MOST = 160
 # Sites count towards a shape's cost up to this quantile of their errors: a few bad ones do not choose it.
 TRIM = 0.85
-BOOTSTRAP_COUNT = 200
-INTERVAL = (5.0, 95.0)
+# A profile: values of one parameter over its range, at each of which the others are fitted anew; its interval holds
+# those at which the sites' errors are not larger than at the best shape, paired by site, at this many standard errors
+# (one-sided, 5 %).
+PROFILE_COUNT, PROFILE_LOOKS, STANDARD_ERRORS = 9, 96, 1.645
 # A parameter is not told by the data where its interval covers more than this share of the range searched.
 UNTOLD_SHARE = 0.5
 
@@ -107,6 +109,7 @@ class PressLibrary:
     linear_places: list[float] = field(default_factory=list)
     linear_curves: list[PressCurve] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
+    _fitted: tuple[int, RBFInterpolator] | None = None
 
     @property
     def start_count(self) -> int:
@@ -156,7 +159,15 @@ class PressLibrary:
         return SampledCurve(self.setting.depth, curve.at(np.linspace(0.0, self.setting.depth, GRID_COUNT)) ** (2 / 3))
 
     def interpolated(self, points: FloatArray) -> list[SampledCurve]:
-        """Curves at points, interpolated between all runs; linear ones stand at cap 1, below the range of caps."""
+        """Curves at points, interpolated between all runs."""
+        if self._fitted is None or self._fitted[0] != len(self.points):
+            self._fitted = len(self.points), self._interpolator()
+        return [
+            SampledCurve(self.setting.depth, np.maximum(row, 0.0)) for row in self._fitted[1](np.atleast_2d(points))
+        ]
+
+    def _interpolator(self) -> RBFInterpolator:
+        """Thin-plate splines through all runs; linear ones stand at cap 1, below the range of caps."""
         below = -math.log(CAP_RANGE[0]) / math.log(CAP_RANGE[1] / CAP_RANGE[0])
         known, values = list(self.points), [self.sampled(curve).root for curve in self.curves]
         for place, curve in zip(self.linear_places, self.linear_curves):
@@ -165,13 +176,12 @@ class PressLibrary:
             for onset, width in ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)):
                 known.append(np.array([*first, onset, width, below]))
                 values.append(self.sampled(curve).root)
-        fit = RBFInterpolator(np.array(known), np.array(values), kernel="thin_plate_spline", degree=1)
-        return [SampledCurve(self.setting.depth, np.maximum(row, 0.0)) for row in fit(np.atleast_2d(points))]
+        return RBFInterpolator(np.array(known), np.array(values), kernel="thin_plate_spline", degree=1)
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A fitted value with its interval from a bootstrap over sites, and whether the data tell it."""
+    """A fitted value, the interval of values that describe the sites as well, and whether the data tell the value."""
 
     value: float
     low: float
@@ -240,12 +250,10 @@ def find_shape(
     errors = site_errors([library.sampled(curve) for curve in library.curves], parts)
     best = int(trimmed_mean(errors).argmin())
     shape = library.space.shape(library.points[best])
-    around = np.clip(library.points[best] + 0.08 * rng.standard_normal((256, library.space.dimension)), 0.0, 1.0)
-    candidates = np.concatenate([looked_at, around, np.array(library.points)])
     return FoundShape(
         shape=shape,
         curve=library.sampled(library.curves[best]),
-        intervals=_intervals(library, shape, candidates, site_errors(library.interpolated(candidates), parts), rng),
+        intervals=_intervals(library, parts, best, looked_at),
         training_count=errors.shape[1],
         cost=float(trimmed_mean(errors)[best]),
         press_count=len(library.curves) + len(library.linear_curves) + len(library.failed),
@@ -283,31 +291,36 @@ def _descended(library: PressLibrary, parts: Sequence[SiteSamples], start: Float
 
 
 def _intervals(
-    library: PressLibrary, shape: PressShape, candidates: FloatArray, errors: FloatArray, rng: np.random.Generator
+    library: PressLibrary, parts: Sequence[SiteSamples], best: int, looked_at: FloatArray
 ) -> dict[str, Interval]:
-    """Intervals of the parameters: the best candidate for each of BOOTSTRAP_COUNT draws of the sites with repetition."""
-    count = errors.shape[1]
-    draws = rng.integers(0, count, (BOOTSTRAP_COUNT, count))
-    best = [candidates[trimmed_mean(errors[:, draw]).argmin()] for draw in draws]
-    shapes = [library.space.shape(point) for point in best]
-    low_shape, high_shape = (library.space.shape(np.full(library.space.dimension, end)) for end in (0.0, 1.0))
+    """Profile of each parameter by interpolated curves, and the interval in which the sites' errors stay as small."""
+    space, point = library.space, library.points[best]
+    reference = site_errors(library.interpolated(point), parts)[0]
+    grid = np.linspace(0.0, 1.0, PROFILE_COUNT)
+    accepted = [point]
+    for axis in range(space.dimension):
+        for value in grid:
+            nearest = looked_at[np.argsort(np.abs(looked_at[:, axis] - value))[:PROFILE_LOOKS]]
+            # Points of the spread nearest to the value, and points around the best shape.
+            tried = np.concatenate([[point], nearest, np.clip(point + 0.3 * (nearest - 0.5), 0.0, 1.0)])
+            tried[:, axis] = value
+            errors = site_errors(library.interpolated(tried), parts)
+            chosen = int(trimmed_mean(errors).argmin())
+            difference = errors[chosen] - reference
+            scatter = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else math.inf
+            if difference.mean() <= STANDARD_ERRORS * scatter:
+                accepted.append(tried[chosen])
+    shapes = [space.shape(one) for one in accepted]
     intervals = {}
-    for name in NAMES:
-        if name == "thickness" and library.space.thickness is not None:
-            continue
-        values = np.array([getattr(one, name) for one in shapes])
-        value = getattr(shape, name)
-        low, high = np.percentile(values, INTERVAL)
-        low, high = min(low, value), max(high, value)
-        span = (_scaled(name, getattr(low_shape, name)), _scaled(name, getattr(high_shape, name)))
-        share = (_scaled(name, high) - _scaled(name, low)) / (span[1] - span[0])
-        intervals[name] = Interval(float(value), float(low), float(high), bool(share <= UNTOLD_SHARE))
+    for name in NAMES[len(NAMES) - space.dimension :]:
+        values = [float(getattr(one, name)) for one in shapes]
+        least, most = (float(getattr(space.shape(np.full(space.dimension, end)), name)) for end in (0.0, 1.0))
+        if name in ("thickness", "tangent_cap"):
+            share = math.log(max(values) / min(values)) / math.log(most / least)
+        else:
+            share = (max(values) - min(values)) / (most - least)
+        intervals[name] = Interval(values[0], min(values), max(values), share <= UNTOLD_SHARE)
     return intervals
-
-
-def _scaled(name: str, value: float) -> float:
-    """A parameter on the scale on which it is searched."""
-    return math.log(value) if name in ("thickness", "tangent_cap") else value
 
 
 def with_thickness(shape: PressShape, thickness: float) -> PressShape:

@@ -1,6 +1,6 @@
 """What is fitted to each site: its modulus and its contact offset; and the measure of error that every report uses.
 
-A recording's depth counts from where contact was declared, at a small force: the ball is already an unknown offset deep.
+A recording's depth counts from where contact was declared, at a small force: the ball is then an unknown offset deep.
 At a site the force is E A(d + o), with the curve A of `press_model`, the site's modulus E and its offset o, both by
 least squares of the force, as a sensor's noise is the same at every depth. The error is |F_model - F| / F, over the
 deeper two thirds of the press.
@@ -30,7 +30,7 @@ GRID_COUNT = 181
 
 @dataclass(frozen=True, eq=False)
 class SampledCurve:
-    """A curve of force over modulus on depths in even steps from 0 to `depth` [m]; `root` is its power 2/3 [m^(4/3)]."""
+    """Force over modulus on depths in even steps from 0 to `depth` [m]; `root` is its power 2/3 [m^(4/3)]."""
 
     depth: float
     root: FloatArray

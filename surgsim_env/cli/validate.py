@@ -13,8 +13,8 @@ from surgsim_env.reports.output_folder import output_folder
 class Validate:
     """Compare the tissue with closed forms and finite elements, print the table, and write it with its plots.
 
-    With --measured, the tissue is compared with recorded presses instead (docs/identify.md). Exit status 0: every row is
-    met or is a known shortfall (surgsim_env/validation/known_shortfalls.toml); 1 otherwise.
+    With --measured, the tissue is compared with recorded presses instead (docs/identify.md). Exit status 0: every row
+    is met or is a known shortfall (surgsim_env/validation/known_shortfalls.toml); 1 otherwise.
     """
 
     quick: bool = False

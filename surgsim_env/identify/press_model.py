@@ -28,6 +28,8 @@ CONTACT_STIFFNESS = 6e4
 CELLS_TO_RADIUS, HALF_WIDTH, FINE_DEPTH = 4, 2.75, 1.5
 # Depths at which the ball is held, denser where the contact is small.
 KNOT_COUNT, KNOT_POWER = 18, 1.4
+# Substep over the stable step of the organ at rest; pressed deeply it is stiffer.
+STEP_SHARE = 0.5
 # Substeps in slow periods of the block: for moving from one depth to the next, for holding, for reading the force.
 MOVE_PERIODS, HOLD_PERIODS, READ_SHARE = 0.12, 0.45, 0.05
 
@@ -108,7 +110,7 @@ def press_block(shape: PressShape, setting: PressSetting, *, cells_to_radius: fl
     model, top = _block(shape, setting, cells_to_radius)
     law = ContactLaw(CONTACT_STIFFNESS * MODULUS, 0.0, 0.0, 0.0)
     model = _even_mass(model, law, top, setting)
-    dt = 0.9 * stable_dt(model, law)
+    dt = STEP_SHARE * stable_dt(model, law)
     # The slowest shear mode of the bonded block, w = pi / (2 h) sqrt(G / rho), is damped critically.
     density = float(model.node_mass.sum() / model.tet_rest_volume.sum())
     shear = MODULUS / (2.0 * (1.0 + setting.poisson_ratio))

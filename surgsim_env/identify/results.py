@@ -172,17 +172,16 @@ def write_summary(result: Identification, path: Path, command_line: str, density
 def error_table(sets: Sequence[SetResult]) -> Table:
     """The errors of sets on held-out sites, beside those of the best linear tissue."""
     table = Table()
-    for heading in ("set", "sites", "held out", "error", "90 %", "linear", "90 %", "modulus [Pa]", "offset [mm]"):
-        table.add_column(heading, justify="left" if heading == "set" else "right")
+    for heading in ("set", "sites", "held out", "error", "90 %", "linear", "90 %", "E [kPa]", "offset [mm]"):
+        table.add_column(heading, justify="left" if heading == "set" else "right", overflow="fold")
     for one in sets:
-        low, middle, high = np.percentile(one.fits.modulus, [25.0, 50.0, 75.0])
         table.add_row(
             one.recording.name,
             str(len(one.recording.presses)),
             str(int((~one.is_training).sum())),
             *(f"{value:.1%}" for value in (one.error.median, one.error.high)),
             *(f"{value:.1%}" for value in (one.linear_error.median, one.linear_error.high)),
-            f"{middle:.3g} ({low:.3g} to {high:.3g})",
+            f"{1e-3 * np.median(one.fits.modulus):.3g}",
             f"{1e3 * np.median(one.fits.offset):.2f}",
         )
     return table

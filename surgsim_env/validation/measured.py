@@ -19,9 +19,10 @@ REPORT_NAME = "validation_measured.md"
 INTRODUCTION = """# Recorded presses
 
 Written by `{command}`. Each set is identified by itself: half of its sites, drawn by seed {seed}, choose thickness and
-law of the tissue; errors are |F_model - F| / F over the deeper two thirds of the press on the other sites, each with its
-own modulus and contact offset by least squares of the force. The linear tissue is the best of all thicknesses. A row is
-met where the identified law is not worse than linear tissue. `docs/identify.md` says where recordings are to be had.
+law of the tissue; errors are |F_model - F| / F over the deeper two thirds of the press on the other sites, each with
+its own modulus and contact offset by least squares of the force. The linear tissue is the best of all thicknesses. A
+row is met where the identified law is not worse than linear tissue. `docs/identify.md` says where recordings are to be
+had.
 """
 HEADINGS = (
     *("set", "sites used", "held out", "error, median", "90 %", "linear, median", "90 %"),

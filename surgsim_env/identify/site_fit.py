@@ -103,9 +103,13 @@ class SiteFits:
     @property
     def site_errors(self) -> FloatArray:
         """Median of these errors at each site, (n_site,)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            errors = np.abs(self.force - self.samples.force) / self.samples.force
-        return np.nanmedian(np.where(self.samples.deep, errors, np.nan), axis=1)
+        deep = self.samples.deep
+        ordered = np.sort(
+            np.where(deep, np.abs(self.force - self.samples.force) / np.where(deep, self.samples.force, 1.0), np.inf),
+            axis=1,
+        )
+        count, rows = deep.sum(axis=1), np.arange(len(deep))
+        return 0.5 * (ordered[rows, (count - 1) // 2] + ordered[rows, count // 2])
 
 
 def fit_sites(curve: SampledCurve, samples: SiteSamples, *, refine: bool = True) -> SiteFits:

@@ -29,7 +29,7 @@ CELLS_TO_RADIUS, HALF_WIDTH, FINE_DEPTH = 4, 2.75, 1.5
 # Depths at which the ball is held, denser where the contact is small.
 KNOT_COUNT, KNOT_POWER = 18, 1.4
 # Substep over the stable step of the organ at rest; pressed deeply it is stiffer.
-STEP_SHARE = 0.5
+STEP_SHARE = 0.8
 # Substeps in slow periods of the block: for moving from one depth to the next, for holding, for reading the force.
 MOVE_PERIODS, HOLD_PERIODS, READ_SHARE = 0.12, 0.45, 0.05
 

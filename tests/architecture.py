@@ -18,8 +18,8 @@ PACKAGES = ("msdm_core", "surgsim_env", "agents", "benchmarks", "scenes")
 # environments and offers the public names; the rooms of the package never import it.
 ORDER = {
     "surgsim_env": (
-        *("reports", "scene", "instruments", "coupling", "haptics", "palpation", "tasks", "validation", "rendering"),
-        *("patient", "envs", "live", "scripting", "bench", "arm_study", "cli", "__init__"),
+        *("reports", "scene", "instruments", "coupling", "haptics", "palpation", "tasks", "identify", "validation"),
+        *("rendering", "patient", "envs", "live", "scripting", "bench", "arm_study", "cli", "__init__"),
     ),
     "msdm_core": (
         *("errors", "numba_cache", "kernels", "mesh", "mesh_files", "material", "meshing", "organ", "lanes"),

@@ -14,6 +14,7 @@ from surgsim_env.cli.arms import Arms
 from surgsim_env.cli.bench import Bench
 from surgsim_env.cli.doctor import Doctor
 from surgsim_env.cli.haptics import Haptics
+from surgsim_env.cli.identify import Identify
 from surgsim_env.cli.materials import Materials
 from surgsim_env.cli.organ import Organ
 from surgsim_env.cli.palpate import Palpate
@@ -25,7 +26,7 @@ from surgsim_env.cli.view import View
 # Options whose value is a list of numbers, which may begin with a minus.
 NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around")
 
-Command = Palpate | Retract | Organ | Scenes | Materials | Arms | Validate | Bench | Haptics | View | Doctor
+Command = Palpate | Retract | Organ | Scenes | Materials | Arms | Identify | Validate | Bench | Haptics | View | Doctor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

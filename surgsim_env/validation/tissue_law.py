@@ -91,7 +91,7 @@ def large_strain(test: Test, cells: int, stiffening: Stiffening | None, *, eleme
     """Tension and compression, or shear, of a cube to 40 % against the continuum of its springs.
 
     A cube with free sides is deformed homogeneously (closed form); with bonded ends the reference is by quadratic
-    hexahedra. Stiffening springs are compressed to three quarters of the strain where the cap begins: see `ellipticity`.
+    hexahedra. Stiffening springs are compressed to 3/4 of the strain where the cap begins: see `ellipticity`.
     """
     material = Material(MODULUS, DENSITY, RATIO, stiffening=stiffening)
     solid, law = solid_of(material), "linear" if stiffening is None else "stiffening"

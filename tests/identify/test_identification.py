@@ -1,0 +1,212 @@
+"""The whole identification on made recordings, with a closed-form press in place of the organ's."""
+
+import csv
+import json
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from surgsim_env.cli.main import main
+from surgsim_env.identify import identification, shape_search
+from surgsim_env.identify.identification import IdentifyOptions, identify
+from surgsim_env.identify.press_model import PressShape
+from surgsim_env.identify.recordings import Recording, SitePress
+from surgsim_env.identify.relaxation import Arms
+from surgsim_env.identify.results import COLUMNS, RESULT_NAMES
+from surgsim_env.scene.load import scene_from_table, scenes_folder
+from tests.identify.made import closed_area, closed_press, recording, truth, write_csv
+from tests.identify.test_relaxation import TIME
+
+LAW = PressShape(0.012, 0.08, 0.2, 25.0)
+KNOWN = IdentifyOptions(thickness=0.012)
+
+
+@pytest.fixture(autouse=True)
+def closed_model(monkeypatch):
+    monkeypatch.setattr(shape_search, "press_block", closed_press)
+    # The stand-in has one number of shape: fewer looks find it.
+    monkeypatch.setattr(shape_search, "LOOKED_AT", 192)
+    monkeypatch.setattr(shape_search, "PROFILE_LOOKS", 32)
+
+
+def tissue(depth):
+    return closed_area(depth, LAW)
+
+
+def silicone(depth):
+    return closed_area(depth, PressShape(0.012))
+
+
+@pytest.fixture(scope="module")
+def stiffening_set():
+    return recording(tissue, noise=0.01)
+
+
+def test_stiffening_tissue_is_described_and_linear_tissue_is_worse(stiffening_set):
+    found = identify([stiffening_set], KNOWN)
+    (one,) = found.sets
+    assert not found.is_linear
+    assert int(one.is_training.sum()) == 12 and len(one.fits.samples) == 24
+    # 1 % of noise has a median size of 0.67 %.
+    assert one.error.median < 0.012 < 0.05 < one.linear_error.median
+    assert one.error.high < 0.025
+    assert np.median(one.fits.modulus / truth()[0]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_interval_holds_the_truth_and_what_is_not_told_is_said(stiffening_set):
+    """The made tissue depends on growth = log(cap) / (onset + cap strain) alone, so that no single one is told."""
+    found = identify([stiffening_set], KNOWN)
+    intervals = found.found.intervals
+    assert set(intervals) == {"onset_strain", "cap_strain", "tangent_cap"}
+    for name in intervals:
+        assert intervals[name].low <= getattr(LAW, name) <= intervals[name].high, name
+        assert intervals[name].low <= intervals[name].value <= intervals[name].high
+    assert not intervals["tangent_cap"].told
+    assert any("tangent_cap is not told" in line for line in found.warnings)
+    assert sum("poisson_ratio is given, not fitted" in line for line in found.warnings) == 2
+
+
+def test_linear_tissue_gets_no_stiffening():
+    found = identify([recording(silicone, noise=0.01)], KNOWN)
+    assert found.is_linear and found.shape.tangent_cap == 1.0
+    assert any("stiffening is not told" in line for line in found.warnings)
+    assert found.sets[0].error == found.sets[0].linear_error
+
+
+def test_an_unknown_thickness_is_searched_with_a_warning(stiffening_set):
+    found = identify([stiffening_set])
+    assert found.sets[0].error.median < 0.015
+    assert "thickness" in found.found.intervals
+    assert any("thickness" in line and "give --thickness" in line for line in found.warnings)
+
+
+def test_two_sets_share_the_law_and_a_seed_repeats(stiffening_set):
+    other = recording(tissue, noise=0.01, seed=5, name="other")
+    first = identify([stiffening_set, other], KNOWN)
+    again = identify([stiffening_set, other], KNOWN)
+    assert [one.recording.name for one in first.sets] == ["made", "other"]
+    assert all(one.error.median < 0.015 for one in first.sets)
+    assert first.shape == again.shape
+    np.testing.assert_array_equal(first.moduli, again.moduli)
+    swapped = identify([stiffening_set], replace(KNOWN, seed=1))
+    assert not np.array_equal(swapped.sets[0].is_training, first.sets[0].is_training)
+
+
+def test_the_held_out_half_does_not_choose_the_law(stiffening_set):
+    """Spoilt forces of held-out sites change their error, and neither the law nor the moduli of the others."""
+    found = identify([stiffening_set], KNOWN)
+    training = found.sets[0].is_training
+    presses = tuple(
+        press if training[row] else replace(press, force=press.force * np.linspace(1.0, 2.0, 10))
+        for row, press in enumerate(stiffening_set.presses)
+    )
+    spoilt = identify([Recording("spoilt", presses)], KNOWN)
+    assert spoilt.shape == found.shape
+    np.testing.assert_array_equal(spoilt.sets[0].fits.modulus[training], found.sets[0].fits.modulus[training])
+    assert spoilt.sets[0].error.median > found.sets[0].error.median
+
+
+def test_bad_sites_are_told(stiffening_set):
+    flat = SitePress(77, np.zeros(3), stiffening_set.presses[0].depth, np.full(10, 0.1))
+    found = identify([Recording("some", (*stiffening_set.presses, flat))], KNOWN)
+    assert any("some: 1 sites are left out" in line and line.endswith(": 77") for line in found.warnings)
+    with pytest.raises(ValueError, match=r"recording few: 5 of 6 sites can be used \(1 with force that rises"):
+        identify([Recording("few", (*stiffening_set.presses[:5], flat))], KNOWN)
+
+
+def test_held_presses_give_arms_and_the_law_at_equilibrium(monkeypatch):
+    arms = Arms((0.3, 0.5), (0.5, 6.0))
+    # The stand-in does not know springs from the volume term.
+    monkeypatch.setattr(identification, "_of_springs", lambda library, shape, curve, relaxation: relaxation)
+    made = recording(tissue, count=16, samples=40, time=TIME, arms=arms, noise=0.005)
+    found = identify([made], KNOWN)
+    assert found.relaxation is not None
+    assert found.relaxation.relative_moduli == pytest.approx(arms.moduli, rel=0.15)
+    assert found.relaxation.times == pytest.approx(arms.times, rel=0.2)
+    assert found.relaxation.error < 0.01 < found.relaxation.elastic_error
+    assert found.sets[0].error.median < 0.015
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"thickness": -1.0}, "thickness is -1 m"),
+        ({"thickness": 12.0}, "give it in metres"),
+        ({"ball_radius": 6.35}, "ball radius is 6.35 m; the rule is 0.0001 to 0.1 m"),
+        ({"poisson_ratio": 0.5}, "Poisson's ratio is 0.5"),
+        ({"seed": -1}, "seed is -1"),
+        ({"workers": 0}, "workers is 0"),
+    ],
+)
+def test_options_out_of_range_are_refused(given, words):
+    with pytest.raises(ValueError, match="the rule is") as caught:
+        IdentifyOptions(**given)
+    assert words in str(caught.value)
+
+
+@pytest.fixture
+def run(tmp_path, stiffening_set, capsys):
+    """The command on one file: the folder, and what it printed."""
+    path = write_csv(stiffening_set, tmp_path / "liver.csv")
+    assert main(["identify", str(path), "--thickness", "0.012", "--out", str(tmp_path / "out")]) == 0
+    return tmp_path / "out", capsys.readouterr().out
+
+
+def test_the_command_writes_a_set_of_results(run):
+    folder, said = run
+    assert {path.name for path in folder.iterdir()} == set(RESULT_NAMES)
+    assert "tangent_cap" in said and "note: poisson_ratio is given" in " ".join(said.split())
+    for name in ("curves.png", "modulus_map.png"):
+        picture = imread(folder / name)
+        assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
+    with (folder / "sites.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert tuple(rows[0]) == COLUMNS and len(rows) == 24
+    assert sum(row["half"] == "held out" for row in rows) == 12
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary["sets"]["liver"]["used"] == 24
+    assert summary["material"]["youngs_modulus"] == pytest.approx(
+        np.median([float(row["youngs_modulus"]) for row in rows]), rel=1e-3
+    )
+
+
+def test_the_material_fits_into_a_scene(run):
+    folder, _ = run
+    text = (folder / "material.toml").read_text(encoding="utf-8")
+    table = tomllib.loads(text)
+    assert set(table["material"]) == {"youngs_modulus", "density", "poisson_ratio", "stiffening"}
+    assert "describe the sites as well" in text and "liver: 24 of 24 sites" in text
+    phantom = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text(encoding="utf-8"))
+    scene = scene_from_table({**phantom, **table}, name="mine", folder=folder)
+    assert scene.material.youngs_modulus == table["material"]["youngs_modulus"]
+    assert scene.material.stiffening.tangent_cap == table["material"]["stiffening"]["tangent_cap"]
+
+
+def test_without_places_there_is_no_map(tmp_path, stiffening_set):
+    path = tmp_path / "set.csv"
+    lines = write_csv(stiffening_set, path).read_text(encoding="utf-8").splitlines()
+    rows = [line.split(",") for line in lines]
+    path.write_text("\n".join(",".join([row[0], *row[5:7]]) for row in rows) + "\n", encoding="utf-8")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "modulus_map.png").write_bytes(b"of an older run")
+    assert main(["identify", str(path), "--thickness", "0.012", "--out", str(tmp_path / "out")]) == 0
+    assert {one.name for one in (tmp_path / "out").iterdir()} == set(RESULT_NAMES) - {"modulus_map.png"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "give a recording"),
+        (["none.csv"], "recording none.csv cannot be read"),
+        (["none.csv", "--thickness", "12"], "thickness is 12 m"),
+        (["none.csv", "--density", "0"], "--density is 0 kg/m^3"),
+    ],
+)
+def test_bad_input_gets_one_line(arguments, words, capsys, tmp_path):
+    assert main(["identify", *arguments, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("surgsim: error: ") and said.count("\n") == 1 and words in said
+    assert not (tmp_path / "out").exists()

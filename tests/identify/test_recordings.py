@@ -1,0 +1,63 @@
+"""Recordings are read as they stand; a wrong file is refused in one line that names the fault."""
+
+import numpy as np
+import pytest
+
+from surgsim_env.identify.recordings import read_recording
+from tests.identify.made import HEADER, recording, write_csv
+
+
+def test_columns_in_any_order_in_si(tmp_path):
+    path = tmp_path / "set.csv"
+    path.write_text("normal_force_n,note,site,depth_mm\n0.1,a,4,0.5\n0.2,b,4,1.0\n\n0.3,c,2,0.7\n", encoding="utf-8")
+    found = read_recording(path)
+    assert found.name == "set" and not found.has_places and not found.has_time
+    assert [press.site for press in found.presses] == [4, 2]
+    np.testing.assert_allclose(found.presses[0].depth, [0.5e-3, 1.0e-3])
+    np.testing.assert_allclose(found.presses[0].force, [0.1, 0.2])
+    assert found.depth_largest == pytest.approx(1e-3)
+
+
+def test_what_is_written_is_read(tmp_path):
+    made = recording(lambda depth: depth**1.5, time=np.linspace(0.1, 2.0, 20), samples=10)
+    found = read_recording(write_csv(made, tmp_path / "made.csv"))
+    assert found.has_places and found.has_time and len(found.presses) == len(made.presses)
+    for one, other in zip(found.presses, made.presses):
+        np.testing.assert_allclose(one.depth, other.depth, atol=1e-8)
+        np.testing.assert_allclose(one.force, other.force, atol=1e-8)
+        np.testing.assert_allclose(one.place, other.place, atol=1e-9)
+        np.testing.assert_allclose(one.time, other.time, atol=1e-5)
+        # At full depth from the tenth sample on: what follows is held.
+        assert one.loading == slice(0, 10)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "has no column 'site'"),
+        ("site,depth_mm\n", "has no column 'normal_force_n'"),
+        (f"{HEADER}\n", "has no samples"),
+        ("site,depth_mm,normal_force_n,x_mm\n0,1,1,1\n", "has x_mm of x_mm, y_mm, z_mm: give all three or none"),
+        ("site,depth_mm,normal_force_n,site\n0,1,1,1\n", "has 2 columns 'site'"),
+        ("site,depth_mm,normal_force_n\n0,1,much\n", "line 2: normal_force_n is 'much'; the rule is a finite number"),
+        ("site,depth_mm,normal_force_n\n0,1,nan\n", "line 2: normal_force_n is 'nan'"),
+        ("site,depth_mm,normal_force_n\n0,1\n", "line 2: normal_force_n is ''"),
+        ("site,depth_mm,normal_force_n\n0.5,1,1\n", "line 2: site is 0.5; the rule is a whole number"),
+        ("site,depth_mm,normal_force_n\n0,3000,1\n", "depth_mm is '3000'; the rule is a finite number of at most 100"),
+        ("site,depth_mm,normal_force_n,time_s\n0,1,1,2\n0,2,2,1\n", "site 0: time_s is 1 after 2"),
+    ],
+)
+def test_a_wrong_file_is_refused(tmp_path, text, words):
+    path = tmp_path / "bad.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match="recording") as caught:
+        read_recording(path)
+    assert words in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_no_text(tmp_path):
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_recording(tmp_path / "none.csv")
+    (tmp_path / "binary.csv").write_bytes(b"site,\xff\xfe\n")
+    with pytest.raises(ValueError, match="is no CSV text"):
+        read_recording(tmp_path / "binary.csv")

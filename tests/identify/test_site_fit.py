@@ -1,0 +1,77 @@
+"""Modulus and offset of made sites are found again; sites that cannot be used are told, not hidden."""
+
+import numpy as np
+import pytest
+
+from surgsim_env.identify.recordings import SitePress
+from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, draw_halves, fit_sites, sort_out
+from tests.identify.made import recording, truth
+
+
+def hertz(depth):
+    return 0.1 * depth**1.5
+
+
+def sampled(area, depth=4.5e-3):
+    return SampledCurve(depth, area(np.linspace(0.0, depth, GRID_COUNT)) ** (2.0 / 3.0))
+
+
+def test_modulus_and_offset_are_found():
+    made = recording(lambda depth: hertz(depth) * np.exp(300.0 * depth))
+    samples = SiteSamples.of(made.presses, 1.5e-3)
+    fits = fit_sites(sampled(lambda depth: hertz(depth) * np.exp(300.0 * depth)), samples)
+    moduli, shifts = truth()
+    # Offsets are tried in steps of 33 um: half a step at the end of the range, and d ln A / d o = 1.5 / d + 300 per m.
+    np.testing.assert_allclose(fits.offset, shifts, atol=17e-6)
+    np.testing.assert_allclose(fits.modulus, moduli, rtol=17e-6 * (1.5 / 2e-3 + 300.0))
+    assert np.median(fits.deep_errors) < 1e-3
+
+
+def test_the_wrong_shape_has_the_error_that_follows_from_it():
+    """F = d against A = d^1.5 without offsets: E by least squares of the force, errors computed by hand."""
+    depth = np.linspace(1.0, 10.0, 10) * 1e-4
+    samples = SiteSamples.of([SitePress(0, np.zeros(3), depth, depth)], 0.0)
+    fits = fit_sites(sampled(lambda one: one**1.5, 1e-3), samples)
+    modulus = (depth**2.5).sum() / (depth**3).sum()
+    assert fits.modulus[0] == pytest.approx(modulus, rel=1e-3)
+    deep = depth > depth[-1] / 3.0
+    wanted = np.abs(modulus * depth[deep] ** 0.5 - 1.0)
+    np.testing.assert_allclose(np.sort(fits.deep_errors), np.sort(wanted), atol=2e-3)
+    assert fits.site_errors[0] == pytest.approx(np.median(wanted), abs=2e-3)
+
+
+def test_rows_of_different_lengths_do_not_touch_each_other():
+    made = recording(hertz)
+    short = SitePress(99, np.zeros(3), made.presses[0].depth[::2], made.presses[0].force[::2])
+    curve = sampled(hertz)
+    both = fit_sites(curve, SiteSamples.of([*made.presses, short], 1.5e-3))
+    alone = fit_sites(curve, SiteSamples.of([short], 1.5e-3))
+    assert both.modulus[-1] == pytest.approx(alone.modulus[0], rel=1e-9)
+    assert both.offset[-1] == pytest.approx(alone.offset[0], abs=1e-12)
+
+
+def test_sites_that_cannot_be_used_are_named_with_their_reason():
+    made = recording(hertz)
+    one = made.presses[0]
+
+    def other(site, depth=one.depth, force=one.force):
+        return SitePress(site, one.place, depth, force)
+
+    bad = [
+        other(100, depth=0.3 * one.depth),
+        other(101, depth=one.depth[[0, 1, 9]], force=one.force[[0, 1, 9]]),
+        other(102, force=-one.force),
+        other(103, force=np.full(len(one.force), 0.1)),
+    ]
+    usable, left_out = sort_out([*made.presses, *bad])
+    assert [site.site for site in usable] == [press.site for press in made.presses]
+    assert {reason.split(" ")[0]: sites for reason, sites in left_out.items()} == {
+        "less": [100], "fewer": [101], "a": [102], "force": [103]
+    }  # fmt: skip
+
+
+def test_halves_are_drawn_by_the_seed():
+    training, held_out = draw_halves(11, 0)
+    assert sorted([*training, *held_out]) == list(range(11)) and len(training) == 6
+    assert not np.array_equal(training, draw_halves(11, 1)[0])
+    assert np.array_equal(training, draw_halves(11, 0)[0])

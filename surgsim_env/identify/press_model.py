@@ -8,15 +8,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from msdm_core.material.tissue_law import Stiffening
 from scipy.interpolate import PchipInterpolator
 
 from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel
 from msdm_core.material.regions import Damping, Material
+from msdm_core.material.tissue_law import Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.stability import contact_node_stiffness, stable_dt
+from msdm_core.organ.stability import contact_node_area, stable_dt
 from msdm_core.organ.stepping import advance_organ, describe_fault, round_shapes
 
 # Of the run: the modulus [Pa], which cancels, and the density [kg/m^3], which a static press does not feel.
@@ -168,7 +168,7 @@ def _even_mass(model: OrganModel, law: ContactLaw, top: FloatArray, setting: Pre
     """
     distance = np.linalg.norm(model.node_rest_position - top, axis=1)
     near = distance < 1.6 * setting.ball_radius
-    held = np.where(near, contact_node_stiffness(model, law), 0.0)
+    held = np.where(near, law.stiffness * contact_node_area(model), 0.0)
     mass = model.node_mass + 0.5 * held * model.stable_step**2
     inverse = np.where(model.node_inverse_mass > 0.0, 1.0 / mass, 0.0)
     for array in (mass, inverse):

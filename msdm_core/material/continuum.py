@@ -196,7 +196,7 @@ def stretch_across(solid: Solid, stretch: FloatArray) -> FloatArray:
         ValueError: no stretch without stress across was found; names the stretch along the bar.
     """
     stretch = np.asarray(stretch, dtype=np.float64)
-    across, step = stretch**-0.45, 1e-6
+    across, change, step = stretch**-0.45, np.zeros_like(stretch), 1e-6
     for _ in range(60):
         stress = solid.first_piola(bar_gradient(stretch, across))[..., 1, 1]
         slope = (solid.first_piola(bar_gradient(stretch, across + step))[..., 1, 1] - stress) / step

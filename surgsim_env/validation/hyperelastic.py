@@ -167,9 +167,8 @@ def _forces(
     before, found = 0.0, []
     for strain in strains:
         count = max(1, int(np.ceil(abs(strain - before) / STRAIN_STEP - 1e-9)))
-        for one in np.linspace(before, strain, count + 1)[1:]:
-            force = _balanced(response, plates, displacement, float(one), f"{name} {one:g}")
-        found.append(force)
+        steps = np.linspace(before, strain, count + 1)[1:]
+        found.append([_balanced(response, plates, displacement, float(one), f"{name} {one:g}") for one in steps][-1])
         before = strain
     return found
 
@@ -192,14 +191,14 @@ def _balanced(
     change = strain * plates.direction - displacement[plates.held]
     step = np.zeros_like(displacement)
     step[plates.held] = change
-    step[free] = _solved(stiffness, free, -force[free] - stiffness[free][:, plates.held] @ change)
+    step[free] = solved(stiffness, free, -force[free] - stiffness[free][:, plates.held] @ change)
     displacement += step
     for _ in range(ROUNDS):
         force, stiffness = response(displacement)
         size = float(np.linalg.norm(force[free]))
         if size <= RESIDUAL * float(np.abs(force[plates.loaded]).sum()):
             return float(force[plates.loaded].sum())
-        step = _solved(stiffness, free, -force[free])
+        step = solved(stiffness, free, -force[free])
         for share in 0.5 ** np.arange(HALVINGS):
             displacement[free] += share * step
             if float(np.linalg.norm(response(displacement)[0][free])) < size:
@@ -210,7 +209,7 @@ def _balanced(
     raise ValueError(f"the block did not come to rest: {name}")
 
 
-def _solved(stiffness: csc_array, free: NDArray[np.int64], right: FloatArray) -> FloatArray:
+def solved(stiffness: csc_array, free: NDArray[np.int64], right: FloatArray) -> FloatArray:
     """Displacement of the free rows [m] under a load [N]."""
     return np.asarray(spsolve(stiffness[free][:, free].tocsc(), right, permc_spec="MMD_AT_PLUS_A"))
 

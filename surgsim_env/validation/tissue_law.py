@@ -11,7 +11,6 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csc_array
-from scipy.sparse.linalg import spsolve
 
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.material.continuum import (
@@ -31,7 +30,7 @@ from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, descr
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.validation.elements import BallContact
-from surgsim_env.validation.hyperelastic import OrganBlock, Plates, QuadraticBlock, Test
+from surgsim_env.validation.hyperelastic import OrganBlock, Plates, QuadraticBlock, Test, solved
 from surgsim_env.validation.punch import reference_layer
 from surgsim_env.validation.relaxation import ViscoelasticBody, spring_creep
 from surgsim_env.validation.row import Curve, Result, Row, bounded, compare
@@ -109,7 +108,7 @@ def large_strain(test: Test, cells: int, stiffening: Stiffening | None, *, eleme
             reference = (uniaxial_stress(solid, 1.0 + np.array(signed)) * SIZE[0] * SIZE[1]).tolist()
         else:
             measured = bonded_block_forces(cells, material, test, signed)
-            reference = QuadraticBlock.of(SIZE, (elements,) * 3).forces(solid, test, signed)
+            reference = QuadraticBlock.of(SIZE, (elements, elements, elements)).forces(solid, test, signed)
             source = f"scikit-fem, {source}"
         for strain in shown:
             at = int(np.argmin(np.abs(sizes - strain)))
@@ -225,7 +224,7 @@ def creep(arms: Relaxation, poisson_ratio: float) -> Iterator[Row]:
     springs, volume = spring_and_volume_stiffness(spec)
     weight = (model.node_mass[:, None] * model.gravity).ravel()
     end = np.zeros(mesh.points.size)
-    end[free] = spsolve(csc_array((springs + volume)[free][:, free]), weight[free])
+    end[free] = solved(csc_array(springs + volume), free, weight[free])
     sunk = end.reshape(-1, 3)[top, 2].mean()
     if poisson_ratio == 0.25:
         expected, source = spring_creep(arms, np.array(CREEP_TIMES)), "linear equations of the arms"
@@ -235,7 +234,7 @@ def creep(arms: Relaxation, poisson_ratio: float) -> Iterator[Row]:
         for time in np.unique([*np.geomspace(1e-4, CREEP_TIMES[-1], 60), *CREEP_TIMES]):
             stiffness, kept = body.step(time - before)
             displacement = np.zeros_like(end)
-            displacement[free] = spsolve(csc_array(stiffness[free][:, free]), (weight + kept)[free])
+            displacement[free] = solved(stiffness, free, (weight + kept)[free])
             body.accept(displacement, time - before)
             before = time
             if time in CREEP_TIMES:

@@ -96,12 +96,12 @@ class PressedLayer:
         self._up = axis == 1
         held = ((place[0] < 1e-12) & ~self._up) | (place[1] <= place[1].min() + 1e-12)
         self._free = np.flatnonzero(~held)
-        r, z = self._basis.global_coordinates().value
+        r, z = self._basis.global_coordinates()
         shear = modulus(r, z) / (2.0 * (1.0 + poisson_ratio))
         self._moduli = shear, 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
         self._weight = 2.0 * np.pi * r * self._basis.dx
         self._rates = _rates(self._basis, r)
-        self._top_rates = _rates(self._top, self._top.global_coordinates().value[0])
+        self._top_rates = _rates(self._top, self._top.global_coordinates()[0])
         self._membrane = membrane / (1.0 - membrane_ratio**2), membrane_ratio
 
     def forces(self, radius: float, depths: Sequence[float], contact_stiffness: float = RIGID) -> list[float]:
@@ -192,7 +192,7 @@ class PressedLayer:
         Plane stress, C = E h / (1 - nu^2).
         """
         size, ratio = self._membrane
-        rates, r = self._top_values(u), self._top.global_coordinates().value[0]
+        rates, r = self._top_values(u), self._top.global_coordinates()[0]
         along, slope, hoop = 1.0 + rates[0], rates[2], 1.0 + rates[4]
         strain, round_strain = 0.5 * (along**2 + slope**2 - 1.0), 0.5 * (hoop**2 - 1.0)
         pull, round_pull = size * (strain + ratio * round_strain), size * (round_strain + ratio * strain)
@@ -207,7 +207,7 @@ class PressedLayer:
 
     def _contact(self, u: FloatArray, radius: float, depth: float, stiffness: float) -> tuple[Any, FloatArray]:
         """Tangent stiffness and forces [N] of a ball `depth` below the surface at rest, on the surface, outward."""
-        rates, (r, _) = self._top_values(u), self._top.global_coordinates().value
+        rates, (r, _) = self._top_values(u), self._top.global_coordinates()
         place = np.array([r + rates[5], rates[6] - (radius - depth)])
         distance = np.sqrt((place**2).sum(axis=0))
         gap, out = np.maximum(radius - distance, 0.0), place / distance

@@ -1,6 +1,7 @@
 """The library of materials: complete, true to its sources, and taken over by scenes."""
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from msdm_core.material.regions import Material
 from surgsim_env.cli.main import main
 from surgsim_env.scene.load import list_materials, make_material, make_scene, scene_from_table, scenes_folder
+from surgsim_env.validation.relaxation import loss_tangent
 
 PHANTOM = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
 OWN = """
@@ -41,6 +43,24 @@ def test_silicone_has_the_moduli_of_its_recipes():
 
 def test_the_linear_liver_is_the_tissue_of_the_scenes():
     assert make_material("liver_linear").material == make_scene("liver").material == make_scene("phantom").material
+
+
+def test_pig_liver_stiffens_and_relaxes_as_its_file_says():
+    elastic, relaxing = (make_material(name).material for name in ("pig_liver_ex_vivo", "pig_liver_ex_vivo_relaxing"))
+    assert elastic.stiffening is not None and elastic.relaxation is None
+    assert replace(relaxing, relaxation=None) == elastic
+    arms = relaxing.relaxation
+    assert arms is not None
+    early, late = arms.remaining([0.2, 10.0])
+    assert 1.0 - late / early == pytest.approx(0.42, abs=0.005)
+    assert loss_tangent(arms, 1.0) == pytest.approx(0.18, abs=0.005)
+
+
+def test_one_number_of_the_law_is_overridden_alone():
+    found = scene_with({"name": "pig_liver_ex_vivo", "stiffening": {"tangent_cap": 20}}).material.stiffening
+    library = make_material("pig_liver_ex_vivo").material.stiffening
+    assert found is not None and library is not None
+    assert found == replace(library, tangent_cap=20.0)
 
 
 def test_a_scene_takes_a_material_by_name():

@@ -300,7 +300,7 @@ def mutated_array(array: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         match rng.integers(4):
             case 0:
                 return array.astype(kinds[rng.integers(len(kinds))])
-            case 1 if array.ndim:
+            case 1 if array.ndim and array.size:
                 return [array[:-1], array[None], np.concatenate([array, array]), array[..., 0]][rng.integers(4)]
             case _ if array.size:
                 array = array.copy()

@@ -199,7 +199,7 @@ def test_organ_that_the_step_does_not_bear_leaves_the_loop_as_it_was():
     loop, _ = pressed()
     before = loop.simulation.organ_model
     with pytest.raises(OrganError, match="substep_count"):
-        loop.reset(loop.simulation.anatomy.organ(modulus_factor=4.0), START)
+        loop.reset(loop.simulation.anatomy.organ(modulus_factor=16.0), START)
     assert loop.simulation.organ_model is before
     assert not loop.step().fault
 

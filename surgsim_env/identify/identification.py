@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -259,7 +260,7 @@ def _relaxation(
     curve: SampledCurve,
     recordings: Sequence[Recording],
     sorted_sets: Sequence[tuple[list[SitePress], dict[str, list[int]]]],
-    drawn: Sequence[tuple[FloatArray, FloatArray]],
+    drawn: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]],
 ) -> RelaxationFit:
     """Arms from the held presses of all sets."""
     training, held_out = (

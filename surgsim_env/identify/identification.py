@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -14,6 +15,7 @@ from surgsim_env.identify.press_model import PressCurve, PressSetting, PressShap
 from surgsim_env.identify.recordings import Recording, SitePress
 from surgsim_env.identify.relaxation import Arms, HeldSamples, RelaxationFit, fit_relaxation, held_sites
 from surgsim_env.identify.shape_search import (
+    CAP_RANGE,
     ROUND_COUNT,
     ROUNDS,
     STANDARD_ERRORS,
@@ -258,7 +260,7 @@ def _relaxation(
     curve: SampledCurve,
     recordings: Sequence[Recording],
     sorted_sets: Sequence[tuple[list[SitePress], dict[str, list[int]]]],
-    drawn: Sequence[tuple[FloatArray, FloatArray]],
+    drawn: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]],
 ) -> RelaxationFit:
     """Arms from the held presses of all sets."""
     training, held_out = (
@@ -353,9 +355,11 @@ def _warnings(result: Identification, library: PressLibrary) -> list[str]:
                 f"thickness ({1e3 * one.low:.3g} to {1e3 * one.high:.3g} mm describe the sites as well) and stiffening "
                 "stand for each other: measure the thickness and give --thickness"
             )
-        cap = result.found.shape.tangent_cap
-        if "tangent_cap" in result.found.intervals and result.found.intervals["tangent_cap"].high > 0.95 * 80.0:
-            said.append(f"tangent_cap {cap:.3g} lies at the end of the range searched: a higher cap may do as well")
+        if result.found.intervals["tangent_cap"].high > 0.95 * CAP_RANGE[1]:
+            said.append(
+                f"the interval of tangent_cap ends with the range searched ({CAP_RANGE[1]:g}): a higher cap may do as "
+                "well"
+            )
     for ratio, (error, factor) in result.other_ratios.items():
         said.append(
             f"poisson_ratio is given, not fitted ({result.options.poisson_ratio:g}): with {ratio:g} the training error "

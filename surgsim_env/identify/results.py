@@ -10,6 +10,7 @@ import numpy as np
 import tomlkit
 from rich.console import Console
 from rich.table import Table
+from tomlkit.items import Table as TomlTable
 
 from surgsim_env.identify.identification import Identification, SetResult
 
@@ -60,7 +61,7 @@ def write_material(result: Identification, path: Path, command_line: str, densit
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
-def _table(values: Mapping[str, Any], comments: Mapping[str, str]) -> tomlkit.items.Table:
+def _table(values: Mapping[str, Any], comments: Mapping[str, str]) -> TomlTable:
     table = tomlkit.table()
     for name, value in values.items():
         item = _table(value, comments) if isinstance(value, Mapping) else tomlkit.item(value)

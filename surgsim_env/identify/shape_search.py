@@ -121,7 +121,8 @@ class PressLibrary:
         """Press linear tissue of some thicknesses, and shapes spread over the whole range."""
         places = [0.0] if self.space.thickness is not None else np.linspace(0.0, 1.0, LINEAR_COUNT).tolist()
         count = self.start_count - len(places)
-        spread = qmc.Sobol(self.space.dimension, seed=1).random(64)[:count]
+        # scipy 1.13 knows `seed` alone, the stubs of later ones `rng` alone.
+        spread = qmc.Sobol(self.space.dimension, seed=1).random(64)[:count]  # pyright: ignore[reportCallIssue]
         for place, found in zip(places, self.press([self.space.linear(one) for one in places], progress)):
             if isinstance(found, PressCurve):
                 self.linear_places.append(place)
@@ -242,7 +243,8 @@ def find_shape(
     """
     rng = np.random.default_rng(seed)
     parts = [_at_most(part, TRAINING_MOST // len(samples), rng) for part in samples]
-    looked_at = qmc.Sobol(library.space.dimension, seed=2).random(1024)[:LOOKED_AT]
+    sobol = qmc.Sobol(library.space.dimension, seed=2)  # pyright: ignore[reportCallIssue]
+    looked_at = sobol.random(1024)[:LOOKED_AT]
     for _ in range(ROUNDS):
         costs = trimmed_mean(site_errors(library.interpolated(looked_at), parts))
         starts = looked_at[_apart(looked_at, costs, ROUND_COUNT)]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.identify.recordings import SitePress
@@ -77,7 +78,7 @@ class SiteSamples:
     def __len__(self) -> int:
         return len(self.sites)
 
-    def subset(self, rows: FloatArray) -> "SiteSamples":
+    def subset(self, rows: NDArray[np.int64]) -> "SiteSamples":
         """The samples of some of the sites."""
         return SiteSamples(
             tuple(self.sites[row] for row in rows),
@@ -183,7 +184,7 @@ def _fault(site: SitePress, usual: float) -> str:
 Half = Literal["training", "held out"]
 
 
-def draw_halves(count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+def draw_halves(count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of the training half and of the held-out half: a random permutation by the seed, its first half trains."""
     order = np.random.default_rng(seed).permutation(count)
     return np.sort(order[: math.ceil(count / 2)]), np.sort(order[math.ceil(count / 2) :])

@@ -83,6 +83,7 @@ def test_an_unknown_thickness_is_searched_with_a_warning(stiffening_set):
     assert any("thickness" in line and "give --thickness" in line for line in found.warnings)
 
 
+@pytest.mark.slow
 def test_two_sets_share_the_law_and_a_seed_repeats(stiffening_set):
     other = recording(tissue, noise=0.01, seed=5, name="other")
     first = identify([stiffening_set, other], KNOWN)

@@ -74,8 +74,8 @@ def test_substeps_of_a_scene_bear_its_worst_randomisation(name):
 
 
 def test_too_few_substeps_are_refused_with_the_number_needed():
-    with pytest.raises(OrganError, match=r"2 substeps of 0\.5 ms are too long .*timing\.substep_count = 3"):
-        Simulation(load_anatomy(changed(timing__substep_count=2)))
+    with pytest.raises(OrganError, match=r"1 substeps of 1 ms are too long .*timing\.substep_count = 2"):
+        Simulation(load_anatomy(changed(timing__substep_count=1)))
     anatomy = load_anatomy(make_scene("phantom"))
     simulation = Simulation(anatomy)
     hard = anatomy.lesion_at([0.03, 0.03, 0.015], 0.01, 40.0, "stone")

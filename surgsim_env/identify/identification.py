@@ -30,6 +30,7 @@ from surgsim_env.identify.site_fit import (
     SampledCurve,
     SiteFits,
     SiteSamples,
+    depth_largest,
     draw_halves,
     fit_sites,
     sort_out,
@@ -154,9 +155,10 @@ class Identification:
 
 def make_library(recordings: Sequence[Recording], options: IdentifyOptions) -> PressLibrary:
     """An empty library of presses, deep enough for these sets with their offsets."""
-    depth = (1.0 + OFFSET_SHARE) * max(one.depth_largest for one in recordings)
+    depth = (1.0 + OFFSET_SHARE) * max(depth_largest(sort_out(one.presses)[0]) for one in recordings)
     if not depth > 0.0:
-        raise ValueError(f"recording {recordings[0].name}: no depth is above 0; is the column depth_mm right?")
+        # No site can be used: `identify` says why.
+        depth = options.ball_radius
     setting = PressSetting(options.ball_radius, depth, options.poisson_ratio)
     library = PressLibrary(ShapeSpace(options.ball_radius, depth, options.thickness), setting)
     if options.workers is not None:
@@ -206,7 +208,7 @@ def identify(
         if starting:
             library.start(advanced)
         drawn = [draw_halves(len(usable), options.seed) for usable, _ in sorted_sets]
-        samples = _samples(recordings, [usable for usable, _ in sorted_sets])
+        samples = _samples([usable for usable, _ in sorted_sets])
         training = [part.subset(rows) for part, (rows, _) in zip(samples, drawn)]
         linear, linear_curve = find_linear(library, training)
         found = find_shape(library, training, seed=options.seed, progress=advanced)
@@ -215,13 +217,13 @@ def identify(
         if rounds == 2:
             # Arms also act while the ball moves: take them out of the forces, and search the shape again.
             curve = linear_curve if is_linear else found.curve
-            relaxation = _relaxation(curve, recordings, sorted_sets, drawn)
+            relaxation = _relaxation(curve, sorted_sets, drawn)
             samples = _without_arms(samples, curve, relaxation)
             training = [part.subset(rows) for part, (rows, _) in zip(samples, drawn)]
             linear, linear_curve = find_linear(library, training)
             found = find_shape(library, training, seed=options.seed, progress=advanced)
             is_linear = _is_linear(found, linear_curve, training)
-            relaxation = _relaxation(linear_curve if is_linear else found.curve, recordings, sorted_sets, drawn)
+            relaxation = _relaxation(linear_curve if is_linear else found.curve, sorted_sets, drawn)
         shape, curve = (linear, linear_curve) if is_linear else (found.shape, found.curve)
         other_ratios = _other_ratios(library, shape, curve, training, advanced)
         if relaxation is not None:
@@ -244,8 +246,8 @@ def identify(
     return replace(result, warnings=tuple(_warnings(result, library)))
 
 
-def _samples(recordings: Sequence[Recording], usable: Sequence[Sequence[SitePress]]) -> list[SiteSamples]:
-    return [SiteSamples.of(sites, OFFSET_SHARE * one.depth_largest) for one, sites in zip(recordings, usable)]
+def _samples(usable: Sequence[Sequence[SitePress]]) -> list[SiteSamples]:
+    return [SiteSamples.of(sites, OFFSET_SHARE * depth_largest(sites)) for sites in usable]
 
 
 def _is_linear(found: FoundShape, linear_curve: SampledCurve, training: Sequence[SiteSamples]) -> bool:
@@ -258,7 +260,6 @@ def _is_linear(found: FoundShape, linear_curve: SampledCurve, training: Sequence
 
 def _relaxation(
     curve: SampledCurve,
-    recordings: Sequence[Recording],
     sorted_sets: Sequence[tuple[list[SitePress], dict[str, list[int]]]],
     drawn: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]],
 ) -> RelaxationFit:
@@ -267,7 +268,7 @@ def _relaxation(
         held_sites([usable[row] for (usable, _), halves in zip(sorted_sets, drawn) for row in halves[half]])
         for half in (0, 1)
     )
-    offsets = np.linspace(0.0, OFFSET_SHARE * max(one.depth_largest for one in recordings), 31)
+    offsets = np.linspace(0.0, OFFSET_SHARE * max(depth_largest(usable) for usable, _ in sorted_sets), 31)
     return fit_relaxation(curve, training, held_out or training, offsets)
 
 

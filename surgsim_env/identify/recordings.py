@@ -64,11 +64,6 @@ class Recording:
     presses: tuple[SitePress, ...]
 
     @property
-    def depth_largest(self) -> float:
-        """Depth of the deepest press [m]."""
-        return max(float(press.depth.max()) for press in self.presses)
-
-    @property
     def has_time(self) -> bool:
         """Whether the samples have times."""
         return self.presses[0].time is not None

@@ -24,7 +24,7 @@ OFFSET_SHARE, OFFSET_COUNT = 0.5, 46
 # A site is usable with at least as many samples in its deeper two thirds.
 DEEP_COUNT_LEAST = 4
 # A usable site reaches this share of the set's median depth, and its force rises by this factor from a third of it on.
-DEPTH_SHARE_LEAST, RISE_LEAST = 0.6, 1.2
+DEPTH_SHARE_LEAST, DEPTH_SHARE_MOST, RISE_LEAST = 0.6, 1.5, 1.2
 # Depths to a curve that is looked up: between them it is straight in (F / E)^(2/3).
 GRID_COUNT = 181
 
@@ -167,6 +167,8 @@ def sort_out(sites: Sequence[SitePress]) -> tuple[list[SitePress], dict[str, lis
 
 def _fault(site: SitePress, usual: float) -> str:
     """Why a site cannot be used; an empty text if it can."""
+    if not site.depth.max() <= DEPTH_SHARE_MOST * usual:
+        return f"deeper than {DEPTH_SHARE_MOST:.0%} of the set's median"
     depth, force = site.depth[site.loading], site.force[site.loading]
     deepest = float(depth.max())
     if deepest < DEPTH_SHARE_LEAST * usual:
@@ -179,6 +181,11 @@ def _fault(site: SitePress, usual: float) -> str:
     if force[-1] < RISE_LEAST * force[deep][0]:
         return f"force that rises by less than {RISE_LEAST:g} times over the deeper two thirds"
     return ""
+
+
+def depth_largest(sites: Sequence[SitePress]) -> float:
+    """Depth of the deepest press of some sites [m]; 0 for none."""
+    return max((float(site.depth.max()) for site in sites), default=0.0)
 
 
 Half = Literal["training", "held out"]

@@ -15,7 +15,6 @@ def test_columns_in_any_order_in_si(tmp_path):
     assert [press.site for press in found.presses] == [4, 2]
     np.testing.assert_allclose(found.presses[0].depth, [0.5e-3, 1.0e-3])
     np.testing.assert_allclose(found.presses[0].force, [0.1, 0.2])
-    assert found.depth_largest == pytest.approx(1e-3)
 
 
 def test_what_is_written_is_read(tmp_path):

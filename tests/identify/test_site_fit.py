@@ -62,11 +62,12 @@ def test_sites_that_cannot_be_used_are_named_with_their_reason():
         other(101, depth=one.depth[[0, 1, 9]], force=one.force[[0, 1, 9]]),
         other(102, force=-one.force),
         other(103, force=np.full(len(one.force), 0.1)),
+        other(104, depth=20.0 * one.depth),
     ]
     usable, left_out = sort_out([*made.presses, *bad])
     assert [site.site for site in usable] == [press.site for press in made.presses]
     assert {reason.split(" ")[0]: sites for reason, sites in left_out.items()} == {
-        "less": [100], "fewer": [101], "a": [102], "force": [103]
+        "less": [100], "fewer": [101], "a": [102], "force": [103], "deeper": [104]
     }  # fmt: skip
 
 

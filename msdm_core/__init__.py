@@ -13,6 +13,7 @@ from msdm_core.material.fitting import FitReport, spring_fit
 from msdm_core.material.lumping import lump_mass
 from msdm_core.material.regions import Capsule, Damping, Lesion, Material
 from msdm_core.material.stiffness import spring_network
+from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.quality import mesh_quality
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
@@ -38,6 +39,8 @@ __all__ = [
     "OrganModel",
     "OrganSpec",
     "OrganState",
+    "Relaxation",
+    "Stiffening",
     "Support",
     "SupportLaw",
     "TetMesh",

@@ -8,7 +8,8 @@ A run makes an environment of one of CASES, alone or several side by side, plays
 next; runs are drawn from a seed and their number. Watched in every control step: observations lie in their space,
 rewards are finite, each end has a name (a fault of FAULTS, a limit, a success, the time), and no tet is turned inside
 out unless the fault says so, by volumes that are computed here from the nodes' positions. At the end of a run a reset
-with the first seed must give the first saved state to the bit. Memory is what a process holds between runs.
+with the first seed must give the first saved state to the bit. Memory is what a process holds between runs, without
+what malloc keeps of freed memory (`memory_held`).
 
 One process for each core (`--processes`); one that dies is a finding, and another takes its place. Prints a table and
 exits 1 with findings.
@@ -16,6 +17,7 @@ exits 1 with findings.
 
 import argparse
 import contextlib
+import ctypes
 import gc
 import itertools
 import multiprocessing
@@ -74,7 +76,7 @@ FAULTS = {
 ENDS = ("success", "hard_limit", "torn", "collided", "declared")
 # Runs until the kinds of environments of a seed repeat: by then all that is kept by scene or kernel is there.
 KINDS = 60
-# How much memory a process may gain from then on [bytes].
+# How much more memory a process may hold from then on [bytes].
 GROWTH_MOST = 20e6
 
 
@@ -166,7 +168,10 @@ class Run:
 
 @dataclass
 class Outcome:
-    """What a run counted; `findings` are what must not happen, a sentence each."""
+    """What a run counted; `findings` are what must not happen, a sentence each.
+
+    `memory` is what the process held after the run, `resident` the same with what malloc kept [bytes].
+    """
 
     substeps: int = 0
     steps: int = 0
@@ -174,6 +179,7 @@ class Outcome:
     ends: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
     memory: float = 0.0
+    resident: float = 0.0
 
 
 def play(run: Run) -> Outcome:
@@ -285,11 +291,24 @@ def volume_ratios(simulation: Any) -> NDArray[np.float64]:
     return volumes(simulation.organ_state.node_position) / volumes(simulation.organ_model.node_rest_position)
 
 
-def memory_held() -> float:
-    """Memory of this process [bytes]; 0 where the system does not say."""
-    gc.collect()
+def memory_resident() -> float:
+    """Resident memory of this process [bytes]; 0 where the system does not say."""
     status = Path("/proc/self/statm")
     return float(int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")) if status.exists() else 0.0
+
+
+def memory_held() -> float:
+    """Memory that this process holds [bytes]: resident after glibc's malloc has returned free pages to the system.
+
+    malloc keeps freed memory for later calls: 30 to 150 MB after a run, another amount after each kind of environments,
+    so that resident memory drifts by tens of MB while nothing is held for longer. Without glibc it is resident memory;
+    0 where the system does not say.
+    """
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(ctypes.c_size_t(0))
+    return memory_resident()
 
 
 # ---- processes -------------------------------------------------------------------------------------------------------
@@ -316,6 +335,7 @@ def work(soak: Soak, first: int, pipe: Connection) -> None:
             outcome = play(run)
         except Exception:  # whatever it is, it is a finding, and the next run goes on
             outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
+        outcome.resident = memory_resident()
         outcome.memory = memory_held()
         pipe.send(outcome)
     pipe.send(None)
@@ -323,12 +343,13 @@ def work(soak: Soak, first: int, pipe: Connection) -> None:
 
 @dataclass
 class Worker:
-    """A process, its present run, and the memory that it held after each run [bytes], by the run's number."""
+    """A process, its present run, what it held after each run [bytes], by the run's number, and its most resident."""
 
     process: Any
     pipe: Connection
     run: Run | None = None
     memory: dict[int, float] = field(default_factory=dict)
+    resident: float = 0.0
     over: bool = False
 
     def growth(self) -> float | None:
@@ -382,6 +403,7 @@ def play_all(soak: Soak, console: Console) -> int:
                 else:
                     assert worker.run is not None
                     worker.memory[worker.run.number] = message.memory
+                    worker.resident = max(worker.resident, message.resident)
                     add(totals.setdefault(worker.run.env_id, Outcome()), message)
                     for one in message.findings:
                         find(one)
@@ -393,7 +415,8 @@ def play_all(soak: Soak, console: Console) -> int:
     for number, worker in enumerate(ended):
         held, growth = list(worker.memory.values()), worker.growth()
         gained = "too few runs to compare" if growth is None else f"{growth / 1e6:+.1f} MB since the kinds repeat"
-        memory.append(f"{held[-1] / 1e6 if held else 0.0:.0f} MB at the end, {gained}")
+        most = f"at most {worker.resident / 1e6:.0f} MB with what malloc kept"
+        memory.append(f"{held[-1] / 1e6 if held else 0.0:.0f} MB at the end, {most}, {gained}")
         if growth is not None and growth > GROWTH_MOST:
             find(f"process {number} gained {growth / 1e6:.1f} MB; the rule is {GROWTH_MOST / 1e6:.0f} MB")
     show(totals, console)

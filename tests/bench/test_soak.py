@@ -1,5 +1,8 @@
 """The soak finds what it watches for, and a run of it repeats."""
 
+import platform
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -96,3 +99,49 @@ def test_memory_is_compared_once_kinds_repeat():
     worker = soak.Worker(None, None, memory={number: 1e6 * max(number - 60, 0) for number in range(0, 100, 2)})
     assert worker.growth() == pytest.approx(20e6)
     assert soak.Worker(None, None, memory=dict.fromkeys(range(69), 1e6)).growth() is None
+
+
+def freed(blocks):
+    """Blocks of 64 kB are made and freed, but for the last, which keeps malloc from giving them back by itself."""
+    made = [np.ones(8192) for _ in range(blocks)]
+    return made[-1]
+
+
+needs_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="malloc_trim is of glibc")
+
+
+@needs_glibc
+def test_memory_held_is_without_what_malloc_keeps():
+    before, resident = soak.memory_held(), soak.memory_resident()
+    last = freed(1600)
+    kept = soak.memory_resident() - resident
+    assert kept > 80e6 and soak.memory_held() - before < 5e6
+    held = np.ones(5_000_000)
+    assert soak.memory_held() - before == pytest.approx(held.nbytes + last.nbytes, abs=5e6)
+
+
+class Sent(list):
+    """A pipe that keeps what is sent through it."""
+
+    send = list.append
+
+
+@needs_glibc
+@pytest.mark.parametrize("leaked", [0, 4_000_000])
+def test_a_leak_is_told_from_what_malloc_keeps(monkeypatch, leaked):
+    leak, last = [], []
+    monkeypatch.setattr(soak, "time", SimpleNamespace(time=lambda: len(leak)))
+
+    def leaky(run):
+        leak.append(np.ones(leaked // 8))
+        # More is made and freed in later runs, as by kinds that alternate.
+        last[:] = [freed(50 * (run.number - soak.KINDS))]
+        return soak.Outcome()
+
+    monkeypatch.setattr(soak, "play", leaky)
+    pipe = Sent()
+    soak.work(soak.Soak(seed=0, processes=1, deadline=12, quick=True), soak.KINDS + 1, pipe)
+    outcomes = pipe[1:-1:2]
+    worker = soak.Worker(None, None, memory={soak.KINDS + n: one.memory for n, one in enumerate(outcomes)})
+    assert len(outcomes) == 12 and max(one.resident - one.memory for one in outcomes) > 10e6
+    assert worker.growth() == pytest.approx(6 * leaked, abs=3e6)

@@ -244,10 +244,10 @@ def test_too_few_substeps_are_refused_with_the_count_that_does():
         timing = replace(scene().timing, substep_count=count)
         return Simulation(replace(anatomy(), scene=replace(scene(), timing=timing)))
 
-    with pytest.raises(OrganError, match=r"1 substeps of 1 ms are too long .* timing.substep_count = \d+") as refused:
-        with_substeps(1).reset(organ, ABOVE)
+    with pytest.raises(OrganError, match=r"2 substeps of 0\.5 ms are too long .* timing.substep_count = \d+") as refused:
+        with_substeps(2).reset(organ, ABOVE)
     needed = int(re.findall(r"substep_count = (\d+)", str(refused.value))[0])
-    assert 1 < needed <= scene().timing.substep_count + 1
+    assert 2 < needed <= scene().timing.substep_count + 1
     with pytest.raises(OrganError, match=f"substep_count = {needed}"):
         with_substeps(needed - 1).reset(organ, ABOVE)
     with_substeps(needed).reset(organ, ABOVE)

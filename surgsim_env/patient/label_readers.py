@@ -286,7 +286,10 @@ def _runs(
                     f"within slice {(first + len(raw) // dtype.itemsize) // layer} of {shape[2]}: {ADVICE}"
                 )
             values = np.frombuffer(raw, dtype=dtype)
-            yield first, values if scaling == (1.0, 0.0) else values * slope + shift
+            # A number that overflows is no label: whoever takes the values refuses it.
+            with np.errstate(over="ignore"):
+                scaled = values if scaling == (1.0, 0.0) else values * slope + shift
+            yield first, scaled
         if len(parsed(file, lambda _: stream.read(TAIL_BYTES), ADVICE)) >= TAIL_BYTES:
             raise MeshError(f"{file}: goes on far beyond the image that its header describes: {ADVICE}")
 

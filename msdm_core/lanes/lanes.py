@@ -1,10 +1,9 @@
 """Organs of one mesh side by side: eight float64 or sixteen float32 advance at once, each as it would alone.
 
 Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, supports,
-damping, gravity and the laws by which springs stiffen
-and relax are shared. With `own_rest` organs of the same tets may also differ in their rest shape and in what
-is anchored, for a few hundredths of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves
-it, whoever its neighbours.
+damping, gravity and the laws by which springs stiffen and relax are shared. With `own_rest` organs of the same tets may
+also differ in their rest shape and in what is anchored, for a few hundredths of the time. In float64 an organ moves to
+the bit as `stepping.advance_organ` moves it, whoever its neighbours.
 """
 
 import math
@@ -144,7 +143,7 @@ def _check_shared(model: LaneModel, lane: int, organ: OrganModel, anchored: NDAr
         way = "a group of its own" if own else "a group of its own, or stack them with own_rest"
         raise OrganError(
             f"the organ for lane {lane} has another {differing} than its neighbours: organs side by side share "
-            f"{shared}, supports, damping and gravity; put it into {way}"
+            f"{shared}, supports, damping, gravity and the laws of their springs; put it into {way}"
         )
 
 

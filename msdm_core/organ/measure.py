@@ -16,6 +16,7 @@ from msdm_core.kernels.guard_kernels import GUARD_SHARE, closest_in_triangle
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_support_forces
+from msdm_core.material.tissue_law import ARM_COUNT
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, tet_volumes
 
 
@@ -92,7 +93,9 @@ def arm_energy(model: OrganModel, state: OrganState, length: FloatArray) -> floa
     rest = model.spring_rest_length
     energy, total = spring_energies(model, length), 0.0
     for modulus, given in zip(
-        model.spring_arm_modulus.reshape(3, -1), state.spring_arm_tension.reshape(3, -1) * rest, strict=True
+        model.spring_arm_modulus.reshape(ARM_COUNT, -1),
+        state.spring_arm_tension.reshape(ARM_COUNT, -1) * rest,
+        strict=True,
     ):
         # Bisection: a linear spring would have to go further for the same tension.
         furthest = given / model.spring_stiffness

@@ -372,6 +372,8 @@ class Simulation:
         different = np.flatnonzero(twin.get_state().view(np.uint64) != vector.view(np.uint64))
         if different.size:
             raise ValueError(f"instrument[{different[0]}] is {vector[different[0]]}, which no such instrument has")
+        if not str(arrays["fault"]) and (wrong := twin.beyond_stepping()):
+            raise ValueError(f"instrument: {wrong}")
 
     def _check_step(self, organ_model: OrganModel) -> None:
         limit = stable_dt(organ_model, self.contact)

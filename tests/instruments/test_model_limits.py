@@ -1,5 +1,6 @@
 """Model files that ask for too much are refused in one line, before MuJoCo reads them or by a child process."""
 
+import contextlib
 import os
 import struct
 import subprocess
@@ -237,4 +238,43 @@ def test_what_a_child_finds_wrong_is_said(tmp_path, capfd):
     with pytest.raises(ValueError, match=r"^arm 'mine': Error: mesh 'flat' has coplanar vertices") as caught:
         load_arm(tmp_path / "mine.toml")
     assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+STICK = """<robot name="r"><link name="base"/><link name="stick">{shapes}</link>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="stick"/><axis xyz="0 0 1"/>
+<limit lower="0.1" upper="{upper}" effort="1" velocity="1"/></joint></robot>"""
+BALL = '<collision name="ball"><geometry><sphere radius="0.1"/></geometry></collision>'
+
+
+@pytest.mark.parametrize(
+    ("shapes", "upper", "message"),
+    [(2 * BALL, 0.2, "a second shape is named 'ball'; it has no name"), (BALL, 0.1, "MuJoCo: .* equal lower and upper limits")],
+)
+def test_what_mujoco_would_print_is_a_warning(shapes, upper, message, tmp_path, capfd):
+    table = """model = "stick.urdf"
+kind = "palpator"
+joints = ["slide"]
+contact = ["ball"]
+[tip]
+body = "stick"
+direction = [0.0, 0.0, -1.0]
+ball = "ball"
+[trocar]
+shaft_body = "stick"
+shaft_axis = [0.0, 0.0, -1.0]
+fixed = true
+[control]
+mode = "servo"
+speed_limit = [0.2]
+stiffness = [2000.0]
+damping = [60.0]
+effort = [20.0]
+[home]
+slide = 0.1
+"""
+    (tmp_path / "stick.toml").write_text(table)
+    (tmp_path / "stick.urdf").write_text(STICK.format(shapes=shapes, upper=upper))
+    with pytest.warns(UserWarning, match=message), contextlib.suppress(ValueError):
+        load_arm(tmp_path / "stick.toml")
     assert capfd.readouterr() == ("", "")

@@ -2,7 +2,10 @@
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -35,9 +38,10 @@ def compile_arm(
     """
     where = f"arm {description.name!r}"
     try:
-        spec = arm_spec(description, port, tip_radius, timestep)
-        add_supports(spec, supports)
-        model = spec.compile()
+        with warned(where):
+            spec = arm_spec(description, port, tip_radius, timestep)
+            add_supports(spec, supports)
+            model = spec.compile()
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
     _check_lengths(model, where)
@@ -53,6 +57,20 @@ def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, 
     return spec
 
 
+@contextmanager
+def warned(where: str) -> Iterator[None]:
+    """Within it, what MuJoCo warns of becomes a Python warning each, instead of lines that it prints and logs."""
+    said: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+        for text in dict.fromkeys(said):
+            warnings.warn(f"{where}: MuJoCo: {' '.join(text.split())}", stacklevel=1)
+
+
 def _read_spec(description: ArmDescription) -> mujoco.MjSpec:
     path, text = description.folder / description.model, ""
     root = read_xml(path)
@@ -62,6 +80,7 @@ def _read_spec(description: ArmDescription) -> mujoco.MjSpec:
     if root.tag == "robot":
         if root.find("mujoco") is None:
             ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
+        _drop_repeated_names(root, path)
         text = ElementTree.tostring(root, encoding="unicode")
     wrong = check_model(path, root, text)
     spec = read_spec(str(path), text)
@@ -87,6 +106,17 @@ def _check_repeated_names(root: ElementTree.Element) -> None:
         if name and (part.tag, name) in seen:
             raise ValueError(f"two parts <{part.tag}> are named {name!r}; names must differ: rename one")
         seen.add((part.tag, name or ""))
+
+
+def _drop_repeated_names(root: ElementTree.Element, path: Path) -> None:
+    """Take the names from URDF shapes whose name another shape had before, as MuJoCo does, with a warning of our own."""
+    seen: set[str] = set()
+    for shape in (shape for link in root.findall("link") for shape in link if shape.tag in ("visual", "collision")):
+        name = shape.get("name", "")
+        if name and name in seen:
+            del shape.attrib["name"]
+            warnings.warn(f"model file {path}: a second shape is named {name!r}; it has no name here", stacklevel=1)
+        seen.add(name)
 
 
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:

@@ -246,9 +246,7 @@ class _Count:
 
     def _count(self, element: ElementTree.Element, tag: str, times: int, default: bool) -> None:
         self.totals["elements"] += times
-        kind = {"body": "bodies", "link": "bodies", "key": "keyframes", "joint": "joints", "freejoint": "joints"}.get(
-            tag
-        )
+        kind = COUNTED.get(tag)
         if kind and not default:
             self.totals[kind] += times
         for attribute, value in element.attrib.items():

@@ -15,7 +15,7 @@ from surgsim_env.instruments.arm.arm_instrument import (
     parked_place,
     start_direction,
 )
-from surgsim_env.instruments.arm.model import LINK_GROUP, arm_spec
+from surgsim_env.instruments.arm.model import LINK_GROUP, arm_spec, warned
 from surgsim_env.instruments.arm.steering import SteeredArm, millimetres, missing, placed
 from surgsim_env.instruments.instrument import Jaw
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ROUGHNESS, SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
@@ -62,7 +62,8 @@ class Pair(SteeredArms):
                 "left arm's first: add them, or take a scene that has them, such as 'lobe'"
             )
         made = {side: load_scene_arm(anatomy, name, port) for side, name, port in zip(SIDES, names, scene.ports)}
-        model = _compile(made, scene)
+        with warned(f"scene {scene.name!r}"):
+            model = _compile(made, scene)
         super().__init__(model, lower, upper, model.site(f"left_{made['left'].description.tip.site}").id)
         driven = [f"{side}_{name}" for side, arm in made.items() for name in arm.joints]
         fingers = {side: [f"{side}_{name}" for name in arm.description.jaw] for side, arm in made.items()}

@@ -134,7 +134,7 @@ BREAKS = [
     # The last twelve are the servo's: three joints' commands, flags of their limits, lower and upper limits.
     ("instrument", lambda array: np.concatenate([array[:-9], [0.5], array[-8:]]), "is 0.5, which no such instrument"),
     # After the time come the coordinates.
-    ("instrument", lambda array: np.r_[array[0], 2e9, array[2:]], "its coordinate 0 is 2e.09; the rule is at most 1000"),
+    ("instrument", lambda array: np.r_[array[0], 2e9, array[2:]], "its coordinate 0 is 2e.09; the rule is at most"),
     ("instrument", lambda array: np.r_[array[:-12], -1e6, array[-11:]], "its commanded speed 0 is -1e.06; the rule"),
     ("fault", lambda array: np.array(0.0), "fault is of type float64; it must be text"),
     ("task", lambda array: np.array("1"), "task: '1' is no JSON object"),

@@ -249,7 +249,10 @@ BALL = '<collision name="ball"><geometry><sphere radius="0.1"/></geometry></coll
 
 @pytest.mark.parametrize(
     ("shapes", "upper", "message"),
-    [(2 * BALL, 0.2, "a second shape is named 'ball'; it has no name"), (BALL, 0.1, "MuJoCo: .* equal lower and upper limits")],
+    [
+        (2 * BALL, 0.2, "a second shape is named 'ball'; it has no name"),
+        (BALL, 0.1, "MuJoCo: .* equal lower and upper limits"),
+    ],
 )
 def test_what_mujoco_would_print_is_a_warning(shapes, upper, message, tmp_path, capfd):
     table = """model = "stick.urdf"

@@ -109,7 +109,7 @@ def _check_repeated_names(root: ElementTree.Element) -> None:
 
 
 def _drop_repeated_names(root: ElementTree.Element, path: Path) -> None:
-    """Take the names from URDF shapes whose name another shape had before, as MuJoCo does, with a warning of our own."""
+    """Take the names from URDF shapes whose name another has already, as MuJoCo does, with a warning of our own."""
     seen: set[str] = set()
     for shape in (shape for link in root.findall("link") for shape in link if shape.tag in ("visual", "collision")):
         name = shape.get("name", "")

@@ -13,7 +13,7 @@ from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.kernels.structure_kernels import SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.organ.compile import blank_state, rest_state
+from msdm_core.organ.compile import blank_state, relax_arms, rest_state
 from msdm_core.organ.stability import stable_dt
 from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
 from surgsim_env.coupling.mujoco_library import runs_compiled
@@ -196,6 +196,7 @@ class Simulation:
         state = self.organ_state
         state.node_position[:] = self._rest_position
         state.support_stretch[:] = self._rest_stretch
+        relax_arms(self.organ_model, state)
         state.node_velocity[:] = 0.0
         state.node_force[:] = 0.0
         state.contact_engaged[:] = 0

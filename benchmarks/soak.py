@@ -25,7 +25,7 @@ import os
 import sys
 import time
 import traceback
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -353,10 +353,16 @@ class Worker:
     over: bool = False
 
     def growth(self) -> float | None:
-        """Memory of the last runs over that of the first after KINDS runs, medians [bytes]; None for too few runs."""
-        held = [memory for number, memory in self.memory.items() if number >= KINDS]
-        some = min(len(held) // 2, KINDS)
-        return float(np.median(held[-some:]) - np.median(held[:some])) if some >= 5 else None
+        """Median over kinds of what was held after the last run over that after the second [bytes]; None for few pairs.
+
+        Runs of one kind are compared because kinds hold different amounts; the first of each makes what is kept.
+        """
+        held = defaultdict(list)
+        for number, memory in self.memory.items():
+            if number >= KINDS:
+                held[number % KINDS].append(memory)
+        gained = [of_kind[-1] - of_kind[0] for of_kind in held.values() if len(of_kind) > 1]
+        return float(np.median(gained)) if len(gained) >= 5 else None
 
 
 def start(soak: Soak, first: int) -> Worker:

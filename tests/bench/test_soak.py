@@ -96,9 +96,11 @@ def test_kinds_of_environments_repeat_with_other_actions():
 
 
 def test_memory_is_compared_once_kinds_repeat():
-    worker = soak.Worker(None, None, memory={number: 1e6 * max(number - 60, 0) for number in range(0, 100, 2)})
-    assert worker.growth() == pytest.approx(20e6)
-    assert soak.Worker(None, None, memory=dict.fromkeys(range(69), 1e6)).growth() is None
+    """Runs of one kind with each other: kinds hold different amounts."""
+    kind = {number: 1e9 * (number % soak.KINDS) for number in range(180)}
+    worker = soak.Worker(None, None, memory={n: kind[n] + 1e6 * max(n - soak.KINDS, 0) for n in range(0, 180, 2)})
+    assert worker.growth() == pytest.approx(60e6)
+    assert soak.Worker(None, None, memory=dict.fromkeys(range(124), 1e6)).growth() is None
 
 
 def freed(blocks):
@@ -142,6 +144,8 @@ def test_a_leak_is_told_from_what_malloc_keeps(monkeypatch, leaked):
     pipe = Sent()
     soak.work(soak.Soak(seed=0, processes=1, deadline=12, quick=True), soak.KINDS + 1, pipe)
     outcomes = pipe[1:-1:2]
-    worker = soak.Worker(None, None, memory={soak.KINDS + n: one.memory for n, one in enumerate(outcomes)})
+    worker = soak.Worker(
+        None, None, memory={soak.KINDS * (1 + n // 6) + n % 6: one.memory for n, one in enumerate(outcomes)}
+    )
     assert len(outcomes) == 12 and max(one.resident - one.memory for one in outcomes) > 10e6
     assert worker.growth() == pytest.approx(6 * leaked, abs=3e6)

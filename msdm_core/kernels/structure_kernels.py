@@ -38,6 +38,7 @@ class OrganModel(NamedTuple):
         spring_growth: 1 / (l0 (e1 - e0)), of its `Stiffening` [1/m]             (n_spring,), (0,) if none stiffens
         spring_onset: e0 / (e1 - e0)                                             likewise
         spring_excess: (c - 1) (e1 - e0)                                         likewise
+        steep_sweeps: of `hold_steep`                                            scalar
         relaxes: whether any spring has Maxwell arms                             scalar
         spring_gain: tension at once over that at equilibrium, 1 + sum g_i       (n_spring,), (0,) if none relaxes
         spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring,), likewise
@@ -80,6 +81,7 @@ class OrganModel(NamedTuple):
     spring_growth: FloatArray
     spring_onset: FloatArray
     spring_excess: FloatArray
+    steep_sweeps: int
     relaxes: bool
     spring_gain: FloatArray
     spring_arm_modulus: FloatArray
@@ -129,6 +131,9 @@ class OrganState(NamedTuple):
         row_force: scratch: likewise                                             (n_node, 4)
         squeezed_tets: scratch: where tets are squeezed below SQUEEZED_RATIO     (n_tet,)
         steep_springs: scratch: where springs are strained beyond STEEP_SHARE    (n_spring,), (0,) if none stiffens
+        steep_places: scratch: those springs, see squeeze_kernels                (n_spring,), likewise
+        steep_rows: scratch: likewise                                            (n_spring, STEEP_WIDTH), likewise
+        steep_speed: scratch: speed that their nodes get to [m/s]                (n_node, 3), (0, 3) if none stiffens
         spring_arm_tension: what each arm has given way to, over l0, arm by arm [N/m] (3 * n_spring,), (0,) without arms
         spring_relief: sum_i g_i times that [N/m]                                (n_spring,), (0,) without arms
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
@@ -156,6 +161,9 @@ class OrganState(NamedTuple):
     row_force: FloatArray
     squeezed_tets: NDArray[np.int32]
     steep_springs: NDArray[np.int32]
+    steep_places: NDArray[np.int32]
+    steep_rows: FloatArray
+    steep_speed: FloatArray
     spring_arm_tension: FloatArray
     spring_relief: FloatArray
     contact_engaged: NDArray[np.uint8]
@@ -176,7 +184,8 @@ class OrganState(NamedTuple):
 
 # Written anew in every call: need not be saved.
 SCRATCH_FIELDS = (
-    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets", "steep_springs"),
+    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets"),
+    *("steep_springs", "steep_places", "steep_rows", "steep_speed"),
     *("contact_candidates", "contact_rows", "contact_places", "contact_hold"),
     *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept"),
 )
@@ -195,7 +204,8 @@ class LaneModel(NamedTuple):
         spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
         spring_stiffness: [N/m]                                                  (n_spring, n_lane)
         spring_rest_length: [m]                                                  (n_spring,) or own
-        stiffens, spring_onset, spring_excess, relaxes, spring_gain, spring_arm_modulus, arm_time: as in OrganModel
+        stiffens, spring_onset, spring_excess, steep_sweeps: as in OrganModel
+        relaxes, spring_gain, spring_arm_modulus, arm_time: as in OrganModel
         spring_growth: as in OrganModel [1/m]                                    (n_spring,) or own, (0,) if none
         tet_nodes: corners of each tet                                           (n_tet, 4)
         tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,) or own
@@ -227,6 +237,7 @@ class LaneModel(NamedTuple):
     spring_growth: FloatArray
     spring_onset: FloatArray
     spring_excess: FloatArray
+    steep_sweeps: int
     relaxes: bool
     spring_gain: FloatArray
     spring_arm_modulus: FloatArray
@@ -277,6 +288,7 @@ class LaneState(NamedTuple):
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
         steep_springs: scratch: springs that a lane has strained beyond STEEP_SHARE (n_spring,), (0,) if none stiffens
+        steep_places, steep_rows, steep_speed: scratch of one lane after the other, as in OrganState
         spring_arm_tension: as in OrganState [N/m]                               (3 * n_spring, n_lane)
         spring_relief: as in OrganState [N/m]                                    (n_spring, n_lane)
         kept_force: scratch: node_force of the lanes that do not move [N]        (n_node, 3, n_lane)
@@ -303,6 +315,9 @@ class LaneState(NamedTuple):
     node_tension: LaneArray
     squeezed_tets: NDArray[np.int32]
     steep_springs: NDArray[np.int32]
+    steep_places: NDArray[np.int32]
+    steep_rows: FloatArray
+    steep_speed: FloatArray
     spring_arm_tension: LaneArray
     spring_relief: LaneArray
     kept_force: LaneArray
@@ -570,7 +585,8 @@ def in_rows(lanes, state):
     return OrganState(
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
         state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
-        state.steep_springs, state.spring_arm_tension, state.spring_relief,
+        state.steep_springs, state.steep_places, state.steep_rows, state.steep_speed,
+        state.spring_arm_tension, state.spring_relief,
         state.contact_engaged, state.contact_stretch, state.contact_candidates,
         state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         state.support_stretch, state.volume_ratio_smallest,

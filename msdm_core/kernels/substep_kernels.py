@@ -281,7 +281,8 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
                 column_of(model.spring_stiffness, lane), column_of(model.spring_rest_length, lane),
                 column_of(model.spring_growth, lane), model.spring_onset, model.spring_excess, model.spring_gain,
                 model.relaxes, model.tet_nodes.shape[0],
-                state.steep_springs, steep_count, group_width(lanes), dt,
+                state.steep_springs, steep_count, group_width(lanes), model.steep_sweeps,
+                state.steep_places, state.steep_rows, state.steep_speed, dt,
             )  # fmt: skip
         hold_contact(surface, touched, moved, law, dt, decay, points, about, push)
         hold_squeezed(

@@ -29,7 +29,7 @@ from msdm_core.kernels.structure_kernels import (
 from msdm_core.kernels.substep_kernels import advance_substeps
 from msdm_core.kernels.vector_kernels import aligned_zeros, lane_counts
 from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.organ.compile import rest_state, support_shape
+from msdm_core.organ.compile import rest_state, steep_scratch, support_shape
 from msdm_core.organ.stepping import unyielding
 
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
@@ -231,6 +231,7 @@ def lanes_of(
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
         steep_springs=np.zeros(len(first.spring_growth), dtype=np.int32),
+        **steep_scratch(first),
         **{name: aligned_zeros((len(getattr(states[0], name)), count), dtype) for name in ARM_FIELDS},
         moving=aligned_zeros((1, count), dtype),
         finite_sum=aligned_zeros((1, count), dtype),
@@ -289,6 +290,9 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
         **{name: np.array(getattr(state, name)[:, :, lane], dtype=np.float64, order="C") for name in NODE_FIELDS},
         **{name: getattr(state, name)[:, lane].astype(np.float64) for name in ARM_FIELDS},
         steep_springs=np.zeros_like(state.steep_springs),
+        steep_places=np.zeros_like(state.steep_places),
+        steep_rows=np.zeros_like(state.steep_rows),
+        steep_speed=np.zeros_like(state.steep_speed),
         contact_engaged=state.contact_engaged[lane][points].copy(),
         contact_stretch=state.contact_stretch[lane][points].copy(),
         contact_passed=state.contact_passed[lane].copy(),

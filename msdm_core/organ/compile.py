@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
+from msdm_core.kernels.squeeze_kernels import STEEP_WIDTH
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneModel, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_support_forces
@@ -37,7 +38,7 @@ from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.measure import spring_tensions
-from msdm_core.organ.stability import own_step
+from msdm_core.organ.stability import own_step, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
 
@@ -165,6 +166,7 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         row_force=aligned_zeros((len(model.node_mass), 4)),
         squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
         steep_springs=np.zeros(len(model.spring_growth), dtype=np.int32),
+        **steep_scratch(model),
         spring_arm_tension=np.zeros_like(model.spring_arm_modulus),
         spring_relief=np.zeros_like(model.spring_gain),
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
@@ -182,6 +184,16 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         candidate_count=np.zeros(1, dtype=np.int32),
         contact_kept=np.ones(1, dtype=np.uint8),
     )
+
+
+def steep_scratch(model: OrganModel) -> dict[str, NDArray[Any]]:
+    """The scratch fields of a state for `hold_steep`; empty where no spring stiffens."""
+    springs = len(model.spring_growth)
+    return {
+        "steep_places": np.zeros(springs, dtype=np.int32),
+        "steep_rows": np.zeros((springs, STEEP_WIDTH)),
+        "steep_speed": np.zeros((len(model.node_mass) if springs else 0, 3)),
+    }
 
 
 def _settle(model: OrganModel, state: OrganState) -> None:
@@ -325,6 +337,7 @@ def _spring_law(spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, sprin
     none = _read_only(np.zeros(0))
     fields: dict[str, Any] = dict.fromkeys(("spring_growth", "spring_onset", "spring_excess"), none)
     fields |= {"spring_gain": none, "spring_arm_modulus": none, "arm_time": _read_only(_arm_times(spec))}
+    fields["steep_sweeps"] = steep_sweeps(1.0 + float(law.rise.max()))
     fields["stiffens"], fields["relaxes"] = bool(law.rise.any()), bool(law.arm_modulus.any())
     everywhere = np.ones(mesh.tet_count)
     if fields["stiffens"]:

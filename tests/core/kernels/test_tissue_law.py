@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganError
+from msdm_core.kernels.element_kernels import STEEP_SHARE
+from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
 from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.lanes.lanes import (
     advance_lanes,
@@ -21,8 +23,8 @@ from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, relax_arms, rest_state
-from msdm_core.organ.measure import internal_forces, kinetic_energy, potential_energy
-from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.measure import angular_momentum, internal_forces, kinetic_energy, potential_energy
+from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 
 LIVER = Stiffening(onset_strain=0.03, cap_strain=0.12, tangent_cap=20.0)
@@ -203,6 +205,7 @@ def test_a_free_organ_gains_no_energy(stiffening: Stiffening | None, relaxation:
     # The symplectic scheme conserves a perturbed energy: its error is of the order of (w dt)^2.
     assert highest < 1.05 * begin
     np.testing.assert_allclose(model.node_mass @ state.node_velocity, momentum, atol=1e-12)
+    assert np.abs(angular_momentum(model, state, np.zeros(3))).max() < 1e-12
     if relaxation is not None:
         assert kinetic_energy(model, state) + potential_energy(model, state) < 0.9 * begin
 
@@ -243,6 +246,63 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
     length = np.linalg.norm(np.diff(state.node_position[model.spring_nodes], axis=1)[:, 0], axis=1)
     assert np.abs(length / model.spring_rest_length - 1.0).max() > LIVER.cap_strain
     assert forces[0] == pytest.approx(forces[1], rel=5e-3)
+
+
+def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatArray:
+    """The matrix that `hold_steep` makes of velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
+    scale = np.sqrt(model.node_mass)[:, None]
+    every, columns = np.arange(len(model.spring_nodes), dtype=np.int32), []
+    for unit in np.eye(state.node_velocity.size):
+        velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
+        hold_steep(
+            state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes, model.spring_stiffness,
+            model.spring_rest_length, model.spring_growth, model.spring_onset, model.spring_excess, model.spring_gain,
+            model.relaxes, len(model.tet_nodes), every, len(every), 1, sweeps,
+            state.steep_places, state.steep_rows, state.steep_speed, dt,
+        )  # fmt: skip
+        columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("relaxation", [None, ARMS])
+def test_steep_springs_are_held_as_by_larger_masses(relaxation: Relaxation | None):
+    """Velocities become C v, C symmetric in the masses, between those of 200 sweeps and 1; 200 sweeps solve exactly."""
+    law = replace(LIVER, tangent_cap=60.0)
+    mesh = box_mesh((0.02, 0.01, 0.01), (2, 1, 1))
+    material = Material(5000.0, 1060.0, 0.45, law, relaxation)
+    model = compile_organ(OrganSpec(mesh, material, damping=Damping(0.0)))
+    state = strained(model, 0.3)
+    dt = stable_dt(model)
+    span = np.diff(state.node_position[model.spring_nodes], axis=1)[:, 0]
+    length = np.linalg.norm(span, axis=1)
+    strain = length / model.spring_rest_length - 1.0
+    gain = 1.0 if relaxation is None else relaxation.instantaneous
+    steep = np.abs(strain) > law.onset_strain + STEEP_SHARE * law.width
+    tangent = STEEP_HOLD * gain * model.spring_stiffness * np.where(steep, law.tangent(strain) - 1.0, 0.0)
+    along = np.zeros((len(span), len(mesh.points), 3))
+    rows = np.arange(len(span))
+    along[rows, model.spring_nodes[:, 1]] = span / length[:, None]
+    along[rows, model.spring_nodes[:, 0]] = -span / length[:, None]
+    along = (along / np.sqrt(model.node_mass)[:, None]).reshape(len(span), -1)
+    exact = np.linalg.inv(np.eye(along.shape[1]) + dt**2 * along.T @ (tangent[:, None] * along))
+    assert np.linalg.eigvalsh(exact)[0] < 0.05
+    np.testing.assert_allclose(held(model, state, 2000, dt), exact, rtol=0, atol=1e-6)
+    for sweeps in (2, 4, 12):
+        changed = held(model, state, sweeps, dt)
+        np.testing.assert_allclose(changed, changed.T, rtol=0, atol=1e-12)
+        assert np.linalg.eigvalsh(changed)[-1] < 1.0 + 1e-12
+        assert np.linalg.eigvalsh(changed - exact)[0] > -1e-12
+
+
+def test_stiffening_costs_at_most_half_as_many_substeps_again():
+    """The laws identified for pig liver have caps of 50 to 71."""
+    linear = stable_dt(block())
+    for cap, share in ((HELD_TANGENT, 0.95), (50.0, 0.8), (71.0, 1.0 / 1.5)):
+        assert stable_dt(block(replace(LIVER, tangent_cap=cap))) > share * linear
+
+
+def test_sweeps_follow_from_the_cap():
+    assert [steep_sweeps(cap) for cap in (1.0, 12.0, 12.1, 24.0, 36.0, 100.0)] == [4, 4, 6, 8, 12, 12]
 
 
 @pytest.mark.parametrize("stiffening", [None, LIVER])

@@ -4,10 +4,8 @@ from numba import njit
 
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
-    STEEP_SHARE,
-    beyond_onset,
+    STEEP_EXCESS,
     spring_length,
-    steep_stiffness,
     tet_shape,
     volume_ratio,
 )
@@ -74,23 +72,24 @@ def hold_squeezed(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def hold_steep(
-    position, velocity, force, inverse_mass, nodes, stiffness, rest_length, growth, onset, excess, gain, relaxes,
-    tet_count, steep, count, width, sweeps, places, rows, speed, dt,
+    position, velocity, force, inverse_mass, nodes, stiffness, steepness, gain, relaxes, tet_count, steep, count, width,
+    sweeps, places, rows, speed, dt,
 ):  # fmt: skip
     """Make what stiffening adds to the tangent of steep springs implicit: tension T + dt K dl/dt at the step's end.
 
-    K = STEEP_HOLD k (c - 1) v^2 (1 + sum g_i); k (c - 1) v^2 alone would limit the step. The tissue kernel has applied
-    T. For the springs strained beyond STEEP_SHARE this one solves for the rest, p = dt K d(l)/dt with the speeds at the
-    end of the step, from the masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs, in
-    order and in reverse in turn, from p = 0. After each pair of sweeps the result is that of symplectic Euler with
+    K = STEEP_HOLD k q (1 + sum g_i), where q is the mean of (c - 1) v^2 of both ends: the tangent of a node's energy
+    over its springs is nowhere above that of springs with q alone, which would limit the step. The tissue kernel has
+    applied T. For the springs with q above STEEP_EXCESS this one solves for the rest, p = dt K d(l)/dt with the speeds
+    at the end of the step, from the masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs,
+    in order and in reverse in turn, from p = 0. After each pair of sweeps the result is that of symplectic Euler with
     larger masses, M <= M' <= M + dt^2 K, symmetric, so that no energy is made; what the sweeps leave is smallest in the
     fast motions, which would limit the step. A spring at rest gets no force, so the static equilibrium does not depend
     on dt.
 
-    In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), nodes (n_spring, 2), stiffness [N/m],
-         rest_length [m], growth [1/m], onset, excess, gain (n_spring,) as in `OrganModel`, relaxes, tet_count: springs
-         that come with a tet, steep: the first of each `width` springs in a row among which one is steep, count:
-         entries of `steep`, width, sweeps: an even number, dt [s]
+    In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), nodes (n_spring, 2), stiffness [N/m]
+         (n_spring,), steepness (n_node,) of `node_law`, gain (n_spring,) as in `OrganModel`, relaxes, tet_count:
+         springs that come with a tet, steep: the first of each `width` springs in a row among which one is steep,
+         count: entries of `steep`, width, sweeps: an even number, dt [s]
     Out: force, added to [N] (n_node, 3); scratch: places (n_spring,), rows (n_spring, STEEP_WIDTH), speed [m/s]
          (n_node, 3)
     """
@@ -99,12 +98,12 @@ def hold_steep(
         begin = steep[entry]
         for spring in range(begin, min(begin + width, tet_count if begin < tet_count else nodes.shape[0])):
             i, j = nodes[spring, 0], nodes[spring, 1]
-            x, y, z = _edge(position, i, j)
-            rest, length = rest_length[spring], spring_length(x, y, z)
-            beyond = beyond_onset(length, rest, growth[spring], onset[spring])
-            if not beyond > STEEP_SHARE:
+            more = 0.5 * (steepness[i] + steepness[j])
+            if not more > STEEP_EXCESS:
                 continue
-            tangent = STEEP_HOLD * stiffness[spring] * steep_stiffness(beyond, rest, growth[spring], excess[spring])
+            x, y, z = _edge(position, i, j)
+            length = spring_length(x, y, z)
+            tangent = STEEP_HOLD * stiffness[spring] * more
             if relaxes:
                 tangent *= gain[spring]
             places[held] = spring

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import SWEEPS
-from msdm_core.kernels.element_kernels import STEEP_SHARE
+from msdm_core.kernels.element_kernels import STEEP_EXCESS
 from msdm_core.kernels.linear_kernels import multiply_stiffness
 from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -45,14 +45,14 @@ def apply_stiffness(
 def explicit_stiffness(model: OrganModel) -> FloatArray:
     """Largest tangent of each spring that the step must bear, Maxwell arms included [N/m], shape (n_spring,).
 
-    What stiffening adds beyond STEEP_SHARE is integrated implicitly (`squeeze_kernels.hold_steep`), which holds a
+    What stiffening adds beyond STEEP_EXCESS is integrated implicitly (`squeeze_kernels.hold_steep`), which holds a
     tangent of up to HELD_TANGENT times that at rest; a larger cap c counts as c / HELD_TANGENT, so that the step is
     shorter by its root.
     """
     stiffness = model.spring_stiffness
     if model.stiffens:
-        rise = model.spring_excess * model.spring_growth * model.spring_rest_length
-        stiffness = stiffness * (1.0 + STEEP_SHARE**2 * rise) * np.maximum((1.0 + rise) / HELD_TANGENT, 1.0)
+        rise = (model.node_excess * model.node_growth)[model.spring_nodes].mean(axis=1)
+        stiffness = stiffness * (1.0 + np.minimum(rise, STEEP_EXCESS)) * np.maximum((1.0 + rise) / HELD_TANGENT, 1.0)
     return stiffness * model.spring_gain if model.relaxes else stiffness
 
 

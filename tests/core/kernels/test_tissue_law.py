@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels.element_kernels import STEEP_SHARE
+from msdm_core.kernels.element_kernels import STEEP_EXCESS
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
 from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.lanes.lanes import (
@@ -23,7 +23,14 @@ from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, relax_arms, rest_state
-from msdm_core.organ.measure import angular_momentum, internal_forces, kinetic_energy, potential_energy
+from msdm_core.organ.measure import (
+    angular_momentum,
+    internal_forces,
+    kinetic_energy,
+    potential_energy,
+    spring_energies,
+    spring_tensions,
+)
 from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 
@@ -63,13 +70,25 @@ def strained(model: OrganModel, size: float, seed: int = 0) -> OrganState:
     return state
 
 
+def equivalent_strain(model: OrganModel, state: OrganState) -> FloatArray:
+    """s_a^2 = 5 sum k (l - l0)^2 / sum k l0^2 over the springs of node a, by a loop, (n_node,)."""
+    strained, rest = np.zeros(len(model.node_mass)), np.zeros(len(model.node_mass))
+    for (i, j), k, l0 in zip(model.spring_nodes, model.spring_stiffness, model.spring_rest_length, strict=True):
+        length = np.linalg.norm(state.node_position[i] - state.node_position[j])
+        for node in (i, j):
+            strained[node] += 5.0 * k * (length - l0) ** 2
+            rest[node] += k * l0**2
+    return np.sqrt(strained / rest)
+
+
 def spring_forces(model: OrganModel, state: OrganState, law: Stiffening, gain: float) -> FloatArray:
-    """Forces of springs of one material, the tension from `Stiffening.tension`."""
+    """Forces of springs of one material, times the mean over both ends of `Stiffening.tension` over strain."""
     ends = state.node_position[model.spring_nodes]
     span = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(span, axis=1)
-    rest = model.spring_rest_length
-    tension = gain * model.spring_stiffness * rest * law.tension(length / rest - 1.0)
+    strain = equivalent_strain(model, state)
+    ratio = (law.tension(strain) / strain)[model.spring_nodes].mean(axis=1)
+    tension = gain * model.spring_stiffness * (length - model.spring_rest_length) * ratio
     pull = span * (tension / length)[:, None]
     force = np.zeros_like(state.node_position)
     np.add.at(force, model.spring_nodes[:, 0], pull)
@@ -88,6 +107,35 @@ def test_forces_are_those_of_the_law(size: float, relaxation: Relaxation | None)
     )
     expected = spring_forces(model, state, LIVER, gain) + volume
     np.testing.assert_allclose(internal_forces(model, state), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("size", [0.02, 0.1, 0.3])
+def test_tensions_are_the_gradient_of_the_energy(size: float):
+    lesion = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, replace(LIVER, tangent_cap=60.0)))
+    model = block(LIVER, lesions=(lesion,))
+    ends = strained(model, size).node_position[model.spring_nodes]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    change = 1e-5 * length * np.random.default_rng(1).uniform(-1.0, 1.0, len(length))
+    slope = 0.5 * (spring_energies(model, length + change).sum() - spring_energies(model, length - change).sum())
+    assert slope == pytest.approx(spring_tensions(model, length) @ change, rel=1e-6)
+
+
+@pytest.mark.parametrize("strain", [-0.1, 0.05, 0.15])
+def test_the_equivalent_strain_of_a_bar_is_its_strain(strain: float):
+    """Along an axis and along a diagonal of the lattice, at constant volume: |e| within second order of it."""
+    model = block(LIVER)
+    cell = SIZE[0] / CELLS[0]
+    place = model.node_rest_position
+    inner = ((place > 1.01 * cell) & (place < np.array(SIZE) - 1.01 * cell)).all(axis=1)
+    assert inner.sum() > 8
+    for along in ((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (1.0, 2.0, 0.0)):
+        axis = np.array(along) / np.linalg.norm(along)
+        across = (1.0 + strain) ** -0.5
+        gradient = across * np.eye(3) + (1.0 + strain - across) * np.outer(axis, axis)
+        state = blank_state(model)
+        state.node_position[:] = model.node_rest_position @ gradient
+        found = equivalent_strain(model, state)[inner]
+        np.testing.assert_allclose(found, abs(strain), rtol=0, atol=strain**2)
 
 
 def test_tangent_is_the_slope_of_the_tension():
@@ -185,7 +233,7 @@ def test_lanes_move_as_organs_alone(dtype: type):
 def test_organs_with_and_without_a_law_do_not_share_lanes():
     with pytest.raises(OrganError, match="another stiffens"):
         stack_organs([block(LIVER), block()])
-    with pytest.raises(OrganError, match="another spring_onset"):
+    with pytest.raises(OrganError, match="another node_onset"):
         stack_organs([block(LIVER), block(replace(LIVER, onset_strain=0.05))])
     with pytest.raises(OrganError, match="another spring_gain"):
         stack_organs([block(None, ARMS), block(None, Relaxation((0.3,), (1.0,)))])
@@ -245,6 +293,7 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
         forces.append(internal_forces(model, state)[top, 2].sum())
     length = np.linalg.norm(np.diff(state.node_position[model.spring_nodes], axis=1)[:, 0], axis=1)
     assert np.abs(length / model.spring_rest_length - 1.0).max() > LIVER.cap_strain
+    assert np.median(equivalent_strain(model, state)) > LIVER.cap_strain
     assert forces[0] == pytest.approx(forces[1], rel=5e-3)
 
 
@@ -256,8 +305,7 @@ def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatA
         velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
         hold_steep(
             state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes, model.spring_stiffness,
-            model.spring_rest_length, model.spring_growth, model.spring_onset, model.spring_excess, model.spring_gain,
-            model.relaxes, len(model.tet_nodes), every, len(every), 1, sweeps,
+            state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes), every, len(every), 1, sweeps,
             state.steep_places, state.steep_rows, state.steep_speed, dt,
         )  # fmt: skip
         columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
@@ -275,10 +323,10 @@ def test_steep_springs_are_held_as_by_larger_masses(relaxation: Relaxation | Non
     dt = stable_dt(model)
     span = np.diff(state.node_position[model.spring_nodes], axis=1)[:, 0]
     length = np.linalg.norm(span, axis=1)
-    strain = length / model.spring_rest_length - 1.0
+    state.node_steepness[:] = law.tangent(equivalent_strain(model, state)) - 1.0
     gain = 1.0 if relaxation is None else relaxation.instantaneous
-    steep = np.abs(strain) > law.onset_strain + STEEP_SHARE * law.width
-    tangent = STEEP_HOLD * gain * model.spring_stiffness * np.where(steep, law.tangent(strain) - 1.0, 0.0)
+    more = state.node_steepness[model.spring_nodes].mean(axis=1)
+    tangent = STEEP_HOLD * gain * model.spring_stiffness * np.where(more > STEEP_EXCESS, more, 0.0)
     along = np.zeros((len(span), len(mesh.points), 3))
     rows = np.arange(len(span))
     along[rows, model.spring_nodes[:, 1]] = span / length[:, None]
@@ -322,14 +370,14 @@ def test_the_stable_step_counts_arms_and_stiffening(stiffening: Stiffening | Non
 def test_a_tet_cut_by_a_lesion_has_the_mean_of_both_laws():
     stiff = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, LIVER))
     model, healthy = block(lesions=(stiff,)), block(LIVER, lesions=(stiff,))
-    stiffens = model.spring_excess > 0.0
-    cut = stiffens & (model.spring_excess < (1.0 - 1e-9) * (LIVER.tangent_cap - 1.0) * LIVER.width)
+    stiffens = model.node_excess > 0.0
+    cut = stiffens & (model.node_excess < (1.0 - 1e-9) * (LIVER.tangent_cap - 1.0) * LIVER.width)
     assert cut.any()
     assert model.stiffens and stiffens.any() and not stiffens.all()
     # The onset and the width are those of the only law there is.
-    np.testing.assert_allclose(model.spring_onset[stiffens], LIVER.onset_strain / LIVER.width)
-    np.testing.assert_allclose((model.spring_growth * model.spring_rest_length)[stiffens], 1.0 / LIVER.width)
-    assert (model.spring_excess <= healthy.spring_excess * (1.0 + 1e-12)).all()
+    np.testing.assert_allclose(model.node_onset[stiffens], LIVER.onset_strain)
+    np.testing.assert_allclose(model.node_growth[stiffens], 1.0 / LIVER.width)
+    assert (model.node_excess <= healthy.node_excess * (1.0 + 1e-12)).all()
 
 
 @pytest.mark.parametrize(

@@ -6,17 +6,18 @@ agree to the bit where they add in the same order.
 
 from numba import njit
 
-from msdm_core.kernels.vector_kernels import any_below, below_zero, keep_lower, root
+from msdm_core.kernels.vector_kernels import any_below, below_zero, root
 
 # Below this volume ratio s a tet also bears the share K' of its volume term that is averaged at nodes, by a pressure
 # that steepens: an average alone lets single tets collapse between swollen neighbours. Its energy
 # K' s V0 ((J - s) - s ln(J / s)) is unbounded at J = 0. With a linear term instead, tets inverted at 50 to 80 % of the
 # force.
 SQUEEZED_RATIO = 0.6
-# A spring strained further than this share of the way from its onset strain to its cap strain is steep: the tangent
-# beyond that of the linear spring is integrated implicitly. Below, it is at most 1 + 0.0009 (c - 1) times as stiff,
-# which `stability.stable_dt` counts.
-STEEP_SHARE = 0.03
+# Springs are steep where stiffening adds more than this to their tangent over that at rest: what it adds is then
+# integrated implicitly. Below, the step bears it, which `stability.stable_dt` counts.
+STEEP_EXCESS = 0.1
+# Added to a strain that is divided by.
+STRAIN_LEAST = 1e-30
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -36,34 +37,43 @@ def spring_scale(share, stiffness):
 
 
 @njit(forceinline=True, error_model="numpy")
-def beyond_onset(length, rest_length, growth, onset):
-    """How far a spring is strained beyond its onset strain, u = (|e| - e0) / (e1 - e0) (`Stiffening`).
-
-    In: length l, rest_length l0 [m], growth 1 / (l0 (e1 - e0)) [1/m], onset e0 / (e1 - e0)
-    Returns u, negative below the onset.
-    """
+def spring_energy(length, rest_length, stiffness):
+    """Twice the energy of a linear spring, k (l - l0)^2 [J]."""
     change = length - rest_length
-    return (change - 2.0 * below_zero(change)) * growth - onset
+    return stiffness * change * change
 
 
 @njit(forceinline=True, error_model="numpy")
-def excess_scale(length, rest_length, share, beyond, excess):
-    """Force over length and stiffness that stiffening adds, sign(e) (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) l0 / l.
+def node_strain(energy, softness):
+    """Equivalent strain of a node, s = sqrt(5 sum k (l - l0)^2 / sum k l0^2) over its springs (`Stiffening`).
 
-    In: length l, rest_length l0 [m], share l0 / l, beyond u, of which v is the part within 0 and 1, excess
-        (c - 1) (e1 - e0)
+    In: energy: sum k (l - l0)^2 [J], softness: 5 / sum k l0^2 [1/J]
     """
+    return root(energy * softness)
+
+
+@njit(forceinline=True, error_model="numpy")
+def node_law(strain, onset, growth, excess):
+    """What stiffening adds around a node, over what linear springs have, to tension and to tangent.
+
+    (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) / s and (c - 1) v^2, with u = (s - e0) / (e1 - e0) and v its part within 0, 1.
+
+    In: strain s, onset e0, growth 1 / (e1 - e0), excess (c - 1) (e1 - e0)
+    """
+    beyond = (strain - onset) * growth
     over = beyond - below_zero(beyond)
     ramp = 1.0 + below_zero(over - 1.0)
     size = ramp * ramp * ramp * (1.0 / 3.0) + (over - ramp)
-    return excess * keep_lower(length, rest_length, size * -1.0, size) * share
+    return excess * size / (strain + STRAIN_LEAST), excess * growth * ramp * ramp
 
 
 @njit(forceinline=True, error_model="numpy")
-def steep_stiffness(beyond, rest_length, growth, excess):
-    """Tangent over stiffness that stiffening adds to a spring, (c - 1) v^2; arguments as in `excess_scale`, numbers."""
-    ramp = min(max(beyond, 0.0), 1.0)
-    return excess * growth * rest_length * ramp * ramp
+def stiffened(scale, rises):
+    """Force over length of a spring whose ends stiffen, T (1 + (r_a + r_b) / 2) / l.
+
+    In: scale: of the linear spring, T / l [N/m], rises: r_a + r_b of its two ends
+    """
+    return scale * (1.0 + 0.5 * rises)
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -9,12 +9,13 @@ from numba import njit
 
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
-    STEEP_SHARE,
-    beyond_onset,
-    excess_scale,
+    node_law,
+    node_strain,
     six_volumes,
+    spring_energy,
     spring_length,
     spring_scale,
+    stiffened,
     tet_gradients,
     tet_scale,
     volume_ratio,
@@ -122,13 +123,78 @@ def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
     store_full(relief, first, total)
 
 
+@njit(forceinline=True, error_model="numpy")
+def _rises(rise, items, first):
+    """Sum of a number of the two ends of eight springs."""
+    return pack(
+        rise[items[first, 0]] + rise[items[first, 1]], rise[items[first + 1, 0]] + rise[items[first + 1, 1]],
+        rise[items[first + 2, 0]] + rise[items[first + 2, 1]], rise[items[first + 3, 0]] + rise[items[first + 3, 1]],
+        rise[items[first + 4, 0]] + rise[items[first + 4, 1]], rise[items[first + 5, 0]] + rise[items[first + 5, 1]],
+        rise[items[first + 6, 0]] + rise[items[first + 6, 1]], rise[items[first + 7, 0]] + rise[items[first + 7, 1]],
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_to_ends(total, items, item, value):
+    """Add a number to both ends of a spring."""
+    total[items[item, 0]] += value
+    total[items[item, 1]] += value
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_energies(energy, items, first, value):
+    """Add the numbers of eight springs to their ends."""
+    _add_to_ends(energy, items, first, _at_0(value))
+    _add_to_ends(energy, items, first + 1, _at_1(value))
+    _add_to_ends(energy, items, first + 2, _at_2(value))
+    _add_to_ends(energy, items, first + 3, _at_3(value))
+    _add_to_ends(energy, items, first + 4, _at_4(value))
+    _add_to_ends(energy, items, first + 5, _at_5(value))
+    _add_to_ends(energy, items, first + 6, _at_6(value))
+    _add_to_ends(energy, items, first + 7, _at_7(value))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_energy_groups(position, energy, nodes, stiffness, rest_length, begin):
+    """Energies of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_energies`.
+
+    Returns the first spring that is in no whole group.
+    """
+    whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
+    for first in range(begin, whole, GROUP):
+        x, y, z = _edges(position, nodes, first, 1)
+        length = spring_length(x, y, z)
+        _add_energies(
+            energy, nodes, first, spring_energy(length, load_full(rest_length, first), load_full(stiffness, first))
+        )
+    return whole
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_rise_groups(energy, softness, onset, growth, excess, rise, steepness):
+    """`tissue_kernels.set_rises` of whole groups of nodes; returns the first node in none, whether one has a rise."""
+    whole = energy.shape[0] // GROUP * GROUP
+    stiffens = False
+    for first in range(0, whole, GROUP):
+        strain = node_strain(load_full(energy, first), load_full(softness, first))
+        more, steeper = strain * 0.0, strain * 0.0
+        if any_below(load_full(onset, first) - strain, 0.0):
+            more, steeper = node_law(
+                strain, load_full(onset, first), load_full(growth, first), load_full(excess, first)
+            )
+            stiffens = True
+        store_full(rise, first, more)
+        store_full(steepness, first, steeper)
+    return whole, stiffens
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count):
     """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
 
     Returns the first spring that is in no whole group, and how many entries `law.steep` has.
     """
-    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     springs = nodes.shape[0]
@@ -144,12 +210,11 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
         rigidity = load_full(stiffness, first)
         scale = spring_scale(share, rigidity)
         if stiffens:
-            beyond = beyond_onset(length, rest, load_full(growth, first), load_full(onset, first))
-            if any_below(beyond * -1.0, 0.0):
-                scale = scale + rigidity * excess_scale(length, rest, share, beyond, load_full(excess, first))
-                if any_below(beyond * -1.0, -STEEP_SHARE):
-                    steep[steep_count] = first
-                    steep_count += 1
+            rises = _rises(rise, nodes, first)
+            scale = stiffened(scale, rises)
+            if any_below(rises * -1.0, -steep_rise):
+                steep[steep_count] = first
+                steep_count += 1
         if relaxes:
             if fades:
                 _fade_arms(arm_modulus, arm_tension, relief, springs, first, scale / share, fade)
@@ -166,28 +231,32 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sum_volume_groups(position, total, tets):
-    """Six times the volume of each tet of whole groups, added up at its corners [m^3].
+def sum_tet_groups(position, total, energy, tets, stiffness, rest_length, averages, stiffens):
+    """Sums at nodes over whole groups of tets; arguments as in `tissue_kernels.sum_at_nodes`.
 
-    In:  position [m] (n_node, 4), tets (n_tet, 4)
-    Out: total, added to [m^3] (n_node,)
     Returns the first tet that is in no whole group.
     """
     whole = tets.shape[0] // GROUP * GROUP
     for first in range(0, whole, GROUP):
         bx, by, bz = _edges(position, tets, first, 1)
-        cx, cy, cz = _edges(position, tets, first, 2)
-        dx, dy, dz = _edges(position, tets, first, 3)
-        g = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
-        six = six_volumes(bx, by, bz, g[0], g[1], g[2])
-        add_to_corners((), total, tets, first, _at_0(six))
-        add_to_corners((), total, tets, first + 1, _at_1(six))
-        add_to_corners((), total, tets, first + 2, _at_2(six))
-        add_to_corners((), total, tets, first + 3, _at_3(six))
-        add_to_corners((), total, tets, first + 4, _at_4(six))
-        add_to_corners((), total, tets, first + 5, _at_5(six))
-        add_to_corners((), total, tets, first + 6, _at_6(six))
-        add_to_corners((), total, tets, first + 7, _at_7(six))
+        if averages:
+            cx, cy, cz = _edges(position, tets, first, 2)
+            dx, dy, dz = _edges(position, tets, first, 3)
+            g = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
+            six = six_volumes(bx, by, bz, g[0], g[1], g[2])
+            add_to_corners((), total, tets, first, _at_0(six))
+            add_to_corners((), total, tets, first + 1, _at_1(six))
+            add_to_corners((), total, tets, first + 2, _at_2(six))
+            add_to_corners((), total, tets, first + 3, _at_3(six))
+            add_to_corners((), total, tets, first + 4, _at_4(six))
+            add_to_corners((), total, tets, first + 5, _at_5(six))
+            add_to_corners((), total, tets, first + 6, _at_6(six))
+            add_to_corners((), total, tets, first + 7, _at_7(six))
+        if stiffens:
+            length = spring_length(bx, by, bz)
+            _add_energies(
+                energy, tets, first, spring_energy(length, load_full(rest_length, first), load_full(stiffness, first))
+            )
     return whole
 
 
@@ -201,7 +270,7 @@ def add_tet_groups(
     Returns the first tet that is in no whole group, how many groups have a squeezed tet, and how many entries
     `law.steep` has.
     """
-    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     springs = stiffness.shape[0]
@@ -230,12 +299,11 @@ def add_tet_groups(
         rigidity = load_full(stiffness, first)
         pull = spring_scale(share, rigidity)
         if stiffens:
-            beyond = beyond_onset(length, rest, load_full(growth, first), load_full(onset, first))
-            if any_below(beyond * -1.0, 0.0):
-                pull = pull + rigidity * excess_scale(length, rest, share, beyond, load_full(excess, first))
-                if any_below(beyond * -1.0, -STEEP_SHARE):
-                    steep[steep_count] = first
-                    steep_count += 1
+            rises = _rises(rise, tets, first)
+            pull = stiffened(pull, rises)
+            if any_below(rises * -1.0, -steep_rise):
+                steep[steep_count] = first
+                steep_count += 1
         if relaxes:
             if fades:
                 _fade_arms(arm_modulus, arm_tension, relief, springs, first, pull / share, fade)

@@ -35,9 +35,12 @@ class OrganModel(NamedTuple):
         spring_stiffness: [N/m]                                                  (n_spring,)
         spring_rest_length: [m]                                                  (n_spring,)
         stiffens: whether any spring stiffens with strain                        scalar
-        spring_growth: 1 / (l0 (e1 - e0)), of its `Stiffening` [1/m]             (n_spring,), (0,) if none stiffens
-        spring_onset: e0 / (e1 - e0)                                             likewise
-        spring_excess: (c - 1) (e1 - e0)                                         likewise
+        node_softness: 5 / sum of k l0^2 over the springs of a node [1/J]        (n_node,), (0,) if none stiffens
+        node_onset: e0 of its `Stiffening`                                       likewise
+        node_growth: 1 / (e1 - e0)                                               likewise
+        node_excess: (c - 1) (e1 - e0)                                           likewise
+        steep_rise: the least rise of a node with a steepness of STEEP_EXCESS    scalar
+        steep_sweeps: of `hold_steep`                                            scalar
         relaxes: whether any spring has Maxwell arms                             scalar
         spring_gain: tension at once over that at equilibrium, 1 + sum g_i       (n_spring,), (0,) if none relaxes
         spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring,), likewise
@@ -77,9 +80,12 @@ class OrganModel(NamedTuple):
     spring_stiffness: FloatArray
     spring_rest_length: FloatArray
     stiffens: bool
-    spring_growth: FloatArray
-    spring_onset: FloatArray
-    spring_excess: FloatArray
+    node_softness: FloatArray
+    node_onset: FloatArray
+    node_growth: FloatArray
+    node_excess: FloatArray
+    steep_rise: float
+    steep_sweeps: int
     relaxes: bool
     spring_gain: FloatArray
     spring_arm_modulus: FloatArray
@@ -128,7 +134,12 @@ class OrganState(NamedTuple):
         row_velocity: scratch: likewise                                          (n_node, 4)
         row_force: scratch: likewise                                             (n_node, 4)
         squeezed_tets: scratch: where tets are squeezed below SQUEEZED_RATIO     (n_tet,)
-        steep_springs: scratch: where springs are strained beyond STEEP_SHARE    (n_spring,), (0,) if none stiffens
+        node_energy: scratch: sum of k (l - l0)^2 over a node's springs [J]      (n_node,), (0,) if none stiffens
+        node_rise, node_steepness: scratch: `element_kernels.node_law`           likewise
+        steep_springs: scratch: where springs are steep                          (n_spring,), (0,) if none stiffens
+        steep_places: scratch: those springs, see squeeze_kernels                (n_spring,), likewise
+        steep_rows: scratch: likewise                                            (n_spring, STEEP_WIDTH), likewise
+        steep_speed: scratch: speed that their nodes get to [m/s]                (n_node, 3), (0, 3) if none stiffens
         spring_arm_tension: what each arm has given way to, over l0, arm by arm [N/m] (3 * n_spring,), (0,) without arms
         spring_relief: sum_i g_i times that [N/m]                                (n_spring,), (0,) without arms
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
@@ -155,7 +166,13 @@ class OrganState(NamedTuple):
     row_velocity: FloatArray
     row_force: FloatArray
     squeezed_tets: NDArray[np.int32]
+    node_energy: FloatArray
+    node_rise: FloatArray
+    node_steepness: FloatArray
     steep_springs: NDArray[np.int32]
+    steep_places: NDArray[np.int32]
+    steep_rows: FloatArray
+    steep_speed: FloatArray
     spring_arm_tension: FloatArray
     spring_relief: FloatArray
     contact_engaged: NDArray[np.uint8]
@@ -176,7 +193,8 @@ class OrganState(NamedTuple):
 
 # Written anew in every call: need not be saved.
 SCRATCH_FIELDS = (
-    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets", "steep_springs"),
+    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets"),
+    *("node_energy", "node_rise", "node_steepness", "steep_springs", "steep_places", "steep_rows", "steep_speed"),
     *("contact_candidates", "contact_rows", "contact_places", "contact_hold"),
     *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept"),
 )
@@ -195,8 +213,9 @@ class LaneModel(NamedTuple):
         spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
         spring_stiffness: [N/m]                                                  (n_spring, n_lane)
         spring_rest_length: [m]                                                  (n_spring,) or own
-        stiffens, spring_onset, spring_excess, relaxes, spring_gain, spring_arm_modulus, arm_time: as in OrganModel
-        spring_growth: as in OrganModel [1/m]                                    (n_spring,) or own, (0,) if none
+        stiffens, node_onset, node_growth, node_excess, steep_rise, steep_sweeps: as in OrganModel
+        node_softness: as in OrganModel [1/J]                                    (n_node, n_lane), (0, n_lane)
+        relaxes, spring_gain, spring_arm_modulus, arm_time: as in OrganModel
         tet_nodes: corners of each tet                                           (n_tet, 4)
         tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,) or own
         tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet, n_lane)
@@ -224,9 +243,12 @@ class LaneModel(NamedTuple):
     spring_stiffness: LaneArray
     spring_rest_length: FloatArray
     stiffens: bool
-    spring_growth: FloatArray
-    spring_onset: FloatArray
-    spring_excess: FloatArray
+    node_softness: LaneArray
+    node_onset: FloatArray
+    node_growth: FloatArray
+    node_excess: FloatArray
+    steep_rise: float
+    steep_sweeps: int
     relaxes: bool
     spring_gain: FloatArray
     spring_arm_modulus: FloatArray
@@ -276,7 +298,9 @@ class LaneState(NamedTuple):
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
-        steep_springs: scratch: springs that a lane has strained beyond STEEP_SHARE (n_spring,), (0,) if none stiffens
+        node_energy, node_rise, node_steepness: scratch: as in OrganState        (n_node, n_lane), (0, n_lane)
+        steep_springs: scratch: springs that are steep in a lane                 (n_spring,), (0,) if none stiffens
+        steep_places, steep_rows, steep_speed: scratch of one lane after the other, as in OrganState
         spring_arm_tension: as in OrganState [N/m]                               (3 * n_spring, n_lane)
         spring_relief: as in OrganState [N/m]                                    (n_spring, n_lane)
         kept_force: scratch: node_force of the lanes that do not move [N]        (n_node, 3, n_lane)
@@ -302,7 +326,13 @@ class LaneState(NamedTuple):
     support_stretch: FloatArray
     node_tension: LaneArray
     squeezed_tets: NDArray[np.int32]
+    node_energy: LaneArray
+    node_rise: LaneArray
+    node_steepness: LaneArray
     steep_springs: NDArray[np.int32]
+    steep_places: NDArray[np.int32]
+    steep_rows: FloatArray
+    steep_speed: FloatArray
     spring_arm_tension: LaneArray
     spring_relief: LaneArray
     kept_force: LaneArray
@@ -375,18 +405,19 @@ class SpringLaw(NamedTuple):
     """How springs depart from linear ones in one substep: fields of model and state, and what the arms lose.
 
     Fields:
-        stiffens, growth, onset, excess: `stiffens`, `spring_growth`, `spring_onset` and `spring_excess` of the model
+        stiffens: whether any node has a rise
+        rise, steep: `node_rise`, `steep_springs` of the state
+        steep_rise: of the model
         relaxes, gain, arm_modulus: `relaxes`, `spring_gain` and `spring_arm_modulus` of the model
         arm_tension, relief: `spring_arm_tension` and `spring_relief` of the state
         fades: whether the arms give way in this substep
         fade: share of its tension that each arm then loses
-        steep: `steep_springs` of the state
     """
 
     stiffens: bool
-    growth: FloatArray
-    onset: FloatArray
-    excess: FloatArray
+    rise: LaneArray
+    steep: NDArray[np.int32]
+    steep_rise: float
     relaxes: bool
     gain: FloatArray
     arm_modulus: FloatArray
@@ -394,7 +425,6 @@ class SpringLaw(NamedTuple):
     relief: LaneArray
     fades: bool
     fade: tuple[float, float, float]
-    steep: NDArray[np.int32]
 
 
 class _Surface(NamedTuple):
@@ -570,7 +600,9 @@ def in_rows(lanes, state):
     return OrganState(
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
         state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
-        state.steep_springs, state.spring_arm_tension, state.spring_relief,
+        state.node_energy, state.node_rise, state.node_steepness,
+        state.steep_springs, state.steep_places, state.steep_rows, state.steep_speed,
+        state.spring_arm_tension, state.spring_relief,
         state.contact_engaged, state.contact_stretch, state.contact_candidates,
         state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         state.support_stretch, state.volume_ratio_smallest,

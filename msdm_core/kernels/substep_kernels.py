@@ -34,6 +34,7 @@ from msdm_core.kernels.structure_kernels import (
 )
 from msdm_core.kernels.support_kernels import add_support_forces
 from msdm_core.kernels.tissue_kernels import (
+    add_energies,
     add_spring_damping,
     add_spring_forces,
     add_tet_forces,
@@ -43,6 +44,8 @@ from msdm_core.kernels.tissue_kernels import (
     integrate,
     put_back,
     set_gravity,
+    set_rises,
+    sum_at_nodes,
 )
 
 # How often the Maxwell arms of springs give way [s]: their shortest time is as long, and usually much longer.
@@ -137,13 +140,32 @@ def _evaluate(model, state, fades, fade_duration):
             faded_share(fade_duration, time[0]), faded_share(fade_duration, time[1]),
             faded_share(fade_duration, time[2]),
         )  # fmt: skip
-    law = SpringLaw(
-        model.stiffens, model.spring_growth, model.spring_onset, model.spring_excess,
-        model.relaxes, model.spring_gain, model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief,
-        fades, fade, state.steep_springs,
-    )  # fmt: skip
     lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
     position, velocity, force, tension = state.node_position, state.node_velocity, state.node_force, state.node_tension
+    averages, stiffens = _averages(lanes, model.averages_volume), model.stiffens
+    tension[:] = 0.0
+    if averages or stiffens:
+        state.node_energy[:] = 0.0
+        sum_at_nodes(
+            lanes, position, tension, state.node_energy, tets, model.spring_stiffness, model.spring_rest_length,
+            averages, stiffens,
+        )  # fmt: skip
+    if averages:
+        average_volumes(lanes, position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
+    if stiffens:
+        add_energies(
+            lanes, position, state.node_energy, model.spring_nodes, model.spring_stiffness, model.spring_rest_length,
+            tets.shape[0],
+        )  # fmt: skip
+        stiffens = set_rises(
+            lanes, state.node_energy, model.node_softness, model.node_onset, model.node_growth, model.node_excess,
+            state.node_rise, state.node_steepness,
+        )  # fmt: skip
+    law = SpringLaw(
+        stiffens, state.node_rise, state.steep_springs, model.steep_rise,
+        model.relaxes, model.spring_gain, model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief,
+        fades, fade,
+    )  # fmt: skip
     set_gravity(lanes, force, model.node_mass, model.gravity)
     steep_count = add_spring_forces(
         lanes, position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0],
@@ -151,9 +173,6 @@ def _evaluate(model, state, fades, fade_duration):
     )  # fmt: skip
     if beta > 0.0:
         add_spring_damping(lanes, position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
-    tension[:] = 0.0
-    if _averages(lanes, model.averages_volume):
-        average_volumes(lanes, position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
     squeezed_count, steep_count = add_tet_forces(
         lanes, position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
         model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
@@ -278,10 +297,10 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
         if steep_count > 0:
             hold_steep(
                 position, velocity, force, surface.node_inverse_mass, model.spring_nodes,
-                column_of(model.spring_stiffness, lane), column_of(model.spring_rest_length, lane),
-                column_of(model.spring_growth, lane), model.spring_onset, model.spring_excess, model.spring_gain,
+                column_of(model.spring_stiffness, lane), column_of(state.node_steepness, lane), model.spring_gain,
                 model.relaxes, model.tet_nodes.shape[0],
-                state.steep_springs, steep_count, group_width(lanes), dt,
+                state.steep_springs, steep_count, group_width(lanes), model.steep_sweeps,
+                state.steep_places, state.steep_rows, state.steep_speed, dt,
             )  # fmt: skip
         hold_contact(surface, touched, moved, law, dt, decay, points, about, push)
         hold_squeezed(

@@ -9,19 +9,27 @@ from numba import njit
 
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
-    STEEP_SHARE,
-    beyond_onset,
-    excess_scale,
+    node_law,
+    node_strain,
     node_tension,
     six_rates,
     spring_drag,
+    spring_energy,
     spring_length,
     spring_scale,
+    stiffened,
     tet_scale,
     tet_shape,
     volume_ratio,
 )
-from msdm_core.kernels.group_kernels import GROUP, add_spring_groups, add_tet_groups, sum_volume_groups
+from msdm_core.kernels.group_kernels import (
+    GROUP,
+    add_energy_groups,
+    add_spring_groups,
+    add_tet_groups,
+    set_rise_groups,
+    sum_tet_groups,
+)
 from msdm_core.kernels.layout_kernels import (
     add_to_corners,
     add_to_node,
@@ -108,6 +116,82 @@ def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
 
 
 @njit(forceinline=True, error_model="numpy")
+def _end_sum(lanes, values, items, item):
+    """Sum of the numbers of a spring's two ends."""
+    return load_item(lanes, values, items[item, 0]) + load_item(lanes, values, items[item, 1])
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_to_ends(lanes, total, items, item, value):
+    """Add a number to both ends of a spring."""
+    for end in range(2):
+        node = items[item, end]
+        store_item(lanes, total, node, load_item(lanes, total, node) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_groups_of_energies(lanes, position, energy, nodes, stiffness, rest_length, begin):
+    """`add_energy_groups` for an organ alone; returns the first spring that is left over."""
+    if len(lanes) == 0:
+        return add_energy_groups(position, energy, nodes, stiffness, rest_length, begin)
+    return begin
+
+
+@njit(forceinline=True, error_model="numpy")
+def _energy(lanes, position, items, item, stiffness, rest_length, edge):
+    """`spring_energy` of a spring along an edge."""
+    rest = load_shared(lanes, position, rest_length, item)
+    return spring_energy(spring_length(edge[0], edge[1], edge[2]), rest, load_item(lanes, stiffness, item))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_energies(lanes, position, energy, nodes, stiffness, rest_length, begin):
+    """Twice the energy of linear springs from number `begin` on, k (l - l0)^2, at both ends of each.
+
+    In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin
+    Out: energy, added to [J] (n_node,)
+    """
+    for spring in range(
+        _add_groups_of_energies(lanes, position, energy, nodes, stiffness, rest_length, begin), nodes.shape[0]
+    ):
+        edge = difference(lanes, position, nodes, spring, 1)
+        twice = _energy(lanes, position, nodes, spring, stiffness, rest_length, edge)
+        _add_to_ends(lanes, energy, nodes, spring, twice)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _set_groups_of_rises(lanes, energy, softness, onset, growth, excess, rise, steepness):
+    """`set_rise_groups` for an organ alone; returns the first node left over and whether any rise is above 0."""
+    if len(lanes) == 0:
+        return set_rise_groups(energy, softness, onset, growth, excess, rise, steepness)
+    return 0, False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_rises(lanes, energy, softness, onset, growth, excess, rise, steepness):
+    """What stiffening adds around each node, over what linear springs have, to tension and to tangent (`node_law`).
+
+    In:  energy: sum of k (l - l0)^2 over a node's springs [J], softness [1/J], onset, growth, excess (n_node,) as in
+         `OrganModel`
+    Out: rise, steepness (n_node,)
+    Returns whether any rise is above 0.
+    """
+    first, stiffens = _set_groups_of_rises(lanes, energy, softness, onset, growth, excess, rise, steepness)
+    for node in range(first, energy.shape[0]):
+        strain = node_strain(load_item(lanes, energy, node), load_item(lanes, softness, node))
+        begin = load_shared(lanes, energy, onset, node)
+        more, steeper = strain * 0.0, strain * 0.0
+        if any_below(begin - strain, 0.0):
+            more, steeper = node_law(
+                strain, begin, load_shared(lanes, energy, growth, node), load_shared(lanes, energy, excess, node)
+            )
+            stiffens = True
+        store_item(lanes, rise, node, more)
+        store_item(lanes, steepness, node, steeper)
+    return stiffens
+
+
+@njit(forceinline=True, error_model="numpy")
 def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, steep_count):
     """`add_spring_groups` for an organ alone; returns the first spring that is left over and the entries of `steep`."""
     if len(lanes) == 0:
@@ -157,7 +241,7 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
          which one is strained beyond STEEP_SHARE
     Returns how many entries `law.steep` has.
     """
-    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     first, steep_count = _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, 0)
@@ -169,17 +253,13 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
         rigidity = load_item(lanes, stiffness, spring)
         scale = spring_scale(share, rigidity)
         if stiffens:
-            beyond = beyond_onset(
-                length, rest, load_shared(lanes, position, growth, spring), load_shared(lanes, position, onset, spring)
-            )
-            if any_below(beyond * -1.0, 0.0):
-                more = load_shared(lanes, position, excess, spring)
-                scale = scale + rigidity * excess_scale(length, rest, share, beyond, more)
-                if any_below(beyond * -1.0, -STEEP_SHARE):
-                    entry = begin + (spring - begin) // width * width
-                    if steep_count == 0 or steep[steep_count - 1] != entry:
-                        steep[steep_count] = entry
-                        steep_count += 1
+            rises = _end_sum(lanes, rise, nodes, spring)
+            scale = stiffened(scale, rises)
+            if any_below(rises * -1.0, -steep_rise):
+                entry = begin + (spring - begin) // width * width
+                if steep_count == 0 or steep[steep_count - 1] != entry:
+                    steep[steep_count] = entry
+                    steep_count += 1
         if relaxes:
             if fades:
                 fade_arms(
@@ -205,11 +285,31 @@ def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _sum_groups_of_volumes(lanes, position, total, tets):
-    """`sum_volume_groups` for an organ alone; returns the first tet that is left over."""
+def _sum_groups_of_tets(lanes, position, total, energy, tets, stiffness, rest_length, averages, stiffens):
+    """`sum_tet_groups` for an organ alone; returns the first tet that is left over."""
     if len(lanes) == 0:
-        return sum_volume_groups(position, total, tets)
+        return sum_tet_groups(position, total, energy, tets, stiffness, rest_length, averages, stiffens)
     return 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sum_at_nodes(lanes, position, total, energy, tets, stiffness, rest_length, averages, stiffens):
+    """Six times the volume of each tet added up at its corners, and twice the energy of its spring at its ends.
+
+    In:  position [m] (n_node, 4), tets (n_tet, 4), stiffness [N/m], rest_length [m] (n_spring,), averages, stiffens:
+         which of the two
+    Out: total [m^3], energy [J], added to (n_node,)
+    """
+    for tet in range(
+        _sum_groups_of_tets(lanes, position, total, energy, tets, stiffness, rest_length, averages, stiffens),
+        tets.shape[0],
+    ):
+        if averages:
+            _, six = tet_shape(*three_edges(lanes, position, tets, tet))
+            add_to_corners(lanes, total, tets, tet, six)
+        if stiffens:
+            edge = difference(lanes, position, tets, tet, 1)
+            _add_to_ends(lanes, energy, tets, tet, _energy(lanes, position, tets, tet, stiffness, rest_length, edge))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -231,11 +331,8 @@ def average_volumes(lanes, position, velocity, tension, tets, node_inverse_volum
 
     In:  position [m], velocity [m/s] (n_node, 4), tets (n_tet, 4), node_inverse_volume [1/m^3], node_bulk [Pa]
          (n_node,), beta [s]
-    Out: tension, zero before [Pa] (n_node,)
+    Out: tension: the sums of `sum_at_nodes` before [m^3], [Pa] after (n_node,)
     """
-    for tet in range(_sum_groups_of_volumes(lanes, position, tension, tets), tets.shape[0]):
-        _, six = tet_shape(*three_edges(lanes, position, tets, tet))
-        add_to_corners(lanes, tension, tets, tet, six)
     if beta > 0.0:
         for tet in range(tets.shape[0]):
             gradients, _ = tet_shape(*three_edges(lanes, position, tets, tet))
@@ -288,7 +385,7 @@ def add_tet_forces(
          `add_spring_forces`
     Returns how many entries `squeezed` and `law.steep` have.
     """
-    stiffens, growth, onset, excess, steep = law.stiffens, law.growth, law.onset, law.excess, law.steep
+    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     first, count, steep_count = _add_groups_of_tets(
@@ -314,17 +411,13 @@ def add_tet_forces(
         rigidity = load_item(lanes, stiffness, tet)
         pull = spring_scale(share, rigidity)
         if stiffens:
-            beyond = beyond_onset(
-                length, rest, load_shared(lanes, position, growth, tet), load_shared(lanes, position, onset, tet)
-            )
-            if any_below(beyond * -1.0, 0.0):
-                more = load_shared(lanes, position, excess, tet)
-                pull = pull + rigidity * excess_scale(length, rest, share, beyond, more)
-                if any_below(beyond * -1.0, -STEEP_SHARE):
-                    entry = tet // width * width
-                    if steep_count == 0 or steep[steep_count - 1] != entry:
-                        steep[steep_count] = entry
-                        steep_count += 1
+            rises = _end_sum(lanes, rise, tets, tet)
+            pull = stiffened(pull, rises)
+            if any_below(rises * -1.0, -steep_rise):
+                entry = tet // width * width
+                if steep_count == 0 or steep[steep_count - 1] != entry:
+                    steep[steep_count] = entry
+                    steep_count += 1
         if relaxes:
             if fades:
                 fade_arms(lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], tet, pull / share, fade, moving)

@@ -29,19 +29,23 @@ from msdm_core.kernels.structure_kernels import (
 from msdm_core.kernels.substep_kernels import advance_substeps
 from msdm_core.kernels.vector_kernels import aligned_zeros, lane_counts
 from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.organ.compile import rest_state, support_shape
+from msdm_core.organ.compile import rest_state, steep_scratch, support_shape
 from msdm_core.organ.stepping import unyielding
 
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
+LAW_FIELDS = ("node_energy", "node_rise", "node_steepness")
 ARM_FIELDS = ("spring_arm_tension", "spring_relief")
 CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch")
 
 # Of an organ's arrays, those that each lane has of its own; all others are shared.
-OWN_FIELDS = ("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk")
+OWN_FIELDS = (
+    *("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk"),
+    "node_softness",
+)
 OWN_NUMBERS = ("averages_volume", "stable_step")
 # Fields that follow from the rest shape, shared or each lane's own; and the rows of surface and supports, which depend
 # on the anchors too and of which lanes may have different numbers.
-REST_FIELDS = ("spring_rest_length", "spring_growth", "tet_inverse_volume", "node_inverse_volume")
+REST_FIELDS = ("spring_rest_length", "tet_inverse_volume", "node_inverse_volume")
 ROW_FIELDS = ("surface_triangles", "surface_rest_area", "support_nodes", "support_area")
 COUNTS = ("surface_count", "support_count")
 ALWAYS_SHARED = tuple(
@@ -230,7 +234,8 @@ def lanes_of(
         support_stretch=np.zeros((count, support_nodes, supports, 3)),
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
-        steep_springs=np.zeros(len(first.spring_growth), dtype=np.int32),
+        **{name: aligned_zeros((len(first.node_softness), count), dtype) for name in LAW_FIELDS},
+        **steep_scratch(first),
         **{name: aligned_zeros((len(getattr(states[0], name)), count), dtype) for name in ARM_FIELDS},
         moving=aligned_zeros((1, count), dtype),
         finite_sum=aligned_zeros((1, count), dtype),
@@ -288,7 +293,11 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
     return OrganState(
         **{name: np.array(getattr(state, name)[:, :, lane], dtype=np.float64, order="C") for name in NODE_FIELDS},
         **{name: getattr(state, name)[:, lane].astype(np.float64) for name in ARM_FIELDS},
+        **{name: np.zeros(len(getattr(state, name))) for name in LAW_FIELDS},
         steep_springs=np.zeros_like(state.steep_springs),
+        steep_places=np.zeros_like(state.steep_places),
+        steep_rows=np.zeros_like(state.steep_rows),
+        steep_speed=np.zeros_like(state.steep_speed),
         contact_engaged=state.contact_engaged[lane][points].copy(),
         contact_stretch=state.contact_stretch[lane][points].copy(),
         contact_passed=state.contact_passed[lane].copy(),

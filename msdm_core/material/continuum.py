@@ -1,10 +1,10 @@
 """Solids at finite strain: the continuum of stiffening springs, Fung's and Ogden's, and springs fitted to them.
 
 Springs in all directions that deform with the continuum are the affine micro-sphere model (Miehe, Göktepe and Lulei
-2004, doi 10.1016/j.jmps.2004.03.011): W = c <psi(l)>, the mean over directions N of the energy psi at the stretch
-l = |F N|, psi'(l) = phi(l - 1). With phi(e) = e it has Lame's lambda = mu = c / 15 at small strain. The springs of a
-BCC lattice have seven directions: the quadrature of degree 5 of that mean. Each node is a centre of symmetry, so that
-a homogeneous deformation of the lattice is affine whatever the law.
+2004, doi 10.1016/j.jmps.2004.03.011): W = c <psi(l)>, the mean over directions N of the energy psi at the stretch l =
+|F N|. With linear springs it has Lame's lambda = mu = c / 15 at small strain. Here that mean, not each spring, is
+what stiffens (`Stiffening`). The springs of a BCC lattice have seven directions: the quadrature of degree 5 of the
+mean. Each node is a centre of symmetry, so that a homogeneous deformation of the lattice is affine whatever the law.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,8 @@ from scipy.optimize import least_squares
 from msdm_core.material.tissue_law import TANGENT_CAP_LARGEST, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 
+# The least strain that is divided by.
+STRAIN_LEAST = 1e-12
 # Directions of a quadrature over the sphere: exact to degree 2 DIRECTION_ORDER - 1.
 DIRECTION_ORDER = 12
 
@@ -61,12 +63,15 @@ def determinant_and_cofactor(gradient: FloatArray) -> tuple[FloatArray, FloatArr
 
 @dataclass(frozen=True, eq=False)
 class SpringSolid:
-    """Affine springs and a volume term: W = 15 mu <psi(|F N|)> + (K_t / 2) (J - 1)^2.
+    """Affine springs that stiffen together, and a volume term: W = 3 mu w(s) + (K_t / 2) (J - 1)^2.
+
+    s^2 = 5 <(|F N| - 1)^2> is the equivalent strain of `Stiffening`, and w' its tension; linear springs have
+    3 mu s^2 / 2.
 
     Args:
         shear_modulus: mu at small strain [Pa].
         volume_modulus: K_t = lambda - mu [Pa].
-        stiffening: of the springs, phi(e); None: linear, phi(e) = e.
+        stiffening: of the springs; None: linear.
         directions: N, (n, 3), and their weights (n,); by default the whole sphere.
     """
 
@@ -75,40 +80,47 @@ class SpringSolid:
     stiffening: Stiffening | None = None
     directions: tuple[FloatArray, FloatArray] = sphere_directions()
 
-    def _law(self, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return spring_law(self.stiffening, strain)
-
-    def first_piola(self, gradient: FloatArray) -> FloatArray:
-        """P = 15 mu <phi / l (F N) N^T> + K_t (J - 1) dJ/dF [Pa], (..., 3, 3)."""
+    def _springs(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """F N (..., n, 3), its length |F N|, (..., n), and the stress of linear springs [Pa], (..., 3, 3)."""
         directions, weights = self.directions
         spans = np.einsum("...ij,aj->...ai", gradient, directions)
         stretch = np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
-        scale = 15.0 * self.shear_modulus * weights * self._law(stretch - 1.0)[0] / stretch
+        scale = 15.0 * self.shear_modulus * weights * (1.0 - 1.0 / stretch)
+        return spans, stretch, np.einsum("...a,...ai,aj->...ij", scale, spans, directions, optimize=True)
+
+    def _rise(self, stretch: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Equivalent strain s, and what stiffening adds to tension and to tangent over those of linear springs."""
+        strain = np.sqrt(5.0 * np.einsum("a,...a->...", self.directions[1], (stretch - 1.0) ** 2))
+        if self.stiffening is None:
+            return strain, np.zeros_like(strain), np.zeros_like(strain)
+        strain = np.maximum(strain, STRAIN_LEAST)
+        return strain, self.stiffening.tension(strain) / strain - 1.0, self.stiffening.tangent(strain) - 1.0
+
+    def first_piola(self, gradient: FloatArray) -> FloatArray:
+        """P = 15 mu (w' / s) <(1 - 1 / l) (F N) N^T> + K_t (J - 1) dJ/dF [Pa], l = |F N|, (..., 3, 3)."""
+        _, stretch, linear = self._springs(gradient)
         volume, cofactor = determinant_and_cofactor(gradient)
-        springs = np.einsum("...a,...ai,aj->...ij", scale, spans, directions, optimize=True)
-        return springs + (self.volume_modulus * (volume - 1.0))[..., None, None] * cofactor
+        rise = self._rise(stretch)[1]
+        return (
+            linear * (1.0 + rise)[..., None, None] + (self.volume_modulus * (volume - 1.0))[..., None, None] * cofactor
+        )
 
     def tangent(self, gradient: FloatArray) -> FloatArray:
         """dP/dF [Pa], (..., 3, 3, 3, 3)."""
         directions, weights = self.directions
-        spans = np.einsum("...ij,aj->...ai", gradient, directions)
-        stretch = np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
-        tension, slope = self._law(stretch - 1.0)
+        spans, stretch, linear = self._springs(gradient)
         share = 15.0 * self.shear_modulus * weights
         dyads = np.einsum("...ai,aj->...aij", spans, directions).reshape(*stretch.shape, 9)
-        along = share * (slope - tension / stretch) / stretch**2
-        found = np.einsum("...a,...ax,...ay->...xy", along, dyads, dyads, optimize=True)
+        found = np.einsum("...a,...ax,...ay->...xy", share / stretch**3, dyads, dyads, optimize=True)
         found = found.reshape(*gradient.shape[:-2], 3, 3, 3, 3)
-        across = np.einsum("...a,aj,al->...jl", share * tension / stretch, directions, directions, optimize=True)
+        across = np.einsum("...a,aj,al->...jl", share * (1.0 - 1.0 / stretch), directions, directions, optimize=True)
         found += np.einsum("ik,...jl->...ijkl", np.eye(3), across)
+        strain, rise, steeper = self._rise(stretch)
+        found *= (1.0 + rise)[..., None, None, None, None]
+        # dw/dF is the stress of linear springs over 3 mu s.
+        more = (steeper - rise) / (3.0 * self.shear_modulus * np.maximum(strain, STRAIN_LEAST) ** 2)
+        found += more[..., None, None, None, None] * np.einsum("...ij,...kl->...ijkl", linear, linear)
         return found + volume_tangent(gradient, self.volume_modulus)
-
-
-def spring_law(stiffening: Stiffening | None, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tension over stiffness and rest length phi(e) of springs at strains e, and its slope."""
-    if stiffening is None:
-        return strain, np.ones_like(strain)
-    return stiffening.tension(strain), stiffening.tangent(strain)
 
 
 def volume_tangent(gradient: FloatArray, modulus: float) -> FloatArray:

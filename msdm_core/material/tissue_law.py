@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from msdm_core.errors import OrganError
 from msdm_core.mesh.tet_mesh import FloatArray
 
-# Beyond this tangent the springs that `hold_steep` does not take implicitly would limit the step (STEEP_SHARE).
+# Of a stiffening tissue over that at rest; measured up to here (`stability.HELD_TANGENT`).
 TANGENT_CAP_LARGEST = 100.0
 # Maxwell arms of a spring.
 ARM_COUNT = 3
@@ -17,15 +17,18 @@ ARM_COUNT = 3
 
 @dataclass(frozen=True)
 class Stiffening:
-    """Tension of a spring that is linear up to an onset strain, then stiffens up to a cap on its tangent.
+    """Tissue that is linear up to an onset strain, then stiffens up to a cap on its tangent.
 
-    With e = l / l0 - 1 the tangent is k (1 + (c - 1) v^2), v = (|e| - e0) / (e1 - e0) within 0 and 1: a short toe and a
-    steep rise as in Fung's exponential law (1967), as a piecewise polynomial, whose values have the same bits on every
-    machine. Tension and compression of a spring are alike: in nearly incompressible tissue that is compressed the
-    springs across are in tension.
+    The energy of the linear springs around a node is that of a strain s, s^2 = 5 sum k (l - l0)^2 / sum k l0^2: the
+    strain of a bar of constant volume that is pulled or compressed. The node's springs then have the energy w(s) in
+    place of s^2 / 2: all of them the factor w'(s) / s, a spring the mean of the factors of its two ends. The tangent is
+    w'' = 1 + (c - 1) v^2, v = (s - e0) / (e1 - e0) within 0 and 1: a short toe and a steep rise as in Fung's
+    exponential law (1967), as a piecewise polynomial, whose values have the same bits on every machine. A node feels
+    all directions, so that stiffening tissue is as isotropic as its linear springs nearly are; were each spring to
+    stiffen by its own strain, the seven directions of a lattice would make a cubic solid, whose columns buckle.
 
     Args:
-        onset_strain: e0, up to which the spring is linear, at least 0.
+        onset_strain: e0, up to which the tissue is linear, at least 0.
         cap_strain: e1, from which the tangent is constant, above e0.
         tangent_cap: c, the largest tangent over that at rest, from 1 to 100.
 
@@ -61,7 +64,7 @@ class Stiffening:
         return self.cap_strain - self.onset_strain
 
     def tension(self, strain: ArrayLike) -> FloatArray:
-        """Tension over k l0 of a spring at strains e, sign(e) (|e| + (c - 1) (e1 - e0) (v^3 / 3 + (u - v)))."""
+        """w'(s) at strains s, s + (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) with u = (s - e0) / (e1 - e0); odd in s."""
         strain = np.asarray(strain, dtype=np.float64)
         beyond = np.maximum((np.abs(strain) - self.onset_strain) / self.width, 0.0)
         ramp = np.minimum(beyond, 1.0)
@@ -69,7 +72,7 @@ class Stiffening:
         return strain + np.sign(strain) * excess
 
     def tangent(self, strain: ArrayLike) -> FloatArray:
-        """Slope of `tension` at strains e, 1 + (c - 1) v^2."""
+        """w''(s) at strains s, 1 + (c - 1) v^2."""
         ramp = np.clip((np.abs(np.asarray(strain, dtype=np.float64)) - self.onset_strain) / self.width, 0.0, 1.0)
         return 1.0 + (self.tangent_cap - 1.0) * ramp**2
 

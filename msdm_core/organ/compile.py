@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
+from msdm_core.kernels.element_kernels import STEEP_EXCESS
+from msdm_core.kernels.squeeze_kernels import STEEP_WIDTH
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneModel, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_support_forces
@@ -37,7 +39,7 @@ from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.measure import spring_tensions
-from msdm_core.organ.stability import own_step
+from msdm_core.organ.stability import own_step, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
 
@@ -102,8 +104,8 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         stiffness = stiffness + membrane_stiffness(mesh, spec.capsule.youngs_modulus, spec.capsule.thickness)
     mass = lump_mass(mesh, density, scheme=spec.mass_scheme)
     order = spring_order(mesh)
-    spring_law = _spring_law(spec, law, spring_modulus, order.springs)
     nodes, stiffness = nodes[order.springs], stiffness[order.springs]
+    spring_law = _spring_law(spec, law, spring_modulus, order.springs, stiffness)
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
     corners = mesh.points[surface]
@@ -164,7 +166,10 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         row_velocity=aligned_zeros((len(model.node_mass), 4)),
         row_force=aligned_zeros((len(model.node_mass), 4)),
         squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
-        steep_springs=np.zeros(len(model.spring_growth), dtype=np.int32),
+        node_energy=np.zeros_like(model.node_softness),
+        node_rise=np.zeros_like(model.node_softness),
+        node_steepness=np.zeros_like(model.node_softness),
+        **steep_scratch(model),
         spring_arm_tension=np.zeros_like(model.spring_arm_modulus),
         spring_relief=np.zeros_like(model.spring_gain),
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
@@ -182,6 +187,17 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         candidate_count=np.zeros(1, dtype=np.int32),
         contact_kept=np.ones(1, dtype=np.uint8),
     )
+
+
+def steep_scratch(model: OrganModel) -> dict[str, NDArray[Any]]:
+    """The scratch fields of a state for `hold_steep`; empty where no spring stiffens."""
+    springs = len(model.spring_nodes) if model.stiffens else 0
+    return {
+        "steep_springs": np.zeros(springs, dtype=np.int32),
+        "steep_places": np.zeros(springs, dtype=np.int32),
+        "steep_rows": np.zeros((springs, STEEP_WIDTH)),
+        "steep_speed": np.zeros((len(model.node_mass) if springs else 0, 3)),
+    }
 
 
 def _settle(model: OrganModel, state: OrganState) -> None:
@@ -307,41 +323,69 @@ class _TetLaw:
         self.arm_modulus[:, members] += fraction * (moduli - self.arm_modulus[:, members])
 
 
-def _spring_law(spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, springs: NDArray[np.intp]) -> dict[str, Any]:
-    """The model's fields of stiffening and relaxation, springs in the kernels' order.
+def _spring_law(
+    spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, springs: NDArray[np.intp], stiffness: FloatArray
+) -> dict[str, Any]:
+    """The model's fields of stiffening and relaxation, springs in the kernels' order with their stiffness [N/m].
 
-    A spring has means of its tets, weighted by the stiffness that each adds to it. Organs side by side share these
-    fields: an amount that is the same in all tets has the same bits in all springs, whatever their moduli.
+    A node stiffens by the mean of its tets, weighted by volume and modulus; a spring relaxes by that of its tets,
+    weighted by the stiffness that each adds to it. Organs side by side share these fields: an amount that is the same
+    in all tets has the same bits everywhere, whatever the moduli.
     """
     mesh = spec.mesh
 
-    def mean(amount: FloatArray, weight: FloatArray) -> FloatArray:
-        """Of each spring; that of the first tet with a weight where no tet of the spring has one."""
+    def mean(amount: FloatArray) -> FloatArray:
+        """Of each spring."""
+        first = float(amount[0])
+        total = spring_sum(mesh, spring_modulus, np.ones(mesh.tet_count), rule=spec.stiffness_rule)
+        differing = spring_sum(mesh, spring_modulus, amount - first, rule=spec.stiffness_rule)
+        return first + (differing / total)[springs]
+
+    def node_mean(amount: FloatArray, weight: FloatArray) -> FloatArray:
+        """Of each node; that of the first tet with a weight where no tet of the node has one."""
         first = float(amount[np.argmax(weight > 0.0)])
-        total = spring_sum(mesh, spring_modulus, weight, rule=spec.stiffness_rule)
-        differing = spring_sum(mesh, spring_modulus, weight * (amount - first), rule=spec.stiffness_rule)
-        return first + np.divide(differing, total, out=np.zeros_like(total), where=total > 0.0)[springs]
+
+        def at_nodes(values: FloatArray) -> FloatArray:
+            return np.bincount(mesh.tets.ravel(), np.repeat(values, 4), mesh.node_count).astype(np.float64)
+
+        total = at_nodes(weight)
+        differing = at_nodes(weight * (amount - first))
+        return first + np.divide(differing, total, out=np.zeros_like(total), where=total > 0.0)
 
     none = _read_only(np.zeros(0))
-    fields: dict[str, Any] = dict.fromkeys(("spring_growth", "spring_onset", "spring_excess"), none)
+    fields: dict[str, Any] = dict.fromkeys(("node_softness", "node_onset", "node_growth", "node_excess"), none)
     fields |= {"spring_gain": none, "spring_arm_modulus": none, "arm_time": _read_only(_arm_times(spec))}
+    fields |= {"steep_sweeps": steep_sweeps(1.0 + float(law.rise.max())), "steep_rise": math.inf}
     fields["stiffens"], fields["relaxes"] = bool(law.rise.any()), bool(law.arm_modulus.any())
-    everywhere = np.ones(mesh.tet_count)
     if fields["stiffens"]:
-        rises = law.rise > 0.0
+        rises, weight = law.rise > 0.0, mesh.volumes * spring_modulus
         onset, width = (
-            mean(np.divide(amount, law.rise, out=np.zeros_like(amount), where=rises), law.rise)
+            node_mean(np.divide(amount, law.rise, out=np.zeros_like(amount), where=rises), law.rise * weight)
             for amount in (law.onset, law.width)
         )
-        length = np.linalg.norm(mesh.points[mesh.edges[:, 0]] - mesh.points[mesh.edges[:, 1]], axis=1)[springs]
-        fields["spring_growth"] = _read_only(1.0 / (length * width))
-        fields["spring_onset"] = _read_only(onset / width)
-        fields["spring_excess"] = _read_only(mean(law.rise, everywhere) * width)
+        rise = node_mean(law.rise, weight)
+        nodes = mesh.edges[springs]
+        length = np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)
+        sums = np.bincount(nodes.ravel(), np.repeat(stiffness * length**2, 2), mesh.node_count)
+        fields["node_softness"] = _read_only(5.0 / sums)
+        fields["node_onset"] = _read_only(onset)
+        fields["node_growth"] = _read_only(1.0 / width)
+        fields["node_excess"] = _read_only(rise * width)
+        fields["steep_rise"] = _steep_rise(onset, width, rise)
     if fields["relaxes"]:
-        moduli = np.stack([mean(arm, everywhere) for arm in law.arm_modulus])
+        moduli = np.stack([mean(arm) for arm in law.arm_modulus])
         fields["spring_gain"] = _read_only(1.0 + moduli.sum(axis=0))
         fields["spring_arm_modulus"] = _read_only(moduli.ravel())
     return fields
+
+
+def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray) -> float:
+    """The least of what stiffening adds to the tension of nodes where it adds STEEP_EXCESS to their tangent."""
+    steep = rise > STEEP_EXCESS
+    ramp = np.sqrt(STEEP_EXCESS / rise[steep])
+    at = rise[steep] * width[steep] * ramp**3 / 3.0 / (onset[steep] + ramp * width[steep])
+    # Lanes in float32 round.
+    return 0.999 * float(at.min(initial=math.inf))
 
 
 def _arm_times(spec: OrganSpec) -> FloatArray:

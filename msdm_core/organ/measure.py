@@ -11,7 +11,7 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_WEIGHT,
     closest_on_axis,
 )
-from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
+from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
 from msdm_core.kernels.guard_kernels import GUARD_SHARE, closest_in_triangle
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
@@ -30,7 +30,7 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
 
     U = sum_s U_s(l_s) + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
         + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) - sum_i m_i g . (x_i - X_i)
-    where U_s is the energy of a spring, k (l - l0)^2 / 2 if it is linear, with that of its Maxwell arms, a is a volume
+    where U_s is the energy of a spring, k (l - l0)^2 / 2 if none stiffens, with that of its Maxwell arms, a is a volume
     averaged at a node, K'_t the share averaged and the fourth sum over tets below s = SQUEEZED_RATIO (infinite for one
     that is inside out). A resting tool's `contact_energy` is not in it, nor what supports store.
     """
@@ -52,61 +52,97 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
 
 
 def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Tension of each spring at some lengths [m] (n_spring,) without its Maxwell arms [N], (n_spring,)."""
+    """Tension of each spring without its Maxwell arms where all have some lengths [m] (n_spring,) [N], (n_spring,)."""
     change = length - model.spring_rest_length
     tension = model.spring_stiffness * change
     if not model.stiffens:
         return tension
-    beyond = np.maximum(np.abs(change) * model.spring_growth - model.spring_onset, 0.0)
+    rise = _node_rises(model, node_strains(model, length))
+    return tension * (1.0 + rise[model.spring_nodes].mean(axis=1))
+
+
+def node_strains(model: OrganModel, length: FloatArray) -> FloatArray:
+    """Equivalent strain of each node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs of some lengths [m]."""
+    twice = model.spring_stiffness * (length - model.spring_rest_length) ** 2
+    return np.sqrt(model.node_softness * np.bincount(model.spring_nodes.ravel(), np.repeat(twice, 2)))
+
+
+def _node_rises(model: OrganModel, strain: FloatArray) -> FloatArray:
+    """`element_kernels.node_law`: what stiffening adds to tension over that of linear springs, (n_node,)."""
+    beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
     ramp = np.minimum(beyond, 1.0)
-    excess = model.spring_excess * (ramp**3 / 3.0 + (beyond - ramp))
-    return tension + np.sign(change) * model.spring_stiffness * model.spring_rest_length * excess
+    return model.node_excess * (ramp**3 / 3.0 + (beyond - ramp)) / np.maximum(strain, STRAIN_LEAST)
 
 
 def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Integral of `spring_tensions` from the rest length to some lengths [m] (n_spring,) [J], (n_spring,)."""
-    change = length - model.spring_rest_length
-    energy = 0.5 * model.spring_stiffness * change**2
+    """Energy of all springs of some lengths [m] (n_spring,), without Maxwell arms, shared among them [J], (n_spring,).
+
+    U = sum_s k (l - l0)^2 / 2 + sum_a A_a w_a(s_a), where w_a' is what stiffening adds to the strain s_a in the
+    tension and A_a = sum k l0^2 / 10 over the springs of node a; a node's part belongs to its springs as k (l - l0)^2
+    does. The gradient is `spring_tensions`.
+    """
+    twice = model.spring_stiffness * (length - model.spring_rest_length) ** 2
     if not model.stiffens:
-        return energy
-    beyond = np.maximum(np.abs(change) * model.spring_growth - model.spring_onset, 0.0)
+        return 0.5 * twice
+    strain = node_strains(model, length)
+    beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
     ramp = np.minimum(beyond, 1.0)
     over = beyond - ramp
-    scale = np.divide(
-        model.spring_stiffness * model.spring_rest_length * model.spring_excess,
-        model.spring_growth,
-        out=np.zeros_like(energy),
-        where=model.spring_growth > 0.0,
-    )
-    return energy + scale * (ramp**4 / 12.0 + over / 3.0 + 0.5 * over**2)
+    added = model.node_excess / model.node_growth * (ramp**4 / 12.0 + over / 3.0 + 0.5 * over**2)
+    # A_a w_a over the sum of k (l - l0)^2, which is s^2 / softness with A = 1 / (2 softness).
+    share = 0.5 * added / np.maximum(strain, STRAIN_LEAST) ** 2
+    return twice * (0.5 + share[model.spring_nodes].sum(axis=1))
 
 
 def arm_energy(model: OrganModel, state: OrganState, length: FloatArray) -> float:
     """Energy that the Maxwell arms of all springs store at some lengths [m] (n_spring,) [J].
 
-    An arm of tension g (T - z), which has given way to the tension z, stores g (U(l) - U(l_z) - z (l - l_z)) with the
-    energy U and tension T of the elastic spring and T(l_z) = z: what it returns where the spring goes back to l_z at
-    once. While it gives way at a constant length, that energy only falls.
+    Arms of tension g (T - z), which have given way to the tensions z, store g (U(l) - U(l_z) - z . (l - l_z)) with the
+    energy U and tensions T of the elastic springs and T(l_z) = z: what they return where the springs go back to l_z at
+    once. While they give way at constant lengths, that energy only falls, because U is convex. Where g differs from
+    spring to spring, each has its share.
+
+    Raises:
+        ValueError: lengths with the tensions z were not found.
     """
     if not model.relaxes:
         return 0.0
-    rest = model.spring_rest_length
     energy, total = spring_energies(model, length), 0.0
     for modulus, given in zip(
         model.spring_arm_modulus.reshape(ARM_COUNT, -1),
-        state.spring_arm_tension.reshape(ARM_COUNT, -1) * rest,
+        state.spring_arm_tension.reshape(ARM_COUNT, -1) * model.spring_rest_length,
         strict=True,
     ):
-        # Bisection: a linear spring would have to go further for the same tension.
-        furthest = given / model.spring_stiffness
-        low, high = rest + np.minimum(furthest, 0.0), rest + np.maximum(furthest, 0.0)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            above = spring_tensions(model, middle) > given
-            low, high = np.where(above, low, middle), np.where(above, middle, high)
-        reached = 0.5 * (low + high)
+        reached = _lengths_of(model, given)
         total += float(modulus @ (energy - spring_energies(model, reached) - given * (length - reached)))
     return total
+
+
+LENGTH_ROUNDS, LENGTH_TOLERANCE = 500, 1e-13
+
+
+def _lengths_of(model: OrganModel, tension: FloatArray) -> FloatArray:
+    """Lengths of the springs at some tensions [N] (n_spring,) [m], (n_spring,): the inverse of `spring_tensions`.
+
+    l - l0 = T / (k (1 + mean of the rises of both ends)): a larger rise gives shorter springs and so a smaller rise.
+    Each node goes the part of the way that one alone would need, tension over strain over tangent.
+    """
+    linear = tension / model.spring_stiffness
+    if not model.stiffens:
+        return model.spring_rest_length + linear
+    rise = np.zeros(len(model.node_mass))
+    for _ in range(LENGTH_ROUNDS):
+        length = model.spring_rest_length + linear / (1.0 + rise[model.spring_nodes].mean(axis=1))
+        strain = node_strains(model, length)
+        wanted = _node_rises(model, strain)
+        if (np.abs(wanted - rise) <= LENGTH_TOLERANCE * (1.0 + rise)).all():
+            return length
+        ramp = np.clip((strain - model.node_onset) * model.node_growth, 0.0, 1.0)
+        tangent = 1.0 + model.node_excess * model.node_growth * ramp**2
+        rise = rise + (wanted - rise) * np.minimum((1.0 + wanted) / tangent, 1.0)
+    raise ValueError(
+        f"no lengths were found for the tensions that the arms have given way to, in {LENGTH_ROUNDS} rounds"
+    )
 
 
 def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> float:

@@ -16,10 +16,11 @@ from scipy.sparse.linalg import spsolve
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
-from msdm_core.material.continuum import spring_law
+from msdm_core.material.continuum import STRAIN_LEAST
 from msdm_core.material.tissue_law import Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.compile import rest_state
+from msdm_core.organ.measure import node_strains
 from surgsim_env.validation.elements import Cells, Size
 from surgsim_env.validation.statics import averaged_gradient, volume_gradient
 
@@ -245,16 +246,35 @@ class OrganBlock:
         return -state.node_force.ravel(), csc_array(matrix)
 
     def _springs(self, position: FloatArray) -> csc_array:
-        """Tangent of the springs, k phi' n n^T + k l0 (phi / l) (1 - n n^T) [N/m]."""
-        nodes, rest = self.model.spring_nodes, self.model.spring_rest_length
+        """Tangent of the springs, (T / x) n n^T + (T / l) (1 - n n^T), x = l - l0, and what their ends add [N/m].
+
+        T = k x (1 + (r_a + r_b) / 2) with the rises r of both ends, of which r_a changes with all springs u of node a:
+        dr_a / dx_u = (dr_a / ds_a) q_a k_u x_u / s_a, where s_a^2 = q_a sum k x^2.
+        """
+        model, nodes = self.model, self.model.spring_nodes
         span = position[nodes[:, 1]] - position[nodes[:, 0]]
         length = np.linalg.norm(span, axis=1)
-        tension, slope = spring_law(self.stiffening, length / rest - 1.0)
-        across = (self.model.spring_stiffness * rest * tension / length)[:, None, None]
-        dyads = span[:, :, None] * span[:, None, :] / (length**2)[:, None, None]
-        along = ((self.model.spring_stiffness * slope)[:, None, None] - across) * dyads + across * np.eye(3)
+        direction, change = span / length[:, None], length - model.spring_rest_length
+        stiffness = model.spring_stiffness
+        if self.stiffening is not None:
+            strain = np.maximum(node_strains(model, length), STRAIN_LEAST)
+            rise = self.stiffening.tension(strain) / strain - 1.0
+            stiffness = stiffness * (1.0 + rise[nodes].mean(axis=1))
+        across = (stiffness * change / length)[:, None, None]
+        dyads = direction[:, :, None] * direction[:, None, :]
+        along = (stiffness[:, None, None] - across) * dyads + across * np.eye(3)
         blocks = np.block([[along, -along], [-along, along]])
-        return _assembled(np.zeros((len(nodes), 6)), blocks, _rows(nodes), position.size)[1]
+        total = _assembled(np.zeros((len(nodes), 6)), blocks, _rows(nodes), position.size)[1]
+        if self.stiffening is None:
+            return total
+        pull = (model.spring_stiffness * change)[:, None] * direction
+        values = np.concatenate([-pull, pull], axis=1)
+        sums = coo_array(
+            (np.tile(values.ravel(), 2), (np.repeat(nodes.T.ravel(), 6), np.tile(_rows(nodes).ravel(), 2))),
+            shape=(len(position), position.size),
+        ).tocsr()
+        more = 0.5 * model.node_softness * (self.stiffening.tangent(strain) - 1.0 - rise) / strain**2
+        return csc_array(total + sums.T @ sums.multiply(more[:, None]).tocsr())
 
     def _volumes(self, position: FloatArray) -> csc_array:
         """Tangent of the volume terms, K / V0 dV dV^T + p d2V, p the tension of each tet and of its nodes [N/m]."""

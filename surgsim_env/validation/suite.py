@@ -65,6 +65,7 @@ CASES: tuple[Case, ...] = (
     ),
     Case("liver, contrast", touch.liver_contrast, slow=True, needs_fem=True),
     Case("large strain, linear", partial(tissue_law.large_strain, "slide", 6, None)),
+    Case("large strain, stiffening", partial(tissue_law.large_strain, "slide", 6, LAW)),
     Case("large strain, pull", partial(tissue_law.large_strain, "pull", 12, LAW), slow=True, needs_fem=True),
     Case("large strain, shear", partial(tissue_law.large_strain, "shear", 16, LAW), slow=True, needs_fem=True),
     Case("stiffening in all directions", tissue_law.all_directions),

@@ -14,7 +14,7 @@ LONG = {
     *("passivity, bounces", "fitted springs, torsion", "cosine load", "capsule, pulled", "on supports", "deep presses"),
     *("contrast, coarse", "fitted springs, tension", "fitted springs, cantilever", "grasped strip"),
     *("flat punch", "cantilever", "clamped torsion", "graded prism", "lesion anywhere", "capsule, curved"),
-    *("large strain, linear", "step strain", "step strain, stiffening", "creep"),
+    *("large strain, linear", "large strain, stiffening", "step strain", "step strain, stiffening", "creep"),
     *("creep, nu 0.45", "stiffening in all directions"),
     *("Eshelby, coarse", "energy", "fitted springs, rod", "capsule, faces", "bar in tension", "passivity, presses"),
 }

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from msdm_core.material.continuum import SpringSolid, lattice_directions, uniaxial_stress
+from msdm_core.material.regions import Damping, Material
+from msdm_core.material.tissue_law import Stiffening
 from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import rest_state
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from surgsim_env.validation import hyperelastic
 from surgsim_env.validation.hyperelastic import OrganBlock, QuadraticBlock
 from surgsim_env.validation.statics import linear_organ
@@ -57,11 +59,12 @@ def test_small_shear_of_hexahedra_and_organ_is_linear():
         assert forces[1] == pytest.approx(2.0 * forces[0], rel=1e-4)
 
 
-def test_the_organs_tangent_is_the_derivative_of_its_kernels_forces():
+@pytest.mark.parametrize("stiffening", [None, Stiffening(0.02, 0.15, 30.0)], ids=["linear", "stiffening"])
+def test_the_organs_tangent_is_the_derivative_of_its_kernels_forces(stiffening):
     """Springs and volume terms, averaged ones too, at an irregular deformation; no tet is squeezed below 0.6."""
     mesh = box_mesh((0.02, 0.02, 0.02), (2, 2, 2))
-    model = linear_organ(mesh, 5000.0, 0.45)
-    block, state, rng = OrganBlock(mesh, model), rest_state(model), np.random.default_rng(0)
+    model = compile_organ(OrganSpec(mesh, Material(5000.0, 1000.0, 0.45, stiffening), damping=Damping(0.0)))
+    block, state, rng = OrganBlock(mesh, model, stiffening), rest_state(model), np.random.default_rng(0)
     displacement, direction = 3e-4 * rng.normal(size=mesh.points.size), rng.normal(size=mesh.points.size)
     step = 1e-9
     slope = (

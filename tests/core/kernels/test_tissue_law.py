@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganError
+from msdm_core.kernels.element_kernels import STEEP_EXCESS
+from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
 from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.lanes.lanes import (
     advance_lanes,
@@ -21,8 +23,15 @@ from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, relax_arms, rest_state
-from msdm_core.organ.measure import internal_forces, kinetic_energy, potential_energy
-from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.measure import (
+    angular_momentum,
+    internal_forces,
+    kinetic_energy,
+    potential_energy,
+    spring_energies,
+    spring_tensions,
+)
+from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 
 LIVER = Stiffening(onset_strain=0.03, cap_strain=0.12, tangent_cap=20.0)
@@ -61,13 +70,25 @@ def strained(model: OrganModel, size: float, seed: int = 0) -> OrganState:
     return state
 
 
+def equivalent_strain(model: OrganModel, state: OrganState) -> FloatArray:
+    """s_a^2 = 5 sum k (l - l0)^2 / sum k l0^2 over the springs of node a, by a loop, (n_node,)."""
+    strained, rest = np.zeros(len(model.node_mass)), np.zeros(len(model.node_mass))
+    for (i, j), k, l0 in zip(model.spring_nodes, model.spring_stiffness, model.spring_rest_length, strict=True):
+        length = np.linalg.norm(state.node_position[i] - state.node_position[j])
+        for node in (i, j):
+            strained[node] += 5.0 * k * (length - l0) ** 2
+            rest[node] += k * l0**2
+    return np.sqrt(strained / rest)
+
+
 def spring_forces(model: OrganModel, state: OrganState, law: Stiffening, gain: float) -> FloatArray:
-    """Forces of springs of one material, the tension from `Stiffening.tension`."""
+    """Forces of springs of one material, times the mean over both ends of `Stiffening.tension` over strain."""
     ends = state.node_position[model.spring_nodes]
     span = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(span, axis=1)
-    rest = model.spring_rest_length
-    tension = gain * model.spring_stiffness * rest * law.tension(length / rest - 1.0)
+    strain = equivalent_strain(model, state)
+    ratio = (law.tension(strain) / strain)[model.spring_nodes].mean(axis=1)
+    tension = gain * model.spring_stiffness * (length - model.spring_rest_length) * ratio
     pull = span * (tension / length)[:, None]
     force = np.zeros_like(state.node_position)
     np.add.at(force, model.spring_nodes[:, 0], pull)
@@ -86,6 +107,35 @@ def test_forces_are_those_of_the_law(size: float, relaxation: Relaxation | None)
     )
     expected = spring_forces(model, state, LIVER, gain) + volume
     np.testing.assert_allclose(internal_forces(model, state), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("size", [0.02, 0.1, 0.3])
+def test_tensions_are_the_gradient_of_the_energy(size: float):
+    lesion = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, replace(LIVER, tangent_cap=60.0)))
+    model = block(LIVER, lesions=(lesion,))
+    ends = strained(model, size).node_position[model.spring_nodes]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    change = 1e-5 * length * np.random.default_rng(1).uniform(-1.0, 1.0, len(length))
+    slope = 0.5 * (spring_energies(model, length + change).sum() - spring_energies(model, length - change).sum())
+    assert slope == pytest.approx(spring_tensions(model, length) @ change, rel=1e-6)
+
+
+@pytest.mark.parametrize("strain", [-0.1, 0.05, 0.15])
+def test_the_equivalent_strain_of_a_bar_is_its_strain(strain: float):
+    """Along an axis and along a diagonal of the lattice, at constant volume: |e| within second order of it."""
+    model = block(LIVER)
+    cell = SIZE[0] / CELLS[0]
+    place = model.node_rest_position
+    inner = ((place > 1.01 * cell) & (place < np.array(SIZE) - 1.01 * cell)).all(axis=1)
+    assert inner.sum() > 8
+    for along in ((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (1.0, 2.0, 0.0)):
+        axis = np.array(along) / np.linalg.norm(along)
+        across = (1.0 + strain) ** -0.5
+        gradient = across * np.eye(3) + (1.0 + strain - across) * np.outer(axis, axis)
+        state = blank_state(model)
+        state.node_position[:] = model.node_rest_position @ gradient
+        found = equivalent_strain(model, state)[inner]
+        np.testing.assert_allclose(found, abs(strain), rtol=0, atol=strain**2)
 
 
 def test_tangent_is_the_slope_of_the_tension():
@@ -183,7 +233,7 @@ def test_lanes_move_as_organs_alone(dtype: type):
 def test_organs_with_and_without_a_law_do_not_share_lanes():
     with pytest.raises(OrganError, match="another stiffens"):
         stack_organs([block(LIVER), block()])
-    with pytest.raises(OrganError, match="another spring_onset"):
+    with pytest.raises(OrganError, match="another node_onset"):
         stack_organs([block(LIVER), block(replace(LIVER, onset_strain=0.05))])
     with pytest.raises(OrganError, match="another spring_gain"):
         stack_organs([block(None, ARMS), block(None, Relaxation((0.3,), (1.0,)))])
@@ -203,6 +253,7 @@ def test_a_free_organ_gains_no_energy(stiffening: Stiffening | None, relaxation:
     # The symplectic scheme conserves a perturbed energy: its error is of the order of (w dt)^2.
     assert highest < 1.05 * begin
     np.testing.assert_allclose(model.node_mass @ state.node_velocity, momentum, atol=1e-12)
+    assert np.abs(angular_momentum(model, state, np.zeros(3))).max() < 1e-12
     if relaxation is not None:
         assert kinetic_energy(model, state) + potential_energy(model, state) < 0.9 * begin
 
@@ -242,7 +293,64 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
         forces.append(internal_forces(model, state)[top, 2].sum())
     length = np.linalg.norm(np.diff(state.node_position[model.spring_nodes], axis=1)[:, 0], axis=1)
     assert np.abs(length / model.spring_rest_length - 1.0).max() > LIVER.cap_strain
+    assert np.median(equivalent_strain(model, state)) > LIVER.cap_strain
     assert forces[0] == pytest.approx(forces[1], rel=5e-3)
+
+
+def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatArray:
+    """The matrix that `hold_steep` makes of velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
+    scale = np.sqrt(model.node_mass)[:, None]
+    every, columns = np.arange(len(model.spring_nodes), dtype=np.int32), []
+    for unit in np.eye(state.node_velocity.size):
+        velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
+        hold_steep(
+            state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes, model.spring_stiffness,
+            state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes), every, len(every), 1, sweeps,
+            state.steep_places, state.steep_rows, state.steep_speed, dt,
+        )  # fmt: skip
+        columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("relaxation", [None, ARMS])
+def test_steep_springs_are_held_as_by_larger_masses(relaxation: Relaxation | None):
+    """Velocities become C v, C symmetric in the masses, between those of 200 sweeps and 1; 200 sweeps solve exactly."""
+    law = replace(LIVER, tangent_cap=60.0)
+    mesh = box_mesh((0.02, 0.01, 0.01), (2, 1, 1))
+    material = Material(5000.0, 1060.0, 0.45, law, relaxation)
+    model = compile_organ(OrganSpec(mesh, material, damping=Damping(0.0)))
+    state = strained(model, 0.3)
+    dt = stable_dt(model)
+    span = np.diff(state.node_position[model.spring_nodes], axis=1)[:, 0]
+    length = np.linalg.norm(span, axis=1)
+    state.node_steepness[:] = law.tangent(equivalent_strain(model, state)) - 1.0
+    gain = 1.0 if relaxation is None else relaxation.instantaneous
+    more = state.node_steepness[model.spring_nodes].mean(axis=1)
+    tangent = STEEP_HOLD * gain * model.spring_stiffness * np.where(more > STEEP_EXCESS, more, 0.0)
+    along = np.zeros((len(span), len(mesh.points), 3))
+    rows = np.arange(len(span))
+    along[rows, model.spring_nodes[:, 1]] = span / length[:, None]
+    along[rows, model.spring_nodes[:, 0]] = -span / length[:, None]
+    along = (along / np.sqrt(model.node_mass)[:, None]).reshape(len(span), -1)
+    exact = np.linalg.inv(np.eye(along.shape[1]) + dt**2 * along.T @ (tangent[:, None] * along))
+    assert np.linalg.eigvalsh(exact)[0] < 0.05
+    np.testing.assert_allclose(held(model, state, 2000, dt), exact, rtol=0, atol=1e-6)
+    for sweeps in (2, 4, 12):
+        changed = held(model, state, sweeps, dt)
+        np.testing.assert_allclose(changed, changed.T, rtol=0, atol=1e-12)
+        assert np.linalg.eigvalsh(changed)[-1] < 1.0 + 1e-12
+        assert np.linalg.eigvalsh(changed - exact)[0] > -1e-12
+
+
+def test_stiffening_costs_at_most_half_as_many_substeps_again():
+    """The laws identified for pig liver have caps of 50 to 71."""
+    linear = stable_dt(block())
+    for cap, share in ((HELD_TANGENT, 0.95), (50.0, 0.8), (71.0, 1.0 / 1.5)):
+        assert stable_dt(block(replace(LIVER, tangent_cap=cap))) > share * linear
+
+
+def test_sweeps_follow_from_the_cap():
+    assert [steep_sweeps(cap) for cap in (1.0, 12.0, 12.1, 24.0, 36.0, 100.0)] == [4, 4, 6, 8, 12, 12]
 
 
 @pytest.mark.parametrize("stiffening", [None, LIVER])
@@ -262,14 +370,14 @@ def test_the_stable_step_counts_arms_and_stiffening(stiffening: Stiffening | Non
 def test_a_tet_cut_by_a_lesion_has_the_mean_of_both_laws():
     stiff = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, LIVER))
     model, healthy = block(lesions=(stiff,)), block(LIVER, lesions=(stiff,))
-    stiffens = model.spring_excess > 0.0
-    cut = stiffens & (model.spring_excess < (1.0 - 1e-9) * (LIVER.tangent_cap - 1.0) * LIVER.width)
+    stiffens = model.node_excess > 0.0
+    cut = stiffens & (model.node_excess < (1.0 - 1e-9) * (LIVER.tangent_cap - 1.0) * LIVER.width)
     assert cut.any()
     assert model.stiffens and stiffens.any() and not stiffens.all()
     # The onset and the width are those of the only law there is.
-    np.testing.assert_allclose(model.spring_onset[stiffens], LIVER.onset_strain / LIVER.width)
-    np.testing.assert_allclose((model.spring_growth * model.spring_rest_length)[stiffens], 1.0 / LIVER.width)
-    assert (model.spring_excess <= healthy.spring_excess * (1.0 + 1e-12)).all()
+    np.testing.assert_allclose(model.node_onset[stiffens], LIVER.onset_strain)
+    np.testing.assert_allclose(model.node_growth[stiffens], 1.0 / LIVER.width)
+    assert (model.node_excess <= healthy.node_excess * (1.0 + 1e-12)).all()
 
 
 @pytest.mark.parametrize(

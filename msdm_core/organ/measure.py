@@ -1,6 +1,7 @@
 """Quantities of the state of an organ: energy, momentum, volume ratios, inverted tets, forces."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,11 +14,15 @@ from msdm_core.kernels.contact_kernels import (
 )
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
 from msdm_core.kernels.guard_kernels import GUARD_SHARE, closest_in_triangle
+from msdm_core.kernels.load_kernels import add_gradients, add_pressures
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_support_forces
 from msdm_core.material.tissue_law import ARM_COUNT
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, tet_volumes
+
+# Of strains, as a margin.
+ROUNDING = 1e-12
 
 
 def kinetic_energy(model: OrganModel, state: OrganState) -> float:
@@ -197,6 +202,52 @@ def _guard_energy(corners: FloatArray, normal: FloatArray, ends: FloatArray, rad
         if distance < reach and offset @ normal[triangle] < 0.0:
             energy += reach * math.log(reach / distance) - (reach - distance)
     return math.pi * radius**2 * stiffness * reach * energy
+
+
+class TissueLoad(NamedTuple):
+    """What tissue bears where it bears most, averaged at nodes.
+
+    Fields:
+        pressure: largest contact pressure, per undeformed area [Pa]; 0 without contact
+        pressure_node: where
+        strain: largest |lambda - 1| of the principal stretches
+        strain_node: where
+    """
+
+    pressure: float
+    pressure_node: int
+    strain: float
+    strain_node: int
+
+
+def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> TissueLoad:
+    """Largest contact pressure and principal strain of an organ.
+
+    p_i = sum of w A k_p g over the quadrature points around node i (`contact_energy`), over a third of the area of its
+    triangles; F_i = sum V_t F_t / sum V_t over its tets, with the singular values lambda: averages over a cell.
+    """
+    push = np.zeros(len(model.node_mass))
+    add_pressures(model, state, shapes, contact.stiffness, push)
+    third = np.repeat(model.surface_rest_area / 3.0, 3)
+    area = np.bincount(model.surface_triangles.ravel(), third, len(push))
+    pressure = np.divide(push, area, out=np.zeros_like(push), where=area > 0.0)
+    gradient = np.zeros((len(push), 3, 3))
+    add_gradients(model.node_rest_position, state.node_position, model.tet_nodes, gradient)
+    gradient /= 4.0 * model.node_rest_volume[:, None, None]
+    squared = gradient.transpose(0, 2, 1) @ gradient
+    # Eigenvalues lie within the mean +- twice the root of a sixth of the deviator's square (Smith 1961): nodes whose
+    # bound is below a strain that is known need no closer look.
+    mean = np.einsum("nii->n", squared) / 3.0
+    spread = 2.0 * np.sqrt(np.maximum(np.einsum("nij,nij->n", squared, squared) - 3.0 * mean**2, 0.0) / 6.0)
+    bound = np.maximum(np.sqrt(mean + spread) - 1.0, 1.0 - np.sqrt(np.maximum(mean - spread, 0.0)))
+    near = np.flatnonzero(bound >= _principal_strain(squared[[bound.argmax()]])[0] - ROUNDING)
+    strain = _principal_strain(squared[near])
+    return TissueLoad(float(pressure.max()), int(pressure.argmax()), float(strain.max()), int(near[strain.argmax()]))
+
+
+def _principal_strain(squared: FloatArray) -> FloatArray:
+    """Largest |lambda - 1| of the square roots lambda of the eigenvalues of C = F^T F (n, 3, 3), (n,)."""
+    return np.abs(np.sqrt(np.maximum(np.linalg.eigvalsh(squared), 0.0)) - 1.0).max(axis=1)
 
 
 def momentum(model: OrganModel, state: OrganState) -> FloatArray:

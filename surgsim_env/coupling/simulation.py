@@ -14,6 +14,7 @@ from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE
 from msdm_core.kernels.structure_kernels import SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import blank_state, relax_arms, rest_state
+from msdm_core.organ.measure import TissueLoad, tissue_load
 from msdm_core.organ.stability import stable_dt
 from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
 from surgsim_env.coupling.mujoco_library import runs_compiled
@@ -159,6 +160,11 @@ class Simulation:
     def grasp(self) -> Grasp | None:
         """The jaw's hold on tissue in the last haptic step; None for an instrument without a jaw."""
         return read_grasp(self.instrument.jaw, self._wrench, self.contact.friction)
+
+    @property
+    def tissue_load(self) -> TissueLoad:
+        """Largest contact pressure and strain of the organ at the end of the last haptic step."""
+        return tissue_load(self.organ_model, self.organ_state, self.instrument.shapes, self.contact)
 
     @property
     def rest_position(self) -> FloatArray:

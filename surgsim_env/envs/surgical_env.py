@@ -119,7 +119,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             )
         self._take(values)
         self._begun = self._running = True
-        info = self._info("", saturated, self.task.info(None, ""), dict.fromkeys(self.task.weights, 0.0))
+        own = self.task.info(None, "") | self.task.tissue_info(None, "")
+        info = self._info("", saturated, own, dict.fromkeys(self.task.weights, 0.0))
         self._show()
         return self._observed(), info
 

@@ -319,6 +319,8 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
         ],
         "maps": {one.name: _map_entry(one) for one in palpation.maps},
         "force_peak_N": max(forces),
+        "tissue_pressure_largest_Pa": max(press.load.pressure for press in palpation.presses),
+        "tissue_strain_largest": max(press.load.strain for press in palpation.presses),
         "volume_ratio_smallest": min(
             press.volume_ratio_smallest for press in (*palpation.presses, *palpation.model_presses)
         ),
@@ -379,6 +381,10 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
         f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not "
         f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N, "
         f"smallest volume ratio {min(press.volume_ratio_smallest for press in every):.2f}"
+    )
+    console.print(
+        f"largest contact pressure {1e-3 * max(press.load.pressure for press in palpation.presses):.2f} kPa, largest "
+        f"strain of the tissue {100.0 * max(press.load.strain for press in palpation.presses):.0f} %"
     )
     scene = palpation.anatomy.scene
     share = share_text(palpation.anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth)

@@ -10,6 +10,7 @@ import numpy as np
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.measure import TissueLoad
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.scene.anatomy import Anatomy
@@ -76,6 +77,7 @@ class Press:
         force_peak: largest contact force of any haptic step [N]
         curve: depth [m] and force along the normal [N] at each haptic step of contact             (n, 2)
         volume_ratio_smallest: of any tet at any substep
+        load: largest contact pressure and strain of the tissue at the end
         end: why it ended early (the hard limit or a fault); empty for a complete press
         duration: simulated time [s]
     """
@@ -87,6 +89,7 @@ class Press:
     force_peak: float
     curve: FloatArray
     volume_ratio_smallest: float
+    load: TissueLoad
     end: str
     duration: float
 
@@ -223,6 +226,7 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
         force_peak=result.force_peak,
         curve=curve[curve[:, 1] > 0.0],
         volume_ratio_smallest=float(simulation.organ_state.volume_ratio_smallest[0]),
+        load=simulation.tissue_load,
         end=end,
         duration=result.duration,
     )

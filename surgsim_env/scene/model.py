@@ -310,12 +310,16 @@ class Timing:
 class Limits:
     """Force limits [N]: more than soft_force costs reward, more than hard_force ends an episode, and so does tearing.
 
-    A jaw that pulls with more than tear_force tears the tissue; by default nothing tears.
+    A jaw that pulls with more than tear_force tears the tissue; by default nothing tears. A largest contact pressure
+    [Pa] or principal strain (1) of the tissue beyond pressure or strain damages it, which ends an episode as well; inf
+    measures them only, and None, the default, does not measure them.
     """
 
     soft_force: float
     hard_force: float
     tear_force: float = math.inf
+    pressure: float | None = None
+    strain: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.soft_force < self.hard_force:
@@ -324,6 +328,16 @@ class Limits:
             )
         if not self.tear_force > 0.0:
             raise ValueError(f"limits.tear_force is {self.tear_force:g} N; it must be above 0")
+        for name, value, unit in (("pressure", self.pressure, " Pa"), ("strain", self.strain, "")):
+            if value is not None and not value > 0.0:
+                raise ValueError(
+                    f"limits.{name} is {value:g}{unit}; it must be above 0, inf to measure it only, or left out"
+                )
+
+    @property
+    def judges_tissue(self) -> bool:
+        """Whether the largest pressure and strain of the tissue are measured in each control step."""
+        return self.pressure is not None or self.strain is not None
 
     def excess(self, force: float) -> float:
         """A force [N] on a scale from the soft limit (0) to the hard limit (1), not clipped."""

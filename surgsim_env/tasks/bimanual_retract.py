@@ -79,6 +79,8 @@ class BimanualRetractTask(RetractTask):
     ## Info
     That of `SurgSim/Retract-v0`, and `collided`, `touches` (bool), `uncovered` (share), `touch_force`,
     `collision_force` [N].
+    Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
+    the tissue, and `damaged` (bool): more than a limit is a safety stop.
 
     ## Arguments
     Those of `SurgSim/Retract-v0`; `instrument` is "psm_pair", or two arms (names or TOML files) as "LEFT+RIGHT":

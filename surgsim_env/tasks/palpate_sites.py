@@ -91,6 +91,8 @@ class PalpateSitesTask(Task):
     `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm), `found`
     (share of lesions with an estimate within 10 mm; on an organ without lesions 1 if the estimate has none),
     `lesion_count_estimated`, `success`.
+    Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
+    the tissue, and `damaged` (bool): more than a limit is a safety stop.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "phantom".

@@ -103,6 +103,8 @@ class RetractTask(Task):
     over the steps that held something), `pull_impulse` [N s], `slips` (holds that began to slip, or were lost while the
     jaw was commanded to close), `path_length` of the tip [m], `strain_held`, `strain_middle`, `strain_free`: largest
     strain of an edge of the mesh in the lobe's thirds, from the held edge to the free one.
+    Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
+    the tissue, and `damaged` (bool): more than a limit is a safety stop.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[retract]` table, or that names such a file, as

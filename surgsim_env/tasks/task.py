@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.measure import TissueLoad
 from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
@@ -32,6 +33,8 @@ SPEED_FULL_SCALE = 0.02
 # Bounds of the tip beyond its workspace [m] and on its speed [m/s].
 POSITION_SLACK = 0.005
 SPEED_BOUND = 0.5
+# Name of the end where tissue bears more than the limits of pressure or strain.
+DAMAGE = "damage"
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,18 +372,21 @@ class Task:
         if not fault:
             self.update(step)
         end, before = self.end(step), self._reached
+        load = simulation.tissue_load if self.limits.judges_tissue and not fault else None
+        if load is not None and end not in self.failures and self._damages(load):
+            end = DAMAGE
         if not fault:
             self._reached = self._values(step)
         # Adding 0.0 turns a product of -0.0 into 0.0.
         rewards = {one.name: one.weight * float(self._amount(one, step, end, before)) + 0.0 for one in self.rewards}
         truncated = not end and self.episode_steps is not None and self.step_count >= self.episode_steps
-        return Verdict(bool(end), truncated, rewards, self.info(step, end))
+        return Verdict(bool(end), truncated, rewards, self.info(step, end) | self.tissue_info(load, end))
 
     @property
     def failures(self) -> tuple[str, ...]:
         """Names of the ends that are failures."""
         declared = [one.name for one in self.rewards if one.per == "failure"]
-        return tuple(dict.fromkeys(("fault", *declared, "hard_force")))
+        return tuple(dict.fromkeys(("fault", *declared, "hard_force", DAMAGE)))
 
     def _values(self, step: ControlStep) -> dict[str, float]:
         """Values of the terms that pay for their change."""
@@ -393,7 +399,8 @@ class Task:
     def _amount(self, reward: Reward, step: ControlStep, end: str, before: Mapping[str, float]) -> float:
         """What a term's weight is multiplied by."""
         if reward.per in ("success", "failure"):
-            return float(end == reward.name)
+            # Damage is a safety stop, as too large a force is.
+            return float(end == reward.name or (end == DAMAGE and reward.name == "hard_force"))
         if reward.per == "change":
             return self._reached[reward.name] - before[reward.name]
         if reward.per == "step left":
@@ -403,6 +410,18 @@ class Task:
                 assert self.episode_steps is not None
                 return float(self.episode_steps - self.step_count)
         return 1.0 if reward.value is None else reward.value(self, step)
+
+    def _damages(self, load: TissueLoad) -> bool:
+        """Whether tissue bears more than the scene's limits of pressure or strain."""
+        limits = self.limits
+        return load.pressure > (limits.pressure or math.inf) or load.strain > (limits.strain or math.inf)
+
+    def tissue_info(self, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
+        """Entries of `info` of a scene whose limits judge tissue: largest pressure [Pa] and strain; 0 without one."""
+        if not self.limits.judges_tissue:
+            return {}
+        pressure, strain = (0.0, 0.0) if load is None else (load.pressure, load.strain)
+        return {"tissue_pressure": pressure, "tissue_strain": strain, "damaged": end == DAMAGE}
 
     def update(self, step: ControlStep) -> None:
         """Take in a control step without a fault, before it is judged; called once for each."""

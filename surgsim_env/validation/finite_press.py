@@ -4,7 +4,7 @@ The ball is rigid and frictionless; what holds the surface off it is a pressure 
 penetration, as in the contact law of this package. With a large k_p this is a rigid ball without penetration.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -110,7 +110,25 @@ class PressedLayer:
         Raises:
             ValueError: Newton's method does not converge.
         """
-        found: list[float] = []
+        found = [
+            self._contact(one, radius, depth, contact_stiffness)[1][self._up].sum()
+            for depth, one in self._pressed(radius, depths, contact_stiffness)
+        ]
+        return [float(force) for force in found]
+
+    def load(self, radius: float, depth: float, contact_stiffness: float = RIGID) -> tuple[float, float]:
+        """Largest contact pressure per undeformed area [Pa] and largest |lambda - 1| of the principal stretches."""
+        ((_, u),) = self._pressed(radius, (depth,), contact_stiffness)
+        rr, rz, zr, zz, hoop = self._strained(u)
+        _, gap, _ = self._gaps(u, radius, depth)
+        across = np.linalg.svd(np.moveaxis(np.array([[rr, rz], [zr, zz]]), (0, 1), (-2, -1)), compute_uv=False)
+        stretches = np.concatenate([across.ravel(), hoop.ravel()])
+        return float(contact_stiffness * gap.max()), float(np.abs(stretches - 1.0).max())
+
+    def _pressed(
+        self, radius: float, depths: Sequence[float], contact_stiffness: float
+    ) -> Iterator[tuple[float, FloatArray]]:
+        """Each depth [m] with the displacement in equilibrium there [m]."""
         displacement = np.zeros(self._basis.N)
         reached, target = 0.0, 0.0
         for depth in depths:
@@ -124,9 +142,7 @@ class PressedLayer:
                         raise ValueError(f"the reference for the ball did not converge at {target * 1e3:.3g} mm")
                     continue
                 displacement, reached = after, target
-            _, push = self._contact(displacement, radius, reached, contact_stiffness)
-            found.append(float(push[self._up].sum()))
-        return found
+            yield depth, displacement
 
     def _balanced(self, start: FloatArray, radius: float, depth: float, stiffness: float) -> FloatArray | None:
         """Displacement in equilibrium [m] from a start, by Newton's method; None where it does not converge."""
@@ -207,14 +223,18 @@ class PressedLayer:
 
     def _contact(self, u: FloatArray, radius: float, depth: float, stiffness: float) -> tuple[Any, FloatArray]:
         """Tangent stiffness and forces [N] of a ball `depth` below the surface at rest, on the surface, outward."""
+        out, gap, distance = self._gaps(u, radius, depth)
+        across = np.eye(2)[:, :, None, None] - _outer(out, out)
+        tangent = stiffness * ((gap > 0.0) * _outer(out, out) - gap / distance * across)
+        weight = 2.0 * np.pi * self._top.global_coordinates()[0] * self._top.dx
+        return _assembled(self._top, self._top_rates[:, 5:], weight, -stiffness * gap * out, tangent)
+
+    def _gaps(self, u: FloatArray, radius: float, depth: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Direction from the ball's centre, penetration and distance [m] of points of the top."""
         rates, (r, _) = self._top_values(u), self._top.global_coordinates()
         place = np.array([r + rates[5], rates[6] - (radius - depth)])
         distance = np.sqrt((place**2).sum(axis=0))
-        gap, out = np.maximum(radius - distance, 0.0), place / distance
-        across = np.eye(2)[:, :, None, None] - _outer(out, out)
-        tangent = stiffness * ((gap > 0.0) * _outer(out, out) - gap / distance * across)
-        weight = 2.0 * np.pi * r * self._top.dx
-        return _assembled(self._top, self._top_rates[:, 5:], weight, -stiffness * gap * out, tangent)
+        return place / distance, np.maximum(radius - distance, 0.0), distance
 
 
 def _outer(one: NDArray, other: NDArray) -> NDArray:

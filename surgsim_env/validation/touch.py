@@ -17,6 +17,7 @@ from msdm_core.material.regions import Damping, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.measure import tissue_load
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import advance_organ, round_shapes
 from surgsim_env.coupling.simulation import Simulation
@@ -207,6 +208,32 @@ def sites(
                 f"{name}, {what}", "homogeneous tissue", expected=0.0, measured=float(measured / force.mean()),
                 tolerance=tolerance, absolute=True, note=f"over the mean; {note}",
             )  # fmt: skip
+
+
+def tissue_loads(cells: int, tolerance: float) -> Iterator[Row]:
+    """Largest contact pressure and principal strain under the scene's tip against those of elements."""
+    scene = phantom(cells)
+    radius, depth = scene.instrument.tip_radius, scene.palpation.press_depth
+    field, mesh = modulus_field(scene.material.youngs_modulus, None), layer_mesh(DISC, SIZE[2], 0.5 * FINE, NEAR)
+    body = PressedLayer(mesh, field, scene.material.poisson_ratio)
+    touch, cell = block(cells, friction=0.0), SIZE[0] / cells
+    found = []
+    for offset in OFFSETS:
+        state = rest_state(touch.model, shape_count=1)
+        shapes = ball(0.5 * np.array(SIZE[:2]) + cell * np.array(offset), radius)
+        touch.move(state, shapes, (0.0, 0.0, -PRESS_SPEED), round(depth / (PRESS_SPEED * STEP)))
+        touch.move(state, shapes, (0.0, 0.0, 0.0), HOLD_COUNT)
+        load = tissue_load(touch.model, state, shapes, touch.law)
+        found.append((load.pressure, load.strain))
+    expected = body.load(radius, depth, scene.contact.stiffness)
+    share = cell / math.sqrt(radius * depth)
+    for what, unit, one, measured in zip(("pressure", "strain"), ("Pa", ""), expected, zip(*found), strict=True):
+        yield compare(
+            f"tissue load, largest {what}, cell / contact radius {share:.2f}", REFERENCE, expected=one,
+            measured=float(np.mean(measured)), tolerance=tolerance, unit=unit,
+            note=f"averages at nodes; {len(OFFSETS)} sites, {min(measured):.3g} to {max(measured):.3g}; tip "
+            f"{1e3 * radius:g} mm pressed {1e3 * depth:g} mm, k_p of the scene in both",
+        )  # fmt: skip
 
 
 def contrast(cells: int, hidden: Hidden) -> Iterator[Row]:

@@ -1,0 +1,87 @@
+"""What tissue bears: contact pressure and principal strain, averaged at nodes.
+
+Single quadrature points and tets feel the mesh: a ball rests on the nodes below it first. At a cell / contact radius of
+0.6 averages at nodes are within 11 % of axisymmetric finite elements, those of points and tets up to 50 % too large.
+"""
+
+import math
+
+from numba import njit
+
+from msdm_core.kernels.contact_kernels import (
+    QUADRATURE_BARYCENTRIC,
+    QUADRATURE_COUNT,
+    QUADRATURE_WEIGHT,
+    closest_on_core,
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_pressures(model, state, shapes, stiffness, push):
+    """Contact force of every node if each were pushed along the normal: sum of w A k_p g (`add_contact_forces`).
+
+    Model: model: surface_triangles (n_surface, 3), surface_rest_area [m^2] (n_surface,)
+    In:    state: node_position [m] (n_node, 3), contact_engaged (n_shape, n_surface * 4); shapes, stiffness k_p [N/m^3]
+    Out:   push, added to [N] (n_node,)
+    """
+    position, engaged, surface = state.node_position, state.contact_engaged, model.surface_triangles
+    ends, spans, area = shapes.shape_ends, shapes.shape_span, model.surface_rest_area
+    for shape in range(shapes.shape_radius.shape[0]):
+        radius = shapes.shape_radius[shape]
+        for item in range(engaged.shape[1]):
+            if not engaged[shape, item]:
+                continue
+            triangle, point = item // QUADRATURE_COUNT, item % QUADRATURE_COUNT
+            a, b, c = surface[triangle, 0], surface[triangle, 1], surface[triangle, 2]
+            bx = position[b, 0] - position[a, 0]
+            by = position[b, 1] - position[a, 1]
+            bz = position[b, 2] - position[a, 2]
+            cx = position[c, 0] - position[a, 0]
+            cy = position[c, 1] - position[a, 1]
+            cz = position[c, 2] - position[a, 2]
+            nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+            size = math.sqrt(nx * nx + ny * ny + nz * nz)
+            wb, wc = QUADRATURE_BARYCENTRIC[point, 1], QUADRATURE_BARYCENTRIC[point, 2]
+            x = position[a, 0] + wb * bx + wc * cx
+            y = position[a, 1] + wb * by + wc * cy
+            z = position[a, 2] + wb * bz + wc * cz
+            px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
+            x, y, z = x - px, y - py, z - pz
+            t = (x * nx + y * ny + z * nz) / size
+            chord_squared = radius * radius - (x * x + y * y + z * z - t * t)
+            if chord_squared > 0.0:
+                s = math.sqrt(chord_squared)
+                force = QUADRATURE_WEIGHT * area[triangle] * stiffness * s * max(s + t, 0.0) / radius
+                push[a] += (1.0 - wb - wc) * force
+                push[b] += wb * force
+                push[c] += wc * force
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_gradients(rest, position, tets, gradient):
+    """Deformation gradient of every tet times its rest volume, added to each of its nodes.
+
+    In:  rest, position: of the nodes [m] (n_node, 3), tets (n_tet, 4)
+    Out: gradient, added to: sum of V F [m^3] (n_node, 3, 3)
+    """
+    for tet in range(tets.shape[0]):
+        i, j, k, m = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
+        ax, ay, az = rest[j, 0] - rest[i, 0], rest[j, 1] - rest[i, 1], rest[j, 2] - rest[i, 2]
+        bx, by, bz = rest[k, 0] - rest[i, 0], rest[k, 1] - rest[i, 1], rest[k, 2] - rest[i, 2]
+        cx, cy, cz = rest[m, 0] - rest[i, 0], rest[m, 1] - rest[i, 1], rest[m, 2] - rest[i, 2]
+        # V times the inverse of the rest edges: a sixth of their cofactors.
+        ux, uy, uz = (by * cz - bz * cy) / 6.0, (bz * cx - bx * cz) / 6.0, (bx * cy - by * cx) / 6.0
+        vx, vy, vz = (cy * az - cz * ay) / 6.0, (cz * ax - cx * az) / 6.0, (cx * ay - cy * ax) / 6.0
+        wx, wy, wz = (ay * bz - az * by) / 6.0, (az * bx - ax * bz) / 6.0, (ax * by - ay * bx) / 6.0
+        for row in range(3):
+            a = position[j, row] - position[i, row]
+            b = position[k, row] - position[i, row]
+            c = position[m, row] - position[i, row]
+            x = a * ux + b * vx + c * wx
+            y = a * uy + b * vy + c * wy
+            z = a * uz + b * vz + c * wz
+            for corner in range(4):
+                node = tets[tet, corner]
+                gradient[node, row, 0] += x
+                gradient[node, row, 1] += y
+                gradient[node, row, 2] += z

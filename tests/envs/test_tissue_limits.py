@@ -1,0 +1,66 @@
+"""Limits on what tissue bears: in `info`, as the end of an episode, and in the scene file."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.save import scene_toml
+
+DOWN = np.array([0.0, 0.0, -1.0], dtype=np.float32)
+
+
+def made(tmp_path, **limits):
+    scene = make_scene("phantom_small")
+    path = tmp_path / "limited.toml"
+    path.write_text(scene_toml(replace(scene, limits=replace(scene.limits, **limits))))
+    return gym.make("SurgSim/Palpate-v0", scene=str(path))
+
+
+def pressed(env, steps=60):
+    """Press down until the episode ends, and one info per control step."""
+    env.reset(seed=0)
+    infos = []
+    action = np.zeros(env.action_space.shape, dtype=np.float32)
+    action[:3] = DOWN
+    for _ in range(steps):
+        _, reward, terminated, truncated, info = env.step(action)
+        infos.append((reward, info))
+        if terminated or truncated:
+            break
+    return infos
+
+
+def test_without_limits_nothing_is_measured():
+    env = gym.make("SurgSim/Palpate-v0", scene="phantom_small")
+    _, info = env.reset(seed=0)
+    assert not {"tissue_pressure", "tissue_strain", "damaged"} & info.keys()
+
+
+def test_an_infinite_limit_measures_only(tmp_path):
+    infos = pressed(made(tmp_path, strain=np.inf))
+    assert infos[-1][1]["hard_limit"] and not infos[-1][1]["damaged"]
+    strains = [info["tissue_strain"] for _, info in infos]
+    pressures = [info["tissue_pressure"] for _, info in infos]
+    assert strains[0] < 0.01 < 0.1 < max(strains) and max(pressures) > 1000.0
+
+
+@pytest.mark.parametrize(
+    ("limit", "entry"), [({"strain": 0.15}, "tissue_strain"), ({"pressure": 1500.0}, "tissue_pressure")]
+)
+def test_too_much_ends_the_episode_as_a_safety_stop(tmp_path, limit, entry):
+    infos = pressed(made(tmp_path, **limit))
+    (most,) = limit.values()
+    assert [info["damaged"] for _, info in infos] == [False] * (len(infos) - 1) + [True]
+    assert infos[-1][1][entry] > most >= max(info[entry] for _, info in infos[:-1])
+    assert not infos[-1][1]["hard_limit"] and not infos[-1][1]["success"]
+    assert infos[-1][0] < -1.0
+
+
+@pytest.mark.parametrize("limit", [{"strain": 0.0}, {"pressure": -1.0}, {"strain": np.nan}])
+def test_a_limit_that_nothing_meets_is_refused(limit):
+    (name,) = limit
+    with pytest.raises(ValueError, match=f"limits.{name} is .*; it must be above 0, inf to measure it only"):
+        replace(make_scene("phantom_small").limits, **limit)

@@ -78,6 +78,7 @@ class Press:
         volume_ratio_smallest: of any tet at any substep
         end: why it ended early (the hard limit or a fault); empty for a complete press
         duration: simulated time [s]
+        far_travel: largest displacement at the end of a node in the half of the organ that is farther from the site [m]
     """
 
     site: FloatArray
@@ -89,6 +90,7 @@ class Press:
     volume_ratio_smallest: float
     end: str
     duration: float
+    far_travel: float
 
 
 def stop_force(limits: Limits) -> float:
@@ -225,7 +227,16 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
         volume_ratio_smallest=float(simulation.organ_state.volume_ratio_smallest[0]),
         end=end,
         duration=result.duration,
+        far_travel=_far_travel(simulation, site),
     )
+
+
+def _far_travel(simulation: Simulation, site: FloatArray) -> float:
+    """`Press.far_travel` of the present state [m]."""
+    rest = simulation.anatomy.mesh.points
+    distance = np.linalg.norm(rest - site, axis=1)
+    far = distance >= np.median(distance)
+    return float(np.linalg.norm(simulation.organ_state.node_position[far] - rest[far], axis=1).max())
 
 
 def scan(

@@ -307,8 +307,7 @@ def scene_text(found: PatientScene) -> str:
     )
     comments = {
         "retract_scene": "used by the retraction environments",
-        "anchors.bed": "chosen: it lies on the side away from the probe; put its ligaments here",
-        "anchors.ball": "given on the command line",
+        **found.anchor_sources,
         "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
         "contact.damping": "[N s/m^3] as in the scene liver",
         "contact.friction": "as in the scene liver",

@@ -13,12 +13,12 @@ from surgsim_env.palpation.surface_scene import (
     CONTACT_MODULI_PER_CELL,
     PATTERN,
     SurfaceOptions,
-    anchors_of,
     with_options,
     with_substeps,
 )
 from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material, without_number
 from surgsim_env.patient.meshers import PatientMesh
+from surgsim_env.patient.supports import organ_anchors
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.levels import LEVELS
 from surgsim_env.scene.load import make_scene
@@ -66,6 +66,7 @@ class PatientScene:
         organ, regions: materials with their sources, of the healthy tissue and of each region by name
         site_count: number of sites of its raster
         notes: remarks on choices that differ from the usual
+        anchor_sources: where numbers of the anchors come from, by the path of their entry in the scene
     """
 
     patient: PatientMesh
@@ -74,6 +75,7 @@ class PatientScene:
     regions: Mapping[str, TissueMaterial]
     site_count: int
     notes: tuple[str, ...]
+    anchor_sources: Mapping[str, str]
 
     @property
     def scene(self) -> Scene:
@@ -101,10 +103,14 @@ def patient_scene(
     }
     _check_moduli(moduli, list(regions))
     scene = _first_scene(patient, out, organ.material, regions, options)
+    anchors, sources = organ_anchors(
+        patient.organ_name, patient.mesh, options, scene.instrument.approach, is_scan=patient.is_scan
+    )
+    scene = replace(scene, anchors=anchors)
     notes: list[str] = []
     anatomy, sites = _with_sites(scene, patient, options, notes)
     anatomy = _with_lesions(anatomy, notes)
-    return PatientScene(patient, _substeps_of_worst(anatomy), organ, regions, sites, tuple(notes))
+    return PatientScene(patient, _substeps_of_worst(anatomy), organ, regions, sites, tuple(notes), sources)
 
 
 def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
@@ -151,7 +157,6 @@ def _first_scene(
     return replace(
         scene,
         instrument=replace(scene.instrument, approach=direction),
-        anchors=anchors_of(options, direction),
         material=material,
     )
 

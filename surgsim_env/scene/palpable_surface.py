@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from msdm_core.kernels.ray_kernels import nearest_hits
 from msdm_core.material.regions import Material
 from msdm_core.mesh.geodesic import NearestTriangle
+from msdm_core.mesh.surface import node_normals
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.scene.model import PalpationSettings
 
@@ -150,11 +151,7 @@ def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: PalpationS
     if not chosen.any():
         raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
     face = triangles[chosen]
-    normals = np.zeros_like(mesh.points)
-    for corner in range(3):
-        np.add.at(normals, face[:, corner], area_vector[chosen])
-    length = np.linalg.norm(normals, axis=1)
-    normals[length > 0.0] /= length[length > 0.0, None]
+    normals = node_normals(mesh.points, face)
     sides = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
     edges, counts = np.unique(sides, axis=0, return_counts=True)
     thickness = np.full(len(face), np.inf)

@@ -132,9 +132,11 @@ def run_palpation(
     factor = float(rng.uniform(1.0 - MODEL_MODULUS_ERROR, 1.0 + MODEL_MODULUS_ERROR))
     organ, model = anatomy.organ(hidden), anatomy.organ(modulus_factor=factor)
     model_sites, model_normals = _displaced(anatomy.face, sites, normals, rng)
-    with _progress(console) as bar:
-        presses = scan(anatomy, organ, sites, normals, workers=workers, progress=_task(bar, "organ", len(sites)))
-        step = _task(bar, "its pre-operative model", len(sites))
+    with press_progress(console) as bar:
+        presses = scan(
+            anatomy, organ, sites, normals, workers=workers, progress=progress_task(bar, "organ", len(sites))
+        )
+        step = progress_task(bar, "its pre-operative model", len(sites))
         model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
     reading = _read(presses, scene.sensor, rng)
     model_reading = _read(model_presses, scene.sensor, rng)
@@ -256,7 +258,8 @@ def _geometry(face: PalpableFace, sites: FloatArray) -> FloatArray | None:
     return np.column_stack([1.0 / thickness, np.exp(-rim / RIM_REACH)])
 
 
-def _progress(console: Console | None) -> Progress:
+def press_progress(console: Console | None) -> Progress:
+    """A bar of presses; hidden without a console."""
     return Progress(
         TextColumn("pressing {task.description:<24}"),
         BarColumn(),
@@ -267,7 +270,8 @@ def _progress(console: Console | None) -> Progress:
     )
 
 
-def _task(bar: Progress, name: str, count: int) -> Callable[[], None]:
+def progress_task(bar: Progress, name: str, count: int) -> Callable[[], None]:
+    """A line of a bar for a number of presses of an organ; the function that advances it by one."""
     task = bar.add_task(name, total=count)
     return lambda: bar.advance(task)
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msdm_core.material.regions import Lesion, lesion_extent
 from msdm_core.mesh.surface import node_normals, triangle_lattice
@@ -42,34 +41,28 @@ def seen_from_surface(lesions: Sequence[Lesion], anatomy: Anatomy) -> list[Truth
     That is the point of the palpable face nearest to the centre where it can be pressed and none is better, or where
     nothing can be pressed.
     """
-    points, normals = pressable_points(anatomy) if lesions else (np.zeros((0, 3)), np.zeros((0, 3)))
-    truths = []
+    face, truths = anatomy.face, []
+    points, normals = _spread(face.points, face.normals, face.triangles[face.thickness >= face.thickness_smallest])
     for lesion in lesions:
         centre, half_axes = lesion_extent(anatomy.mesh, lesion)
-        point, normal = anatomy.face.project(centre)
-        if len(points):
-            weights = felt_weights(anatomy, lesion, points, normals)
-            best = int(np.argmax(weights))
-            above = felt_weights(anatomy, lesion, point[None], normal[None])[0]
-            if weights[best] > above or not _is_pressable(anatomy, point[None])[0]:
-                point, normal = points[best], normals[best]
+        point, normal = face.project(centre)
+        weights = felt_weights(anatomy, lesion, points, normals)
+        least = felt_weights(anatomy, lesion, point[None], normal[None])[0] if is_pressable(anatomy, point) else -1.0
+        for index in np.argsort(-weights):
+            if weights[index] <= least:
+                break
+            if is_pressable(anatomy, points[index]):
+                point, normal = points[index], normals[index]
+                break
         truths.append(Truth(lesion.name, centre, point, normal, float(half_axes.max())))
     return truths
 
 
-def pressable_points(anatomy: Anatomy) -> tuple[FloatArray, FloatArray]:
-    """Points all over the palpable face where sites may lie [m] and unit outward normals there, each (n_point, 3)."""
+def is_pressable(anatomy: Anatomy, point: FloatArray) -> bool:
+    """Whether a site may lie at a point of the palpable face [m] (3,): open, far from its border and what holds it."""
     face = anatomy.face
-    points, normals = _spread(face.points, face.normals, face.triangles[face.thickness >= face.thickness_smallest])
-    chosen = _is_pressable(anatomy, points)
-    return points[chosen], normals[chosen]
-
-
-def _is_pressable(anatomy: Anatomy, points: FloatArray) -> NDArray[np.bool_]:
-    """Whether points of the palpable face [m] (n_point, 3) are far enough from its border and from what holds it."""
-    face = anatomy.face
-    inside = np.array([face.rim_distance(point) >= face.margin for point in points], dtype=bool)
-    return inside & anatomy.clear_of_supports(points)
+    inside = face.rim_distance(point) >= face.margin and face.is_open(point)
+    return inside and bool(anatomy.clear_of_supports(point[None])[0])
 
 
 def surface_points(anatomy: Anatomy) -> tuple[FloatArray, FloatArray]:

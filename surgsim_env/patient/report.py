@@ -176,6 +176,7 @@ def _palpation(found: PatientScene) -> Rows:
         ("sites", f"{found.site_count}, {palpation.site_spacing * 1e3:g} mm apart"),
         ("cell / contact radius", share_text(found.anatomy.palpable_cell, tip, depth)),
         ("contact", hidden_text(2.0 * hertz_force(scene.material, tip, depth), tip, depth, scene.contact.stiffness)),
+        ("held", "not checked" if found.hold is None else found.hold.text),
         ("force limits", f"{scene.limits.soft_force:g} and {scene.limits.hard_force:g} N"),
     ]
 

@@ -18,6 +18,9 @@ from surgsim_env.scene.model import PalpationSettings
 # A raster of more points means a spacing in the wrong unit.
 SITES_MOST = 100_000
 
+# A point is open if the face over it is higher by at most this [m]: rounding.
+OPEN_GAP = 1e-6
+
 # A ray that starts on the surface meets its own triangle nearer than this [m].
 HIT_LEAST = 1e-6
 
@@ -79,7 +82,7 @@ class PalpableFace:
         return np.cumsum(area)
 
     def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
-        """A point drawn uniformly over the face, thick enough and rim_distance [m] from its border, with its normal.
+        """A point drawn uniformly over the open face, thick and rim_distance [m] from its border, with its normal.
 
         Raises:
             ValueError: no such point in 1000 draws.
@@ -93,7 +96,7 @@ class PalpableFace:
             if self.thickness[face] < self.thickness_smallest:
                 continue
             point, normal = self._at(face, weights)
-            if self.rim_distance(point) >= rim_distance:
+            if self.rim_distance(point) >= rim_distance and self.is_open(point):
                 return point, normal
         raise ValueError(
             f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: "
@@ -114,6 +117,12 @@ class PalpableFace:
         """
         hit = _drop(*self._plane, u, v)
         return None if hit is None else self._at(*hit)
+
+    def is_open(self, point: FloatArray) -> bool:
+        """Whether nothing of the face lies above a point of it [m] (3,), so that a straight tool gets there."""
+        u, v = (float(point @ axis) for axis in tangent_axes(self.approach))
+        top = self.drop(u, v)
+        return top is None or float((top[0] - point) @ -self.approach) <= OPEN_GAP
 
     def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
         """`drop`, but None also where the organ is thin or the border is nearer than the margin less a slack [m]."""

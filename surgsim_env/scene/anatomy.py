@@ -172,7 +172,7 @@ class Anatomy:
         """Refuse a ball that is not inside the organ.
 
         Raises:
-            ValueError: it sticks out, or lies outside; says by how much and where.
+            ValueError: it sticks out, or its centre is outside; says by how much and where.
         """
         if lesion.region is not None or lesion.radius is None:
             return
@@ -181,9 +181,14 @@ class Anatomy:
         corners = self._surface.corners[triangle]
         nearest = weights @ corners
         inward = (nearest - centre) @ np.cross(corners[1] - corners[0], corners[2] - corners[0]) > 0.0
-        depth = float(np.linalg.norm(nearest - centre)) * (1.0 if inward else -1.0)
+        depth = float(np.linalg.norm(nearest - centre))
+        x, y, z = nearest * 1e3
+        if not inward:
+            raise ValueError(
+                f"{lesion.name}: its centre is {depth * 1e3:.3g} mm outside the surface at {x:.1f}, {y:.1f}, "
+                f"{z:.1f} mm; the rule is that a lesion lies inside the organ (coordinates are metres)"
+            )
         if depth < lesion.radius - COVER_TOLERANCE:
-            x, y, z = nearest * 1e3
             raise ValueError(
                 f"{lesion.name}: its ball of radius {lesion.radius * 1e3:.3g} mm sticks out of the organ by "
                 f"{(lesion.radius - depth) * 1e3:.3g} mm at {x:.1f}, {y:.1f}, {z:.1f} mm: move it deeper or make it "

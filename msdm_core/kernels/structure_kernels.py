@@ -66,6 +66,9 @@ class OrganModel(NamedTuple):
         support_stiffness: pressure per penetration [N/m^3]                      scalar
         support_damping: pressure per closing speed [N s/m^3]                    scalar
         support_tangential_stiffness: traction per stretch while sticking [N/m^3] scalar
+        foundation_nodes: nodes that elastic foundations hold                    (n_held,)
+        foundation_position: where those nodes are without force [m]             (n_held, 3)
+        foundation_stiffness: force per displacement, all foundations together [N/m] (n_held, 3, 3)
         gravity: [m/s^2]                                                         (3,)
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
@@ -111,6 +114,9 @@ class OrganModel(NamedTuple):
     support_stiffness: float
     support_damping: float
     support_tangential_stiffness: float
+    foundation_nodes: NDArray[np.int32]
+    foundation_position: FloatArray
+    foundation_stiffness: FloatArray
     gravity: FloatArray
     alpha: float
     beta: float
@@ -230,6 +236,7 @@ class LaneModel(NamedTuple):
         support_nodes, support_area: as in OrganModel                            (n_support_node,) or own
         support_count: how many of them each lane has                            (n_lane,)
         support_kind and the other support_ fields: as in OrganModel
+        foundation_nodes and the other foundation_ fields: as in OrganModel
         gravity: [m/s^2]                                                         (3,)
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
@@ -275,6 +282,9 @@ class LaneModel(NamedTuple):
     support_stiffness: float
     support_damping: float
     support_tangential_stiffness: float
+    foundation_nodes: NDArray[np.int32]
+    foundation_position: FloatArray
+    foundation_stiffness: FloatArray
     gravity: FloatArray
     alpha: float
     beta: float

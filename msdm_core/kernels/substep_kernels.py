@@ -32,7 +32,7 @@ from msdm_core.kernels.structure_kernels import (
     surface_of,
     touched_of,
 )
-from msdm_core.kernels.support_kernels import add_support_forces
+from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
 from msdm_core.kernels.tissue_kernels import (
     add_energies,
     add_spring_damping,
@@ -267,7 +267,7 @@ def _begin(lanes, model, state, shapes, response, duration):
 
 @njit(forceinline=True, error_model="numpy")
 def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench):
-    """Supports, contact, guard, steep springs and squeezed tets, lane by lane; returns how many lanes move.
+    """What holds an organ, contact, guard, steep springs, squeezed tets, lane by lane; returns how many lanes move.
 
     An inverted tet stops its lane before anything moves: the state shows which tet it was.
     """
@@ -285,6 +285,10 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
         if model.support_kind.shape[0] > 0:
             stretch = part_of(lanes, state.support_stretch, lane)
             add_support_forces(supports_of(lanes, model, lane), position, velocity, force, stretch, dt)
+        if model.foundation_nodes.shape[0] > 0:
+            add_foundation_forces(
+                model.foundation_nodes, model.foundation_position, model.foundation_stiffness, position, force
+            )
         count = state.candidate_count[lane]
         if count == 0 and squeezed_count == 0 and steep_count == 0:
             continue
@@ -395,7 +399,7 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def evaluate_forces(model, state):
-    """Internal forces and gravity of a state, without contact and supports.
+    """Internal forces and gravity of a state, without contact, supports and foundations.
 
     In:  model, state: positions [m] and velocities [m/s] (n_node, 3)
     Out: state: node_force [N] (n_node, 3), volume_ratio_smallest (1,)

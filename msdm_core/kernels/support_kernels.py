@@ -1,4 +1,4 @@
-"""Contact of an organ with fixed solids: pressure on every node inside one, and stick-slip friction."""
+"""What holds an organ: contact with fixed solids (pressure, stick-slip friction) and elastic foundations."""
 
 import math
 
@@ -63,6 +63,24 @@ def add_support_forces(model, position, velocity, force, stretch, dt):
             force[node, 0] += area * (load * nx - across * ux)
             force[node, 1] += area * (load * ny - across * uy)
             force[node, 2] += area * (load * nz - across * uz)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_foundation_forces(nodes, rest, stiffness, position, force):
+    """Hold nodes elastically where they are without force: f = -K (x - x0).
+
+    In:  nodes (n_held,), rest: x0 [m] (n_held, 3), stiffness: K [N/m] (n_held, 3, 3), position [m] (n_node, 3)
+    Out: force, added to [N] (n_node, 3)
+    """
+    for item in range(nodes.shape[0]):
+        node = nodes[item]
+        x = position[node, 0] - rest[item, 0]
+        y = position[node, 1] - rest[item, 1]
+        z = position[node, 2] - rest[item, 2]
+        for axis in range(3):
+            force[node, axis] -= (
+                stiffness[item, axis, 0] * x + stiffness[item, axis, 1] * y + stiffness[item, axis, 2] * z
+            )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -45,6 +45,23 @@ def triangles_facing(
     return cosine >= np.cos(np.radians(angle_deg))
 
 
+def node_normals(points: FloatArray, triangles: NDArray[np.integer]) -> FloatArray:
+    """Unit outward normal at each node, the mean of its triangles' weighted by their areas; 0 without any (n_node, 3).
+
+    Args:
+        points: nodes [m], shape (n_node, 3).
+        triangles: corners in outward order, shape (n_triangle, 3).
+    """
+    corners = points[triangles]
+    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], area_vector)
+    length = np.linalg.norm(normals, axis=1)
+    normals[length > 0.0] /= length[length > 0.0, None]
+    return normals
+
+
 def merge_vertices(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArray, Int64Array]:
     """Give exactly coinciding vertices one number (an STL file shares none) and drop the unused ones."""
     points, corners = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)

@@ -19,7 +19,7 @@ from msdm_core.kernels.element_kernels import STEEP_EXCESS
 from msdm_core.kernels.squeeze_kernels import STEEP_WIDTH
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneModel, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
-from msdm_core.kernels.support_kernels import add_support_forces
+from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
 from msdm_core.kernels.vector_kernels import aligned_zeros
 from msdm_core.material.lumping import MassScheme, lump_mass
 from msdm_core.material.regions import (
@@ -38,6 +38,7 @@ from msdm_core.material.tissue_law import ARM_COUNT, Stiffening
 from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
+from msdm_core.organ.foundation import Foundation, foundation_fields
 from msdm_core.organ.measure import spring_tensions
 from msdm_core.organ.stability import own_step, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
@@ -70,6 +71,7 @@ class OrganSpec:
         gravity: [m/s^2]; off by default, because a scanned shape is the equilibrium.
         supports: fixed solids that it rests on.
         support_law: their contact law.
+        foundations: elastic ones that hold its surface.
     """
 
     mesh: TetMesh
@@ -83,6 +85,7 @@ class OrganSpec:
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     supports: tuple[Support, ...] = ()
     support_law: SupportLaw = field(default_factory=SupportLaw)
+    foundations: tuple[Foundation, ...] = ()
 
 
 def compile_organ(spec: OrganSpec) -> OrganModel:
@@ -92,7 +95,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
 
     Raises:
         OrganError: an organ of impossible size, a region without material, a lesion outside the organ or smaller than
-            a cell, an anchor that is no node, a support smaller than a cell.
+            a cell, an anchor that is no node, a support smaller than a cell, a foundation off the surface.
     """
     mesh = spec.mesh
     _check_extent(mesh)
@@ -130,6 +133,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         surface_triangles=_read_only(np.ascontiguousarray(surface)),
         surface_rest_area=_read_only(area),
         **support_fields(spec.supports, spec.support_law, mesh, surface, anchored),
+        **foundation_fields(spec.foundations, mesh, anchored),
         gravity=_read_only(_checked_gravity(spec.gravity)),
         alpha=float(spec.damping.alpha),
         beta=float(spec.damping.beta),
@@ -253,6 +257,10 @@ def _relax(model: OrganModel, state: OrganState) -> None:
         add_support_forces(
             relaxed, state.node_position, state.node_velocity, state.node_force, state.support_stretch, 0.0
         )
+        add_foundation_forces(
+            relaxed.foundation_nodes, relaxed.foundation_position, relaxed.foundation_stiffness,
+            state.node_position, state.node_force,
+        )  # fmt: skip
         if np.linalg.norm(state.node_force[free], axis=1).sum() <= FORCE_TOLERANCE * weight:
             return
         displacement = state.node_position - model.node_rest_position

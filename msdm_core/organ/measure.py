@@ -31,13 +31,14 @@ def kinetic_energy(model: OrganModel, state: OrganState) -> float:
 
 
 def potential_energy(model: OrganModel, state: OrganState) -> float:
-    """Energy of springs, volume term and gravity, zero at the undeformed position [J].
+    """Energy of springs, volume term, foundations and gravity, zero at the undeformed position [J].
 
     U = sum_s U_s(l_s) + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
-        + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) - sum_i m_i g . (x_i - X_i)
+        + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) + sum_h u_h . K_h u_h / 2 - sum_i m_i g . (x_i - X_i)
     where U_s is the energy of a spring, k (l - l0)^2 / 2 if none stiffens, with that of its Maxwell arms, a is a volume
     averaged at a node, K'_t the share averaged and the fourth sum over tets below s = SQUEEZED_RATIO (infinite for one
-    that is inside out). A resting tool's `contact_energy` is not in it, nor what supports store.
+    that is inside out), and u_h the displacement of a node on an elastic foundation. A resting tool's `contact_energy`
+    is not in it, nor what supports store.
     """
     ends = state.node_position[model.spring_nodes]
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -53,7 +54,9 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(model.node_mass)) / model.node_rest_volume
     volume += 0.5 * float((model.node_bulk * model.node_rest_volume) @ (averaged - 1.0) ** 2)
     lift = (state.node_position - model.node_rest_position) @ model.gravity
-    return springs + volume - float(model.node_mass @ lift)
+    moved = state.node_position[model.foundation_nodes] - model.foundation_position
+    held = 0.5 * float(np.einsum("ni,nij,nj->", moved, model.foundation_stiffness, moved))
+    return springs + volume + held - float(model.node_mass @ lift)
 
 
 def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:

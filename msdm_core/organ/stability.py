@@ -31,7 +31,9 @@ HELD_TANGENT = SWEEPS_MOST / SWEEPS_PER_TANGENT
 def apply_stiffness(
     model: OrganModel, displacement: FloatArray, force: FloatArray, spring_stiffness: FloatArray | None = None
 ) -> None:
-    """Fill `force` with the linearised internal forces at rest, K u [N], of a displacement u [m]; both (n_node, 3).
+    """Fill `force` with the linearised forces at rest, K u [N], of a displacement u [m]; both (n_node, 3).
+
+    K is that of the tissue and of its foundations.
 
     The springs have the stiffness of the model, in equilibrium, or the one given [N/m], (n_spring,).
     """
@@ -40,6 +42,9 @@ def apply_stiffness(
         model.node_rest_position, model.spring_nodes, stiffness, model.tet_nodes, model.tet_rest_volume,
         model.tet_bulk, model.node_rest_volume, model.node_bulk, displacement, np.empty(len(model.node_mass)), force,
     )  # fmt: skip
+    held = model.foundation_nodes
+    if len(held):
+        force[held] += np.einsum("nij,nj->ni", model.foundation_stiffness, displacement[held])
 
 
 def explicit_stiffness(model: OrganModel) -> FloatArray:
@@ -171,7 +176,7 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
 
 
 def own_step(model: OrganModel) -> float:
-    """Largest stable step without instruments [s]: springs, volume term, alpha, beta and supports."""
+    """Largest stable step without instruments [s]: springs, volume term, alpha, beta, supports and foundations."""
     if not len(model.support_kind):
         return step_limit(largest_frequency(model), model.alpha, model.beta)
     return _held_step(model, *support_hold(model))
@@ -275,7 +280,7 @@ def _with_mass(model: OrganModel, mass: FloatArray) -> OrganModel:
 
 
 def _node_stiffness(model: OrganModel) -> FloatArray:
-    """Stiffness of each node while all others are fixed, with supports [N/m], shape (n_node,)."""
+    """Stiffness of each node while all others are fixed, with what holds it [N/m], shape (n_node,)."""
     block = np.zeros((len(model.node_mass), 3, 3))
     span = model.node_rest_position[model.spring_nodes]
     along = (span[:, 1] - span[:, 0]) / model.spring_rest_length[:, None]
@@ -290,4 +295,5 @@ def _node_stiffness(model: OrganModel) -> FloatArray:
         np.add.at(
             block, model.tet_nodes[:, corner], modulus[:, None, None] * np.einsum("ti,tj->tij", gradient, gradient)
         )
+    block[model.foundation_nodes] += model.foundation_stiffness
     return np.linalg.eigvalsh(block)[:, -1].astype(np.float64) + support_hold(model)[0]

@@ -90,6 +90,7 @@ class Organ:
             options=SurfaceOptions(approach=vector_of("--approach", self.approach), youngs_modulus=self.youngs_modulus),
             moduli=_moduli(self.modulus),
         )
+        found = patient.with_hold(found, console)
         found, retraction = patient.add_retraction(found, out)
         patient.print_patient(found, console)
         console.print(f"retraction: {told(retraction)}", highlight=False)

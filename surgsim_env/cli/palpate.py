@@ -22,6 +22,7 @@ from surgsim_env.palpation.job import (
     MODEL_MODULUS_ERROR,
     PICTURE_NAME,
     SUMMARY_NAME,
+    plan_sites,
     print_report,
     run_palpation,
     write_csv,
@@ -29,7 +30,7 @@ from surgsim_env.palpation.job import (
 )
 from surgsim_env.palpation.surface_scene import SurfaceOptions, load_stable_anatomy, surface_scene, with_options
 from surgsim_env.reports.output_folder import OutputFolder, output_folder
-from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Ball, Scene, Vector
 
@@ -59,8 +60,11 @@ class Palpate:
     lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """x,y,z,radius,ratio: centre and radius [m], ratio of its modulus to the healthy one; repeatable; replaces the
     scene's lesions."""
+    lesion_below: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """SITE,DEPTH,RADIUS,RATIO: a lesion below a site of the raster, by its number in palpation.csv; depth of its centre
+    and radius [m], ratio as in --lesion; repeatable, with or without --lesion."""
     anchors: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """x,y,z,radius: a ball [m]; the surface inside it is held. Default: the deepest 15 % along the approach."""
+    """x,y,z,radius: a ball [m]; the surface inside it is fixed. Default: fat over the side away from the probe."""
     approach: MaybeText = None
     """x,y,z: direction of the probe. Default: the scene's; 0,0,-1 for --surface (from the head where z is up)."""
     around: MaybeText = None
@@ -106,7 +110,7 @@ class Palpate:
         """
         _check(self)
         # Checked before an organ is made, which takes a minute.
-        around, asked = _around(self), _asked_lesions(self)
+        around, asked, below = _around(self), _asked_lesions(self), _asked_below(self)
         # Without a cell size, an organ is made in proportion to its size, as `surgsim organ` makes it.
         file = self.segmentation or (self.surface if self.cell_size is None else None)
         if file is None:
@@ -121,8 +125,11 @@ class Palpate:
             assert scene is not None
             anatomy = load_anatomy(scene)
             lesions = anatomy.demonstration_lesions()
-            if asked:
-                lesions = [anatomy.lesion_at(*one, f"lesion {number}") for number, one in enumerate(asked, start=1)]
+            if asked or below:
+                places = [*asked, *(_below_site(anatomy, *one) for one in below)]
+                lesions = [anatomy.lesion_at(*one, f"lesion {number}") for number, one in enumerate(places, start=1)]
+                for lesion in lesions:
+                    anatomy.check_inside(lesion)
             anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
             found = run_palpation(
                 anatomy, lesions=lesions, around=around, seed=self.seed, workers=self.workers, console=console
@@ -174,6 +181,33 @@ def _asked_lesions(command: Palpate) -> list[tuple[Vector, float, float]]:
     return asked
 
 
+def _asked_below(command: Palpate) -> list[tuple[int, float, float, float]]:
+    """Site, depth of the centre [m], radius [m] and modulus ratio of each --lesion-below."""
+    asked = []
+    for text in command.lesion_below:
+        site, depth, radius, ratio = numbers_of("--lesion-below", text, "SITE,DEPTH,RADIUS,RATIO")
+        if site != int(site) or site < 0:
+            raise ValueError(f"--lesion-below {text}: the site is {site:g}; it must be a site's number, from 0")
+        if not ratio > 0.0:
+            raise ValueError(f"--lesion-below {text}: the modulus ratio is {ratio:g}; it must be above 0")
+        if not depth > radius > 0.0:
+            raise ValueError(
+                f"--lesion-below {text}: the centre is {depth * 1e3:g} mm deep, the radius {radius * 1e3:g} mm; the "
+                "rule is depth > radius > 0, or it sticks out of the organ"
+            )
+        asked.append((int(site), depth, radius, ratio))
+    return asked
+
+
+def _below_site(anatomy: Anatomy, site: int, depth: float, radius: float, ratio: float) -> tuple[Vector, float, float]:
+    """Centre [m], radius [m] and modulus ratio of a lesion below a site."""
+    sites, normals, _ = plan_sites(anatomy)
+    if site >= len(sites):
+        raise ValueError(f"--lesion-below {site}: there are {len(sites)} sites, from 0 to {len(sites) - 1}")
+    x, y, z = (sites[site] - depth * normals[site]).tolist()
+    return (x, y, z), radius, ratio
+
+
 def _scene(command: Palpate, console: Console) -> Scene:
     """The scene of a file or a name, or of a surface with a cell size."""
     if command.surface is not None:
@@ -206,7 +240,7 @@ def _surface_scene(command: Palpate, file: Path, console: Console) -> Scene:
     assert unit is not None and cell_size is not None
     scene = surface_scene(file, length_unit=unit, cell_size=cell_size, options=command.options)
     x, y, z = scene.instrument.approach
-    held = "the anchors given" if command.anchors else "its bed, the deepest 15 % along the approach"
+    held = "the anchors given" if command.anchors else "fat on the side away from the probe"
     material, depth, tip = scene.material, scene.palpation.press_depth, scene.instrument.tip_radius
     console.print(
         f"{file.name}: pressed along {x:.3g}, {y:.3g}, {z:.3g} of the file's axes (--approach), "

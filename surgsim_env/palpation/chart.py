@@ -275,6 +275,7 @@ def _digest(anatomy: Anatomy) -> str:
         *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing, scene.limits),
         *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports, scene.support_law),
         tuple(region for region in scene.regions if not region.lesion),
+        tuple(one for one in scene.anchors if one.is_elastic),
     )
     digest.update(repr(parts).encode())
     core, here = Path(msdm_core.__file__).parent, Path(__file__)

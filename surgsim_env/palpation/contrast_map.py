@@ -1,15 +1,15 @@
 """Contrast maps: stiffness over a healthy baseline at each site, the lesions felt on a map, and their errors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from msdm_core.material.regions import Lesion, lesion_extent
 from msdm_core.mesh.geodesic import SurfaceDistance
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.lesion_estimator import strongest_apart
+from surgsim_env.palpation.truth import Truth
 
 # Rounds of reweighting: first Huber's weights, whose problem is convex, then Tukey's, which reject lesions.
 HUBER_ROUNDS = 8
@@ -42,8 +42,6 @@ HEALTHY_DISTANCE = 0.015
 # Distances are capped at this [m] when estimates are matched with lesions.
 MATCHING_REACH = 0.05
 
-Projection = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -52,17 +50,6 @@ class Estimate:
     point: FloatArray
     contrast: float
     excess: float
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """A lesion seen from the surface: the face's point nearest to its centre [m], the normal there, its radius."""
-
-    name: str
-    centre: FloatArray
-    point: FloatArray
-    normal: FloatArray
-    radius: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +77,9 @@ class ContrastMap:
         estimates: lesions, strongest first
         scores: one for each lesion
         false_alarms: estimates that lie within no lesion's radius
-        healthy_std, healthy_robust_std: of the contrast over sites far from every lesion
+        healthy_count: sites far from every lesion
+        healthy_std, healthy_robust_std: of the contrast over them
+        threshold: a maximum is felt where the smoothed contrast exceeds its surroundings by more
     """
 
     name: str
@@ -98,8 +87,10 @@ class ContrastMap:
     estimates: tuple[Estimate, ...]
     scores: tuple[LesionScore, ...]
     false_alarms: int
+    healthy_count: int
     healthy_std: float
     healthy_robust_std: float
+    threshold: float
 
     @property
     def felt_count(self) -> int:
@@ -229,10 +220,9 @@ def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> 
     if len(sites) < 2:
         return []
     distance = np.linalg.norm(sites[:, None] - sites[None], axis=2) / spacing
-    kernel = np.exp(-0.5 * (distance / KERNEL_SPACINGS) ** 2)
-    smooth = kernel @ contrast / kernel.sum(axis=1)
+    smooth = smoothed(sites, contrast, spacing=spacing)
     middle = healthy_majority(smooth)[0]
-    threshold = max(CONTRAST_FLOOR, SCATTERS_ABOVE * robust_spread(contrast - smooth))
+    threshold = felt_threshold(sites, contrast, spacing=spacing)
     near = distance <= CENTROID_SPACINGS
     maxima = np.flatnonzero(smooth >= np.where(near, smooth, -np.inf).max(axis=1))
     excess = np.array([smooth[one] - _surroundings(smooth, distance[one], middle) for one in maxima])
@@ -248,21 +238,23 @@ def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> 
     return estimates
 
 
+def smoothed(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> FloatArray:
+    """The contrast smoothed over the sites by a Gaussian, shape (n_site,); arguments as in `feel_lesions`."""
+    distance = np.linalg.norm(sites[:, None] - sites[None], axis=2) / spacing
+    kernel = np.exp(-0.5 * (distance / KERNEL_SPACINGS) ** 2)
+    return kernel @ contrast / kernel.sum(axis=1)
+
+
+def felt_threshold(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> float:
+    """How far a maximum of the smoothed contrast must exceed its surroundings; arguments as in `feel_lesions`."""
+    return max(CONTRAST_FLOOR, SCATTERS_ABOVE * robust_spread(contrast - smoothed(sites, contrast, spacing=spacing)))
+
+
 def _surroundings(smooth: FloatArray, distance: FloatArray, majority: float) -> float:
     """The healthy level around a site; that of the whole map where the raster ends too soon."""
     low, high = SURROUNDINGS_SPACINGS
     ring = (distance > low) & (distance <= high)
     return float(np.quantile(smooth[ring], 0.25)) if ring.sum() >= FEWEST_SURROUNDING else majority
-
-
-def seen_from_surface(lesions: Sequence[Lesion], mesh: TetMesh, project: Projection) -> list[Truth]:
-    """The lesions with the nearest point of the palpable face and the normal there."""
-    truths = []
-    for lesion in lesions:
-        centre, half_axes = lesion_extent(mesh, lesion)
-        point, normal = project(centre)
-        truths.append(Truth(lesion.name, centre, point, normal, float(half_axes.max())))
-    return truths
 
 
 def score_map(
@@ -272,6 +264,8 @@ def score_map(
     estimates: Sequence[Estimate],
     truths: Sequence[Truth],
     surface: SurfaceDistance,
+    *,
+    spacing: float,
 ) -> ContrastMap:
     """Match estimates to lesions one to one by the least sum of distances along the surface, and measure the map."""
     places = np.array([estimate.point for estimate in estimates]).reshape(-1, 3)
@@ -295,6 +289,8 @@ def score_map(
         estimates=tuple(estimates),
         scores=tuple(scores),
         false_alarms=int((~inside.any(axis=0)).sum()) if len(places) else 0,
+        healthy_count=int(healthy.sum()),
         healthy_std=float(contrast[healthy].std()) if healthy.any() else np.nan,
         healthy_robust_std=robust_spread(contrast[healthy]) if healthy.any() else np.nan,
+        threshold=felt_threshold(sites, contrast, spacing=spacing),
     )

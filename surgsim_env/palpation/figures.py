@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.contrast_map import ContrastMap, Truth
+from surgsim_env.palpation.contrast_map import ContrastMap
 from surgsim_env.palpation.job import MODEL, PalpationResult
 from surgsim_env.palpation.surface_drawing import (
     FADE_TO,
@@ -23,6 +23,7 @@ from surgsim_env.palpation.surface_drawing import (
     save_png,
     tube,
 )
+from surgsim_env.palpation.truth import Truth
 from surgsim_env.scene.palpable_surface import tangent_axes
 
 if TYPE_CHECKING:

@@ -22,15 +22,16 @@ from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.palpation.contrast_map import (
     ContrastMap,
     LesionScore,
-    Truth,
     contrast_with_model,
     contrast_with_neighbours,
     feel_lesions,
     score_map,
-    seen_from_surface,
 )
+from surgsim_env.palpation.hold import Hold, hold_of
+from surgsim_env.palpation.misses import HEALTHY_FEWEST, Miss, PressedSites, explain_misses
 from surgsim_env.palpation.press import Press, scan
-from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.palpation.truth import Truth, seen_from_surface
+from surgsim_env.scene.anatomy import SUPPORT_TIP_RADII, Anatomy
 from surgsim_env.scene.model import Ball, ForceSensor
 from surgsim_env.scene.palpable_surface import (
     PalpableFace,
@@ -44,8 +45,6 @@ from surgsim_env.scene.palpable_surface import (
 # Errors of the pre-operative model: modulus by up to this share, place of each press by this distance [m].
 MODEL_MODULUS_ERROR = 0.2
 MODEL_SITE_ERROR = 0.002
-# A site within this many tip radii of a fixed node is dominated by the support and is not pressed.
-SUPPORT_TIP_RADII = 2.0
 # Decay length of the rim's influence on stiffness [m].
 RIM_REACH = 0.015
 
@@ -69,6 +68,8 @@ class PalpationResult:
         reading: of the force sensor along the normal at the end of each press [N]                 (n_site,)
         used: sites whose two presses both reached the set depth and read a force above 0           (n_site,)
         maps: against the healthy neighbours and against the model; they hold the used sites only
+        misses: why lesions were not felt, for each map that does not show one
+        hold: how the healthy model's presses were borne; None where none of them was complete
         model_modulus_factor: modulus of the model over the true one
         support_count: raster sites too near to a support, which were not pressed
         seed, wall_time [s]: of the run
@@ -82,6 +83,8 @@ class PalpationResult:
     reading: FloatArray
     used: np.ndarray
     maps: tuple[ContrastMap, ...]
+    misses: tuple[Miss, ...]
+    hold: Hold | None
     model_modulus_factor: float
     support_count: int
     seed: int
@@ -129,9 +132,11 @@ def run_palpation(
     factor = float(rng.uniform(1.0 - MODEL_MODULUS_ERROR, 1.0 + MODEL_MODULUS_ERROR))
     organ, model = anatomy.organ(hidden), anatomy.organ(modulus_factor=factor)
     model_sites, model_normals = _displaced(anatomy.face, sites, normals, rng)
-    with _progress(console) as bar:
-        presses = scan(anatomy, organ, sites, normals, workers=workers, progress=_task(bar, "organ", len(sites)))
-        step = _task(bar, "its pre-operative model", len(sites))
+    with press_progress(console) as bar:
+        presses = scan(
+            anatomy, organ, sites, normals, workers=workers, progress=progress_task(bar, "organ", len(sites))
+        )
+        step = progress_task(bar, "its pre-operative model", len(sites))
         model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
     reading = _read(presses, scene.sensor, rng)
     model_reading = _read(model_presses, scene.sensor, rng)
@@ -144,7 +149,9 @@ def run_palpation(
             f"no press gave a stiffness at the set depth of {scene.palpation.press_depth * 1e3:g} mm; the first ended "
             f"by: {why}: change the press depth, limits.hard_force or the sensor"
         )
-    truths = tuple(seen_from_surface(hidden, anatomy.mesh, anatomy.face.project))
+    truths = tuple(seen_from_surface(hidden, anatomy))
+    maps = _maps(anatomy, presses, model_presses, (reading, model_reading), used, truths)
+    pressed = PressedSites(sites[used], sites[~used], scene.palpation.site_spacing)
     return PalpationResult(
         anatomy=anatomy,
         lesions=hidden,
@@ -153,7 +160,9 @@ def run_palpation(
         model_presses=tuple(model_presses),
         reading=reading,
         used=used,
-        maps=_maps(anatomy, presses, model_presses, (reading, model_reading), used, truths),
+        maps=maps,
+        misses=explain_misses(anatomy, organ, hidden, truths, maps, pressed),
+        hold=hold_of(anatomy, model_presses, modulus_factor=factor),
         model_modulus_factor=factor,
         support_count=support_count,
         seed=seed,
@@ -180,13 +189,13 @@ def plan_sites(anatomy: Anatomy, around: Ball | None = None) -> tuple[FloatArray
     if around is not None:
         inside = np.linalg.norm(sites - np.asarray(around.centre), axis=1) <= around.radius
         sites, normals = sites[inside], normals[inside]
-    held = anatomy.mesh.points[anatomy.anchors]
-    gap = SUPPORT_TIP_RADII * scene.instrument.tip_radius
-    free = np.array([np.linalg.norm(held - site, axis=1).min() > gap for site in sites], dtype=bool)
+    free = anatomy.clear_of_supports(sites)
     if not free.any():
+        tip = scene.instrument.tip_radius * 1e3
         raise ValueError(
             f"scene {scene.name!r}: no site to press: {len(sites)} raster sites lie on the palpable face (inside the "
-            f"ball asked for, if any), all within {gap * 1e3:g} mm of a support: use a smaller site_spacing or "
+            f"ball asked for, if any), all within {SUPPORT_TIP_RADII * tip:g} mm of a fixed support or {tip:g} mm of "
+            "an elastic one: use a smaller site_spacing or "
             "face_margin, turn the approach, or move the anchors"
         )
     return sites[free], normals[free], int((~free).sum())
@@ -225,7 +234,15 @@ def _maps(
         MODEL: contrast_with_model(stiffness, model_stiffness),
     }
     first, second = (
-        score_map(name, sites, contrast, feel_lesions(sites, contrast, spacing=spacing), truths, anatomy.along_surface)
+        score_map(
+            name,
+            sites,
+            contrast,
+            feel_lesions(sites, contrast, spacing=spacing),
+            truths,
+            anatomy.along_surface,
+            spacing=spacing,
+        )
         for name, contrast in contrasts.items()
     )
     return first, second
@@ -241,7 +258,8 @@ def _geometry(face: PalpableFace, sites: FloatArray) -> FloatArray | None:
     return np.column_stack([1.0 / thickness, np.exp(-rim / RIM_REACH)])
 
 
-def _progress(console: Console | None) -> Progress:
+def press_progress(console: Console | None) -> Progress:
+    """A bar of presses; hidden without a console."""
     return Progress(
         TextColumn("pressing {task.description:<24}"),
         BarColumn(),
@@ -252,7 +270,8 @@ def _progress(console: Console | None) -> Progress:
     )
 
 
-def _task(bar: Progress, name: str, count: int) -> Callable[[], None]:
+def progress_task(bar: Progress, name: str, count: int) -> Callable[[], None]:
+    """A line of a bar for a number of presses of an organ; the function that advances it by one."""
     task = bar.add_task(name, total=count)
     return lambda: bar.advance(task)
 
@@ -317,7 +336,8 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
             {"name": one.name, "centre_m": one.centre, "surface_point_m": one.point, "radius_m": one.radius}
             for one in palpation.truths
         ],
-        "maps": {one.name: _map_entry(one) for one in palpation.maps},
+        "maps": {one.name: _map_entry(one, palpation.misses) for one in palpation.maps},
+        "held": _held_entry(palpation.hold),
         "force_peak_N": max(forces),
         "tissue_pressure_largest_Pa": max(press.load.pressure for press in palpation.presses),
         "tissue_strain_largest": max(press.load.strain for press in palpation.presses),
@@ -333,7 +353,18 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
     return plain
 
 
-def _map_entry(one: ContrastMap) -> dict[str, Any]:
+def _held_entry(hold: Hold | None) -> dict[str, Any] | None:
+    if hold is None:
+        return None
+    return {
+        "healthy_force_over_hertz": hold.force_share,
+        "far_travel_over_depth": hold.far_share,
+        "faults": list(hold.faults),
+    }
+
+
+def _map_entry(one: ContrastMap, misses: Sequence[Miss]) -> dict[str, Any]:
+    reasons = {miss.lesion: miss for miss in misses if miss.map_name == one.name}
     return {
         "estimates": [
             {"point_m": item.point, "contrast": item.contrast, "excess": item.excess} for item in one.estimates
@@ -345,18 +376,21 @@ def _map_entry(one: ContrastMap) -> dict[str, Any]:
                 "error_mm": score.error * 1e3,
                 "estimate": score.estimate,
                 "contrast": score.contrast,
+                "miss": reasons[score.truth.name].reason if score.truth.name in reasons else None,
+                "why": reasons[score.truth.name].text if score.truth.name in reasons else None,
             }
             for score in one.scores
         ],
         "felt": one.felt_count,
         "false_alarms": one.false_alarms,
+        "healthy_sites": one.healthy_count,
         "healthy_std": one.healthy_std,
         "healthy_robust_std": one.healthy_robust_std,
     }
 
 
 def _healthy(one: ContrastMap) -> str:
-    return "-" if math.isnan(one.healthy_std) else f"1 ± {one.healthy_std:.2f}"
+    return "-" if math.isnan(one.healthy_std) else f"1 ± {one.healthy_std:.2f} ({one.healthy_count})"
 
 
 def print_report(palpation: PalpationResult, console: Console) -> None:
@@ -375,6 +409,19 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
     console.print(table)
     for one in palpation.maps:
         console.print(verdict(one))
+        for miss in palpation.misses:
+            if miss.map_name == one.name:
+                console.print(f"  {miss.lesion}: {miss.text}", highlight=False)
+    fewest = min(one.healthy_count for one in palpation.maps)
+    if fewest < HEALTHY_FEWEST:
+        console.print(
+            f"weak baseline: {fewest} healthy sites, the rule is at least {HEALTHY_FEWEST}: press more sites (smaller "
+            "--spacing, no --around)"
+        )
+    if palpation.hold is not None:
+        console.print(f"held: {palpation.hold.text}", highlight=False)
+        for fault in palpation.hold.faults:
+            console.print(f"not held well: {fault}", highlight=False)
     early = int((~palpation.used).sum())
     every = (*palpation.presses, *palpation.model_presses)
     console.print(

@@ -80,6 +80,7 @@ class Press:
         load: largest contact pressure and strain of the tissue at the end
         end: why it ended early (the hard limit or a fault); empty for a complete press
         duration: simulated time [s]
+        far_travel: largest displacement at the end of a node in the half of the organ that is farther from the site [m]
     """
 
     site: FloatArray
@@ -92,6 +93,7 @@ class Press:
     load: TissueLoad
     end: str
     duration: float
+    far_travel: float
 
 
 def stop_force(limits: Limits) -> float:
@@ -229,7 +231,16 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
         load=simulation.tissue_load,
         end=end,
         duration=result.duration,
+        far_travel=_far_travel(simulation, site),
     )
+
+
+def _far_travel(simulation: Simulation, site: FloatArray) -> float:
+    """`Press.far_travel` of the present state [m]."""
+    rest = simulation.anatomy.mesh.points
+    distance = np.linalg.norm(rest - site, axis=1)
+    far = distance >= np.median(distance)
+    return float(np.linalg.norm(simulation.organ_state.node_position[far] - rest[far], axis=1).max())
 
 
 def scan(

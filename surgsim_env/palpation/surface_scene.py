@@ -11,13 +11,22 @@ from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.organ.stability import stable_dt
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import Anchor, Ball, Bed, MeshSource, Scene, SurfaceMesh, Vector, substeps_needed
+from surgsim_env.scene.model import Anchor, Ball, MeshSource, Scene, Side, SurfaceMesh, Vector, substeps_needed
 
 PATTERN = "liver"
 # Against the file's third axis: from above if z points up; from the head in a CT's patient axes (z to the head).
 DEFAULT_APPROACH = (0.0, 0.0, -1.0)
-# Without anchors, surface nodes in this deepest share of the organ along the approach are held (its bed).
-BED_SHARE = 0.15
+# Without anchors an organ lies in fat but for the side that faces the probe: E / h and E / 3h of 8 mm of it (chosen).
+# E is 3 x 752 Pa, the shear modulus of human fat that bears no load, by MR elastography at 50 Hz (gluteal, J Mech Behav
+# Biomed Mater 2023, "Strain-dependent shear properties of human adipose tissue in vivo"); in pigs 3 x 530 Pa (doi
+# 10.1007/s10237-010-0207-9).
+FAT_STIFFNESS, FAT_SHEAR_STIFFNESS = 2.8e5, 9.4e4
+# It reaches around the flanks: largest angle between outward normal and approach [degrees].
+FAT_ANGLE = 110.0
+FAT_SOURCE = (
+    "[N/m^3] E / h, and E / 3h across, of a layer of fat, h 8 mm (chosen), E 3 x 752 Pa (human, MR elastography 2023)"
+)
+FAT_NAME = "surrounding fat and wall"
 # Contact stiffness times cell over Young's modulus: about 0.2 mm of penetration in a press, as in the liver scene.
 CONTACT_MODULI_PER_CELL = 18.0
 # Limit of organ substeps in a haptic step: more would take hours.
@@ -32,7 +41,7 @@ class SurfaceOptions:
 
     Args:
         approach: direction of the probe's approach, in the file's axes; DEFAULT_APPROACH if not given.
-        anchors: balls whose surface nodes are held: x, y, z, radius [m]; without one, the bed is held.
+        anchors: balls whose surface nodes are fixed: x, y, z, radius [m]; without one, `soft_bed` holds the organ.
         press_depth, tip_radius, spacing: [m].
         youngs_modulus: of the healthy tissue [Pa].
     """
@@ -142,10 +151,15 @@ def _direction(vector: Vector) -> Vector:
     return x, y, z
 
 
+def soft_bed(approach: Vector, name: str = FAT_NAME) -> Anchor:
+    """Fat over the side away from the probe and the flanks."""
+    return Anchor(name, side=Side(approach, FAT_ANGLE), stiffness=FAT_STIFFNESS, shear_stiffness=FAT_SHEAR_STIFFNESS)
+
+
 def anchors_of(options: SurfaceOptions, approach: Vector) -> tuple[Anchor, ...]:
-    """The balls given as anchors, else the bed along the approach."""
+    """The balls given as anchors, else the soft bed on the side away from the probe."""
     if not options.anchors:
-        return (Anchor("bed", bed=Bed(approach, BED_SHARE)),)
+        return (soft_bed(approach),)
     balls = []
     for number, (x, y, z, radius) in enumerate(options.anchors, start=1):
         if not radius > 0.0:

@@ -16,6 +16,9 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
 from msdm_core.organ.compile import OrganSpec, compile_organ
+from surgsim_env.palpation.hold import SITES as HOLD_SITES
+from surgsim_env.palpation.hold import check_hold
+from surgsim_env.palpation.job import plan_sites, press_progress, progress_task
 from surgsim_env.palpation.surface_scene import SurfaceOptions
 from surgsim_env.patient.label_image import FORM, is_image, parse_labels, read_label_image
 from surgsim_env.patient.meshers import mesh_image, mesh_surfaces
@@ -93,6 +96,16 @@ def make_patient(
             )
         mesh = mesh_surfaces(files, regions, length_unit, cell_size=cell_size, mesher=mesher, mend=mend)
     return patient_scene(mesh, out, options=options, moduli=moduli or {})
+
+
+def with_hold(found: PatientScene, console: Console) -> PatientScene:
+    """The organ with a check of what holds it: a few healthy presses, with a bar; what is wrong is one of the notes."""
+    sites, normals, _ = plan_sites(found.anatomy)
+    with press_progress(console) as bar:
+        step = progress_task(bar, "what holds it", min(HOLD_SITES, len(sites)))
+        hold = check_hold(found.anatomy, sites, normals, progress=step)
+    faults = ("no press of the healthy organ reached its depth",) if hold is None else hold.faults
+    return replace(found, hold=hold, notes=(*found.notes, *faults))
 
 
 def add_retraction(found: PatientScene, out: Path) -> tuple[PatientScene, RetractScene | str]:
@@ -234,6 +247,8 @@ def print_patient(found: PatientScene, console: Console) -> None:
     """Print a summary of a patient's organ, and warn of what was dropped, repaired or is unusual."""
     patient, scene = found.patient, found.scene
     rows = {}
+    if found.hold is not None:
+        rows["held"] = found.hold.text
     for one in patient.volumes[1:]:
         modulus = found.regions[one.name].material.youngs_modulus
         rows[one.name] = f"{one.mesh * 1e6:.2f} ml (error {one.error:+.2%}), E {modulus:g} Pa"
@@ -307,8 +322,7 @@ def scene_text(found: PatientScene) -> str:
     )
     comments = {
         "retract_scene": "used by the retraction environments",
-        "anchors.bed": "chosen: it lies on the side away from the probe; put its ligaments here",
-        "anchors.ball": "given on the command line",
+        **found.anchor_sources,
         "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
         "contact.damping": "[N s/m^3] as in the scene liver",
         "contact.friction": "as in the scene liver",

@@ -8,17 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from msdm_core.material.regions import Material
+from surgsim_env.palpation.hold import Hold
 from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, plan_sites
 from surgsim_env.palpation.surface_scene import (
     CONTACT_MODULI_PER_CELL,
     PATTERN,
     SurfaceOptions,
-    anchors_of,
     with_options,
     with_substeps,
 )
+from surgsim_env.patient.facing import faced_note, facing_approach
 from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material, without_number
 from surgsim_env.patient.meshers import PatientMesh
+from surgsim_env.patient.supports import organ_anchors
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.levels import LEVELS
 from surgsim_env.scene.load import make_scene
@@ -66,6 +68,8 @@ class PatientScene:
         organ, regions: materials with their sources, of the healthy tissue and of each region by name
         site_count: number of sites of its raster
         notes: remarks on choices that differ from the usual
+        anchor_sources: where numbers of the anchors come from, by the path of their entry in the scene
+        hold: how healthy presses are borne, where it was checked
     """
 
     patient: PatientMesh
@@ -74,6 +78,8 @@ class PatientScene:
     regions: Mapping[str, TissueMaterial]
     site_count: int
     notes: tuple[str, ...]
+    anchor_sources: Mapping[str, str]
+    hold: Hold | None = None
 
     @property
     def scene(self) -> Scene:
@@ -101,10 +107,14 @@ def patient_scene(
     }
     _check_moduli(moduli, list(regions))
     scene = _first_scene(patient, out, organ.material, regions, options)
-    notes: list[str] = []
+    anchors, sources = organ_anchors(
+        patient.organ_name, patient.mesh, options, scene.instrument.approach, is_scan=patient.is_scan
+    )
+    scene = replace(scene, anchors=anchors)
+    notes = faced_note(patient, scene)
     anatomy, sites = _with_sites(scene, patient, options, notes)
     anatomy = _with_lesions(anatomy, notes)
-    return PatientScene(patient, _substeps_of_worst(anatomy), organ, regions, sites, tuple(notes))
+    return PatientScene(patient, _substeps_of_worst(anatomy), organ, regions, sites, tuple(notes), sources)
 
 
 def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
@@ -121,7 +131,8 @@ def _first_scene(
     wanted = math.ceil(cell / (CELL_PER_CONTACT_RADIUS * math.sqrt(DEPTH_PER_TIP)) / TIP_STEP) * TIP_STEP
     tip = options.tip_radius or min(max(_rounded(wanted, TIP_STEP), TIP_RANGE[0]), TIP_RANGE[1])
     depth = options.press_depth or _rounded(DEPTH_PER_TIP * tip, DEPTH_STEP)
-    approach = options.approach or (APPROACH_SCAN if patient.is_scan else APPROACH_FILE)
+    usual = APPROACH_SCAN if patient.is_scan else APPROACH_FILE
+    approach = options.approach or facing_approach(patient, usual, liver.palpation.face_angle_deg)
     described = f"{patient.organ_name} of {', '.join(patient.sources)}, {patient.mesh.volumes.sum() * 1e6:.0f} ml"
     if patient.lesions:
         described += f", {len(patient.lesions)} segmented lesion(s)"
@@ -151,7 +162,6 @@ def _first_scene(
     return replace(
         scene,
         instrument=replace(scene.instrument, approach=direction),
-        anchors=anchors_of(options, direction),
         material=material,
     )
 

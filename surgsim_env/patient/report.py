@@ -16,6 +16,7 @@ from surgsim_env.palpation.surface_drawing import INK, PAPER, OrthographicView, 
 from surgsim_env.patient.meshers import DIHEDRAL_SMALLEST
 from surgsim_env.patient.patient_scene import PatientScene
 from surgsim_env.patient.retract_scene import RetractScene, told
+from surgsim_env.patient.supports import held_text
 from surgsim_env.rendering.tissue import cut_edges
 from surgsim_env.reports.html_page import Picture, page_start, render_page
 from surgsim_env.scene.palpable_surface import hertz_force, hidden_text, share_text
@@ -60,7 +61,7 @@ def report_page(
     """
     outside = (
         "Top: the whole organ; bottom: cut open through the middle of its largest region, without the part nearer to "
-        "the viewer. Lighter: the face that the probe can press; grey: fixed tissue."
+        "the viewer. Lighter: the face that the probe can press; grey: held, fixed or on fat and ligaments."
     )
     quality = "Quality of the tets; counts are logarithmic."
     return render_page(
@@ -157,7 +158,8 @@ def _step(found: PatientScene) -> Rows:
     return [
         ("total mass", f"{organ.node_mass.sum():.4f} kg"),
         ("springs", f"{len(organ.spring_nodes)}"),
-        ("fixed nodes", f"{len(anatomy.anchors)}: {', '.join(one.name for one in scene.anchors)}"),
+        ("held by", "; ".join(held_text(one) for one in scene.anchors)),
+        ("fixed and elastically held nodes", f"{len(anatomy.anchors)} and {len(anatomy.foundation_nodes)}"),
         ("capsule", f"{shell}, over {len(organ.surface_triangles)} free boundary triangles"),
         ("stable step", f"{organ.stable_step * 1e3:.3f} ms, in contact {in_contact * 1e3:.3f} ms"),
         ("substeps in a haptic step of 1 ms", f"{scene.timing.substep_count}"),
@@ -174,6 +176,7 @@ def _palpation(found: PatientScene) -> Rows:
         ("sites", f"{found.site_count}, {palpation.site_spacing * 1e3:g} mm apart"),
         ("cell / contact radius", share_text(found.anatomy.palpable_cell, tip, depth)),
         ("contact", hidden_text(2.0 * hertz_force(scene.material, tip, depth), tip, depth, scene.contact.stiffness)),
+        ("held", "not checked" if found.hold is None else found.hold.text),
         ("force limits", f"{scene.limits.soft_force:g} and {scene.limits.hard_force:g} N"),
     ]
 
@@ -231,7 +234,8 @@ def _outer_colours(found: PatientScene) -> FloatArray:
     colours = np.broadcast_to(TISSUE, (len(triangles), 3)).copy()
     palpable = {tuple(row) for row in anatomy.face.triangles.tolist()}
     colours[[tuple(row) in palpable for row in triangles.tolist()]] = PALPABLE
-    colours[np.isin(triangles, anatomy.anchors).all(axis=1)] = HELD
+    held = np.concatenate([anatomy.anchors, anatomy.foundation_nodes])
+    colours[np.isin(triangles, held).all(axis=1)] = HELD
     tags = mesh.region[mesh.boundary_tets]
     for tag, colour in _region_colours(mesh).items():
         colours[tags == tag] = colour

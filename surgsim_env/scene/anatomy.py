@@ -1,5 +1,6 @@
 """The anatomy of a scene: its organ's mesh, anchored nodes and palpable face, and organs compiled with lesions."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -12,10 +13,11 @@ from msdm_core.material.regions import Lesion, Material
 from msdm_core.mesh.geodesic import NearestTriangle, SurfaceDistance
 from msdm_core.mesh.ordering import in_sweep_order
 from msdm_core.mesh.quality import surface_cell
-from msdm_core.mesh.surface import triangles_facing
+from msdm_core.mesh.surface import node_normals, triangles_facing
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 from msdm_core.organ.compile import OrganSpec, compile_organ
+from msdm_core.organ.foundation import Foundation
 from msdm_core.organ.stability import scale_mass
 from msdm_core.organ.support import SupportLaw
 from surgsim_env.scene.model import Anchor, LesionDraw, Scene, step_needed
@@ -23,16 +25,27 @@ from surgsim_env.scene.palpable_surface import PalpableFace, find_palpable_face,
 
 # How exactly a drawn lesion's cover is met [m].
 COVER_TOLERANCE = 1e-4
+# A press within this many tip radii of a fixed node is dominated by it.
+SUPPORT_TIP_RADII = 2.0
+# Cosines are exact to this where it is decided which way a surface faces.
+SIDE_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """A scene with its mesh, anchored nodes [n_anchor] and palpable face."""
+    """A scene with its mesh, anchored nodes [n_anchor], palpable face and the elastic foundations that hold it."""
 
     scene: Scene
     mesh: TetMesh
     anchors: IntArray
     face: PalpableFace
+    foundations: tuple[Foundation, ...] = ()
+
+    @cached_property
+    def foundation_nodes(self) -> IntArray:
+        """Surface nodes that an elastic foundation holds (n_held,)."""
+        held = [np.asarray(one.nodes, dtype=np.int32) for one in self.foundations]
+        return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int32)
 
     @cached_property
     def palpable_cell(self) -> float:
@@ -49,6 +62,18 @@ class Anatomy:
     def along_surface(self) -> SurfaceDistance:
         """Distances along the resting surface."""
         return SurfaceDistance(self.mesh.points, self.mesh.boundary_triangles)
+
+    def clear_of_supports(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Whether a press at each of some points [m] (n_point, 3) feels the tissue and not what holds it, (n_point,).
+
+        Fixed nodes are farther than SUPPORT_TIP_RADII; elastic tissue, which yields but covers the surface, than one.
+        """
+        tip, nodes = self.scene.instrument.tip_radius, self.mesh.points
+        held = ((nodes[self.anchors], SUPPORT_TIP_RADII * tip), (nodes[self.foundation_nodes], tip))
+        return np.array(
+            [all((np.linalg.norm(near - point, axis=1) > gap).all() for near, gap in held) for point in points],
+            dtype=np.bool_,
+        )
 
     def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
         """The organ with given lesions, all moduli of the healthy tissue and its capsule multiplied by a factor.
@@ -70,6 +95,7 @@ class Anatomy:
             capsule=capsule,
             lesions=(*(replace(one, material=_stiffer(one.material, modulus_factor)) for one in standing), *lesions),
             anchors=self.anchors,
+            foundations=self.foundations,
             damping=scene.damping,
             stiffness_rule=scene.stiffness_rule,
             gravity=scene.gravity,
@@ -142,6 +168,37 @@ class Anatomy:
         held = np.isin(triangles, self.anchors).all(axis=1)
         return NearestTriangle(self.mesh.points[triangles[~held]])
 
+    def check_inside(self, lesion: Lesion) -> None:
+        """Refuse a ball that is not inside the organ.
+
+        Raises:
+            ValueError: it sticks out, or its centre is outside; says by how much and where.
+        """
+        if lesion.region is not None or lesion.radius is None:
+            return
+        centre = np.asarray(lesion.centre, dtype=np.float64)
+        triangle, weights = self._surface(centre)
+        corners = self._surface.corners[triangle]
+        nearest = weights @ corners
+        inward = (nearest - centre) @ np.cross(corners[1] - corners[0], corners[2] - corners[0]) > 0.0
+        depth = float(np.linalg.norm(nearest - centre))
+        x, y, z = nearest * 1e3
+        if not inward:
+            raise ValueError(
+                f"{lesion.name}: its centre is {depth * 1e3:.3g} mm outside the surface at {x:.1f}, {y:.1f}, "
+                f"{z:.1f} mm; the rule is that a lesion lies inside the organ (coordinates are metres)"
+            )
+        if depth < lesion.radius - COVER_TOLERANCE:
+            raise ValueError(
+                f"{lesion.name}: its ball of radius {lesion.radius * 1e3:.3g} mm sticks out of the organ by "
+                f"{(lesion.radius - depth) * 1e3:.3g} mm at {x:.1f}, {y:.1f}, {z:.1f} mm: move it deeper or make it "
+                "smaller"
+            )
+
+    @cached_property
+    def _surface(self) -> NearestTriangle:
+        return NearestTriangle(self.mesh.points[self.mesh.boundary_triangles])
+
     def lesion_below(self, point: FloatArray, radius: float, cover: float, ratio: float, name: str) -> Lesion:
         """A sphere whose top lies `cover` below a point of the surface [m], `ratio` times as stiff as the tissue."""
         surface_point, normal = self.face.project(point)
@@ -198,7 +255,8 @@ def anatomy_of(scene: Scene, mesh: TetMesh) -> Anatomy:
     for region in scene.regions:
         mesh.region_tag(region.name)
     face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)
-    return Anatomy(scene, mesh, _anchored_nodes(mesh, scene.anchors), face)
+    fixed, foundations = _held(mesh, scene.anchors)
+    return Anatomy(scene, mesh, fixed, face, foundations)
 
 
 def _load_mesh(scene: Scene) -> TetMesh:
@@ -228,25 +286,43 @@ def _load_mesh(scene: Scene) -> TetMesh:
     return in_sweep_order(read_mesh(scene.folder / source.tets.file, length_unit=source.tets.length_unit))
 
 
-def _anchored_nodes(mesh: TetMesh, anchors: Sequence[Anchor]) -> IntArray:
-    held: NDArray[np.bool_] = np.zeros(mesh.node_count, dtype=bool)
+def _held(mesh: TetMesh, anchors: Sequence[Anchor]) -> tuple[IntArray, tuple[Foundation, ...]]:
+    """The nodes that anchors fix, and the foundations of those that hold elastically."""
+    fixed: NDArray[np.bool_] = np.zeros(mesh.node_count, dtype=bool)
     on_surface = np.zeros(mesh.node_count, dtype=bool)
     on_surface[mesh.boundary_nodes] = True
+    foundations = []
     for anchor in anchors:
-        if anchor.box is not None:
-            inside = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
-        elif anchor.bed is not None:
-            depth = mesh.points @ np.asarray(anchor.bed.direction)
-            inside = on_surface & (depth >= depth.max() - anchor.bed.share * np.ptp(depth))
-        else:
-            assert anchor.ball is not None
-            distance = np.linalg.norm(mesh.points - np.asarray(anchor.ball.centre), axis=1)
-            inside = on_surface & (distance <= anchor.ball.radius)
+        inside = _inside(mesh, anchor, on_surface)
         if not inside.any():
             raise ValueError(
                 f"anchor {anchor.name!r} holds no node of the organ; move or enlarge it (coordinates are metres)"
             )
-        held |= inside
-    if not held.any():
+        if anchor.stiffness is None or anchor.shear_stiffness is None:
+            fixed |= inside
+        else:
+            nodes = np.flatnonzero(inside).astype(np.int32)
+            foundations.append(Foundation(anchor.name, nodes, anchor.stiffness, anchor.shear_stiffness))
+    if not anchors:
         raise ValueError("nothing holds the organ: give at least one anchor, or it is pushed away")
-    return np.flatnonzero(held).astype(np.int32)
+    return np.flatnonzero(fixed).astype(np.int32), tuple(foundations)
+
+
+def _inside(mesh: TetMesh, anchor: Anchor, on_surface: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Nodes in the place of an anchor, shape (n_node,); of the surface, but in the box of a fixed one all."""
+    if anchor.box is not None:
+        within = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
+        return np.asarray(within & on_surface if anchor.is_elastic else within, dtype=np.bool_)
+    if anchor.bed is not None:
+        depth: FloatArray = mesh.points @ np.asarray(anchor.bed.direction)
+        deep = depth >= depth.max() - anchor.bed.share * np.ptp(depth)
+        return on_surface & np.asarray(deep, dtype=np.bool_)
+    if anchor.side is not None:
+        direction = np.asarray(anchor.side.direction) / np.linalg.norm(anchor.side.direction)
+        if anchor.side.angle_deg == 180.0:
+            return on_surface
+        facing = node_normals(mesh.points, mesh.boundary_triangles) @ direction
+        # The flanks of a block, at a right angle up to rounding, face neither way.
+        return on_surface & np.asarray(facing > math.cos(math.radians(anchor.side.angle_deg)) + SIDE_ROUNDING)
+    assert anchor.ball is not None
+    return on_surface & (np.linalg.norm(mesh.points - np.asarray(anchor.ball.centre), axis=1) <= anchor.ball.radius)

@@ -115,17 +115,56 @@ class Bed:
 
 
 @dataclass(frozen=True)
+class Side:
+    """The surface whose outward normal is less than an angle from a direction; 90 degrees: all that faces that way."""
+
+    direction: Vector
+    angle_deg: float = 90.0
+
+    def __post_init__(self) -> None:
+        require_direction("side: direction", self.direction)
+        if not 0.0 < self.angle_deg <= 180.0:
+            raise ValueError(f"side: angle_deg is {self.angle_deg:g}; it must be above 0 and at most 180")
+
+
+@dataclass(frozen=True)
 class Anchor:
-    """A place where the organ is held: every surface node inside is fixed; inside a box, every node."""
+    """A place where the organ is held, by fixed nodes or by tissue around it.
+
+    Without a stiffness every surface node inside is fixed; inside a box, every node. With one the surface nodes inside
+    lie on springs to the ground, so many per area, as on fat or a ligament (`msdm_core.organ.foundation`).
+
+    Args:
+        name: of the tissue.
+        box, ball, bed, side: the place; exactly one of them.
+        stiffness: pressure per displacement along the normal, about E / h of a layer h thick [N/m^3]; None: fixed.
+        shear_stiffness: traction per displacement along the surface, about G / h [N/m^3]; given with `stiffness`.
+    """
 
     name: str
     box: Box | None = None
     ball: Ball | None = None
     bed: Bed | None = None
+    side: Side | None = None
+    stiffness: float | None = None
+    shear_stiffness: float | None = None
 
     def __post_init__(self) -> None:
-        if sum(part is not None for part in (self.box, self.ball, self.bed)) != 1:
-            raise ValueError(f"anchor {self.name!r}: give one of a box, a ball and a bed")
+        what = f"anchor {self.name!r}"
+        if sum(part is not None for part in (self.box, self.ball, self.bed, self.side)) != 1:
+            raise ValueError(f"{what}: give one of a box, a ball, a bed and a side")
+        if (self.stiffness is None) != (self.shear_stiffness is None):
+            raise ValueError(
+                f"{what}: stiffness and shear_stiffness go together; give both for elastic tissue, none for fixed nodes"
+            )
+        if self.stiffness is not None and self.shear_stiffness is not None:
+            require_number(f"{what}: stiffness", self.stiffness, 0.0, "N/m^3", above=True)
+            require_number(f"{what}: shear_stiffness", self.shear_stiffness, 0.0, "N/m^3")
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether it holds by springs in place of fixed nodes."""
+        return self.stiffness is not None
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,15 @@ from numpy.typing import ArrayLike
 from msdm_core.kernels.ray_kernels import nearest_hits
 from msdm_core.material.regions import Material
 from msdm_core.mesh.geodesic import NearestTriangle
+from msdm_core.mesh.surface import node_normals
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.scene.model import PalpationSettings
 
 # A raster of more points means a spacing in the wrong unit.
 SITES_MOST = 100_000
+
+# A point is open if the face over it is higher by at most this [m]: rounding.
+OPEN_GAP = 1e-6
 
 # A ray that starts on the surface meets its own triangle nearer than this [m].
 HIT_LEAST = 1e-6
@@ -78,7 +82,7 @@ class PalpableFace:
         return np.cumsum(area)
 
     def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
-        """A point drawn uniformly over the face, thick enough and rim_distance [m] from its border, with its normal.
+        """A point drawn uniformly over the open face, thick and rim_distance [m] from its border, with its normal.
 
         Raises:
             ValueError: no such point in 1000 draws.
@@ -92,7 +96,7 @@ class PalpableFace:
             if self.thickness[face] < self.thickness_smallest:
                 continue
             point, normal = self._at(face, weights)
-            if self.rim_distance(point) >= rim_distance:
+            if self.rim_distance(point) >= rim_distance and self.is_open(point):
                 return point, normal
         raise ValueError(
             f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: "
@@ -113,6 +117,12 @@ class PalpableFace:
         """
         hit = _drop(*self._plane, u, v)
         return None if hit is None else self._at(*hit)
+
+    def is_open(self, point: FloatArray) -> bool:
+        """Whether nothing of the face lies above a point of it [m] (3,), so that a straight tool gets there."""
+        u, v = (float(point @ axis) for axis in tangent_axes(self.approach))
+        top = self.drop(u, v)
+        return top is None or float((top[0] - point) @ -self.approach) <= OPEN_GAP
 
     def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
         """`drop`, but None also where the organ is thin or the border is nearer than the margin less a slack [m]."""
@@ -150,11 +160,7 @@ def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: PalpationS
     if not chosen.any():
         raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
     face = triangles[chosen]
-    normals = np.zeros_like(mesh.points)
-    for corner in range(3):
-        np.add.at(normals, face[:, corner], area_vector[chosen])
-    length = np.linalg.norm(normals, axis=1)
-    normals[length > 0.0] /= length[length > 0.0, None]
+    normals = node_normals(mesh.points, face)
     sides = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
     edges, counts = np.unique(sides, axis=0, return_counts=True)
     thickness = np.full(len(face), np.inf)

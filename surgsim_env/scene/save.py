@@ -8,12 +8,12 @@ from typing import Any, get_args, get_type_hints
 import tomlkit
 from tomlkit.items import AbstractTable, Item, Table
 
-from surgsim_env.scene.model import Ball, Bed, Box, Scene
+from surgsim_env.scene.model import Ball, Bed, Box, Scene, Side
 
 # A file's own name and folder, which it does not state.
 PATH_FIELDS = ("name", "folder")
 # Tables that are written on one line.
-INLINE_TABLES = (Box, Ball, Bed)
+INLINE_TABLES = (Box, Ball, Bed, Side)
 # Comments begin here [characters], or behind an entry that is longer.
 COMMENT_COLUMN = 23
 

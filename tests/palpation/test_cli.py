@@ -107,6 +107,25 @@ def test_the_lesion_raises_the_stiffness_above_it(rows):
 
 
 @pytest.mark.slow
+def test_a_lesion_below_a_site_that_is_too_deep_is_missed_for_that_reason(tmp_path, capsys, rows):
+    """Around a site of the middle; 10 mm of cover, twice as stiff, hardly changes a press."""
+    place = np.array([float(rows[5][key]) for key in "xyz"])
+    around = ",".join(map(str, [*place, 0.012]))
+    given = [*COARSE, "--lesion-below", "5,0.016,0.006,2", "--around", around, "--out", str(tmp_path)]
+    assert main(given) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    (truth,) = summary["truth"]
+    assert truth["centre_m"] == pytest.approx([*place[:2], place[2] - 0.016], abs=1e-6)
+    said = " ".join(capsys.readouterr().out.split())
+    for entry in summary["maps"].values():
+        (lesion,) = entry["lesions"]
+        assert lesion["miss"] in ("deeper than the map's reach", "below the sensor's noise")
+        assert lesion["why"].startswith(f"{lesion['miss']}: a press feels ")
+        assert entry["healthy_sites"] < 8
+    assert "weak baseline: " in said and "of Hertz's force; far nodes move by " in said
+
+
+@pytest.mark.slow
 def test_same_seed_same_table_and_another_seed_another(run, tmp_path, capsys):
     around = ["--around", "0.036,0.026,0.03,0.008"]
     for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
@@ -251,6 +270,14 @@ def test_lesion_outside(capsys, tmp_path):
         (["--lesion", "0.03,0.03,0.015,-0.008,8"], "radius is -0.008"),
         (["--lesion", "0.03,0.03,0.015,0.001,8"], "less than half of the"),
         (["--lesion", "0.03,0.03"], "the form is x,y,z,radius,ratio"),
+        (["--lesion", "0.03,0.03,0.025,0.008,8"], "sticks out of the organ by 3 mm at 30.0, 30.0, 30.0 mm"),
+        (["--lesion-below", "3,0.015"], "the form is SITE,DEPTH,RADIUS,RATIO"),
+        (["--lesion-below", "99,0.015,0.008,8"], "there are 16 sites, from 0 to 15"),
+        (["--lesion-below", "1.5,0.015,0.008,8"], "the site is 1.5; it must be a site's number"),
+        (["--lesion-below", "-1,0.015,0.008,8"], "the site is -1; it must be a site's number"),
+        (["--lesion-below", "3,0.007,0.008,8"], "the rule is depth > radius > 0, or it sticks out"),
+        (["--lesion-below", "3,0.015,0.008,0"], "modulus ratio is 0; it must be above 0"),
+        (["--lesion-below", "3,0.025,0.008,8"], "sticks out of the organ by 3 mm"),
         (["--approach", "down"], "the form is x,y,z"),
         (["--approach", "0,0,0"], "give a direction"),
         (["--youngs-modulus", "-5000"], "Young's modulus is -5000; it must be finite and above 0"),

@@ -3,20 +3,17 @@
 import numpy as np
 import pytest
 
-from msdm_core.material.regions import Lesion, Material
 from msdm_core.mesh.geodesic import SurfaceDistance
-from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.palpation.contrast_map import (
-    Truth,
     contrast_with_model,
     contrast_with_neighbours,
     feel_lesions,
     healthy_majority,
     robust_spread,
     score_map,
-    seen_from_surface,
 )
+from surgsim_env.palpation.truth import Truth
 from surgsim_env.scene.model import ForceSensor
 
 SPACING = 0.010
@@ -94,7 +91,7 @@ def test_order_is_by_strength_and_each_lesion_is_felt_once():
     estimates = felt(sites, contrast_with_neighbours(stiffness_of(sites, *bumps, noise=0.01), sites[:, :2]))
     assert [one.contrast for one in estimates] == sorted((one.contrast for one in estimates), reverse=True)
     truths = [truth_at(x, y, f"{height}") for x, y, height in bumps]
-    scored = score_map("m", sites, np.ones(len(sites)), estimates, truths, SURFACE)
+    scored = score_map("m", sites, np.ones(len(sites)), estimates, truths, SURFACE, spacing=SPACING)
     assert [score.estimate for score in scored.scores] == [2, 0, 1]
     assert scored.felt_count == 3
     assert scored.false_alarms == 0
@@ -140,7 +137,7 @@ def test_few_sites(count):
         assert contrast.shape == (count,)
         np.testing.assert_allclose(contrast, 1.0)
         assert felt(sites, contrast) == []
-        scored = score_map("m", sites, contrast, [], [truth_at(0.1, 0.08)], SURFACE)
+        scored = score_map("m", sites, contrast, [], [truth_at(0.1, 0.08)], SURFACE, spacing=SPACING)
         assert scored.felt_count == 0
         assert scored.scores[0].error == np.inf
 
@@ -150,7 +147,7 @@ def test_score_counts_misses_false_alarms_and_the_healthy_spread():
     # Lesion at (0.05, 0.05); the map shows one 7 mm beside it and one where there is nothing.
     contrast = stiffness_of(sites, (0.057, 0.05, 0.5), (0.15, 0.11, 0.7), trend=0.0) / 60.0
     truths = [truth_at(0.05, 0.05, "A"), truth_at(0.10, 0.135, "B")]
-    scored = score_map("m", sites, contrast, felt(sites, contrast), truths, SURFACE)
+    scored = score_map("m", sites, contrast, felt(sites, contrast), truths, SURFACE, spacing=SPACING)
     first, second = scored.scores
     assert first.felt
     assert first.error == pytest.approx(0.007, abs=0.001)
@@ -171,19 +168,10 @@ def test_lesions_keep_their_own_estimate():
     contrast = np.ones(len(sites))
     estimates = felt(sites, stiffness_of(sites, (0.06, 0.05, 0.6), (0.10, 0.05, 0.6), trend=0.0) / 60.0)
     assert len(estimates) == 2
-    scored = score_map("m", sites, contrast, estimates, [truth_at(0.075, 0.05), truth_at(0.062, 0.05)], SURFACE)
-    assert {score.estimate for score in scored.scores} == {0, 1}
-
-
-def test_truth_is_the_nearest_point_of_the_face():
-    tissue = Material(5000.0, 1060.0)
-    lesion = Lesion(centre=(0.03, 0.04, -0.02), radius=0.01, material=tissue, name="A")
-    up = np.array([0.0, 0.0, 1.0])
-    (truth,) = seen_from_surface(
-        [lesion], box_mesh((0.1, 0.1, 0.05), (2, 2, 1)), lambda point: (point * [1.0, 1.0, 0.0], up)
+    scored = score_map(
+        "m", sites, contrast, estimates, [truth_at(0.075, 0.05), truth_at(0.062, 0.05)], SURFACE, spacing=SPACING
     )
-    np.testing.assert_allclose(truth.point, [0.03, 0.04, 0.0])
-    assert truth.radius == 0.01
+    assert {score.estimate for score in scored.scores} == {0, 1}
 
 
 def test_healthy_majority_ignores_a_lesion_that_reaches_many_sites():

@@ -1,0 +1,97 @@
+"""Elastic foundations: tissue around an organ holds its surface by springs to the ground (Winkler's foundation)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msdm_core.errors import OrganError
+from msdm_core.mesh.tet_mesh import TetMesh
+
+
+@dataclass(frozen=True, eq=False)
+class Foundation:
+    """Springs from a part of an organ's surface to the ground, so many per area; they pull as they push.
+
+    Args:
+        name: used in messages.
+        nodes: indices of surface nodes, shape (n,).
+        stiffness: pressure per displacement along the surface normal [N/m^3].
+        shear_stiffness: traction per displacement along the surface [N/m^3].
+    """
+
+    name: str
+    nodes: ArrayLike
+    stiffness: float
+    shear_stiffness: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.stiffness) and self.stiffness > 0.0):
+            raise OrganError(
+                f"foundation {self.name!r}: stiffness is {self.stiffness:g} N/m^3; it must be finite and above 0"
+            )
+        if not (math.isfinite(self.shear_stiffness) and self.shear_stiffness >= 0.0):
+            raise OrganError(
+                f"foundation {self.name!r}: shear_stiffness is {self.shear_stiffness:g} N/m^3; it must be finite and "
+                "at least 0"
+            )
+
+
+def foundation_fields(
+    foundations: Sequence[Foundation], mesh: TetMesh, anchored: NDArray[np.bool_]
+) -> dict[str, NDArray[Any]]:
+    """The fields of an OrganModel that describe its foundations.
+
+    A node has the stiffness K = sum over the surface triangles around it of (A / 3) (k_t I + (k_n - k_t) n n^T), with
+    the area A and the normal n of each; those of several foundations add up.
+
+    Args:
+        foundations: on the organ.
+        mesh: the organ.
+        anchored: the nodes held fixed, shape (n_node,); foundations do not act on them.
+
+    Raises:
+        OrganError: nodes that are not on the surface.
+    """
+    blocks = np.zeros((mesh.node_count, 3, 3))
+    triangles = mesh.boundary_triangles
+    corners = mesh.points[triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # |a x b| is twice the area; n n^T A / 3 = (a x b)(a x b)^T / (6 |a x b|).
+    double = np.linalg.norm(across, axis=1)
+    for foundation in foundations:
+        held = np.zeros(mesh.node_count, dtype=bool)
+        held[_surface_nodes(foundation, mesh)] = True
+        third = double[:, None, None] / 6.0 * np.eye(3)
+        normal = np.einsum("ti,tj->tij", across, across) / (6.0 * double[:, None, None])
+        each = foundation.shear_stiffness * (third - normal) + foundation.stiffness * normal
+        for corner in range(3):
+            inside = held[triangles[:, corner]]
+            np.add.at(blocks, triangles[inside, corner], each[inside])
+    nodes = np.flatnonzero(blocks.any(axis=(1, 2)) & ~anchored)
+    fields: dict[str, NDArray[Any]] = {
+        "foundation_nodes": nodes.astype(np.int32),
+        "foundation_position": mesh.points[nodes].astype(np.float64),
+        "foundation_stiffness": blocks[nodes],
+    }
+    for array in fields.values():
+        array.setflags(write=False)
+    return fields
+
+
+def _surface_nodes(foundation: Foundation, mesh: TetMesh) -> NDArray[Any]:
+    nodes = np.asarray(foundation.nodes)
+    on_surface = np.zeros(mesh.node_count, dtype=bool)
+    on_surface[mesh.boundary_nodes] = True
+    if nodes.ndim != 1 or nodes.size == 0 or nodes.dtype.kind not in "iu":
+        raise OrganError(f"foundation {foundation.name!r} holds nothing: give indices of surface nodes, shape (n,)")
+    for node in nodes:
+        if not (0 <= node < mesh.node_count and on_surface[node]):
+            raise OrganError(
+                f"foundation {foundation.name!r}: node {node} is not on the surface; the rule is indices of surface "
+                f"nodes, of which there are {on_surface.sum()}"
+            )
+    return nodes

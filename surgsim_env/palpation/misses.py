@@ -1,0 +1,157 @@
+"""Why a hidden lesion was not felt: for each one a reason, with the numbers that show it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.material.regions import Lesion
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.palpation.contrast_map import APART_SPACINGS, MATCHING_REACH, ContrastMap, LesionScore, smoothed
+from surgsim_env.palpation.press import scan
+from surgsim_env.palpation.scores import LesionReach
+from surgsim_env.palpation.truth import Truth, felt_weights, surface_points
+from surgsim_env.scene.anatomy import Anatomy
+
+# A lesion is not under the pressed face where another point of the surface is pressed with so many times its strain.
+HIDDEN_RATIO = 2.0
+# A baseline from fewer healthy sites is weak.
+HEALTHY_FEWEST = 8
+
+NOT_FACED, NEAR_SUPPORT, NO_SITE, NOISE, TOO_DEEP, MASKED, MISPLACED, NO_MAXIMUM = (
+    *("not under the pressed face", "too near a support", "no complete press near it", "below the sensor's noise"),
+    *("deeper than the map's reach", "masked by a neighbour", "felt elsewhere", "no maximum of the map"),
+)
+
+
+@dataclass(frozen=True)
+class Miss:
+    """Why one lesion was not felt on one map.
+
+    Args:
+        map_name, lesion: names of the map and the lesion.
+        reason: one of the reasons above.
+        text: the reason with its numbers.
+    """
+
+    map_name: str
+    lesion: str
+    reason: str
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class PressedSites:
+    """What the maps were made from.
+
+    Args:
+        sites: those in the maps [m], shape (n_site, 3).
+        ended_early: those whose presses ended early [m], shape (n, 3).
+        spacing: of the raster [m].
+    """
+
+    sites: FloatArray
+    ended_early: FloatArray
+    spacing: float
+
+
+def explain_misses(
+    anatomy: Anatomy,
+    organ: OrganModel,
+    lesions: Sequence[Lesion],
+    truths: Sequence[Truth],
+    maps: Sequence[ContrastMap],
+    pressed: PressedSites,
+) -> tuple[Miss, ...]:
+    """The reason for each lesion that a map does not show; presses once with and once without each of those.
+
+    Args:
+        anatomy: the organ.
+        organ: compiled, with all lesions.
+        lesions: in it.
+        truths: their places, as in the maps' scores.
+        maps: with scores.
+        pressed: sites of the maps.
+    """
+    missed = [index for index in range(len(lesions)) if not all(one.scores[index].felt for one in maps)]
+    misses = []
+    for index in missed:
+        truth = truths[index]
+        hidden = _hidden(anatomy, lesions[index], truth)
+        bare = anatomy.organ([lesion for number, lesion in enumerate(lesions) if number != index])
+        force, force_without = (
+            scan(anatomy, model, truth.point[None], truth.normal[None], workers=1)[0].force for model in (organ, bare)
+        )
+        reach = LesionReach(force, force_without, anatomy.scene.sensor.noise)
+        for one in maps:
+            if one.scores[index].felt:
+                continue
+            reason, text = _why(one, one.scores[index], reach, hidden, pressed)
+            if one.healthy_count < HEALTHY_FEWEST:
+                text += f"; the baseline is weak: {one.healthy_count} healthy sites, {HEALTHY_FEWEST} are the rule"
+            misses.append(Miss(one.name, truth.name, reason, f"{reason}: {text}"))
+    return tuple(misses)
+
+
+def _hidden(anatomy: Anatomy, lesion: Lesion, truth: Truth) -> tuple[str, str] | None:
+    """Reason and text for a lesion that is better felt from where no site is; None for any other."""
+    points, normals = surface_points(anatomy)
+    weights = felt_weights(anatomy, lesion, points, normals)
+    here = float(felt_weights(anatomy, lesion, truth.point[None], truth.normal[None])[0])
+    best = int(np.argmax(weights))
+    if weights[best] < HIDDEN_RATIO * here:
+        return None
+    more = f"{weights[best] / here:.1f} times" if here > 0.0 else "much"
+    there = f"a press at {_place(points[best])} mm would strain it {more} as much"
+    facing = np.degrees(np.arccos(np.clip(-normals[best] @ anatomy.face.approach, -1.0, 1.0)))
+    if facing <= anatomy.scene.palpation.face_angle_deg and not anatomy.clear_of_supports(points[best][None])[0]:
+        return NEAR_SUPPORT, f"{there}, where the organ is held: move the anchor, if it is not there"
+    into = ",".join(f"{value:.2f}" for value in -normals[best] + 0.0)
+    return NOT_FACED, f"{there}; --approach {into} faces it"
+
+
+def _why(
+    one: ContrastMap,
+    score: LesionScore,
+    reach: LesionReach,
+    hidden: tuple[str, str] | None,
+    pressed: PressedSites,
+) -> tuple[str, str]:
+    truth, contrast = score.truth, reach.force / reach.force_without
+    felt = (
+        f"a press feels {reach.force:.3f} N, {reach.force_without:.3f} N without the lesion (contrast {contrast:.2f})"
+    )
+    weak = contrast - 1.0 < one.threshold
+    if hidden is not None and weak:
+        return hidden
+    away = np.linalg.norm(pressed.sites - truth.point, axis=1)
+    if away.min() > pressed.spacing:
+        early = np.linalg.norm(pressed.ended_early - truth.point, axis=1) <= pressed.spacing
+        said = f"{int(early.sum())} presses near it ended early, " if early.any() else ""
+        return NO_SITE, f"{said}the nearest site of the map is {away.min() * 1e3:.1f} mm away"
+    if reach.below:
+        return NOISE, f"{felt}; the sensor's noise is {reach.noise:g} N"
+    if weak:
+        return TOO_DEEP, f"{felt}; this map shows what exceeds its surroundings by {one.threshold:.2f}"
+    for other in one.scores:
+        apart = float(np.linalg.norm(other.truth.point - truth.point))
+        if other is not score and apart < APART_SPACINGS * pressed.spacing:
+            return MASKED, (
+                f"{felt}, but {other.truth.name} is felt {apart * 1e3:.1f} mm beside it: maxima nearer than "
+                f"{APART_SPACINGS * pressed.spacing * 1e3:.1f} mm, {APART_SPACINGS:g} site spacings, are one"
+            )
+    if score.estimate is not None and score.error < MATCHING_REACH:
+        return MISPLACED, (
+            f"{felt}, but the nearest maximum of the map lies {score.error * 1e3:.1f} mm from it, farther than its "
+            f"radius of {truth.radius * 1e3:.1f} mm"
+        )
+    level = float(smoothed(pressed.sites, one.contrast, spacing=pressed.spacing)[int(np.argmin(away))])
+    return NO_MAXIMUM, (
+        f"{felt}, but the smoothed contrast of the nearest site, {away.min() * 1e3:.1f} mm away, is {level:.2f} "
+        f"and does not exceed its surroundings by {one.threshold:.2f}"
+    )
+
+
+def _place(point: FloatArray) -> str:
+    return ", ".join(f"{value * 1e3:.1f}" for value in point)

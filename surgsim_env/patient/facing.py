@@ -1,0 +1,75 @@
+"""The direction from which a probe faces an organ's segmented lesions."""
+
+import numpy as np
+
+from msdm_core.material.regions import Lesion, Material, lesion_extent
+from msdm_core.mesh.geodesic import NearestTriangle
+from msdm_core.mesh.surface import node_normals
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.patient.meshers import PatientMesh
+from surgsim_env.scene.model import Scene, Vector
+
+# Directions that are tried, spread evenly over the sphere (Fibonacci lattice): 9 degrees apart.
+DIRECTIONS = 500
+# Lesions within this angle of the border of the palpable face are near its rim, where no site lies [degrees].
+MARGIN_DEG = 15.0
+
+
+def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) -> Vector:
+    """The approach that faces most segmented lesions, of those the one nearest to the usual one, of length 1.
+
+    A lesion is faced if the inward normal at the surface point nearest to its centre is within the angle of the
+    palpable face, less MARGIN_DEG, of the approach.
+
+    Args:
+        patient: the organ.
+        usual: the approach without lesions, of any length.
+        face_angle_deg: of the palpable face [degrees].
+    """
+    first = np.array(usual) / np.linalg.norm(usual)
+    inward = _inward_normals(patient)
+    if len(inward) == 0:
+        return usual
+    least = np.cos(np.radians(face_angle_deg - MARGIN_DEG))
+    tried = np.concatenate([first[None], _sphere()])
+    faced = (tried @ inward.T >= least).sum(axis=1)
+    best = np.flatnonzero(faced == faced.max())
+    chosen = tried[best[int(np.argmax(tried[best] @ first))]]
+    x, y, z = chosen.tolist()
+    return x, y, z
+
+
+def faced_note(patient: PatientMesh, scene: Scene) -> list[str]:
+    """A remark on the lesions that the scene's approach does not face, if there are any."""
+    cosines = _inward_normals(patient) @ np.asarray(scene.instrument.approach)
+    angle = scene.palpation.face_angle_deg
+    hidden = [name for name, cosine in zip(patient.lesions, cosines) if cosine < np.cos(np.radians(angle))]
+    if not hidden:
+        return []
+    given = ", ".join(f"{part:.2f}" for part in scene.instrument.approach)
+    return [
+        f"the approach {given} does not face {', '.join(hidden)}: the nearest surface is turned away by over "
+        f"{angle:g} degrees; it may not be felt (--approach)"
+    ]
+
+
+def _inward_normals(patient: PatientMesh) -> FloatArray:
+    """Inward unit normal at the surface point nearest to each lesion's centre (n_lesion, 3)."""
+    mesh = patient.mesh
+    triangles = mesh.boundary_triangles
+    normals, nearest = node_normals(mesh.points, triangles), NearestTriangle(mesh.points[triangles])
+    found = np.zeros((len(patient.lesions), 3))
+    for row, name in zip(found, patient.lesions, strict=True):
+        centre, _ = lesion_extent(mesh, Lesion(region=name, material=Material(1.0, 1.0), name=name))
+        triangle, weights = nearest(centre)
+        outward = weights @ normals[triangles[triangle]]
+        row[:] = -outward / np.linalg.norm(outward)
+    return found
+
+
+def _sphere() -> FloatArray:
+    """Unit vectors spread evenly over the sphere, (DIRECTIONS, 3)."""
+    turn = np.arange(DIRECTIONS) * np.pi * (3.0 - np.sqrt(5.0))
+    z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
+    radius = np.sqrt(1.0 - z * z)
+    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])

@@ -1,0 +1,87 @@
+"""An organ that sways on its support is told from one that is held."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surgsim_env.palpation.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST, SITES, Hold, check_hold, hold_of
+from surgsim_env.palpation.job import plan_sites
+from surgsim_env.palpation.surface_scene import soft_bed
+from surgsim_env.scene.anatomy import anatomy_of
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Anchor, Bed
+from surgsim_env.scene.palpable_surface import hertz_force
+from tests.patient.organs import kidney
+
+DOWN = (0.0, 0.0, -1.0)
+# The support that patients' organs had: the deepest 15 % of their surface fixed.
+BACK = Anchor("bed", bed=Bed(DOWN, 0.15))
+
+
+def bean(anchor):
+    """The bean under a tip of 8 mm."""
+    liver = make_scene("liver")
+    scene = replace(
+        liver,
+        name="bean",
+        anchors=(anchor,),
+        capsule=None,
+        lesion=None,
+        demonstration=(),
+        instrument=replace(liver.instrument, tip_radius=0.008, approach=DOWN),
+        palpation=replace(
+            liver.palpation, press_depth=0.0045, face_margin=0.008, thickness_smallest=0.02, site_spacing=0.009
+        ),
+        timing=replace(liver.timing, substep_count=4),
+    )
+    return anatomy_of(scene, kidney())
+
+
+def held(anchor):
+    anatomy = bean(anchor)
+    sites, normals, _ = plan_sites(anatomy)
+    return check_hold(anatomy, sites, normals)
+
+
+def test_a_bean_held_by_the_middle_of_its_back_sways():
+    """As the kidney of a CT did: what is pressed goes down whole."""
+    hold = held(BACK)
+    assert hold.far_share.max() > FAR_SHARE_LARGEST
+    assert any("the organ sways: pressed at " in fault for fault in hold.faults)
+
+
+def test_a_bean_in_fat_is_held():
+    calls = []
+    anatomy = bean(soft_bed(DOWN))
+    sites, normals, _ = plan_sites(anatomy)
+    hold = check_hold(anatomy, sites, normals, progress=lambda: calls.append(1))
+    assert len(hold.force) == len(calls) == SITES
+    assert hold.faults == ()
+    assert hold.far_share.max() <= FAR_SHARE_LARGEST
+    assert np.median(hold.force_share) >= FORCE_SHARE_LEAST
+
+
+def press(*, force=0.2, depth=0.004, far=1e-4, end=""):
+    return SimpleNamespace(site=np.zeros(3), force=force, depth=depth, far_travel=far, end=end)
+
+
+def test_figures_are_beside_hertz_at_the_depth_that_was_reached():
+    anatomy = bean(soft_bed(DOWN))
+    expected = 1.2 * hertz_force(anatomy.scene.material, 0.008, 0.003)
+    hold = hold_of(
+        anatomy, [press(force=0.5 * expected, depth=0.003, far=6e-4), press(end="fault")], modulus_factor=1.2
+    )
+    np.testing.assert_allclose(hold.force_share, [0.5])
+    np.testing.assert_allclose(hold.far_share, [0.2])
+    assert hold_of(anatomy, [press(end="fault")]) is None
+
+
+@pytest.mark.parametrize(
+    ("force", "far", "faults"),
+    [((0.9, 0.9, 0.1), 0.1, 0), ((0.9, 0.1, 0.1), 0.1, 1), ((0.9, 0.9, 0.9), 0.16, 1), ((0.1, 0.1, 0.9), 0.16, 2)],
+)
+def test_faults_are_the_median_force_and_the_largest_travel(force, far, faults):
+    hold = Hold(np.zeros((3, 3)), np.array(force), np.ones(3), np.array([0.01, far, 0.02]))
+    assert len(hold.faults) == faults

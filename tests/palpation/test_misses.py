@@ -1,0 +1,119 @@
+"""Each lesion that a map does not show has its reason: one organ, in which a lesion can be missed in every way."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from msdm_core.meshing.lattice_meshing import box_mesh
+from surgsim_env.palpation import misses
+from surgsim_env.palpation.contrast_map import Estimate, score_map
+from surgsim_env.palpation.misses import (
+    MASKED,
+    MISPLACED,
+    NEAR_SUPPORT,
+    NO_MAXIMUM,
+    NO_SITE,
+    NOISE,
+    NOT_FACED,
+    TOO_DEEP,
+    PressedSites,
+    explain_misses,
+)
+from surgsim_env.palpation.truth import seen_from_surface
+from surgsim_env.scene.anatomy import anatomy_of
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Anchor, Ball, Bed
+
+PHANTOM = make_scene("phantom")
+SPACING = 0.008
+ANATOMY = anatomy_of(
+    replace(
+        PHANTOM,
+        anchors=(
+            Anchor("floor", bed=Bed((0.0, 0.0, -1.0), 0.01)),
+            Anchor("clamp", ball=Ball((0.08, 0.04, 0.05), 0.012)),
+        ),
+        palpation=replace(PHANTOM.palpation, face_margin=0.008),
+        sensor=replace(PHANTOM.sensor, noise=0.01),
+    ),
+    box_mesh((0.10, 0.08, 0.05), (10, 8, 5)),
+)
+U, V = np.meshgrid(np.arange(0.01, 0.0601, SPACING), np.arange(0.01, 0.0701, SPACING))
+SITES = np.column_stack([U.ravel(), V.ravel(), np.full(U.size, 0.05)])
+
+
+def lesion(x, y, z, name="A", radius=0.008):
+    return replace(ANATOMY.lesion_at((x, y, z), radius, 8.0, name))
+
+
+NOWHERE = np.zeros((0, 3))
+ABOVE = lesion(0.034, 0.042, 0.036)
+
+
+def missed(monkeypatch, *lesions, forces=(0.30, 0.20), estimates=(), sites=SITES, early=NOWHERE):
+    """The misses of one map with contrast 1 everywhere, where presses feel the forces with and without the lesion."""
+    felt = iter(forces * len(lesions))
+    monkeypatch.setattr(misses, "scan", lambda *args, **options: [SimpleNamespace(force=next(felt))])
+    truths = seen_from_surface(lesions, ANATOMY)
+    found = [Estimate(np.array(place), 1.5, 0.5) for place in estimates]
+    one = score_map("m", sites, np.ones(len(sites)), found, truths, ANATOMY.along_surface, spacing=SPACING)
+    pressed = PressedSites(sites, early, SPACING)
+    return explain_misses(ANATOMY, ANATOMY.organ(lesions), lesions, truths, (one,), pressed)
+
+
+def test_a_lesion_that_is_felt_needs_no_reason(monkeypatch):
+    assert missed(monkeypatch, ABOVE, estimates=[(0.036, 0.042, 0.05)]) == ()
+
+
+@pytest.mark.parametrize(
+    ("reason", "lesions", "options"),
+    [
+        (NOT_FACED, (lesion(0.034, 0.042, 0.012),), {"forces": (0.201, 0.2)}),
+        (NEAR_SUPPORT, (lesion(0.08, 0.04, 0.036),), {"forces": (0.201, 0.2)}),
+        (NO_SITE, (ABOVE,), {"sites": SITES[:12]}),
+        (NOISE, (lesion(0.034, 0.042, 0.030),), {"forces": (0.219, 0.2)}),
+        (TOO_DEEP, (lesion(0.034, 0.042, 0.030),), {"forces": (0.221, 0.2)}),
+        (MASKED, (ABOVE, lesion(0.050, 0.042, 0.036, "B")), {"estimates": [(0.050, 0.042, 0.05)]}),
+        (MISPLACED, (ABOVE,), {"estimates": [(0.034, 0.054, 0.05)]}),
+        (NO_MAXIMUM, (ABOVE,), {}),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_the_reason(monkeypatch, reason, lesions, options):
+    (miss,) = missed(monkeypatch, *lesions, **options)
+    assert (miss.map_name, miss.lesion, miss.reason) == ("m", "A", reason)
+    assert miss.text.startswith(f"{reason}: ")
+
+
+def test_the_approach_that_would_face_it_is_said(monkeypatch):
+    """A lesion near the flank at y = 0, below: from there."""
+    (miss,) = missed(monkeypatch, lesion(0.034, 0.011, 0.022), forces=(0.201, 0.2))
+    said = re.search(r"--approach (\S+) faces it", miss.text)
+    assert said, miss.text
+    into = np.array([float(part) for part in said[1].split(",")])
+    np.testing.assert_allclose(into, [0.0, 1.0, 0.0], atol=0.01)
+
+
+def test_a_deep_lesion_that_a_press_feels_all_the_same_is_not_called_hidden(monkeypatch):
+    (miss,) = missed(monkeypatch, lesion(0.034, 0.042, 0.012), forces=(0.30, 0.2))
+    assert miss.reason == NO_MAXIMUM
+
+
+def test_presses_that_ended_early_are_counted(monkeypatch):
+    (miss,) = missed(monkeypatch, ABOVE, sites=SITES[:12], early=np.array([[0.034, 0.042, 0.05], [0.0, 0.0, 0.05]]))
+    assert "1 presses near it ended early" in miss.text
+
+
+def test_a_weak_baseline_is_said_so(monkeypatch):
+    few = SITES[np.linalg.norm(SITES - [0.034, 0.042, 0.05], axis=1) < 0.02]
+    (miss,) = missed(monkeypatch, ABOVE, sites=few)
+    assert "the baseline is weak: 0 healthy sites, 8 are the rule" in miss.text
+    assert "weak" not in missed(monkeypatch, ABOVE)[0].text
+
+
+def test_forces_and_noise_are_in_the_text(monkeypatch):
+    (miss,) = missed(monkeypatch, lesion(0.034, 0.042, 0.030), forces=(0.219, 0.2))
+    assert "0.219 N, 0.200 N without the lesion (contrast 1.09); the sensor's noise is 0.01 N" in miss.text

@@ -18,6 +18,7 @@ from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.instruments.arm.find_arm import find_arm, joint_inertia
 from surgsim_env.instruments.arm.model import hold_joints, read_model
 from surgsim_env.instruments.arm.urdf import find_mesh
+from surgsim_env.rendering.arm_picture import draw_arm
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.scene.arm_description import AddedShape, LinkInertia, read_description
 from surgsim_env.scene.load import scenes_folder
@@ -125,6 +126,17 @@ def test_meshes_of_a_package_are_found_and_drawn(scope):
     # MuJoCo turns a mesh into its principal axes.
     sizes = np.array([np.sort(np.ptp(vertices(model, mesh), axis=0)) for mesh in range(3)])
     np.testing.assert_allclose(sizes, [[0.1, 0.2, 0.3]] * 3, atol=1e-6)
+
+
+def test_the_picture_shows_the_meshes(scope):
+    arm = load_arm(find_arm(scope).description)
+    bare = load_arm(replace(arm.description, dropped_meshes=("package://scope/meshes/visual/block.stl",)))
+    try:
+        whole, less = (draw_arm(one, one.home).astype(int) for one in (arm, bare))
+    except NoGLError as error:
+        pytest.skip(str(error))
+    drawn = [(np.abs(image - image[0, 0]).sum(axis=2) > 30).sum() for image in (whole, less)]
+    assert drawn[0] > 1.2 * drawn[1] > 0
 
 
 def vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray:

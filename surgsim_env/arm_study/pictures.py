@@ -408,8 +408,9 @@ def write_pictures(
     evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], folder: AnyFolder, *, name: str = "arms"
 ) -> list[Picture]:
     """Write a picture of the arms as capsules, which needs no OpenGL, and those that the evaluation contains."""
-    given = write_given_pictures(evaluation.pictures, folder, name=name)
     places = poses(evaluation)
+    shown = "Drawn with OpenGL, with the arms' meshes: " + _where_tips_are(places)
+    given = write_given_pictures(evaluation.pictures, folder, name=name, description=shown)
     if not places:
         return given
     organ = curved_patches(evaluation.surface_points, evaluation.surface_triangles, 2)
@@ -431,8 +432,21 @@ def write_pictures(
     return [Picture.of_file(path, "The arms and the endoscope over the organ", description), *given]
 
 
-def write_given_pictures(pictures: Mapping[str, NDArray[np.uint8]], folder: AnyFolder, *, name: str) -> list[Picture]:
-    """Write RGB images by caption as PNG files, numbered from 1."""
+def _where_tips_are(places: Mapping[str, int]) -> str:
+    """Which tips are at a point that their arm reaches, and which arms reach none and stand at home."""
+    at_home = [side for side in SIDES if side not in places]
+    if not at_home:
+        return "each tip is at a point that its arm reaches."
+    if len(at_home) == len(SIDES):
+        return "neither arm reaches a point; both stand at home."
+    (side,) = places
+    return f"the {side} tip is at a point that its arm reaches; the {at_home[0]} arm reaches none and stands at home."
+
+
+def write_given_pictures(
+    pictures: Mapping[str, NDArray[np.uint8]], folder: AnyFolder, *, name: str, description: str
+) -> list[Picture]:
+    """Write RGB images by caption as PNG files, numbered from 1, with a description of all."""
     from matplotlib.image import imsave
 
     written = []
@@ -440,7 +454,7 @@ def write_given_pictures(pictures: Mapping[str, NDArray[np.uint8]], folder: AnyF
         path = folder / f"{name}_{number}.png"
         imsave(path, np.ascontiguousarray(image), format="png")
         title = caption[0].upper() + caption[1:]
-        written.append(Picture.of_file(path, title, "Drawn with OpenGL: each tip is at a point that its arm reaches."))
+        written.append(Picture.of_file(path, title, description))
     return written
 
 

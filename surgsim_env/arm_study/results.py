@@ -26,6 +26,14 @@ RANKING_RULE = (
 )
 
 
+class Touch(NamedTuple):
+    """A part of an arm that keeps it from points: index into REASONS, the part's name, the number of points."""
+
+    reason: int
+    part: str
+    points: int
+
+
 @dataclass(frozen=True)
 class ArmReach:
     """One arm at every point; what needs joints is NaN where the point is not reachable.
@@ -45,6 +53,7 @@ class ArmReach:
         organ_clearance: smallest distance of shaft and links from the organ [m]             (n_point,)
         wall_clearance: smallest distance of shaft and links from the body wall [m]          (n_point,)
         trocar_error: distance of the shaft's axis from the trocar [m]                       (n_point,)
+        touches: parts that touch organ or wall where that is the reason, the most frequent first
     """
 
     name: str
@@ -61,6 +70,7 @@ class ArmReach:
     organ_clearance: FloatArray
     wall_clearance: FloatArray
     trocar_error: FloatArray
+    touches: tuple[Touch, ...] = ()
 
     @property
     def reachable(self) -> NDArray[np.bool_]:
@@ -317,7 +327,7 @@ def verdict(evaluation: ArmsEvaluation) -> str:
                 "available wherever an arm reaches."
             )
     obstacles = [
-        f"the {side} arm most often because {_because(counts[0][0])} ({counts[0][1]} points)"
+        f"the {side} arm most often because {_because(arm, counts[0][0])} ({counts[0][1]} points)"
         for side, arm in sides(evaluation)
         if (counts := reason_counts(arm))
     ]
@@ -326,8 +336,11 @@ def verdict(evaluation: ArmsEvaluation) -> str:
     return " ".join(said)
 
 
-def _because(reason: str) -> str:
-    return f"of {reason}" if reason == REASONS[2] else reason
+def _because(arm: ArmReach, reason: str) -> str:
+    if reason == REASONS[2]:
+        return f"of {reason}"
+    parts = [touch.part for touch in arm.touches if REASONS[touch.reason] == reason]
+    return f"{reason} with {parts[0]}" if parts else reason
 
 
 class Column(NamedTuple):

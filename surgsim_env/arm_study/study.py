@@ -284,6 +284,7 @@ def _arm_summary(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
     return {
         "arm": arm.name,
         "reasons": counts,
+        "touches": [{"reason": REASONS[one.reason], "part": one.part, "points": one.points} for one in arm.touches],
         **{one.field: _extremes(getattr(arm, one.field)[outer]) for one in QUANTITIES if one.field != "position_error"},
     }
 
@@ -360,8 +361,8 @@ def run_study(
     pictures = write_pictures(first, (setups[0].left, setups[0].right), folder)
     shown = "Drawn with OpenGL: the lobe and both arms in the overview and through the endoscope; "
     shown += "the target is green, arrows are the tissue's force on each tool."
-    written = write_given_pictures({} if episodes is None else episodes.pictures, folder, name="episode")
-    ends = [replace(one, description=shown) for one in written]
+    drawn = {} if episodes is None else episodes.pictures
+    ends = write_given_pictures(drawn, folder, name="episode", description=shown)
     maps = ArmMaps(first).write_all(folder)
     write_report(
         first,
@@ -476,6 +477,7 @@ def write_report(
         values=_values(evaluation),
         distances=[(title, *spread(getattr(evaluation, field)).texts(1e3, 1)) for field, title, _ in DISTANCES],
         reasons=_reasons(evaluation),
+        touches=_touches(evaluation),
         episodes=episodes and _episodes(episodes, evaluation.scene, episode_pictures),
         definitions=_definitions(),
         columns=columns(evaluation),
@@ -514,6 +516,16 @@ def _reasons(evaluation: ArmsEvaluation) -> Rows:
         masks = [arm.reason == index for _, arm in sides(evaluation)]
         rows.append((reason, *(f"{int(mask.sum())} ({share_text(mask)})" for mask in masks)))
     return rows
+
+
+def _touches(evaluation: ArmsEvaluation) -> Rows:
+    """Parts that touch, what they touch, and the number of points for the left and the right arm."""
+    found: dict[tuple[int, str], list[int]] = {}
+    for number, (_, arm) in enumerate(sides(evaluation)):
+        for touch in arm.touches:
+            found.setdefault((touch.reason, touch.part), [0, 0])[number] = touch.points
+    ranked = sorted(found.items(), key=lambda item: (item[0][0], -sum(item[1])))
+    return [(part, REASONS[reason], *map(str, counts)) for (reason, part), counts in ranked]
 
 
 def _episodes(episodes: Episodes, organ: str, pictures: Sequence[Picture]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import tyro
 from rich.console import Console
 
+from surgsim_env.cli.arm import Arm
 from surgsim_env.cli.arms import Arms
 from surgsim_env.cli.bench import Bench
 from surgsim_env.cli.doctor import Doctor
@@ -24,9 +25,11 @@ from surgsim_env.cli.validate import Validate
 from surgsim_env.cli.view import View
 
 # Options whose value is a list of numbers, which may begin with a minus.
-NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around")
+NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around", "--trocar")
 
-Command = Palpate | Retract | Organ | Scenes | Materials | Arms | Identify | Validate | Bench | Haptics | View | Doctor
+Command = (
+    Palpate | Retract | Organ | Scenes | Materials | Arm | Arms | Identify | Validate | Bench | Haptics | View | Doctor
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,6 +15,13 @@ ROWS_LARGEST = 3_600_000
 # Of a pose: 31 bits, so that they fit into any integer type.
 BUTTONS_LARGEST = 2**31 - 1
 BUTTONS_RULE = f"a whole number from 0 to {BUTTONS_LARGEST}"
+# Names of the columns with the tip's place [m], which recordings of `surgsim view` have: in these a row stands for one
+# haptic step, and steps in which no hand gave a place have none.
+TIP = "tip_"
+# Rows of a recording whose spacing is more than this many steps have a pause between them.
+PAUSE_LEAST = 1.5
+# Tolerance of a row's time, as a share of the haptic step.
+ROUNDING = 1e-3
 
 
 class Motion(NamedTuple):
@@ -24,11 +31,13 @@ class Motion(NamedTuple):
         time: of each row [s]                        (n,)
         position: of each hand [m]                   (n, hand, 3)
         buttons: one bit each; 0 without a column    (n, hand)
+        recorded: whether it is a recording, where a place of nan stands for a step without one
     """
 
     time: FloatArray
     position: FloatArray
     buttons: IntArray
+    recorded: bool = False
 
 
 def are_buttons(value: float) -> bool:
@@ -42,13 +51,16 @@ def motion_columns(mark: str = "") -> list[str]:
     return [f"{name}{mark}" for name in ("x", "y", "z", "buttons")]
 
 
-def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int) -> Motion:
+def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int, of_tip: bool = False) -> Motion:
     """Read a file with a header: time [s]; for each hand x, y, z [m] and optionally buttons; other columns are ignored.
+
+    In a recording (a file with the tip's place) pauses are gaps in time; the motion has a row for each step of them.
 
     Args:
         path: of the file.
         marks: suffix of the column names of each hand.
-        rows_largest: largest number of rows.
+        rows_largest: largest number of rows, those of pauses included.
+        of_tip: read the recorded tips in place of the hands.
 
     Raises:
         ValueError: a missing column, a row that is not numeric, invalid buttons, too many rows or none; names the file
@@ -58,7 +70,8 @@ def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int) 
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         reader = csv.DictReader(file)
         try:
-            places, pressed = _columns(reader.fieldnames or [], marks, path.name)
+            names = reader.fieldnames or []
+            places, pressed = _columns(names, marks, path.name, TIP if of_tip else "")
             rows = list(_rows(reader, [*places, *pressed], path.name, rows_largest))
         except csv.Error as error:
             raise ValueError(f"{path.name}, line {reader.line_num + 1}: {error}; it is not a CSV file") from None
@@ -70,12 +83,31 @@ def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int) 
         name = motion_columns(mark)[3]
         if name in pressed:
             buttons[:, hand] = table[:, len(places) + pressed.index(name)]
-    return Motion(table[:, 0], table[:, 1 : len(places)].reshape(-1, len(marks), 3), buttons)
+    motion = Motion(table[:, 0], table[:, 1 : len(places)].reshape(-1, len(marks), 3), buttons)
+    return _with_pauses(motion, path.name, rows_largest) if f"{TIP}x" in names else motion
 
 
-def _columns(names: Sequence[str], marks: Sequence[str], file_name: str) -> tuple[list[str], list[str]]:
+def _with_pauses(motion: Motion, file_name: str, rows_largest: int) -> Motion:
+    """A recording with a row without places for each step that its file leaves out; as it is where times are wrong."""
+    spacing = np.diff(motion.time)
+    # Others say which time is wrong.
+    if not len(spacing) or not np.isfinite(motion.time).all() or not (spacing > 0.0).all():
+        return motion._replace(recorded=True)
+    step = float(np.median(spacing))
+    steps = np.where(spacing > PAUSE_LEAST * step, np.round(spacing / step), 1.0)
+    if not steps.sum() < rows_largest:
+        raise ValueError(f"{file_name}: more than {rows_largest} steps with those of its pauses; cut it into parts")
+    row = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    count = int(row[-1]) + 1
+    position, buttons = np.full((count, *motion.position.shape[1:]), np.nan), np.zeros((count, motion.buttons.shape[1]))
+    position[row], buttons[row] = motion.position, motion.buttons
+    time = np.interp(np.arange(count), row, motion.time)
+    return Motion(time, position, buttons.astype(np.int32), recorded=True)
+
+
+def _columns(names: Sequence[str], marks: Sequence[str], file_name: str, of: str) -> tuple[list[str], list[str]]:
     """The columns of time and positions, and those of buttons that exist."""
-    places = ["time", *(name for mark in marks for name in motion_columns(mark)[:3])]
+    places = ["time", *(f"{of}{name}" for mark in marks for name in motion_columns(mark)[:3])]
     pressed = [motion_columns(mark)[3] for mark in marks]
     missing = [name for name in places if name not in names]
     if missing:
@@ -105,6 +137,8 @@ def _rows(reader: csv.DictReader, columns: Sequence[str], file_name: str, rows_l
 class TrajectoryDevice:
     """Plays positions over time, interpolated linearly, one haptic step per `read`; forces are stored.
 
+    In the pauses of a recording it gives no pose, as a device that has none.
+
     Fields:
         force: the last one written [N]                                    (3,)
     """
@@ -118,6 +152,7 @@ class TrajectoryDevice:
         buttons: Sequence[int] | IntArray | None = None,
         *,
         haptic_step: float = 1e-3,
+        recorded: bool = False,
     ) -> None:
         """Play a trajectory; its last pose is held at the end.
 
@@ -126,6 +161,7 @@ class TrajectoryDevice:
             position: in the device's frame [m], (n, 3).
             buttons: pressed from each row on, from 0 to 2^31 - 1, (n,); none by default.
             haptic_step: of the loop [s].
+            recorded: whether a row with three places of nan stands for a step without a pose.
 
         Raises:
             ValueError: inconsistent shapes, a number that is not finite, times that do not increase (names the row).
@@ -148,7 +184,9 @@ class TrajectoryDevice:
                 f"buttons of row {wrong[0]} of the trajectory are {pressed[wrong[0]]}; they must be {BUTTONS_RULE}"
             )
         self._buttons = pressed.astype(np.int32)
-        finite = np.isfinite(self._time) & np.isfinite(self._position).all(axis=1)
+        no_place = np.isnan(self._position).all(axis=1) & recorded
+        self._has_place = np.logical_not(no_place)
+        finite = np.isfinite(self._time) & (np.isfinite(self._position).all(axis=1) | ~self._has_place)
         if not finite.all():
             raise ValueError(f"row {np.flatnonzero(~finite)[0]} of the trajectory has a number that is not finite")
         backward = np.flatnonzero(np.diff(self._time) <= 0.0)
@@ -169,7 +207,13 @@ class TrajectoryDevice:
         """
         motion = read_motion(path, rows_largest=ROWS_LARGEST)
         try:
-            return cls(motion.time, motion.position[:, 0], motion.buttons[:, 0], haptic_step=haptic_step)
+            return cls(
+                motion.time,
+                motion.position[:, 0],
+                motion.buttons[:, 0],
+                haptic_step=haptic_step,
+                recorded=motion.recorded,
+            )
         except ValueError as error:
             raise ValueError(f"{path.name}: {error}") from None
 
@@ -182,8 +226,14 @@ class TrajectoryDevice:
         """The pose of the next haptic step."""
         now = self._time[0] + self._step * self._haptic_step
         self._step += 1
-        row = int(np.searchsorted(self._time, now, side="right")) - 1
-        place = np.array([np.interp(now, self._time, column) for column in self._position.T])
+        # Written times are rounded.
+        row = int(np.searchsorted(self._time, now + ROUNDING * self._haptic_step, side="right")) - 1
+        later = min(row + 1, len(self._time) - 1)
+        exact = row == later or abs(now - self._time[row]) <= ROUNDING * self._haptic_step
+        if not self._has_place[row] or not (exact or self._has_place[later]):
+            return None
+        span = slice(row, row + 1) if exact else slice(row, later + 1)
+        place = np.array([np.interp(now, self._time[span], column) for column in self._position[span].T])
         return DevicePose(place, float(now), int(self._buttons[row]))
 
     def write(self, force: FloatArray) -> None:

@@ -1,4 +1,4 @@
-"""Recordings as CSV files: one row a haptic step, readable by `surgsim_env.haptics.trajectory`."""
+"""Recordings as CSV files, readable by `surgsim_env.haptics.trajectory`: one row for each haptic step with a hand."""
 
 from pathlib import Path
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.haptics.trajectory import Motion, motion_columns, read_motion
+from surgsim_env.haptics.trajectory import TIP, Motion, motion_columns, read_motion
 from surgsim_env.live.exchange_records import RECORDING_MOST, recording_type
 from surgsim_env.reports.output_folder import output_folder
 
@@ -19,14 +19,19 @@ def columns(arm_count: int) -> list[str]:
     names = ["time"]
     for arm in range(arm_count):
         names += motion_columns(_mark(arm))
-        names += [f"{what}{axis}{_mark(arm)}" for what in ("tip_", "force_") for axis in "xyz"]
+        names += [f"{what}{axis}{_mark(arm)}" for what in (TIP, "force_") for axis in "xyz"]
     return names
 
 
 def write_recording(steps: NDArray[Any], folder: Path) -> str:
-    """Write steps to the next free recording-NUMBER.csv of a folder; returns a sentence that states the result."""
+    """Write steps to the next free recording-NUMBER.csv of a folder; returns a sentence that states the result.
+
+    Steps in which no hand gave a place are left out: a pause is a gap in time.
+    """
+    has_place = np.isfinite(steps["hand"]).all(axis=2)
+    steps = steps[np.any(has_place, axis=1)]
     if not len(steps):
-        return "nothing was recorded"
+        return "nothing was recorded: no hand moved an instrument"
     arm_count = steps["hand"].shape[1]
     parts = [steps["time"][:, None]]
     for arm in range(arm_count):
@@ -47,7 +52,7 @@ def read_recording(path: Path, arm_count: int, haptic_step: float) -> NDArray[An
     """The steps of a file that `write_recording` wrote, or of a trajectory with columns time, x, y, z.
 
     Rows one haptic step [s] apart are used unchanged. Otherwise the rows are interpolated linearly in time, with the
-    buttons of the earlier row; next to a row without a position (nan) there is none.
+    buttons of the earlier row; next to a row without a position (nan) and in pauses there is none.
 
     Raises:
         ValueError: names the file, the line and what is wrong with it: no number, not finite, times that do not
@@ -67,7 +72,7 @@ def read_recording(path: Path, arm_count: int, haptic_step: float) -> NDArray[An
     if (np.abs(np.diff(time) - haptic_step) > STEP_TOLERANCE * haptic_step).any():
         motion = _resampled(path, motion, haptic_step)
     steps = np.zeros(len(motion.time), dtype=recording_type(arm_count))
-    steps["time"], steps["hand"], steps["buttons"] = motion
+    steps["time"], steps["hand"], steps["buttons"] = motion.time, motion.position, motion.buttons
     return steps
 
 

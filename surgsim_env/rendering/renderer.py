@@ -193,7 +193,7 @@ class DrawnCapsule:
 
 
 def draw_still(
-    surface: tuple[FloatArray, IntArray],
+    surface: tuple[FloatArray, IntArray] | None,
     arms: Sequence[tuple[mujoco.MjModel, mujoco.MjData]],
     capsules: Sequence[DrawnCapsule],
     cameras: Sequence[Camera],
@@ -202,7 +202,7 @@ def draw_still(
     """A picture (height, width, 3) from each camera.
 
     Args:
-        surface: points [m] (n_node, 3) and outward triangles (n_triangle, 3) of the organ.
+        surface: points [m] (n_node, 3) and outward triangles (n_triangle, 3) of the organ; None without one.
         arms: models and data, their kinematics computed; drawn as they are posed.
         capsules: whatever else is there.
         cameras: the first one's `up` is up in the scene.
@@ -212,10 +212,11 @@ def draw_still(
         NoGLError: there is no OpenGL; names the packages that are missing.
     """
     context = gl.context()
-    organ = drawn_surface(*surface)
+    organ = None if surface is None else drawn_surface(*surface)
     spec = empty_scene(*size, STILL_BACKGROUND, far=STILL_FAR)
     add_lights(spec, -cameras[0].up)
-    add_tissue(spec, "organ", organ.vertex_count, len(organ.faces))
+    if organ is not None:
+        add_tissue(spec, "organ", organ.vertex_count, len(organ.faces))
     for number, (model, _) in enumerate(arms):
         add_instrument(spec, model, f"arm_{number}")
     for capsule in capsules:
@@ -224,14 +225,15 @@ def draw_still(
             geom.type, geom.pos = mujoco.mjtGeom.mjGEOM_SPHERE, capsule.ends[0]
         else:
             geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, capsule.ends.ravel()
-    model, data, meshes = compile_scene(spec, ["organ"])
+    model, data, meshes = compile_scene(spec, [] if organ is None else ["organ"])
     for number, (arm, posed) in enumerate(arms):
         find_instrument(model, arm, f"arm_{number}").pose(posed, data)
     with LOCK:
         context.make_current()
         canvas = Canvas(model, data, context)
         canvas.select()
-        meshes["organ"].upload(Shape(*organ.follow(surface[0]), organ.faces), canvas.context)
+        if surface is not None and organ is not None:
+            meshes["organ"].upload(Shape(*organ.follow(surface[0]), organ.faces), canvas.context)
         frames = []
         for camera in cameras:
             canvas.look(camera)

@@ -1,7 +1,7 @@
 """The TOML file that describes an arm beside its MJCF or URDF model: contact geoms, tip, trocar, control."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from surgsim_env.scene.load import fill, list_arms, nearest, read_toml, scenes_folder
@@ -76,6 +76,7 @@ class JointControl:
         stiffness: of each added servo [N m/rad or N/m].
         damping: of each added servo [N m s/rad or N s/m].
         effort: largest torque or force of each added servo [N m or N].
+        armature: rotor inertia of each joint with an added servo [kg m^2 or kg]; the model's where none is given.
     """
 
     mode: str
@@ -83,6 +84,7 @@ class JointControl:
     stiffness: tuple[float, ...] = ()
     damping: tuple[float, ...] = ()
     effort: tuple[float, ...] = ()
+    armature: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.mode not in CONTROL_MODES:
@@ -91,6 +93,63 @@ class JointControl:
             if bool(getattr(self, name)) != (self.mode == "servo"):
                 rule = "must be given" if self.mode == "servo" else "must be left out"
                 raise ValueError(f"control.{name} {rule} with control.mode = {self.mode!r}")
+        if self.armature and self.mode != "servo":
+            raise ValueError(f"control.armature must be left out with control.mode = {self.mode!r}")
+
+
+@dataclass(frozen=True)
+class AddedShape:
+    """A capsule or a ball that the model file lacks: tissue feels spheres and capsules, not meshes.
+
+    Args:
+        name: of the geom that is added.
+        body: the body that carries it.
+        start: end of the capsule's axis, or the middle of the ball, in that body's frame [m].
+        radius: [m].
+        end: the other end of the capsule's axis [m]; none for a ball.
+    """
+
+    name: str
+    body: str
+    start: Vector
+    radius: float
+    end: Vector | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("shapes: a shape has no name; contact and links name it")
+        _require_finite(f"start of shape {self.name!r}", self.start)
+        require_number(f"radius of shape {self.name!r}", self.radius, 0.0, "m", above=True)
+        if self.end is not None:
+            _require_finite(f"end of shape {self.name!r}", self.end)
+            if self.end == self.start:
+                raise ValueError(f"shape {self.name!r} ends where it starts, at {self.start}: leave end out for a ball")
+
+
+@dataclass(frozen=True)
+class LinkInertia:
+    """Mass and moments of inertia of a URDF link whose own are missing or not those of a body.
+
+    Args:
+        link: its name.
+        mass: [kg].
+        centre: centre of mass in the link's frame [m].
+        moments: about the axes of that frame through the centre [kg m^2].
+    """
+
+    link: str
+    mass: float
+    centre: Vector
+    moments: Vector
+
+    def __post_init__(self) -> None:
+        what = f"of link {self.link!r} in inertias"
+        require_number(f"mass {what}", self.mass, 0.0, "kg", above=True)
+        _require_finite(f"centre {what}", self.centre)
+        for one in self.moments:
+            require_number(f"moment {what}", one, 0.0, "kg m^2", above=True)
+        if 2.0 * max(self.moments) > sum(self.moments) * (1.0 + 1e-9):
+            raise ValueError(f"moments {what} are {self.moments}; in a body none exceeds the sum of the others")
 
 
 @dataclass(frozen=True)
@@ -108,6 +167,11 @@ class ArmDescription:
         tip, trocar, control: see there.
         home: value of each joint with the shaft in the trocar [rad or m].
         jaw: joints whose sum is the jaw's opening angle; none for a rigid tip.
+        limits: least and largest value of joints [rad or m], in place of the model's.
+        held: joints that do not move and their values [rad or m]; couplings and actuators of theirs are left out.
+        shapes: spheres and capsules that the model file lacks.
+        inertias: of links of a URDF file, in place of its own.
+        dropped_meshes: file names of a URDF's meshes that are left out, as the URDF gives them.
         description: one line.
     """
 
@@ -123,6 +187,11 @@ class ArmDescription:
     home: dict[str, float]
     links: tuple[str, ...] = ()
     jaw: tuple[str, ...] = ()
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    held: dict[str, float] = field(default_factory=dict)
+    shapes: tuple[AddedShape, ...] = ()
+    inertias: tuple[LinkInertia, ...] = ()
+    dropped_meshes: tuple[str, ...] = ()
     description: str = ""
 
     def __post_init__(self) -> None:
@@ -133,21 +202,30 @@ class ArmDescription:
         for name in ("joints", "contact"):
             if not getattr(self, name):
                 raise ValueError(f"{name} is empty; name at least one")
-        _require_distinct("joints and jaw", (*self.joints, *self.jaw))
         _require_distinct("contact and links", (*self.contact, *self.links))
+        _require_distinct("joints, jaw and held", (*self.joints, *self.jaw, *self.held))
+        _require_distinct("shapes", tuple(one.name for one in self.shapes))
+        _require_distinct("inertias", tuple(one.link for one in self.inertias))
+        for joint, value in self.held.items():
+            if not math.isfinite(value):
+                raise ValueError(f"held joint {joint!r} is at {value:g}; it must be finite")
+        for joint, (least, most) in self.limits.items():
+            if not -math.inf < least < most < math.inf:
+                raise ValueError(f"limits of joint {joint!r} are {least:g} to {most:g}; they must be finite and rise")
         self._check_control()
         self._check_home()
 
     def _check_control(self) -> None:
         control = self.control
-        for name in ("speed_limit", "stiffness", "damping", "effort"):
+        for name in ("speed_limit", "stiffness", "damping", "effort", "armature"):
             values = getattr(control, name)
-            if not values and control.mode == "position" and name != "speed_limit":
+            if not values and (name == "armature" or (control.mode == "position" and name != "speed_limit")):
                 continue
             if len(values) != len(self.joints):
                 raise ValueError(f"control.{name} has {len(values)} numbers for {len(self.joints)} joints; one each")
             for joint, value in zip(self.joints, values, strict=True):
-                if not 0.0 < value < math.inf:
+                # A joint may have no rotor inertia.
+                if not (0.0 < value < math.inf or (name == "armature" and value == 0.0)):
                     raise ValueError(f"control.{name} of joint {joint!r} is {value:g}; it must be finite and above 0")
 
     def _check_home(self) -> None:

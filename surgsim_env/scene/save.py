@@ -1,4 +1,4 @@
-"""Scenes as the text of TOML files, written from the dataclasses' fields, so that no field can be left out."""
+"""Scenes and arms as the text of TOML files, written from the dataclasses' fields, so that no field can be left out."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,6 +8,7 @@ from typing import Any, get_args, get_type_hints
 import tomlkit
 from tomlkit.items import AbstractTable, Item, Table
 
+from surgsim_env.scene.arm_description import ArmDescription
 from surgsim_env.scene.model import Ball, Bed, Box, Scene, Side
 
 # A file's own name and folder, which it does not state.
@@ -30,22 +31,42 @@ def scene_toml(scene: Scene, *, head: Sequence[str] = (), comments: Mapping[str,
     Raises:
         ValueError: a comment's path names no field; a field is None while its default is not (TOML has no null).
     """
-    for path in comments or {}:
-        _check_path(path)
+    return _toml(scene, head, comments or {})
+
+
+def arm_toml(
+    description: ArmDescription, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
+) -> str:
+    """An arm's description as TOML; `read_description` reads an equal one.
+
+    Args:
+        description: to be written.
+        head: comment lines at the top.
+        comments: texts by the path of their entry or table, such as "trocar.point".
+
+    Raises:
+        ValueError: a comment's path names no field.
+    """
+    return _toml(description, head, comments or {})
+
+
+def _toml(values: Scene | ArmDescription, head: Sequence[str], comments: Mapping[str, str]) -> str:
+    for path in comments:
+        _check_path(path, type(values))
     document = tomlkit.document()
     for line in head:
         document.add(tomlkit.comment(_printable(line)))
-    _fill(document, scene, "", comments or {})
+    _fill(document, values, "", comments)
     return tomlkit.dumps(document)
 
 
-def _check_path(path: str) -> None:
-    """Refuse a comment that would be lost, as no scene has a field at its path."""
-    kind: Any = Scene
+def _check_path(path: str, root: type) -> None:
+    """Refuse a comment that would be lost, as there is no field at its path."""
+    kind: Any = root
     for name in re.sub(r"\[\d+\]", "", path).split("."):
         hints = get_type_hints(kind) if is_dataclass(kind) else {}
         if name not in hints:
-            raise ValueError(f"the comment at {path!r} is for no field of a scene")
+            raise ValueError(f"the comment at {path!r} is for no field of a {root.__name__}")
         kind = next((part for part in (hints[name], *get_args(hints[name])) if is_dataclass(part)), None)
 
 
@@ -54,7 +75,7 @@ def _fill(table: tomlkit.TOMLDocument | AbstractTable, values: Any, path: str, c
     found = [(one, getattr(values, one.name)) for one in fields(values) if path or one.name not in PATH_FIELDS]
     # TOML wants a table's entries before its sub-tables.
     for one, value in sorted(found, key=lambda pair: _is_table(pair[1])):
-        if value in (None, ()) and value == _default(one):
+        if value in (None, (), {}) and value == _default(one):
             continue
         if value is None:
             raise ValueError(f"{path}{one.name} is None, which TOML cannot hold; its default is {_default(one)!r}")
@@ -71,6 +92,10 @@ def _item(name: str, value: Any, path: str, comments: Mapping[str, str]) -> Item
     if is_dataclass(value):
         item = tomlkit.inline_table() if isinstance(value, INLINE_TABLES) else tomlkit.table()
         _fill(item, value, f"{path}.", comments)
+    elif isinstance(value, dict):
+        item = tomlkit.table()
+        for key, one in value.items():
+            item.add(key, _plain(one))
     else:
         item = tomlkit.item(_plain(value))
     plain = re.sub(r"\[\d+\]", "", path)
@@ -88,7 +113,9 @@ def _is_tables(value: Any) -> bool:
 
 
 def _is_table(value: Any) -> bool:
-    return _is_tables(value) or (is_dataclass(value) and not isinstance(value, INLINE_TABLES))
+    return (
+        _is_tables(value) or isinstance(value, dict) or (is_dataclass(value) and not isinstance(value, INLINE_TABLES))
+    )
 
 
 def _default(one: Field) -> Any:

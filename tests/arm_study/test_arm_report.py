@@ -13,6 +13,7 @@ from surgsim_env.arm_study.pictures import ArmMaps, camera_view, poses, write_pi
 from surgsim_env.arm_study.results import (
     QUANTITIES,
     REASONS,
+    Touch,
     columns,
     number_text,
     share_text,
@@ -20,7 +21,7 @@ from surgsim_env.arm_study.results import (
     worse_of_both,
     write_points,
 )
-from surgsim_env.arm_study.study import write_report
+from surgsim_env.arm_study.study import _touches, write_report
 from surgsim_env.instruments.arm.arm import load_arm
 from tests.arm_study.made import PICTURE, PORTS, made_evaluation
 
@@ -351,6 +352,38 @@ def test_nothing_reached_is_told_as_that(tmp_path):
     assert "reaches 0 %" in said and "no clearances and forces to report" in said
     page = Page((written(evaluation, tmp_path) / "report.html").read_text(encoding="utf-8"))
     assert page.row("tip force [N]")[1:] == ["–"] * 9
+
+
+@pytest.mark.parametrize(
+    ("left_to", "right_to", "words"),
+    [
+        (2.0, 2.0, "each tip is at a point that its arm reaches."),
+        (-2.0, 2.0, "the right tip is at a point that its arm reaches; the left arm reaches none and stands at home."),
+        (-2.0, -2.0, "neither arm reaches a point; both stand at home."),
+    ],
+)
+def test_a_picture_says_which_arm_stands_at_home(tmp_path, left_to, right_to, words):
+    evaluation = made_evaluation(left_to=left_to, right_to=right_to)
+    arms = tuple(load_arm(name, PORTS[side]) for name, side in (("psm_grasper", "left"), ("psm_palpator", "right")))
+    drawn = [one for one in write_pictures(evaluation, arms, tmp_path) if one.name != "arms.png"]
+    assert drawn
+    assert all(one.description.endswith(words) for one in drawn)
+
+
+def test_parts_that_touch_are_named(tmp_path):
+    evaluation = made_evaluation(pictures=False)
+    reason = evaluation.left.reason.copy()
+    reason[~evaluation.inner] = 4
+    left = replace(evaluation.left, reason=reason, touches=(Touch(4, "sled", 31), Touch(5, "rail", 2)))
+    right = replace(evaluation.right, touches=(Touch(4, "sled", 3),))
+    evaluation = replace(evaluation, left=left, right=right)
+    assert "the left arm most often because the arm touches the organ with sled" in verdict(evaluation)
+    assert _touches(evaluation) == [
+        ("sled", "the arm touches the organ", "31", "3"),
+        ("rail", "the arm touches the wall", "2", "0"),
+    ]
+    page = Page((written(evaluation, tmp_path) / "report.html").read_text(encoding="utf-8"))
+    assert page.row("sled")[1:] == ["the arm touches the organ", "31", "3"]
 
 
 @pytest.mark.slow

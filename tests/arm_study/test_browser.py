@@ -47,12 +47,12 @@ def report(tmp_path_factory) -> Path:
     write_report(
         evaluation,
         path,
-        pictures=write_given_pictures(evaluation.pictures, folder, name="arms"),
+        pictures=write_given_pictures(evaluation.pictures, folder, name="arms", description="the arms"),
         maps=ArmMaps(evaluation).write_all(folder),
         command="surgsim arms --scene liver --left psm_grasper --right psm_palpator --ports ports.toml",
         ranking=rank(others),
         episodes=episodes,
-        episode_pictures=write_given_pictures(episodes.pictures, folder, name="episode"),
+        episode_pictures=write_given_pictures(episodes.pictures, folder, name="episode", description="the ends"),
     )
     return path
 

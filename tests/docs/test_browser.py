@@ -28,7 +28,7 @@ class Silent(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def address(site_folder) -> Iterator[str]:
-    """Where the site is served: Material's search works there, and not from the disk."""
+    """Where the site is served."""
     handler = functools.partial(Silent, directory=str(site_folder))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
@@ -62,10 +62,12 @@ def test_the_home_page_is_painted(address, chromium):
         assert len(np.unique((part * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 60
 
 
-def test_a_word_that_is_typed_is_found(address, chromium):
+@pytest.mark.parametrize("page", ["index.html", "environments/palpate.html"])
+@pytest.mark.parametrize("place", ["served", "disk"])
+def test_a_word_that_is_typed_is_found(address, site_folder, chromium, place, page):
     """Material's search fetches its index and works in a worker: neither shows in pages that are only looked at."""
     with chromium.page(1280, 900) as browser:
-        browser.open(f"{address}/index.html")
+        browser.open(f"{address if place == 'served' else site_folder.as_uri()}/{page}")
         browser.wait_for_page()
         browser.wait_for("!!document.querySelector('input.md-search__input')")
         browser.run("document.querySelector('input.md-search__input').focus()")

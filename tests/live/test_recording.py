@@ -88,16 +88,71 @@ def test_a_gap_in_a_slow_trajectory_stays_one(tmp_path):
     assert np.isnan(places[11:30]).all() and np.isfinite(places[:10]).all() and np.isfinite(places[31:]).all()
 
 
-def test_a_native_recording_is_taken_as_it_is(tmp_path):
-    """To the bit of what is written, with steps in which the hand said nothing, and late enough for rounded times."""
-    steps = made_steps(count=200)
+def paused(count=200, arm_count=1):
+    """Steps of which some have no hand, late enough for rounded times."""
+    steps = made_steps(arm_count, count)
     steps["time"] += 290.0
-    steps["hand"][50:60] = np.nan
+    steps["hand"][50:60], steps["buttons"][50:60] = np.nan, 0
+    steps["hand"][120], steps["buttons"][120] = np.nan, 0
+    return steps
+
+
+def test_a_native_recording_is_taken_as_it_is(tmp_path):
+    """To the bit of what is written, with the steps in which the hand said nothing."""
+    steps = paused()
     write_recording(steps, tmp_path)
     read = read_recording(tmp_path / "recording-1.csv", 1, STEP)
     written = np.genfromtxt(tmp_path / "recording-1.csv", delimiter=",", names=True)
-    np.testing.assert_array_equal(read["hand"][:, 0], np.column_stack([written[axis] for axis in "xyz"]))
+    present = np.isfinite(steps["hand"][:, 0, 0])
+    np.testing.assert_array_equal(read["hand"][present, 0], np.column_stack([written[axis] for axis in "xyz"]))
+    assert np.isnan(read["hand"][~present]).all()
     np.testing.assert_array_equal(read["buttons"], steps["buttons"])
+    np.testing.assert_allclose(read["time"], steps["time"], atol=1e-6)
+
+
+def test_a_pause_is_a_gap_in_time(tmp_path):
+    """No row is without numbers, which other programs would stumble over."""
+    assert write_recording(paused(), tmp_path).startswith("189 steps written")
+    table = np.genfromtxt(tmp_path / "recording-1.csv", delimiter=",", skip_header=1)
+    assert len(table) == 189
+    assert np.isfinite(table).all()
+    np.testing.assert_allclose(np.unique(np.diff(table[:, 0]).round(4)), [0.001, 0.002, 0.011])
+
+
+def test_of_two_arms_a_row_has_a_hand_at_least(tmp_path):
+    steps = paused(arm_count=2)
+    steps["hand"][80:90, 1] = np.nan
+    assert write_recording(steps, tmp_path).startswith("189 steps written")
+    read = read_recording(tmp_path / "recording-1.csv", 2, STEP)
+    np.testing.assert_array_equal(np.isnan(read["hand"]), np.isnan(steps["hand"]))
+
+
+def test_a_recording_without_a_hand_says_so(tmp_path):
+    steps = made_steps()
+    steps["hand"] = np.nan
+    assert "no hand moved an instrument" in write_recording(steps, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_haptic_package_plays_pauses(tmp_path):
+    """No pose in the same steps in which there was none."""
+    steps = paused()
+    write_recording(steps, tmp_path)
+    device = TrajectoryDevice.load(tmp_path / "recording-1.csv", haptic_step=STEP)
+    played = [device.read() for _ in range(len(steps))]
+    assert device.over
+    assert [pose is None for pose in played] == np.isnan(steps["hand"][:, 0, 0]).tolist()
+    places = np.array([np.full(3, np.nan) if pose is None else pose.position for pose in played])
+    np.testing.assert_allclose(places, steps["hand"][:, 0], rtol=1e-8)
+    assert [0 if pose is None else pose.buttons for pose in played] == steps["buttons"][:, 0].tolist()
+
+
+def test_a_pause_of_a_recording_may_not_be_endless(tmp_path):
+    path = tmp_path / "long.csv"
+    path.write_text("time,x,y,z,tip_x\n0,0,0,0,0\n0.001,0,0,0,0\n0.002,0,0,0,0\n1e9,0,0,0,0\n")
+    for play in (lambda: read_recording(path, 1, STEP), lambda: TrajectoryDevice.load(path)):
+        with pytest.raises(ValueError, match=r"more than \d+ steps with those of its pauses"):
+            play()
 
 
 def test_nothing_recorded_writes_nothing(tmp_path):

@@ -116,5 +116,5 @@ def test_a_field_that_toml_cannot_hold_is_refused():
 
 @pytest.mark.parametrize("path", ["contact.stifness", "stiffness", "ports[1].inot", "description.text"])
 def test_a_comment_for_no_field_is_refused(path):
-    with pytest.raises(ValueError, match="is for no field of a scene"):
+    with pytest.raises(ValueError, match="is for no field of a Scene"):
         scene_toml(make_scene("phantom"), comments={path: "lost"})

@@ -10,6 +10,7 @@ import surgsim_env  # noqa: F401
 from surgsim_env.scripting import (
     Control,
     Declare,
+    Follow,
     Hold,
     Lift,
     MoveTo,
@@ -249,3 +250,58 @@ class Nudge:
 def test_a_step_of_ones_own_is_a_step():
     with pytest.raises(ScriptError, match=r"step 1 of 1, 'nudge', gave up at 0\.040 m"):
         run_script(above(), [Nudge()])
+
+
+def recorded(path, trace, *, pause=slice(0, 0)):
+    """A trace's tip as `surgsim view` would record it, with a hand that is somewhere else and lets go for a while."""
+    rows = np.column_stack([trace.haptic_time, np.zeros((len(trace.haptic_time), 4)), trace.tip_position])
+    rows = np.delete(rows, pause, axis=0)
+    np.savetxt(path, rows, delimiter=",", header="time,x,y,z,buttons,tip_x,tip_y,tip_z", comments="", fmt="%.9g")
+    return path
+
+
+@pytest.mark.parametrize("pause", [slice(0, 0), slice(300, 420)], ids=["whole", "paused"])
+def test_a_recording_is_followed(tmp_path, pause):
+    first = run_script(above(), [PressUntil(0.2, max_depth=0.008), Hold(0.5)])
+    again = run_script(above(gap=0.003), [Follow(recorded(tmp_path / "r.csv", first, pause=pause)), Hold(0.3)])
+    played = again.between("Follow")
+    # The tip ends where it was recorded, at that pace, and feels the same: 0.1 mm is 0.01 N here.
+    np.testing.assert_allclose(again.tip_position[-1], first.tip_position[-1], atol=1e-4)
+    assert again.force[-1, 2] == pytest.approx(first.force[-1, 2], abs=0.015)
+    assert played.duration > first.haptic_time[-1] - first.haptic_time[0]
+
+
+def test_a_trajectory_of_places_alone_is_followed(tmp_path):
+    start = np.array([*MIDDLE, TOP + RADIUS + 0.004])
+    path = tmp_path / "t.csv"
+    path.write_text(
+        "time,x,y,z\n" + "\n".join(f"{t},{start[0] + 0.01 * (t - 5)},{start[1]},{start[2]}" for t in (5, 5.5, 6))
+    )
+    trace = run_script(above(gap=0.004), [Follow(path), Hold(0.2)])
+    np.testing.assert_allclose(trace.tip_position[-1] - start, [0.01, 0.0, 0.0], atol=1e-4)
+
+
+def test_a_path_that_is_too_fast_fails_with_the_distance(tmp_path):
+    path, height = tmp_path / "fast.csv", TOP + RADIUS + 0.002
+    path.write_text(f"time,x,y,z\n0,0.03,0.03,{height}\n0.1,0.05,0.03,{height}\n1,0.05,0.03,{height}\n")
+    with pytest.raises(ScriptError, match=r"was \d+\.\d mm from the path of fast.csv at 0\.\d+ s"):
+        run_script(above(), [Follow(path)])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time,x,y\n0,0,0\n", "column 'z' is missing"),
+        ("time,x,y,z\n0,0,0,0\n0.1,nan,nan,nan\n", "row 1: a number is not finite"),
+        ("time,x,y,z\n0,0,0,0\n0,0,0,0\n", "row 1: time 0 s is not after"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(tmp_path, text, words):
+    (tmp_path / "bad.csv").write_text(text)
+    with pytest.raises(ValueError, match=words):
+        run_script(above(), [Follow(tmp_path / "bad.csv")])
+
+
+def test_an_arm_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="Follow: arm is 3; it must be 1 or 2"):
+        Follow("r.csv", arm=3)

@@ -3,7 +3,7 @@
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,17 @@ import numpy as np
 
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.model_limits import check_model, read_spec, read_xml
+from surgsim_env.instruments.arm.urdf import prepare_urdf
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
-from surgsim_env.scene.arm_description import ArmDescription
+from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
 from surgsim_env.scene.load import nearest
 from surgsim_env.scene.model import LENGTH_LARGEST, Port, frame_into
 
 # Groups of geoms: visual only, outer links for clearances; geoms of CONTACT_GROUP are felt by tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
-# For URDF: keep visual geoms, keep every link as a separate body, look for meshes beside the file.
-URDF_COMPILER = {"discardvisual": "false", "fusestatic": "false", "strippath": "true", "balanceinertia": "true"}
+# Of shapes that a description adds.
+SHAPE_COLOUR = (0.72, 0.74, 0.78, 1.0)
 
 
 def compile_arm(
@@ -51,8 +52,10 @@ def compile_arm(
 
 def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, timestep: float) -> mujoco.MjSpec:
     """The specification that `compile_arm` compiles, also for a model with several arms."""
-    spec = _read_spec(description)
+    spec = read_model(description.folder / description.model, description.inertias, description.dropped_meshes)
+    _add_shapes(spec, description)
     _check_parts(spec, description)
+    hold_joints(spec, description.held)
     _set_up(spec, description, port, tip_radius, timestep)
     return spec
 
@@ -71,17 +74,28 @@ def warned(where: str) -> Iterator[None]:
             warnings.warn(f"{where}: MuJoCo: {' '.join(text.split())}", stacklevel=1)
 
 
-def _read_spec(description: ArmDescription) -> mujoco.MjSpec:
-    path, text = description.folder / description.model, ""
+def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes: Sequence[str] = ()) -> mujoco.MjSpec:
+    """MuJoCo's specification of an MJCF or URDF file that was checked (`model_limits`).
+
+    Args:
+        path: of the file.
+        inertias: of links of a URDF file, in place of its own.
+        dropped_meshes: file names of meshes of a URDF file that are left out.
+
+    Raises:
+        ValueError: a file that is missing, too large or wrong; entries for a URDF with an MJCF.
+    """
+    text = ""
     root = read_xml(path)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"model file {path} begins with <{root.tag}>; it must be MJCF (<mujoco>) or URDF (<robot>)")
     _check_repeated_names(root)
     if root.tag == "robot":
-        if root.find("mujoco") is None:
-            ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
-        _drop_repeated_names(root, path)
+        prepare_urdf(root, path, inertias, dropped_meshes)
         text = ElementTree.tostring(root, encoding="unicode")
+    elif inertias or dropped_meshes:
+        name = "inertias" if inertias else "dropped_meshes"
+        raise ValueError(f"{name} is for URDF files; model file {path} is MJCF: change it there")
     wrong = check_model(path, root, text)
     spec = read_spec(str(path), text)
     for mesh in spec.meshes:
@@ -108,17 +122,6 @@ def _check_repeated_names(root: ElementTree.Element) -> None:
         seen.add((part.tag, name or ""))
 
 
-def _drop_repeated_names(root: ElementTree.Element, path: Path) -> None:
-    """Take the names from URDF shapes whose name another has already, as MuJoCo does, with a warning of our own."""
-    seen: set[str] = set()
-    for shape in (shape for link in root.findall("link") for shape in link if shape.tag in ("visual", "collision")):
-        name = shape.get("name", "")
-        if name and name in seen:
-            del shape.attrib["name"]
-            warnings.warn(f"model file {path}: a second shape is named {name!r}; it has no name here", stacklevel=1)
-        seen.add(name)
-
-
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
     """Check that every part of the description is in the model and of a permitted kind."""
     joints = {joint.name: joint for joint in spec.joints}
@@ -127,6 +130,8 @@ def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
         _require_part(what, name, joints)
         if joints[name].type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
             raise ValueError(f"{what} {name!r} is neither a hinge nor a slide; give single joints")
+    for name in description.limits:
+        _require_part("limits of joint", name, joints)
     for name, joint in joints.items():
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
             raise ValueError(f"the model hangs on the free joint {name!r}: take it out, the port places the arm")
@@ -177,6 +182,11 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
         body.gravcomp = 1.0
     if arm.tip.body is not None:
         spec.body(arm.tip.body).add_site(name=TIP_SITE, pos=arm.tip.offset, size=[0.001, 0.001, 0.001])
+    for name, limits in arm.limits.items():
+        joint = spec.joint(name)
+        if joint is not None:  # None for one that is held
+            joint.range = np.array(limits) / _angle_unit(spec, joint)
+            joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
     for name in (*arm.joints, *arm.jaw):
         lower, upper = spec.joint(name).range
         if lower > upper or (lower == upper != 0.0):
@@ -186,11 +196,82 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
     _place(spec, arm, port)
 
 
+def _add_shapes(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
+    """Add the description's own spheres and capsules, without mass; those of links are not seen in pictures."""
+    bodies, taken = {body.name: body for body in spec.bodies}, {geom.name for geom in spec.geoms}
+    for shape in arm.shapes:
+        _require_part(f"body of shape {shape.name!r},", shape.body, bodies)
+        if shape.name in taken:
+            raise ValueError(f"shapes: the model has a geom {shape.name!r} already: rename the shape")
+        colour = (*SHAPE_COLOUR[:3], 0.0) if shape.name in arm.links else SHAPE_COLOUR
+        geom = bodies[shape.body].add_geom(name=shape.name, mass=0.0, rgba=colour)
+        if shape.end is None:
+            geom.type, geom.pos = mujoco.mjtGeom.mjGEOM_SPHERE, shape.start
+        else:
+            geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, [*shape.start, *shape.end]
+        geom.size = [shape.radius, 0.0, 0.0]
+
+
+def hold_joints(spec: mujoco.MjSpec, held: Mapping[str, float]) -> None:
+    """Fix joints at values [rad or m]: take them out, with what couples and drives them, and place their bodies.
+
+    Raises:
+        ValueError: a joint that is not there or whose body's place cannot be changed.
+    """
+    joints = {joint.name: joint for joint in spec.joints}
+    for name, value in held.items():
+        _require_part("held joint", name, joints)
+        joint, body = joints[name], joints[name].parent
+        way = value - joint.ref * _angle_unit(spec, joint)
+        if abs(way) > 1e-12:
+            turned = body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT
+            if body.frame is not None or turned or len(body.joints) > 1:
+                raise ValueError(
+                    f"held joint {name!r} is at {value:g}, but its body {body.name!r} is in a <frame>, turned by other "
+                    "angles than a quaternion, or has several joints: hold it at its value in the model, or change that"
+                )
+            _move_body(body, joint, way)
+        spec.delete(joint)
+    coupled = [one for one in spec.equalities if not held.keys().isdisjoint((one.name1, one.name2))]
+    driven = [one for one in spec.actuators if one.target in held]
+    for part in (*coupled, *driven):
+        spec.delete(part)
+
+
+def _move_body(body: Any, joint: Any, way: float) -> None:
+    """Place a body as if its joint were moved by a way [rad or m] from where the model has it."""
+    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    turned = np.zeros(3)
+    if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
+        mujoco.mju_rotVecQuat(turned, way * axis, body.quat)
+        body.pos = body.pos + turned
+        return
+    turn, quaternion, anchor = np.zeros(4), np.zeros(4), np.zeros(3)
+    mujoco.mju_axisAngle2Quat(turn, axis, way)
+    mujoco.mju_rotVecQuat(anchor, np.array(joint.pos), turn)
+    mujoco.mju_rotVecQuat(turned, np.array(joint.pos) - anchor, body.quat)
+    mujoco.mju_mulQuat(quaternion, body.quat, turn)
+    body.pos, body.quat = body.pos + turned, quaternion
+
+
+def _angle_unit(spec: mujoco.MjSpec, joint: Any) -> float:
+    """Radians in the unit of a joint's angles in the specification; 1 for slides."""
+    return math.radians(1.0) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+
+
 def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
-    """Add a position and a speed servo to each joint; the joint's effort limits their sum."""
+    """Give each joint a position and a speed servo in place of its actuators; its effort limits their sum."""
     control = arm.control
+    for actuator in list(spec.actuators):
+        if actuator.target in arm.joints:
+            spec.delete(actuator)
+    # Keyframes give a control for each actuator of the file.
+    for key in list(spec.keys):
+        spec.delete(key)
     for index, name in enumerate(arm.joints):
         joint, effort = spec.joint(name), control.effort[index]
+        if control.armature:
+            joint.armature = control.armature[index]
         joint.actfrcrange = [-effort, effort]
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
         shared: dict[str, Any] = {"trntype": mujoco.mjtTrn.mjTRN_JOINT, "target": name}
@@ -198,6 +279,9 @@ def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
         hold.set_to_position(kp=control.stiffness[index])
         drive = spec.add_actuator(name=f"drive_{name}", **shared)
         drive.set_to_velocity(kv=control.damping[index])
+        # The file's default class may limit actuators.
+        for servo in (hold, drive):
+            servo.ctrllimited = servo.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
 def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:

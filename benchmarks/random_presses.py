@@ -19,9 +19,11 @@ from numpy.random import Generator
 from tqdm import tqdm
 
 from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.stability import stable_dt
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_material, make_scene
+from surgsim_env.scene.model import substeps_needed
 from surgsim_env.scene.palpable_surface import find_palpable_face, tangent_axes
 
 CLEARANCE = 1e-3  # [m]
@@ -99,6 +101,9 @@ def main() -> None:
     if arguments.material:
         law = make_material(arguments.material).material
         scene = replace(scene, material=replace(scene.material, stiffening=law.stiffening, relaxation=law.relaxation))
+        limit = stable_dt(load_anatomy(scene).organ(), scene.contact.law)
+        count = max(scene.timing.substep_count, substeps_needed(scene.timing.haptic_step, limit))
+        scene = replace(scene, timing=replace(scene.timing, substep_count=count))
     plain = replace(scene, material=replace(scene.material, stiffening=None, relaxation=None))
     measured, linear = Simulation(load_anatomy(scene)), Simulation(load_anatomy(plain))
     force_most = arguments.force or scene.limits.hard_force
@@ -123,7 +128,8 @@ def main() -> None:
                     f"{linear.fault or f'no fault up to {reached:.3f} N'}",
                     flush=True,
                 )
-    print(f"presses {presses} 1\nsubsteps {substeps} 1\nforce_peak/median {np.median(peaks):.3f} N")
+    print(f"substeps_in_haptic_step {measured.substep_count} 1\npresses {presses} 1\nsubsteps {substeps} 1")
+    print(f"force_peak/median {np.median(peaks):.3f} N")
     print(f"force_peak/largest {max(peaks):.3f} N\nfaults {faults} 1\nfaults/own {own} 1")
     sys.exit(1 if own else 0)
 

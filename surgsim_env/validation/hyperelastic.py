@@ -256,6 +256,7 @@ class OrganBlock:
         length = np.linalg.norm(span, axis=1)
         direction, change = span / length[:, None], length - model.spring_rest_length
         stiffness = model.spring_stiffness
+        strain = rise = np.zeros(len(position))
         if self.stiffening is not None:
             strain = np.maximum(node_strains(model, length), STRAIN_LEAST)
             rise = self.stiffening.tension(strain) / strain - 1.0

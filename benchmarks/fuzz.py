@@ -107,15 +107,22 @@ def mesh_cases(folder: Path) -> Iterator[Case]:
         yield Case({name: (folder / name).read_bytes()})
 
 
+def cells_of(size: float) -> Any:
+    """Cells of one size [m]."""
+    from surgsim_env.patient.meshers import Cells
+
+    return Cells(size, is_given=True, coarsening=1, fine_depth=0.0, approach=(0.0, 0.0, -1.0), face_angle_deg=60.0)
+
+
 def read_mesh_file(path: Path) -> None:
     from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
-    from surgsim_env.patient.make_patient import convert_tets
-    from surgsim_env.patient.meshers import mesh_surfaces
+    from surgsim_env.patient.meshers import mesh_surfaces, read_surfaces
+    from surgsim_env.patient.tet_files import read_tets
 
     if path.suffix in SURFACE_SUFFIXES:
-        mesh_surfaces([path], (), "m", cell_size=0.01, mesher="lattice", mend=False)
+        mesh_surfaces(read_surfaces([path], (), "m", mend=False), cells=cells_of(0.01), mesher="lattice")
     else:
-        convert_tets(path, None, None, None, quiet())
+        read_tets(path, None, ())
 
 
 def scene_cases(folder: Path) -> Iterator[Case]:
@@ -234,7 +241,7 @@ def read_image(path: Path) -> None:
 
     # A DICOM image of SimpleITK's has its labels as numbers of voxels, like the others.
     image = read_label_image(path, parse_labels("liver=1,lesion=2"))
-    mesh_image(image, path.name, cell_size=0.012, mesher="lattice", mend=True)
+    mesh_image(image, path.name, cells=cells_of(0.012), mesher="lattice", mend=True)
 
 
 STICK = """<robot name="stick">

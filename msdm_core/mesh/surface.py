@@ -37,8 +37,14 @@ def triangles_facing(
         direction: any length above zero, shape (3,).
         angle_deg: [degrees].
     """
-    points, corners = check_surface(vertices, triangles)
-    a, b, c = (points[corner] for corner in corners.T)
+    return outward_facing(*check_surface(vertices, triangles), direction, angle_deg)
+
+
+def outward_facing(
+    points: FloatArray, triangles: NDArray[np.integer], direction: ArrayLike, angle_deg: float
+) -> NDArray[np.bool_]:
+    """`triangles_facing` for triangles that are known to turn outward."""
+    a, b, c = (points[corner] for corner in triangles.T)
     normal = np.cross(b - a, c - a)
     along = np.asarray(direction, dtype=np.float64)
     cosine = -(normal @ along) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(along))

@@ -223,6 +223,11 @@ def _only_tets(file: Path, raw: Any) -> NDArray[np.integer]:
         )
     if wrong:
         raise MeshError(f"{file}: has volume cells that are not tets ({there}); split them into tets first")
+    if set(counts) & {"triangle", "quad", "polygon"} and "tetra" not in counts:
+        raise MeshError(
+            f"{file}: holds a surface ({there}), and no tets: save it as STL, OBJ or PLY (ParaView: Extract Surface, "
+            "Triangulate, Save Data; or meshio convert IN OUT.stl), which is filled with tets"
+        )
     if "tetra" not in counts:
         raise MeshError(f"{file}: has no tets ({there}); mesh the volume first, for instance with mesh_surface")
     return np.concatenate([np.asarray(block.data) for block in raw.cells if block.type == "tetra"])

@@ -1,4 +1,4 @@
-"""A closed surface filled with a graded lattice: fine cells at chosen triangles, 2 or 4 times as long ones elsewhere.
+"""A body filled with a graded lattice: fine cells at chosen triangles, 2 or 4 times as long ones elsewhere.
 
 The lattice is a weakly balanced octree of cells, filled with tets (Labelle and Shewchuk 2007); a leaf of level l is a
 cube of 2^l fine cells along each edge. Grid coordinates count half FINE cells, as in `msdm_core.meshing.stuffing`,
@@ -22,12 +22,11 @@ from msdm_core.mesh.tet_mesh import TET_EDGES, TET_FACES, FloatArray, tet_volume
 from msdm_core.meshing.stuffing import (
     ALPHA_LONG,
     ALPHA_SHORT,
+    Body,
     Cuts,
     Lattice,
-    edge_fractions,
     fill_background,
     lattice_around,
-    node_signs,
 )
 
 CELLS_ACROSS_MIN = 2
@@ -102,26 +101,26 @@ def check_coarse_cell_size(points: FloatArray, size: float, coarsest: int) -> No
 
 
 def stuff_graded(
-    vertices: FloatArray, triangles: Int64Array, fine: Int64Array, cell_size: float, fine_depth: float, coarsest: int
+    body: Body, fine: FloatArray, cell_size: float, fine_depth: float, coarsest: int
 ) -> tuple[FloatArray, Int64Array]:
-    """Fill a closed surface with tets: points (n_node, 3) [m] and tets (n_tet, 4), not oriented.
+    """Fill a body with tets: points (n_node, 3) [m] and tets (n_tet, 4), not oriented.
 
     Args:
-        vertices: of the closed surface [m], shape (n_vertex, 3).
-        triangles: shape (n_triangle, 3).
-        fine: indices of the triangles at which cells are fine, shape (n_fine,).
+        body: a closed surface's or a level set's.
+        fine: corners of the triangles at which cells are fine [m], shape (n_fine, 3, 3).
         cell_size: edge of the fine cells [m].
         fine_depth: cells that come within this distance of such a triangle along each axis are fine [m].
         coarsest: the largest cells have an edge of 2^coarsest fine cells.
     """
-    lattice = lattice_around(vertices, cell_size, 2**coarsest)
-    permitted = _permitted_levels(vertices[triangles[fine]], lattice, fine_depth, coarsest)
-    inside = node_signs((vertices - lattice.origin) / lattice.half_cell, triangles, lattice) > 0
+    lattice = lattice_around(body.box, cell_size, 2**coarsest)
+    permitted = _permitted_levels(fine, lattice, fine_depth, coarsest)
+    inside = body.signs(lattice) > 0
     lattice, permitted = _laid_out(lattice, permitted, inside.reshape(lattice.shape))
+    sign = body.signs(lattice)
     reach = 0
     while True:
         level = balanced_levels(permitted)
-        points, tets = _fill(vertices, triangles, lattice, level)
+        points, tets = _fill(body, sign.copy(), lattice, level)
         places = points[tets[_poor_tets(points, tets)]].mean(axis=1)
         if not len(places):
             return points, tets
@@ -168,20 +167,14 @@ def _laid_out(lattice: Lattice, permitted: Int64Array, inside: NDArray[np.bool_]
     return Lattice(origin, lattice.half_cell, lattice.shape), np.roll(permitted, best, (0, 1, 2))
 
 
-def _fill(
-    vertices: FloatArray, triangles: Int64Array, lattice: Lattice, level: Int64Array
-) -> tuple[FloatArray, Int64Array]:
-    grid_vertices = (vertices - lattice.origin) / lattice.half_cell
-    sign = node_signs(grid_vertices, triangles, lattice)
+def _fill(body: Body, sign: NDArray[np.int8], lattice: Lattice, level: Int64Array) -> tuple[FloatArray, Int64Array]:
     background = octree_tets(level)
     background = background[(sign[background] > 0).any(axis=1)]
-    cuts, limit = _edge_cuts(background, sign, grid_vertices, triangles, lattice)
+    cuts, limit = _edge_cuts(background, sign, body, lattice)
     return fill_background(background, cuts, limit, sign, lattice)
 
 
-def _edge_cuts(
-    background: Int64Array, sign: NDArray[np.int8], grid_vertices: FloatArray, triangles: Int64Array, lattice: Lattice
-) -> tuple[Cuts, FloatArray]:
+def _edge_cuts(background: Int64Array, sign: NDArray[np.int8], body: Body, lattice: Lattice) -> tuple[Cuts, FloatArray]:
     """The cuts of the edges whose ends lie on different sides, and the share of each within which a node moves."""
     ends = np.sort(background[:, TET_EDGES], axis=2)
     keys = ends[..., 0] * sign.size + ends[..., 1]
@@ -193,7 +186,7 @@ def _edge_cuts(
     directions, which = np.unique(np.sign(step), axis=0, return_inverse=True)
     for k in range(len(directions)):
         chosen = which.ravel() == k
-        fraction[chosen] = edge_fractions(step[chosen], node[chosen], grid_vertices, triangles, lattice)
+        fraction[chosen] = body.fractions(step[chosen], node[chosen], sign, lattice)
     is_long = (step != 0).sum(axis=1) == 1
     diagonal_count = (lattice.coordinates(ends[..., 0]) != lattice.coordinates(ends[..., 1])).all(axis=2).sum(axis=1)
     is_bcc = diagonal_count == 4

@@ -25,7 +25,7 @@ from msdm_core.meshing.grading import (
     octree_tets,
     stuff_graded,
 )
-from msdm_core.meshing.stuffing import lattice_around, stuff
+from msdm_core.meshing.stuffing import SurfaceBody, lattice_around, stuff
 
 STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
 SIDE_RANGE = (1e-9, 1e9)  # of a block [m], so that nothing overflows
@@ -180,9 +180,11 @@ def mesh_surface(
     if coarsest:
         check_coarse_cell_size(points, size, coarsest)
         fine = checked_fine_triangles(fine_triangles, len(corners))
-        nodes, tets = stuff_graded(points, corners, fine, size, float(fine_depth), coarsest)
+        nodes, tets = stuff_graded(
+            SurfaceBody(points, corners), points[corners[fine]], size, float(fine_depth), coarsest
+        )
     else:
-        nodes, tets = stuff(points, corners, lattice_around(points, size))
+        nodes, tets = stuff(SurfaceBody(points, corners), lattice_around(points, size))
     if not len(tets):
         raise MeshError(
             f"cell_size {size:g} m leaves no tets: every part of the surface is thinner than a cell; try {size / 2:g} m"

@@ -14,9 +14,11 @@ from scipy import ndimage
 
 from msdm_core.errors import MeshError
 from msdm_core.material.regions import tet_samples
+from msdm_core.mesh.surface import outward_facing
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.meshing.grading import COARSENINGS, stuff_graded
 from msdm_core.meshing.lattice_meshing import check_cell_size, largest_body_mesh
-from msdm_core.meshing.stuffing import lattice_around, stuff_level_set
+from msdm_core.meshing.stuffing import LevelSetBody, lattice_around, stuff
 
 Names = Mapping[int, str] | Sequence[tuple[int, str]]
 
@@ -101,8 +103,32 @@ def mesh_segmentation(labels: ArrayLike, spacing: ArrayLike, *, cell_size: float
     return filled.mesh
 
 
-def fill_labels(labels: ArrayLike, spacing: ArrayLike, *, cell_size: float, region_names: Names) -> FilledLabels:
-    """`mesh_segmentation`, with the change of volume.
+@dataclass(frozen=True)
+class FineFace:
+    """Where the cells of a level set are fine, and how coarse they are elsewhere.
+
+    Args:
+        direction: of what presses the body, along the image's axes, shape (3,).
+        angle_deg: the face's inward normals are within this angle of the direction [degrees].
+        depth: cells that come within this distance of the face along each axis are fine [m].
+        coarsening: edge of the largest cells over that of the fine ones: 2 or 4.
+    """
+
+    direction: tuple[float, float, float]
+    angle_deg: float
+    depth: float
+    coarsening: int
+
+
+def fill_labels(
+    labels: ArrayLike,
+    spacing: ArrayLike,
+    *,
+    cell_size: float,
+    region_names: Names,
+    fine_face: FineFace | None = None,
+) -> FilledLabels:
+    """`mesh_segmentation`, with the change of volume, and graded where a face is given at which cells are fine.
 
     The organ's share of each voxel (1 or 0) is smoothed by a Gaussian, and filled where it exceeds a level. Smoothing
     removes volume where the surface is convex, and so do the flat faces of tets; the level is moved from 1/2 until the
@@ -114,7 +140,7 @@ def fill_labels(labels: ArrayLike, spacing: ArrayLike, *, cell_size: float, regi
     volume = float(np.count_nonzero(organ)) * float(np.prod(step))
     check_cell_size(_extent(organ, step), volume, cell_size)
     field = smoothed_share(organ, corner, step, cell_size)
-    mesh, change = _filled_to_volume(field, volume, cell_size)
+    mesh, change = _filled_to_volume(field, volume, cell_size, fine_face)
     inside = np.where(organ, inside, 0)
     region, volumes = _regions(mesh, inside, corner, step, names)
     return FilledLabels(
@@ -246,7 +272,9 @@ def smoothed_share(
     return SmoothedShare(values, start, block, smoothing)
 
 
-def _filled_to_volume(field: SmoothedShare, volume: float, cell_size: float) -> tuple[TetMesh, float]:
+def _filled_to_volume(
+    field: SmoothedShare, volume: float, cell_size: float, fine_face: FineFace | None
+) -> tuple[TetMesh, float]:
     """The mesh whose volume is nearest to the wanted one [m^3], and the share by which smoothing alone changed it."""
     change = field.volume_above(0.5) / volume - 1.0
     level, best = 0.5, None
@@ -254,7 +282,7 @@ def _filled_to_volume(field: SmoothedShare, volume: float, cell_size: float) -> 
     slope = (field.volume_above(0.4) - field.volume_above(0.6)) / 0.2
     before = None
     for _ in range(VOLUME_TRIES):
-        mesh = _mesh_above(field, level, cell_size)
+        mesh = _mesh_above(field, level, cell_size, fine_face)
         error = float(mesh.volumes.sum()) - volume
         if best is None or abs(error) < abs(best[0]):
             best = (error, mesh)
@@ -268,7 +296,7 @@ def _filled_to_volume(field: SmoothedShare, volume: float, cell_size: float) -> 
     return best[1], change
 
 
-def _mesh_above(field: SmoothedShare, level: float, cell_size: float) -> TetMesh:
+def _mesh_above(field: SmoothedShare, level: float, cell_size: float, fine_face: FineFace | None) -> TetMesh:
     places = [np.flatnonzero((field.values > level).any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
     if not len(places[0]):
         raise MeshError(
@@ -277,7 +305,16 @@ def _mesh_above(field: SmoothedShare, level: float, cell_size: float) -> TetMesh
         )
     # A block beyond the outermost one above the level: the level lies between the two.
     box = np.array([[one[0] - 1, one[-1] + 1] for one in places]).T * field.step + field.start
-    nodes, tets = stuff_level_set(lambda at: field.at(at) - level, lattice_around(box, cell_size))
+    body = LevelSetBody(lambda at: field.at(at) - level, box)
+    # Where the face is, a mesh of cells of one size tells.
+    width = 1 if fine_face is None else fine_face.coarsening
+    nodes, tets = stuff(body, lattice_around(box, width * cell_size))
+    if fine_face is not None and len(tets):
+        rough = largest_body_mesh(nodes, tets, f"a cell_size below {cell_size:g} m")
+        faces = rough.boundary_triangles
+        chosen = outward_facing(rough.points, faces, fine_face.direction, fine_face.angle_deg)
+        corners = rough.points[faces[chosen]]
+        nodes, tets = stuff_graded(body, corners, cell_size, fine_face.depth, COARSENINGS.index(width))
     if not len(tets):
         raise MeshError(
             f"cell_size {cell_size:g} m leaves no tets: every part of the organ is thinner than a cell; "

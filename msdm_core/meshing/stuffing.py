@@ -10,6 +10,7 @@ A node's number is its row-major place in the enclosing integer grid.
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations, product
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,45 +138,89 @@ class Cuts:
     is_long: NDArray[np.bool_]  # (n_cut,)
 
 
-def stuff(vertices: FloatArray, triangles: Int64Array, lattice: Lattice) -> tuple[FloatArray, Int64Array]:
-    """Fill a closed surface with tets: points (n_node, 3) [m] and tets (n_tet, 4) (Labelle and Shewchuk 2007, alg. 1).
+class Body(Protocol):
+    """What is filled with tets: where it is, which grid points lie inside, and where its surface cuts edges."""
 
-    Args:
-        vertices: of the closed surface [m], shape (n_vertex, 3).
-        triangles: shape (n_triangle, 3).
-        lattice: from `lattice_around`.
+    @property
+    def box(self) -> FloatArray:
+        """Points whose bounding box encloses the body [m], shape (n, 3)."""
+        ...
+
+    def signs(self, lattice: Lattice) -> NDArray[np.int8]:
+        """+1 inside, -1 outside, per grid point, shape (n_grid,); only nodes count."""
+        ...
+
+    def fractions(self, step: Int64Array, node: Int64Array, sign: NDArray[np.int8], lattice: Lattice) -> FloatArray:
+        """Fraction of each edge at which its surface crosses it (n,); `step`, `node` as in `edge_fractions`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceBody:
+    """The inside of a closed surface: vertices [m] (n_vertex, 3) and triangles (n_triangle, 3)."""
+
+    vertices: FloatArray
+    triangles: Int64Array
+
+    @property
+    def box(self) -> FloatArray:
+        """The vertices."""
+        return self.vertices
+
+    def signs(self, lattice: Lattice) -> NDArray[np.int8]:
+        """As `Body.signs`."""
+        return node_signs(self._on_grid(lattice), self.triangles, lattice)
+
+    def fractions(self, step: Int64Array, node: Int64Array, sign: NDArray[np.int8], lattice: Lattice) -> FloatArray:
+        """As `Body.fractions`."""
+        return edge_fractions(step, node, self._on_grid(lattice), self.triangles, lattice)
+
+    def _on_grid(self, lattice: Lattice) -> FloatArray:
+        return (self.vertices - lattice.origin) / lattice.half_cell
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSetBody:
+    """Where a function of place is above 0, in a box.
+
+    Fields:
+        value: continuous, of places [m] (n, 3), shape (n,); its sign alone is used, below 0 outside of the box
+        box: two opposite corners [m] (2, 3)
     """
-    grid_vertices = (vertices - lattice.origin) / lattice.half_cell
-    sign = node_signs(grid_vertices, triangles, lattice)
 
-    def fractions(step: Int64Array, node: Int64Array) -> FloatArray:
-        return edge_fractions(step, node, grid_vertices, triangles, lattice)
+    value: Field
+    box: FloatArray
 
-    return _stuffed(sign, _edge_cuts(fractions, lattice, sign), lattice)
+    def signs(self, lattice: Lattice) -> NDArray[np.int8]:
+        """As `Body.signs`."""
+        sign = np.full(lattice.shape, -1, dtype=np.int8)
+        # Two shells of the grid stay outside: no tet may reach past it.
+        for first in (2, 3):
+            axes = [np.arange(first, count - 2, 2) for count in lattice.shape]
+            for plane in axes[0]:
+                grid = np.stack(np.meshgrid([plane], axes[1], axes[2], indexing="ij"), axis=-1)
+                inside = self.value(lattice.origin + lattice.half_cell * grid.reshape(-1, 3)) > 0
+                sign[plane, first:-2:2, first:-2:2] = np.where(inside, 1, -1).reshape(grid.shape[1:3])
+        return sign.ravel()
 
-
-def stuff_level_set(value: Field, lattice: Lattice) -> tuple[FloatArray, Int64Array]:
-    """Fill where a function of place is above 0: points (n_node, 3) [m] and tets (n_tet, 4), as `stuff` does.
-
-    Args:
-        value: continuous, of places [m] (n, 3), shape (n,); its sign alone is used, below 0 near the lattice's rim.
-        lattice: around the body, from `lattice_around`.
-    """
-    sign = np.full(lattice.shape, -1, dtype=np.int8)
-    # Two shells of the grid stay outside: no tet may reach past it.
-    for first in (2, 3):
-        axes = [np.arange(first, count - 2, 2) for count in lattice.shape]
-        for plane in axes[0]:
-            grid = np.stack(np.meshgrid([plane], axes[1], axes[2], indexing="ij"), axis=-1)
-            inside = value(lattice.origin + lattice.half_cell * grid.reshape(-1, 3)) > 0
-            sign[plane, first:-2:2, first:-2:2] = np.where(inside, 1, -1).reshape(grid.shape[1:3])
-    sign = sign.ravel()
-
-    def fractions(step: Int64Array, node: Int64Array) -> FloatArray:
+    def fractions(self, step: Int64Array, node: Int64Array, sign: NDArray[np.int8], lattice: Lattice) -> FloatArray:
+        """As `Body.fractions`."""
         start = lattice.origin + lattice.half_cell * lattice.coordinates(node)
-        return _roots(value, start, np.multiply(step, lattice.half_cell, dtype=np.float64), sign[node] > 0)
+        return _roots(self.value, start, np.multiply(step, lattice.half_cell, dtype=np.float64), sign[node] > 0)
 
-    return _stuffed(sign, _edge_cuts(fractions, lattice, sign), lattice)
+
+def stuff(body: Body, lattice: Lattice) -> tuple[FloatArray, Int64Array]:
+    """Fill a body with tets: points (n_node, 3) [m] and tets (n_tet, 4) (Labelle and Shewchuk 2007, algorithm 1).
+
+    Args:
+        body: a closed surface's or a level set's.
+        lattice: around it, from `lattice_around`.
+    """
+    sign = body.signs(lattice)
+    cuts, warped_to = _warp(_edge_cuts(body, lattice, sign), sign, lattice)
+    background = _background_tets(lattice, sign)
+    tets = _stencils(background, sign, cuts, lattice)
+    return _compressed(tets, warped_to, cuts, lattice)
 
 
 def _roots(value: Field, start: FloatArray, span: FloatArray, inside: NDArray[np.bool_]) -> FloatArray:
@@ -186,13 +231,6 @@ def _roots(value: Field, start: FloatArray, span: FloatArray, inside: NDArray[np
         same = (value(start + middle[:, None] * span) > 0) == inside
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return 0.5 * (low + high)
-
-
-def _stuffed(sign: NDArray[np.int8], cuts: Cuts, lattice: Lattice) -> tuple[FloatArray, Int64Array]:
-    cuts, warped_to = _warp(cuts, sign, lattice)
-    background = _background_tets(lattice, sign)
-    tets = _stencils(background, sign, cuts, lattice)
-    return _compressed(tets, warped_to, cuts, lattice)
 
 
 def fill_background(
@@ -212,14 +250,12 @@ def fill_background(
     return _compressed(_stencils(background, sign, cuts, lattice), warped_to, cuts, lattice)
 
 
-def _edge_cuts(
-    fractions: Callable[[Int64Array, Int64Array], FloatArray], lattice: Lattice, sign: NDArray[np.int8]
-) -> Cuts:
-    """The cuts of all lattice edges whose ends lie on different sides; `fractions` of a step and its first nodes."""
+def _edge_cuts(body: Body, lattice: Lattice, sign: NDArray[np.int8]) -> Cuts:
+    """The cuts of all lattice edges whose ends lie on different sides."""
     found = []
     for step in np.concatenate([AXES, DIAGONALS]):
         node = _changing_edges(step, sign, lattice)
-        fraction = fractions(step, node)
+        fraction = body.fractions(step, node, sign, lattice)
         found.append((node, node + step @ lattice.strides, fraction))
     node, other, fraction = (np.concatenate(column) for column in zip(*found, strict=True))
     order = np.lexsort([other, node])

@@ -30,6 +30,7 @@ from surgsim_env.palpation.job import (
 )
 from surgsim_env.palpation.surface_scene import SurfaceOptions, load_stable_anatomy, surface_scene, with_options
 from surgsim_env.reports.output_folder import OutputFolder, output_folder
+from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Ball, Scene, Vector
@@ -222,16 +223,19 @@ def _patient_scene(command: Palpate, file: Path, files: OutputFolder, console: C
 
     out = files.path / f"{_stem(file)}.vtu"
     check_targets(out)
-    found = make_patient(
-        (file,),
-        out,
-        labels=command.labels,
-        length_unit=unit_of(command.length_unit),
-        cell_size=command.cell_size,
-        options=command.options,
-    )
-    print_patient(found, console)
-    write_organ(found, files, out.name, command.command_line)
+    with StepProgress(console) as progress:
+        found = make_patient(
+            (file,),
+            out,
+            labels=command.labels,
+            length_unit=unit_of(command.length_unit),
+            cell_size=command.cell_size,
+            options=command.options,
+            progress=progress,
+        )
+        print_patient(found, console)
+        with progress.step("drawing the report"):
+            write_organ(found, files, out.name, command.command_line)
     return load_scene(files / out.with_suffix(".toml").name)
 
 

@@ -1,20 +1,28 @@
 """The chart of a palpable face, a grid of sites across the approach, and the healthy organ's stiffness at each."""
 
+import contextlib
 import hashlib
 import os
+import threading
+import zipfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from rich.console import Console
 
 import msdm_core
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import SitePress, press_in_lanes, press_phases
+from surgsim_env.palpation.press import SitePress, core_count, press_in_lanes, press_phases
+from surgsim_env.palpation.surface_scene import with_substeps
 from surgsim_env.reports.output_folder import output_folder
+from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
@@ -27,7 +35,7 @@ POINTS_BETWEEN = 2
 # Rounding puts the chart's border slightly inside the margin: sites up to this [m] within it are accepted.
 ROUNDING = 1e-9
 # Organs that are pressed side by side.
-LANES = 8
+LANES = {np.float64: 8, np.float32: 16}
 # Environment variable with the cache's folder.
 FOLDER_VARIABLE = "SURGSIM_CACHE"
 
@@ -211,10 +219,12 @@ def charted_face(anatomy: Anatomy) -> ChartedFace:
 
 
 def healthy_map(scene: Scene) -> HealthyMap:
-    """The map of a scene, from its cache on disk or by pressing its healthy organ at every site of the chart's grid.
+    """The map of a scene, from beside its file or the cache on disk, or by pressing its healthy organ at every site.
 
-    Pressing takes 5 s of processor time for `phantom` and 90 s for `phantom_wide`. The cache is the folder named by
-    SURGSIM_CACHE, else the user's cache folder; if it is not writable, each process computes the map.
+    `surgsim organ` writes it beside a patient's scene (`healthy_file`). One of another organ, instrument or version is
+    made anew, with progress on standard error: 5 s of processor time for `phantom`, 90 s for `phantom_wide`. The cache
+    is the folder named by SURGSIM_CACHE, else the user's cache folder; if it is not writable, each process computes the
+    map.
 
     Raises:
         ValueError: a press on healthy tissue that ended in a fault or measured no force (says where).
@@ -222,21 +232,52 @@ def healthy_map(scene: Scene) -> HealthyMap:
     return _healthy_map(load_anatomy(with_instrument(scene, "probe")))
 
 
+def healthy_file(scene_file: Path) -> Path:
+    """Path of the healthy map beside a scene file."""
+    return scene_file.with_name(f"{scene_file.stem}_healthy.npz")
+
+
+def write_healthy_map(scene: Scene, path: Path, progress: StepProgress) -> None:
+    """Press the healthy organ of a scene at every site of the chart's grid, and write its map to an npz file.
+
+    Organs advance in float32, twice as many side by side, and in as many substeps as healthy tissue needs: on the left
+    kidney of OpenHELP stiffness then differs by 3e-5 of itself.
+
+    Raises:
+        ValueError: as in `healthy_map`.
+    """
+    anatomy = load_anatomy(with_instrument(scene, "probe"))
+    grid = _pressed(with_substeps(anatomy, [anatomy.organ()]), progress, np.float32)
+    np.savez_compressed(path, digest=np.array(_digest(anatomy)), grid=grid)
+
+
 @lru_cache(maxsize=8)
 def _healthy_map(anatomy: Anatomy) -> HealthyMap:
-    folder = _folder()
-    if folder is None:
-        return HealthyMap(_pressed(anatomy))
-    path = folder / f"healthy-{_digest(anatomy)}.npy"
-    try:
-        grid = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError):
-        grid = _pressed(anatomy)
+    scene, digest, folder = anatomy.scene, _digest(anatomy), _folder()
+    grid = _shipped(healthy_file(scene.folder / f"{scene.name}.toml"), digest)
+    if grid is not None:
+        return HealthyMap(grid)
+    path = None if folder is None else folder / f"healthy-{digest}.npy"
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        if path is not None:
+            return HealthyMap(np.load(path, allow_pickle=False))
+    with StepProgress(Console(stderr=True)) as progress:
+        grid = _pressed(anatomy, progress)
+    if path is not None:
         _keep(path, grid)
     return HealthyMap(grid)
 
 
-def _pressed(anatomy: Anatomy) -> FloatArray:
+def _shipped(path: Path, digest: str) -> FloatArray | None:
+    """The map beside a scene file; None if there is none, or it is of another organ or version, or broken."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return archive["grid"] if str(archive["digest"]) == digest else None
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        return None
+
+
+def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type = np.float64) -> FloatArray:
     """Press the healthy organ at each site of the chart's grid; stiffness [N/m], shape (m, m).
 
     A coarser grid would alias the mesh, which changes the force by some 3 % within a cell, into a slope of the organ.
@@ -245,24 +286,54 @@ def _pressed(anatomy: Anatomy) -> FloatArray:
     every = [charted.site(place) for place in charted.chart.sites]
     # Places that may not be pressed are moved to others of the grid.
     sites = list({site.place.tobytes(): site for site in every}.values())
-    simulations = [Simulation(anatomy) for _ in range(LANES)]
-    group = LaneGroup(simulations)
-    stiffness: dict[bytes, float] = {}
-    for first in range(0, len(sites), LANES):
-        chosen = range(first, min(first + LANES, len(sites)))
-        presses = [SitePress(simulations[n - first], sites[n].point, sites[n].normal) for n in chosen]
-        press_in_lanes(group, [*presses, *[None] * (LANES - len(presses))], phases)
-        for site, press in zip(sites[first : chosen.stop], presses, strict=True):
-            result = press.result()
-            force = float(result.force @ press.normal)
-            if result.fault or not force > 0.0:
-                raise ValueError(
-                    f"scene {anatomy.scene.name!r}: a press on healthy tissue at {press.point.tolist()} m measured "
-                    f"{force:g} N {result.fault}: check palpation.press_depth and the palpable face"
-                )
-            stiffness[site.place.tobytes()] = force / result.depth
-    values = [stiffness[site.place.tobytes()] for site in every]
+    lanes = LANES[dtype]
+    batches = [sites[first : first + lanes] for first in range(0, len(sites), lanes)]
+    threads = min(core_count(), len(batches))
+    stopped = threading.Event()
+
+    def press(number: int, advance: Callable[[int], None]) -> dict[bytes, float]:
+        """Every so many batches, from one of these numbers on, in one thread."""
+        simulations = [Simulation(anatomy) for _ in range(lanes)]
+        group, stiffness = LaneGroup(simulations, dtype), {}
+        try:
+            for batch in batches[number::threads]:
+                if stopped.is_set():
+                    break
+                presses = [
+                    SitePress(one, site.point, site.normal) for one, site in zip(simulations, batch, strict=False)
+                ]
+                press_in_lanes(group, [*presses, *[None] * (lanes - len(presses))], phases)
+                for site, one in zip(batch, presses, strict=True):
+                    stiffness[site.place.tobytes()] = _stiffness(anatomy, one)
+                advance(len(batch))
+        except BaseException:
+            stopped.set()
+            raise
+        return stiffness
+
+    found: dict[bytes, float] = {}
+    with progress.step("pressing the healthy organ", len(sites)) as advance, ThreadPoolExecutor(threads) as pool:
+        try:
+            for part in pool.map(press, range(threads), [advance] * threads):
+                found.update(part)
+        except BaseException:
+            # Ctrl-C, or an error in one thread: the others end after their current presses.
+            stopped.set()
+            raise
+    values = [found[site.place.tobytes()] for site in every]
     return np.array(values).reshape(charted.chart.side_count, -1)
+
+
+def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
+    """Stiffness of a press on healthy tissue [N/m]."""
+    result = press.result()
+    force = float(result.force @ press.normal)
+    if result.fault or not force > 0.0:
+        raise ValueError(
+            f"scene {anatomy.scene.name!r}: a press on healthy tissue at {press.point.tolist()} m measured "
+            f"{force:g} N {result.fault}: check palpation.press_depth and the palpable face"
+        )
+    return force / result.depth
 
 
 def _digest(anatomy: Anatomy) -> str:

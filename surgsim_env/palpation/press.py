@@ -243,6 +243,11 @@ def _far_travel(simulation: Simulation, site: FloatArray) -> float:
     return float(np.linalg.norm(simulation.organ_state.node_position[far] - rest[far], axis=1).max())
 
 
+def core_count() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def scan(
     anatomy: Anatomy,
     organ_model: OrganModel,
@@ -267,8 +272,7 @@ def scan(
     """
     if workers is not None and workers < 1:
         raise ValueError(f"workers is {workers}; it must be at least 1, or left out for one per core")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = min(workers or cores, max(1, len(sites)))
+    count = min(workers or core_count(), max(1, len(sites)))
     stopped = threading.Event()
     presses: list[Press | None] = [None] * len(sites)
 

@@ -170,7 +170,8 @@ def draw_patches(
     order = order[normals[order] @ view.towards > -0.15]
     face = colours[order]
     axes.add_collection(
-        PolyCollection(list(view.flat(corners[order])), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder)
+        # An array, which takes a fifth of the time of a list.
+        PolyCollection(view.flat(corners[order]), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder)
     )
     axes.autoscale_view()
 

@@ -83,16 +83,7 @@ def with_options(scene: Scene, options: SurfaceOptions) -> Scene:
     Raises:
         ValueError: a value that is not above 0 (names it).
     """
-    given = {
-        "press depth": options.press_depth,
-        "tip radius": options.tip_radius,
-        "spacing": options.spacing,
-        "Young's modulus": options.youngs_modulus,
-    }
-    for name, value in given.items():
-        if value is not None and not 0.0 < value < math.inf:
-            unit = "Pa" if "modulus" in name else "metres"
-            raise ValueError(f"{name} is {value:g}; it must be finite and above 0 ({unit})")
+    check_options(options)
     palpation, material = scene.palpation, scene.material
     instrument = scene.instrument
     return replace(
@@ -109,6 +100,22 @@ def with_options(scene: Scene, options: SurfaceOptions) -> Scene:
         ),
         material=replace(material, youngs_modulus=options.youngs_modulus or material.youngs_modulus),
     )
+
+
+def check_options(options: SurfaceOptions) -> None:
+    """Refuse a length or modulus that is not above 0, and a direction without length."""
+    if options.approach is not None:
+        _direction(options.approach)
+    given = {
+        "press depth": options.press_depth,
+        "tip radius": options.tip_radius,
+        "spacing": options.spacing,
+        "Young's modulus": options.youngs_modulus,
+    }
+    for name, value in given.items():
+        if value is not None and not 0.0 < value < math.inf:
+            unit = "Pa" if "modulus" in name else "metres"
+            raise ValueError(f"{name} is {value:g}; it must be finite and above 0 ({unit})")
 
 
 def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_factor_largest: float) -> Anatomy:

@@ -1,6 +1,7 @@
 """A patient's organ from files: mesh and scene made, summary printed, mesh, scenes and report written."""
 
 import math
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,30 +10,40 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.material.regions import Material
-from msdm_core.mesh.quality import mesh_quality, surface_cell
-from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.mesh.quality import mesh_quality
 from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
-from msdm_core.organ.compile import OrganSpec, compile_organ
+from surgsim_env.palpation.chart import healthy_file, write_healthy_map
 from surgsim_env.palpation.hold import SITES as HOLD_SITES
 from surgsim_env.palpation.hold import check_hold
-from surgsim_env.palpation.job import plan_sites, press_progress, progress_task
-from surgsim_env.palpation.surface_scene import SurfaceOptions
-from surgsim_env.patient.label_image import FORM, is_image, parse_labels, read_label_image
-from surgsim_env.patient.meshers import mesh_image, mesh_surfaces
+from surgsim_env.palpation.job import plan_sites
+from surgsim_env.palpation.surface_scene import PATTERN, SurfaceOptions, check_options
+from surgsim_env.patient.facing import facing_approach
+from surgsim_env.patient.label_image import FORM, LabelImage, is_image, parse_labels, read_label_image
+from surgsim_env.patient.materials import is_lesion, organ_material
+from surgsim_env.patient.meshers import (
+    Cells,
+    PatientMesh,
+    PatientSurfaces,
+    image_volume,
+    mesh_image,
+    mesh_surfaces,
+    read_surfaces,
+)
 from surgsim_env.patient.patient_scene import (
-    CELL_PER_CONTACT_RADIUS,
     HARD_PER_PRESS,
     SITES_MOST,
     SOFT_PER_PRESS,
     PatientScene,
+    approach_of,
     patient_scene,
 )
 from surgsim_env.patient.report import MARK, report_page
 from surgsim_env.patient.retract_scene import BED_GAP, BED_INSIDE, MODULUS_SPREAD, RetractScene, find_retraction
+from surgsim_env.patient.tet_files import PatientTets, patient_of_tets, read_tets, surfaces_of_tets
+from surgsim_env.patient.touch import plan_text, plan_touch
 from surgsim_env.reports.output_folder import OutputFolder, output_folder
+from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import share_text, warn_of_coarse_cells
@@ -55,37 +66,56 @@ def make_patient(
     cell_size: float | None = None,
     mesher: str = MESHERS[0],
     mend: bool = False,
+    remesh: bool = False,
     options: SurfaceOptions,
     moduli: Mapping[str, float] | None = None,
+    progress: StepProgress,
 ) -> PatientScene:
     """Mesh an organ and make its palpation scene; writes nothing.
 
     Args:
-        files: a label image; or closed surfaces, the organ's first, then one for each region.
+        files: a label image; or closed surfaces, the organ's first, then one for each region; or one file of tets.
         out: path of the mesh to be written; its stem names the scene.
-        labels: which labels of an image are which tissue, as in `parse_labels`.
+        labels: which labels of an image, or tags of tets, are which tissue, as in `parse_labels`.
         regions: further regions of surfaces, as NAME=FILE.
         length_unit: of surfaces.
-        cell_size: of the lattice [m]; default: in proportion to the organ.
+        cell_size: of the lattice, the same everywhere [m], from which the tip follows; default: cells follow from the
+            tip, fine at the pressed face.
         mesher: one of MESHERS.
         mend: whether holes, self-intersections and cavities are repaired.
+        remesh: whether the surfaces of tets are filled anew; else the file's tets are kept.
         options: touch, anchors and healthy tissue.
         moduli: Young's modulus of regions by name [Pa].
+        progress: where the steps are shown.
 
     Raises:
         MeshError: a file that cannot become an organ.
         ValueError: arguments that do not go together, or values out of range.
     """
+    from msdm_core.mesh_files.mesh_io import FORMATS
+
     if mesher not in MESHERS:
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
+    check_options(options)
+    if cell_size is not None and not 0.0 < cell_size < math.inf:
+        raise ValueError(f"cell_size is {cell_size:g}; the rule is a positive length in metres")
     first = files[0]
     if is_image(first):
         if len(files) > 1:
             raise ValueError(f"{first}: one image is taken, {len(files)} files are given")
         if labels is None:
             raise ValueError(f"{first}: which labels are the organ? Give {FORM}")
-        image = read_label_image(first, parse_labels(labels))
-        mesh = mesh_image(image, first.name, cell_size=cell_size, mesher=mesher, mend=mend)
+        with progress.step(f"reading {first.name}"):
+            given = read_label_image(first, parse_labels(labels))
+        name, volume = given.names[0], image_volume(given)
+    elif first.suffix.lower() in FORMATS:
+        if len(files) > 1:
+            raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
+        with progress.step(f"reading {first.name}"):
+            given = read_tets(first, length_unit, parse_labels(labels) if labels is not None else ())
+            if remesh:
+                given = surfaces_of_tets(given)
+        name, volume = given.organ.name if isinstance(given, PatientSurfaces) else given.names[0], given.volume
     else:
         wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
         if wrong:
@@ -94,18 +124,53 @@ def make_patient(
             raise ValueError(
                 f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
             )
-        mesh = mesh_surfaces(files, regions, length_unit, cell_size=cell_size, mesher=mesher, mend=mend)
-    return patient_scene(mesh, out, options=options, moduli=moduli or {})
+        with progress.step(f"reading {first.name}"):
+            given = read_surfaces(files, regions, length_unit, mend=mend)
+        name, volume = given.organ.name, given.volume
+    approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
+    if isinstance(given, PatientTets):
+        touch = replace(
+            plan_touch(volume, options, cell_size=given.face_cell(approach, angle), graded=False),
+            known_node_count=given.mesh.node_count,
+        )
+    else:
+        touch = plan_touch(volume, options, cell_size=cell_size, graded=mesher == MESHERS[0])
+    progress.say(plan_text(touch, organ_material(name, options.youngs_modulus).material, approach))
+    cells = Cells(touch.cell_size, touch.is_given, touch.coarsening, touch.fine_depth, approach, angle)
+    if options.approach is None and touch.coarsening > 1 and _has_lesions(given):
+        # Where the probe comes from follows from the lesions, and where cells are fine from that.
+        with progress.step("turning the probe to the lesions"):
+            rough = replace(cells, size=touch.coarsening * touch.cell_size, is_given=True, coarsening=1)
+            approach = facing_approach(_meshed(given, first.name, rough, mesher, mend), approach, angle)
+        options, cells = replace(options, approach=approach), replace(cells, approach=approach)
+    with progress.step("filling it with tets"):
+        mesh = _meshed(given, first.name, cells, mesher, mend)
+    with progress.step("choosing sites, lesions and the step"):
+        return patient_scene(mesh, out, touch=touch, options=options, moduli=moduli or {})
 
 
-def with_hold(found: PatientScene, console: Console) -> PatientScene:
+def with_hold(found: PatientScene, progress: StepProgress) -> PatientScene:
     """The organ with a check of what holds it: a few healthy presses, with a bar; what is wrong is one of the notes."""
     sites, normals, _ = plan_sites(found.anatomy)
-    with press_progress(console) as bar:
-        step = progress_task(bar, "what holds it", min(HOLD_SITES, len(sites)))
-        hold = check_hold(found.anatomy, sites, normals, progress=step)
+    with progress.step("pressing what holds it", min(HOLD_SITES, len(sites))) as advance:
+        hold = check_hold(found.anatomy, sites, normals, progress=lambda: advance(1))
     faults = ("no press of the healthy organ reached its depth",) if hold is None else hold.faults
     return replace(found, hold=hold, notes=(*found.notes, *faults))
+
+
+def _meshed(
+    given: LabelImage | PatientSurfaces | PatientTets, source: str, cells: Cells, mesher: str, mend: bool
+) -> PatientMesh:
+    if isinstance(given, PatientTets):
+        return patient_of_tets(given, cells.size)
+    if isinstance(given, PatientSurfaces):
+        return mesh_surfaces(given, cells=cells, mesher=mesher)
+    return mesh_image(given, source, cells=cells, mesher=mesher, mend=mend)
+
+
+def _has_lesions(given: LabelImage | PatientSurfaces | PatientTets) -> bool:
+    names = [one.name for one in given.inner] if isinstance(given, PatientSurfaces) else given.names[1:]
+    return any(map(is_lesion, names))
 
 
 def add_retraction(found: PatientScene, out: Path) -> tuple[PatientScene, RetractScene | str]:
@@ -117,25 +182,50 @@ def add_retraction(found: PatientScene, out: Path) -> tuple[PatientScene, Retrac
 
 
 def write_patient(
-    found: PatientScene, out: Path, command: str, retraction: RetractScene | str | None = None
+    found: PatientScene,
+    out: Path,
+    command: str,
+    retraction: RetractScene | str | None = None,
+    *,
+    healthy_map: bool,
+    progress: StepProgress,
 ) -> list[Path]:
-    """Write the mesh, its scene, report.html and the files of a retraction scene; all of them or none.
+    """Write the mesh, its scene, report.html, the files of a retraction scene and the healthy map; all or none.
 
     Args:
         found: the organ with its scene.
         out: path of the mesh; the other files lie beside it.
         command: the command line that makes the organ, for the report.
         retraction: the retraction scene, or why there is none; None if it was not looked for.
+        healthy_map: whether the healthy organ is pressed for the map of `SurgSim/PalpateSites-v0`.
+        progress: where the steps are shown.
 
     Returns:
         The paths of the files.
+
+    Warns:
+        UserWarning: says why there is no healthy map.
     """
     turned = _retract_file(out)
     lifted = turned.with_suffix(".toml")
     # Left by an earlier run for an organ that is now replaced.
     older = [turned.name, lifted.name] if lifted.exists() and _begins(lifted, FIRST_LINE) else []
+    healthy = healthy_file(out.with_suffix(".toml")).name
+    if (out.parent / healthy).exists():
+        older.append(healthy)
     with output_folder(out.parent, older) as files:
-        names = write_organ(found, files, out.name, command, retraction)
+        with progress.step("drawing the report"):
+            names = write_organ(found, files, out.name, command, retraction)
+        if healthy_map and found.scene.lesion is not None:
+            try:
+                write_healthy_map(load_scene(files / out.with_suffix(".toml").name), files / healthy, progress)
+                names.append(healthy)
+            except ValueError as error:
+                warnings.warn(
+                    f"there is no map of the healthy organ, and SurgSim/PalpateSites-v0 refuses this one: {error}",
+                    UserWarning,
+                    stacklevel=2,
+                )
     return [out.with_name(name) for name in names]
 
 
@@ -199,13 +289,14 @@ def check_targets(out: Path) -> None:
 
 
 def check_target(out: Path) -> None:
-    """Refuse, before the work, a mesh file in an unknown format or in a folder that does not exist."""
+    """Refuse, before the work, a mesh file in an unknown format or below what is no folder."""
     from msdm_core.mesh_files.mesh_io import FORMATS
 
     if out.suffix.lower() not in FORMATS:
         raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; known: {', '.join(FORMATS)}")
-    if not out.parent.is_dir():
-        raise ValueError(f"--out {out}: the folder {out.parent} does not exist; create it first")
+    place = next(one for one in out.absolute().parents if one.exists())
+    if not (place.is_dir() and os.access(place, os.W_OK)):
+        raise ValueError(f"--out {out}: {place} is no folder that you may write to; choose another place")
 
 
 def _begins(path: Path, mark: str) -> bool:
@@ -213,78 +304,12 @@ def _begins(path: Path, mark: str) -> bool:
         return stream.read(len(mark)) == mark
 
 
-def convert_tets(
-    file: Path, length_unit: LengthUnit | None, youngs_modulus: float | None, out: Path | None, console: Console
-) -> None:
-    """Print a summary of an organ made from a file of tets, with the shipped liver's tissue and touch, and write it.
-
-    Raises:
-        MeshError: the file cannot become an organ.
-        ValueError: the length unit is missing or unknown.
-    """
-    from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
-
-    if out is not None:
-        check_target(out)
-    mesh = read_mesh(file, length_unit=length_unit)
-    liver = make_scene("liver")
-    material = liver.material
-    if youngs_modulus is not None:
-        material = replace(material, youngs_modulus=youngs_modulus)
-    organ = compile_organ(OrganSpec(mesh=mesh, materials=material, damping=liver.damping))
-    cell = surface_cell(mesh, mesh.boundary_triangles)
-    touch = (liver.instrument.tip_radius, liver.palpation.press_depth)
-    _print_organ(
-        file.name, mesh, organ, material=material, volume_error=None, cell=cell, touch=touch, more={}, console=console
-    )
-    if out is not None:
-        with output_folder(out.parent) as files:
-            write_mesh(files / out.name, mesh)
-        console.print(f"written: {out}", highlight=False, soft_wrap=True)
-
-
 def print_patient(found: PatientScene, console: Console) -> None:
     """Print a summary of a patient's organ, and warn of what was dropped, repaired or is unusual."""
-    patient, scene = found.patient, found.scene
-    rows = {}
-    if found.hold is not None:
-        rows["held"] = found.hold.text
-    for one in patient.volumes[1:]:
-        modulus = found.regions[one.name].material.youngs_modulus
-        rows[one.name] = f"{one.mesh * 1e6:.2f} ml (error {one.error:+.2%}), E {modulus:g} Pa"
-    _print_organ(
-        ", ".join(patient.sources),
-        patient.mesh,
-        found.anatomy.organ(found.anatomy.demonstration_lesions()),
-        material=scene.material,
-        volume_error=patient.volume_error,
-        cell=found.anatomy.palpable_cell,
-        touch=(scene.instrument.tip_radius, scene.palpation.press_depth),
-        more=rows,
-        console=console,
-    )
-    for note in (*patient.notes, *found.notes):
-        warnings.warn(note, UserWarning, stacklevel=2)
-
-
-def _print_organ(
-    title: str,
-    mesh: TetMesh,
-    organ: OrganModel,
-    *,
-    material: Material,
-    volume_error: float | None,
-    cell: float,
-    touch: tuple[float, float],
-    console: Console,
-    more: Mapping[str, str],
-) -> None:
-    """Print a table of an organ, and warn if its cells [m] would be felt by a touch (tip radius, press depth) [m].
-
-    `volume_error` is the mesh's against its source, None if that has no volume.
-    """
-    quality = mesh_quality(mesh)
-    fit = "no surface to compare with" if volume_error is None else f"{volume_error:+.2%}"
+    patient, scene, cell = found.patient, found.scene, found.anatomy.palpable_cell
+    mesh, material, title = patient.mesh, scene.material, ", ".join(patient.sources)
+    organ, quality = found.anatomy.organ(found.anatomy.demonstration_lesions()), mesh_quality(mesh)
+    touch = (scene.instrument.tip_radius, scene.palpation.press_depth)
     x, y, z = (mesh.points.max(axis=0) - mesh.points.min(axis=0)) * 1e3
     step = f"{organ.stable_step * 1e3:.3f} ms"
     rows = {
@@ -292,8 +317,14 @@ def _print_organ(
         "nodes": f"{mesh.node_count}",
         "tets": f"{mesh.tet_count}, {mesh.reoriented_count} reoriented",
         "springs": f"{len(organ.spring_nodes)}",
-        "volume": f"{quality.volume * 1e6:.1f} ml (error {fit})",
-        **more,
+        "volume": f"{quality.volume * 1e6:.1f} ml (error {patient.volume_error:+.2%})",
+    }
+    if found.hold is not None:
+        rows["held"] = found.hold.text
+    for one in patient.volumes[1:]:
+        modulus = found.regions[one.name].material.youngs_modulus
+        rows[one.name] = f"{one.mesh * 1e6:.2f} ml (error {one.error:+.2%}), E {modulus:g} Pa"
+    rows |= {
         "mass": f"{organ.node_mass.sum():.4f} kg at {material.density:g} kg/m^3",
         "dihedral angles": f"{quality.dihedral_smallest_deg:.1f} to {quality.dihedral_largest_deg:.1f} degrees",
         "radius ratio": f"from {quality.radius_ratio_smallest:.3f} (1 is regular)",
@@ -305,6 +336,8 @@ def _print_organ(
         table.add_row(name, value)
     console.print(table)
     warn_of_coarse_cells(title, cell, *touch)
+    for note in (*patient.notes, *found.notes):
+        warnings.warn(note, UserWarning, stacklevel=2)
 
 
 def scene_text(found: PatientScene) -> str:
@@ -315,7 +348,7 @@ def scene_text(found: PatientScene) -> str:
     head = (
         SCENE_MARK,
         f"From {', '.join(patient.sources)}.",
-        f"Mesh: {patient.mesher}, cells of {patient.cell_size * 1e3:.4g} mm.",
+        f"Mesh: {patient.mesher}, {patient.cells_text}.",
         f"Axes: {patient.convention}.",
         "Change any number here; surgsim organ replaces this file only while its first line is unchanged.",
         *(f"Note: {note}" for note in (*patient.notes, *found.notes)),
@@ -326,8 +359,7 @@ def scene_text(found: PatientScene) -> str:
         "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
         "contact.damping": "[N s/m^3] as in the scene liver",
         "contact.friction": "as in the scene liver",
-        "instrument.tip_radius": f"[m] chosen for the cells: cell / contact radius {share:.2f}, wanted "
-        f"{CELL_PER_CONTACT_RADIUS}",
+        "instrument.tip_radius": f"[m] chosen with the cells: cell / contact radius {share:.2f}",
         "instrument.approach": "direction of the probe, in the axes above",
         "timing.haptic_step": "[s]",
         "timing.substep_count": "stable with contact, with all lesions here and the stiffest drawn one",

@@ -6,17 +6,19 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.quality import dihedral_angles
-from msdm_core.mesh.surface import check_surface, surface_volume
+from msdm_core.mesh.surface import check_surface, outward_facing, surface_volume
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.meshing.lattice_meshing import largest_body_mesh, mesh_surface
 from msdm_core.meshing.segmentation_meshing import (
+    FineFace,
     RegionShare,
     SmoothedShare,
     fill_labels,
@@ -38,11 +40,8 @@ from surgsim_env.patient.surface_files import (
     region_name,
     voxels_inside,
 )
+from surgsim_env.scene.model import Vector
 
-# Cells of a default mesh, with about two nodes and twelve tets each: a palpation then takes a minute.
-CELLS_WANTED = 2000
-# Default cell sizes are multiples of CELL_STEP, and at least CELL_SMALLEST [m].
-CELL_STEP, CELL_SMALLEST = 1e-4, 1e-3
 # A default mesh with a smaller dihedral angle [degrees] is made again with cells scaled by the next share.
 DIHEDRAL_SMALLEST = 10.0
 CELL_SHARES = (1.0, 0.98, 0.96, 0.94)
@@ -81,7 +80,8 @@ class PatientMesh:
         mesh: with named regions, the organ's own first; in metres
         lesions: names of the regions that are lesions
         volumes: of the whole organ, under its name, then of each region
-        cell_size, mesher: how it was made
+        cell_size, coarsening, mesher: how it was made; the size is that of the fine cells [m], and the largest cells
+            are `coarsening` times as long
         convention: the meaning of its axes, in words
         sources: names of the files
         is_scan: whether the axes are the patient's (LPS)
@@ -94,6 +94,7 @@ class PatientMesh:
     lesions: tuple[str, ...]
     volumes: tuple[RegionVolume, ...]
     cell_size: float
+    coarsening: int
     mesher: str
     convention: str
     sources: tuple[str, ...]
@@ -108,22 +109,47 @@ class PatientMesh:
         return self.volumes[0].name
 
     @property
+    def cells_text(self) -> str:
+        """Its cells in words."""
+        graded = f" at the pressed face, {self.coarsening} times as long elsewhere" if self.coarsening > 1 else ""
+        return f"cells of {self.cell_size * 1e3:.4g} mm{graded}"
+
+    @property
     def volume_error(self) -> float:
         """Relative volume error of the whole organ, (mesh - source) / source."""
         return self.volumes[0].error
 
 
-def well_shaped(make: Callable[[float], PatientMesh], cell_size: float | None, volume: float) -> PatientMesh:
-    """A mesh of a given cell size [m]; by default in proportion to a volume [m^3], slightly smaller for better angles.
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a mesh.
+
+    Fields:
+        size: edge of the lattice's cells, of the fine ones where it is graded [m]
+        is_given: whether the size is the user's; else slightly smaller cells are tried for better angles
+        coarsening: edge of the largest cells over that of the fine ones, 1, 2 or 4; the lattice's alone
+        fine_depth: cells are fine to this depth under the face that faces the approach [m]
+        approach, face_angle_deg: direction of the probe in the organ's axes, and angle of that face [degrees]
+    """
+
+    size: float
+    is_given: bool
+    coarsening: int
+    fine_depth: float
+    approach: Vector
+    face_angle_deg: float
+
+
+def well_shaped(make: Callable[[float], PatientMesh], cells: Cells) -> PatientMesh:
+    """A mesh of given cells; with slightly smaller ones for better angles where the size is not the user's.
 
     Isosurface stuffing guarantees 9.3 degrees; slightly smaller cells are cut elsewhere, often with larger angles.
     """
-    if cell_size is not None:
-        return make(cell_size)
+    if cells.is_given:
+        return make(cells.size)
     best, largest = None, -math.inf
-    usual = max(math.ceil((volume / CELLS_WANTED) ** (1.0 / 3.0) / CELL_STEP) * CELL_STEP, CELL_SMALLEST)
     for share in CELL_SHARES:
-        mesh = make(round(share * usual, 6))
+        mesh = make(round(share * cells.size, 6))
         angle = float(dihedral_angles(mesh.mesh).min())
         if angle > largest:
             best, largest = mesh, angle
@@ -143,13 +169,19 @@ def region_volumes(
     return tuple(volumes)
 
 
-def mesh_image(image: LabelImage, source: str, *, cell_size: float | None, mesher: str, mend: bool) -> PatientMesh:
+def image_volume(image: LabelImage) -> float:
+    """Volume of an image's labels [m^3]."""
+    return float(np.count_nonzero(image.tags)) * image.voxel_volume
+
+
+def mesh_image(image: LabelImage, source: str, *, cells: Cells, mesher: str, mend: bool) -> PatientMesh:
     """Mesh the largest part of an image's labels, in LPS."""
-    volume = float(np.count_nonzero(image.tags)) * image.voxel_volume
-    return well_shaped(lambda size: _mesh_labels(image, source, size, mesher, mend), cell_size, volume)
+    return well_shaped(lambda size: _mesh_labels(image, source, cells, size, mesher, mend), cells)
 
 
-def _mesh_labels(image: LabelImage, source: str, cell_size: float, mesher: str, mend: bool) -> PatientMesh:
+def _mesh_labels(
+    image: LabelImage, source: str, cells: Cells, cell_size: float, mesher: str, mend: bool
+) -> PatientMesh:
     labels = clean_labels(image, cell_size=cell_size, mend=mend)
     if mesher == "tetwild":
         placed, volumes, smoothed = _conforming(labels, cell_size)
@@ -157,7 +189,10 @@ def _mesh_labels(image: LabelImage, source: str, cell_size: float, mesher: str, 
         smoothing, change = smoothed.smoothing, smoothed.volume_above(0.5) / whole - 1.0
     else:
         names = list(enumerate(labels.names, start=1))
-        filled = fill_labels(labels.tags, image.geometry.spacing, cell_size=cell_size, region_names=names)
+        fine = _fine_face(cells, image.geometry.direction)
+        filled = fill_labels(
+            labels.tags, image.geometry.spacing, cell_size=cell_size, region_names=names, fine_face=fine
+        )
         placed, volumes, whole = filled.mesh, filled.region_volumes, filled.label_volume
         smoothing, change = filled.smoothing, filled.smoothing_change
     mesh = TetMesh(image.geometry.places(placed.points), placed.tets, placed.region, placed.region_names)
@@ -166,6 +201,7 @@ def _mesh_labels(image: LabelImage, source: str, cell_size: float, mesher: str, 
         lesions=labels.lesions,
         volumes=region_volumes(mesh, labels.names, whole, volumes),
         cell_size=cell_size,
+        coarsening=1 if mesher == "tetwild" else cells.coarsening,
         mesher=mesher,
         convention=CONVENTION,
         sources=(source,),
@@ -176,23 +212,45 @@ def _mesh_labels(image: LabelImage, source: str, cell_size: float, mesher: str, 
     )
 
 
-def mesh_surfaces(
-    files: Sequence[Path],
-    regions: Sequence[str],
-    length_unit: LengthUnit,
-    *,
-    cell_size: float | None,
-    mesher: str,
-    mend: bool,
-) -> PatientMesh:
-    """Mesh closed surfaces, in the files' own axes.
+def _fine_face(cells: Cells, axes: FloatArray) -> FineFace | None:
+    """The face at which cells are fine, in an image whose axes are the columns of (3, 3); None for one size."""
+    if cells.coarsening == 1:
+        return None
+    x, y, z = (np.asarray(cells.approach) @ axes).tolist()
+    return FineFace((x, y, z), cells.face_angle_deg, cells.fine_depth, cells.coarsening)
+
+
+@dataclass(frozen=True, eq=False)
+class PatientSurfaces:
+    """Surfaces of an organ and of the regions in it.
+
+    Fields:
+        organ: closed, or broken and to be mended
+        inner: of the regions, in their order
+        sources: names of the files
+        notes: remarks on what was dropped
+    """
+
+    organ: ClosedSurface | BrokenSurface
+    inner: tuple[ClosedSurface, ...]
+    sources: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def volume(self) -> float:
+        """Volume that the organ's surface encloses [m^3]."""
+        return abs(surface_volume(self.organ.vertices, self.organ.triangles))
+
+
+def read_surfaces(
+    files: Sequence[Path], regions: Sequence[str], length_unit: LengthUnit, *, mend: bool
+) -> PatientSurfaces:
+    """Read closed surfaces, in the files' own axes.
 
     Args:
         files: the organ's surface, then those of regions, named after their files.
         regions: further regions, as NAME=FILE.
         length_unit: of all files.
-        cell_size: of the lattice [m]; default: in proportion to the organ.
-        mesher: "lattice" or "tetwild".
         mend: whether an organ's surface that is open or crosses itself may be rebuilt from voxels.
     """
     organ, dropped = read_organ_surface(files[0], length_unit, mend=mend)
@@ -206,38 +264,60 @@ def mesh_surfaces(
             f"region {twice!r} is given twice; give the files other names, or name them: --region NAME=FILE"
         )
     sources = tuple(file.name for file in files) + tuple(_named(text)[1].name for text in regions)
-    volume = abs(surface_volume(organ.vertices, organ.triangles))
+    return PatientSurfaces(organ, tuple(inner), sources, tuple(dropped))
+
+
+def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
+    """Mesh closed surfaces, in the files' own axes.
+
+    Args:
+        given: the surfaces.
+        cells: of the mesh.
+        mesher: "lattice" or "tetwild".
+    """
+    organ, inner = given.organ, given.inner
+    names = [organ.name, *(one.name for one in inner)]
+    graded: dict[str, Any] = {}
+    if cells.coarsening > 1 and isinstance(organ, ClosedSurface):
+        facing = outward_facing(organ.vertices, organ.triangles, cells.approach, cells.face_angle_deg)
+        graded = {"fine_triangles": facing, "fine_depth": cells.fine_depth}
 
     def make(cell_size: float) -> PatientMesh:
-        notes = list(dropped)
+        notes = list(given.notes)
         smoothing = change = None
         if isinstance(organ, BrokenSurface):
             tags, step, start, note = mended_voxels(organ, cell_size)
             notes.append(note)
-            filled = fill_labels(tags, step, cell_size=cell_size, region_names={1: organ.name})
+            fine = _fine_face(cells, np.eye(3))
+            filled = fill_labels(tags, step, cell_size=cell_size, region_names={1: organ.name}, fine_face=fine)
             notes += [f"{len(filled.dropped)} part(s) apart from the largest were left out"] if filled.dropped else []
             plain = TetMesh(filled.mesh.points + start, filled.mesh.tets)
             volume, smoothing, change = filled.label_volume, filled.smoothing, filled.smoothing_change
         elif mesher == "tetwild":
             plain, volume = tetwild_mesh([organ, *inner], cell_size), organ.volume
         else:
-            plain, volume = mesh_surface(organ.vertices, organ.triangles, cell_size=cell_size), organ.volume
+            coarse = cells.coarsening * cell_size if graded else None
+            plain = mesh_surface(
+                organ.vertices, organ.triangles, cell_size=cell_size, coarse_cell_size=coarse, **graded
+            )
+            volume = organ.volume
         mesh, tagged = _with_regions(plain, names[0], inner, cell_size)
         return PatientMesh(
             mesh=mesh,
             lesions=tuple(name for name in names[1:] if is_lesion(name)),
             volumes=region_volumes(mesh, names, volume, tagged),
             cell_size=cell_size,
+            coarsening=1 if mesher == "tetwild" else cells.coarsening,
             mesher="lattice" if isinstance(organ, BrokenSurface) else mesher,
             convention=FILE_CONVENTION,
-            sources=sources,
+            sources=given.sources,
             notes=tuple(notes),
             is_scan=False,
             smoothing=smoothing,
             smoothing_change=change,
         )
 
-    return well_shaped(make, cell_size, volume)
+    return well_shaped(make, cells)
 
 
 def _named(text: str) -> tuple[str, Path]:

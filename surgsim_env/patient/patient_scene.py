@@ -18,11 +18,12 @@ from surgsim_env.palpation.surface_scene import (
     with_substeps,
 )
 from surgsim_env.patient.facing import faced_note, facing_approach
+from surgsim_env.patient.lesion_room import lack_of_room, sample_face
 from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material, without_number
 from surgsim_env.patient.meshers import PatientMesh
 from surgsim_env.patient.supports import organ_anchors
+from surgsim_env.patient.touch import DEPTH_STEP, TouchPlan
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
-from surgsim_env.scene.levels import LEVELS
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import (
     LesionDraw,
@@ -36,12 +37,9 @@ from surgsim_env.scene.model import (
 )
 from surgsim_env.scene.palpable_surface import hertz_force
 
-# As in the scene liver, whose cells are 0.85 of the contact radius sqrt(tip radius x press depth).
-CELL_PER_CONTACT_RADIUS = 0.85
-DEPTH_PER_TIP = 7.0 / 12.0
+# As in the scene liver.
 SPACING_PER_TIP = 13.0 / 12.0
-TIP_STEP, TIP_RANGE = 5e-4, (0.002, 0.015)
-DEPTH_STEP, SPACING_STEP = 1e-4, 5e-4
+SPACING_STEP = 5e-4
 # From the front and above in a scan's axes; against the third axis of files whose axes have no stated meaning.
 APPROACH_SCAN: Vector = (0.0, math.sqrt(0.5), -math.sqrt(0.5))
 APPROACH_FILE: Vector = (0.0, 0.0, -1.0)
@@ -55,7 +53,6 @@ SOFT_PER_PRESS, HARD_PER_PRESS = 2.0, 4.0
 LESION_RADIUS, LESION_COVER, LESION_RIM = (1.5, 2.1), (0.25, 0.65), 2.1
 LESION_RATIO = (5.0, 8.0)
 LESION_SHRINKS = (1.0, 0.75, 0.55)
-LESION_DRAWS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,15 +84,21 @@ class PatientScene:
         return self.anatomy.scene
 
 
+def approach_of(options: SurfaceOptions, *, is_scan: bool) -> Vector:
+    """Direction of the probe: the one given, or the default for axes of a patient or of a file."""
+    return options.approach or (APPROACH_SCAN if is_scan else APPROACH_FILE)
+
+
 def patient_scene(
-    patient: PatientMesh, out: Path, *, options: SurfaceOptions, moduli: Mapping[str, float]
+    patient: PatientMesh, out: Path, *, touch: TouchPlan, options: SurfaceOptions, moduli: Mapping[str, float]
 ) -> PatientScene:
     """Make the palpation scene of a patient's organ.
 
     Args:
         patient: the organ.
         out: path of the mesh file, beside which the scene file is; its stem names the scene.
-        options: touch, anchors and healthy tissue.
+        touch: tip and press depth.
+        options: spacing, approach, anchors and healthy tissue.
         moduli: of regions by name [Pa].
 
     Raises:
@@ -106,7 +109,7 @@ def patient_scene(
         one.name: region_material(one.name, patient.organ_name, organ.material, moduli) for one in patient.volumes[1:]
     }
     _check_moduli(moduli, list(regions))
-    scene = _first_scene(patient, out, organ.material, regions, options)
+    scene = _first_scene(patient, out, organ.material, regions, touch, options)
     anchors, sources = organ_anchors(
         patient.organ_name, patient.mesh, options, scene.instrument.approach, is_scan=patient.is_scan
     )
@@ -124,14 +127,17 @@ def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
 
 
 def _first_scene(
-    patient: PatientMesh, out: Path, material: Material, regions: Mapping[str, TissueMaterial], options: SurfaceOptions
+    patient: PatientMesh,
+    out: Path,
+    material: Material,
+    regions: Mapping[str, TissueMaterial],
+    touch: TouchPlan,
+    options: SurfaceOptions,
 ) -> Scene:
-    """The scene with all values that follow from the cells and the tissue."""
+    """The scene with all values that follow from the touch, the cells and the tissue."""
     liver, cell = make_scene(PATTERN), patient.cell_size
-    wanted = math.ceil(cell / (CELL_PER_CONTACT_RADIUS * math.sqrt(DEPTH_PER_TIP)) / TIP_STEP) * TIP_STEP
-    tip = options.tip_radius or min(max(_rounded(wanted, TIP_STEP), TIP_RANGE[0]), TIP_RANGE[1])
-    depth = options.press_depth or _rounded(DEPTH_PER_TIP * tip, DEPTH_STEP)
-    usual = APPROACH_SCAN if patient.is_scan else APPROACH_FILE
+    tip, depth = touch.tip_radius, touch.press_depth
+    usual = approach_of(options, is_scan=patient.is_scan)
     approach = options.approach or facing_approach(patient, usual, liver.palpation.face_angle_deg)
     described = f"{patient.organ_name} of {', '.join(patient.sources)}, {patient.mesh.volumes.sum() * 1e6:.0f} ml"
     if patient.lesions:
@@ -205,7 +211,8 @@ def _thick_enough(scene: Scene, patient: PatientMesh, notes: list[str]) -> tuple
 
 def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
     """The anatomy with ranges of hidden lesions that fit into it; without a lesion table if none fit."""
-    tip = anatomy.scene.instrument.tip_radius
+    tip, lack = anatomy.scene.instrument.tip_radius, ""
+    sample = sample_face(anatomy)
     for shrink in LESION_SHRINKS:
         draw = LesionDraw(
             radius=_pair(LESION_RADIUS, shrink * tip),
@@ -213,28 +220,16 @@ def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
             modulus_ratio=LESION_RATIO,
             rim_distance=_rounded(LESION_RIM * shrink * tip, DEPTH_STEP),
         )
-        tried = replace(anatomy, scene=replace(anatomy.scene, lesion=draw))
-        if _has_room(tried):
-            if shrink != 1.0:
-                notes.append(f"hidden lesions are {shrink:g} times the size that suits the tip: the organ is small")
-            return tried
-    notes.append("the organ has no room for hidden lesions: there is no [lesion] table, and environments refuse it")
+        why = lack_of_room(sample, draw)
+        if not why:
+            if lack:
+                notes.append(f"hidden lesions are {shrink:g} times the size that suits the tip, since {lack}")
+            return replace(anatomy, scene=replace(anatomy.scene, lesion=draw))
+        lack = why
+    notes.append(
+        f"no hidden lesions: there is no [lesion] table, and environments of palpation refuse the organ, since {lack}"
+    )
     return anatomy
-
-
-def _has_room(anatomy: Anatomy) -> bool:
-    """Whether draws find a place: the largest lesions under the thickest cover, and the most lesions of each level."""
-    draws, draw = np.random.default_rng(0), anatomy.scene.lesion
-    assert draw is not None
-    largest = replace(draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[1],) * 2)
-    try:
-        for number in range(LESION_DRAWS):
-            anatomy.random_lesion(draws, largest if number % 2 else None)
-        for level in LEVELS.values():
-            level.draw(anatomy, draws, lesion_count=len(level.lesion_count_weights) - 1)
-    except ValueError:
-        return False
-    return draw.radius[0] > 0.0
 
 
 def _substeps_of_worst(anatomy: Anatomy) -> Anatomy:

@@ -109,7 +109,7 @@ def _source(found: PatientScene) -> Rows:
     rows: Rows = [
         ("files", ", ".join(patient.sources)),
         ("axes", patient.convention),
-        ("mesher", f"{patient.mesher}, cells of {patient.cell_size * 1e3:.4g} mm"),
+        ("mesher", f"{patient.mesher}, {patient.cells_text}"),
     ]
     if patient.smoothing is not None and patient.smoothing_change is not None:
         change = (
@@ -218,7 +218,8 @@ def quality_picture(mesh: TetMesh) -> bytes:
     middle.hist(ratios, bins=np.linspace(0.0, 1.0, 41), color=BLUE)
     middle.set_xlabel(f"radius ratio, from {ratios.min():.2f}; 1 is regular")
     volumes = mesh.volumes * 1e9
-    right.hist(volumes, bins=40, color=BLUE)
+    # From 0: the tets of a block may all be alike.
+    right.hist(volumes, bins=np.linspace(0.0, 1.001 * volumes.max(), 41), color=BLUE)
     right.set_xlabel(f"volume [mm³], from {volumes.min():.2g}")
     for one, what in ((left, "angles"), (middle, "tets"), (right, "tets")):
         one.set_ylabel(f"number of {what}")

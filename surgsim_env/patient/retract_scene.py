@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from msdm_core.mesh.ordering import in_sweep_order
+from msdm_core.mesh.quality import surface_cell
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.support import Support
 from surgsim_env.palpation.surface_scene import with_substeps
@@ -280,14 +281,24 @@ class RetractScene:
 
 def find_retraction(found: PatientScene, out: Path) -> RetractScene | str:
     """The retraction scene of an organ, with its mesh to be written to `out`; or the reason why there is none."""
-    cell = found.patient.cell_size
+    mesh, cell = found.patient.mesh, found.patient.cell_size
     if cell > CELL_MOST:
-        return (
-            f"cells of {cell * 1e3:.3g} mm are too coarse for an edge between a jaw's pads: "
-            f"use --cell-size {CELL_MOST:g} or less"
-        )
-    rim = find_rim(found.patient.mesh, -np.array(found.scene.instrument.approach))
-    return rim.reason if isinstance(rim, NoRim) else retract_scene(found, rim, out)
+        return _too_coarse(cell)
+    rim = find_rim(mesh, -np.array(found.scene.instrument.approach))
+    if isinstance(rim, NoRim):
+        return rim.reason
+    # Cells may be coarse away from the face that the probe presses.
+    triangles = mesh.boundary_triangles
+    near = np.linalg.norm(mesh.points[triangles].mean(axis=1) - rim.place, axis=1) < FLAP_DEPTH
+    cell = surface_cell(mesh, triangles[near])
+    return _too_coarse(cell) if cell > CELL_MOST else retract_scene(found, rim, out)
+
+
+def _too_coarse(cell: float) -> str:
+    return (
+        f"cells of {cell * 1e3:.3g} mm are too coarse for an edge between a jaw's pads: "
+        f"use --cell-size {CELL_MOST:g} or less"
+    )
 
 
 def retract_scene(found: PatientScene, rim: Rim, out: Path) -> RetractScene | str:

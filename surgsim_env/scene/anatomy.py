@@ -80,7 +80,14 @@ class Anatomy:
 
         With the scene's `mass_scaling`, mass is added as its number of substeps needs (`OrganModel.added_mass`).
         """
+        if not lesions and modulus_factor == 1.0:
+            return self._healthy_organ
         return self.compiled(self.specification(lesions, modulus_factor=modulus_factor))
+
+    @cached_property
+    def _healthy_organ(self) -> OrganModel:
+        """Shared by all simulations of the scene: its arrays are read-only, and the stable step takes time to find."""
+        return self.compiled(self.specification())
 
     def specification(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganSpec:
         """The specification that `organ` compiles, for further changes by an episode's draw."""
@@ -135,27 +142,32 @@ class Anatomy:
         ratio = float(rng.uniform(*draw.modulus_ratio)) * modulus_factor
         for _ in range(200):
             point, normal = self.face.random_point(rng, draw.rim_distance)
-            centre = self._centre_below(point, normal, cover + radius)
-            if centre is not None:
+            centre = self.centres_below(point[None], normal[None], cover + radius)[0]
+            if np.isfinite(centre).all():
                 return self.lesion_at(centre, radius, ratio, "lesion")
         raise ValueError(
             f"scene {self.scene.name!r}: no room for a lesion of radius {radius * 1000:.3g} mm under "
             f"{cover * 1000:.3g} mm of tissue: use smaller lesions"
         )
 
-    def _centre_below(self, point: FloatArray, normal: FloatArray, distance: float) -> FloatArray | None:
-        """The point on the inward normal at a distance from the surface [m]; None if there is none."""
-        depth = distance
+    def centres_below(self, points: FloatArray, normals: FloatArray, distance: float) -> FloatArray:
+        """Points on the inward normals (n, 3) of points (n, 3) [m] at a distance from the organ's surface [m], (n, 3).
+
+        NaN where there is none, because another side of the organ is near.
+        """
+        depth = np.full(len(points), distance)
+        centres, sought = np.full((len(points), 3), np.nan), np.arange(len(points))
         for _ in range(20):
-            centre = point - normal * depth
-            gap = distance - self.surface_distance(centre)
-            if abs(gap) <= COVER_TOLERANCE:
-                return centre
-            depth += gap
+            tried = points[sought] - normals[sought] * depth[sought, None]
+            gap = distance - self._free_surface.distances(tried)
+            met = np.abs(gap) <= COVER_TOLERANCE
+            centres[sought[met]] = tried[met]
+            depth[sought] += gap
             # A curved surface needs a little more depth; far more means that another side of the organ is near.
-            if not distance - 0.01 <= depth <= distance + 0.01:
-                return None
-        return None
+            sought = sought[~met & (np.abs(depth[sought] - distance) <= 0.01)]
+            if not len(sought):
+                break
+        return centres
 
     def surface_distance(self, point: FloatArray) -> float:
         """Distance from a point to the free part of the organ's surface [m]."""

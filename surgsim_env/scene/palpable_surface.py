@@ -87,12 +87,8 @@ class PalpableFace:
         Raises:
             ValueError: no such point in 1000 draws.
         """
-        cumulative = self._cumulative_area
         for _ in range(1000):
-            face = int(np.searchsorted(cumulative, rng.random() * cumulative[-1]))
-            u, v = rng.random(2)
-            root = math.sqrt(u)
-            weights = np.array([1.0 - root, root * (1.0 - v), root * v])
+            face, weights = self._random_place(rng)
             if self.thickness[face] < self.thickness_smallest:
                 continue
             point, normal = self._at(face, weights)
@@ -102,6 +98,20 @@ class PalpableFace:
             f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: "
             "widen palpation.face_angle_deg"
         )
+
+    def random_points(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Points drawn uniformly over the face [m], normals, each (count, 3), and thickness below [m] (count,)."""
+        places = [self._random_place(rng) for _ in range(count)]
+        points, normals = zip(*(self._at(*place) for place in places), strict=True)
+        return np.array(points), np.array(normals), self.thickness[[face for face, _ in places]]
+
+    def _random_place(self, rng: np.random.Generator) -> tuple[int, FloatArray]:
+        """A triangle and barycentric weights (3,) in it, uniformly over the face."""
+        cumulative = self._cumulative_area
+        face = int(np.searchsorted(cumulative, rng.random() * cumulative[-1]))
+        u, v = rng.random(2)
+        root = math.sqrt(u)
+        return face, np.array([1.0 - root, root * (1.0 - v), root * v])
 
     @cached_property
     def _plane(self) -> tuple[FloatArray, FloatArray]:

@@ -165,7 +165,7 @@ def test_the_map_is_made_once_and_anew_where_its_file_is_broken(tmp_path, monkey
     monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
     made = []
 
-    def pressed(anatomy):
+    def pressed(anatomy, progress, dtype=None):
         made.append(anatomy.scene.name)
         return np.full((13, 13), 50.0)
 

@@ -41,7 +41,8 @@ def folder(tmp_path_factory) -> Path:
     """The folder of a wedge's organ with a lesion; to be read only."""
     path = tmp_path_factory.mktemp("wedge")
     file = wedge(tmp_path_factory.mktemp("scan") / "wedge.nii.gz", spacing=2.0)
-    assert main(["organ", str(file), *LABELS, "--cell-size", str(CELL), "--out", str(path / "patient.vtu")]) == 0
+    given = ["organ", str(file), *LABELS, "--cell-size", str(CELL), "--no-healthy-map"]
+    assert main([*given, "--out", str(path / "patient.vtu")]) == 0
     return path
 
 
@@ -164,7 +165,8 @@ def test_the_oracle_lifts_the_wedge_s_edge(env):
 @pytest.mark.slow
 def test_a_real_liver_s_edge_is_lifted_from_the_command_line(tmp_path, anatomy_folder):
     out = tmp_path / "patient.vtu"
-    assert main(["organ", str(anatomy_folder / "openhelp_liver.stl"), "--length-unit", "mm", "--out", str(out)]) == 0
+    given = ["organ", str(anatomy_folder / "openhelp_liver.stl"), "--length-unit", "mm", "--no-healthy-map"]
+    assert main([*given, "--out", str(out)]) == 0
     for arms in ([], ["--bimanual"]):
         run = ["retract", "--scene", str(out.with_suffix(".toml")), "--seed", "3", "--out", str(tmp_path / "run")]
         assert main([*run, *arms]) == 0
@@ -182,7 +184,8 @@ def test_an_organ_without_a_thin_edge_says_so(tmp_path, capsys):
     earlier = [tmp_path / "patient_retract.vtu", tmp_path / "patient_retract.toml"]
     for file in earlier:
         file.write_text(f"{FIRST_LINE}\n", encoding="utf-8")
-    assert main(["organ", str(tmp_path / "ball.stl"), "--length-unit", "mm", "--out", str(out)]) == 0
+    given = ["organ", str(tmp_path / "ball.stl"), "--length-unit", "mm", "--no-healthy-map"]
+    assert main([*given, "--out", str(out)]) == 0
     assert "retraction: none: " in capsys.readouterr().out
     assert not any(file.exists() for file in earlier)
     reason = load_scene(out.with_suffix(".toml")).retract_refusal

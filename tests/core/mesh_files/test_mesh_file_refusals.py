@@ -76,7 +76,7 @@ BAD_BODIES = {
         [("tetra", [[0, 1, 2, 3], [3, 4, 5, 6]])],
         "falls into 2 disconnected parts, which share no face, of 1, 1 tets; .*hinge",
     ),
-    "triangles": (POINTS, [("triangle", TETS[:, :3])], r"has no tets \(2 triangle\); mesh the volume first"),
+    "triangles": (POINTS, [("triangle", TETS[:, :3])], r"holds a surface \(2 triangle\), and no tets: save it as STL"),
     "quadratic": (np.random.default_rng(0).random((10, 3)), [("tetra10", [range(10)])], "quadratic .*1 tetra10"),
     "mixed": (np.vstack([POINTS, FAR[5:]]), [("tetra", TETS), ("hexahedron", [range(8)])], "not tets .*1 hexahedron"),
 }

@@ -17,7 +17,7 @@ from msdm_core.mesh.tet_mesh import TET_FACES, TetMesh
 from msdm_core.meshing import grading
 from msdm_core.meshing.grading import balanced_levels, octree_tets
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
-from msdm_core.meshing.stuffing import lattice_around, stuff
+from msdm_core.meshing.stuffing import SurfaceBody, lattice_around, stuff
 
 ROOT = Path(__file__).parents[3]
 CT_LIVER = ROOT.parent / "shared" / "data" / "anatomy" / "openhelp_liver.stl"
@@ -102,8 +102,9 @@ def test_cells_of_one_size_give_the_uniform_mesh_to_the_bit():
     assert uniform.points.tobytes() == same.points.tobytes() and uniform.tets.tobytes() == same.tets.tobytes()
     # The octree's own way through the same lattice: the same corners of the same tets, to the bit.
     points, corners = check_surface(vertices, faces)
-    graded = grading.stuff_graded(points, corners, np.arange(len(corners)), 0.01, 0.0, 0)
-    plain = stuff(points, corners, lattice_around(points, 0.01))
+    body = SurfaceBody(points, corners)
+    graded = grading.stuff_graded(body, points[corners], 0.01, 0.0, 0)
+    plain = stuff(body, lattice_around(points, 0.01))
     np.testing.assert_array_equal(corner_sets(*graded), corner_sets(*plain))
 
 

@@ -1,0 +1,89 @@
+"""A file of tets becomes a patient: with its own tets, or its surfaces filled anew."""
+
+import numpy as np
+import pytest
+from meshio import Mesh
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
+from msdm_core.meshing.lattice_meshing import box_mesh
+from surgsim_env.cli.main import main
+from surgsim_env.patient.label_image import parse_labels
+from surgsim_env.patient.tet_files import patient_of_tets, read_tets, surfaces_of_tets
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import load_scene
+
+SIDE, CORE = 0.06, 0.02
+
+
+def block(names=()) -> TetMesh:
+    """A block of 60 x 60 x 40 mm with a core of 20 x 20 x 20 mm, whose tets have tag 7, the others 3."""
+    mesh = box_mesh((SIDE, SIDE, 0.04), (6, 6, 4))
+    middle = mesh.points[mesh.tets].mean(axis=1)
+    inside = (np.abs(middle - [SIDE / 2, SIDE / 2, 0.02]) < CORE / 2).all(axis=1)
+    return TetMesh(mesh.points, mesh.tets, np.where(inside, 7, 3), names)
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".msh"])
+def test_tets_are_kept_and_their_regions_named(suffix, tmp_path):
+    file = tmp_path / f"organ{suffix}"
+    # The smaller region is named first: the organ is the largest.
+    write_mesh(file, block(((7, "tumour"), (3, "kidney"))))
+    given = read_tets(file, None, ())
+    assert given.names == ("kidney", "tumour")
+    assert given.volume == pytest.approx(SIDE * SIDE * 0.04)
+    patient = patient_of_tets(given, 0.01)
+    assert patient.lesions == ("tumour",)
+    assert [one.name for one in patient.volumes] == ["kidney", "tumour"]
+    mesh = block()
+    assert patient.volumes[1].mesh == pytest.approx(mesh.volumes[mesh.region == 7].sum())
+
+
+def test_tags_without_names_are_named_by_the_user(tmp_path):
+    file = tmp_path / "organ.vtu"
+    write_mesh(file, block())
+    with pytest.raises(MeshError, match=r"regions 3, 7 of 3, 7 have no name: give --labels NAME=TAG"):
+        read_tets(file, None, ())
+    with pytest.raises(MeshError, match=r"regions 7 of 3, 7 have no name"):
+        read_tets(file, None, parse_labels("kidney=3"))
+    with pytest.raises(MeshError, match=r"--labels stone=9: no tet has this tag; those there are 3, 7"):
+        read_tets(file, None, parse_labels("kidney=3,tumour=7,stone=9"))
+    assert read_tets(file, None, parse_labels("kidney=3,tumour=7")).names == ("kidney", "tumour")
+
+
+def test_surfaces_of_tets_enclose_the_same_volumes(tmp_path):
+    file = tmp_path / "organ.vtu"
+    write_mesh(file, block(((3, "kidney"), (7, "tumour"))))
+    given = read_tets(file, None, ())
+    surfaces = surfaces_of_tets(given)
+    assert surfaces.volume == pytest.approx(given.volume)
+    (tumour,) = surfaces.inner
+    mesh = given.mesh
+    assert tumour.name == "tumour" and tumour.volume == pytest.approx(mesh.volumes[mesh.region == 2].sum())
+
+
+def test_a_scene_is_made_of_tets(tmp_path):
+    file, out = tmp_path / "organ.vtu", tmp_path / "made" / "patient.vtu"
+    write_mesh(file, block(((3, "kidney"), (7, "tumour"))))
+    assert main(["organ", str(file), "--no-healthy-map", "--out", str(out)]) == 0
+    assert {path.name for path in out.parent.iterdir()} >= {"patient.vtu", "patient.toml", "report.html"}
+    scene = load_scene(out.with_suffix(".toml"))
+    assert [(one.name, one.lesion) for one in scene.regions] == [("tumour", True)]
+    anatomy = load_anatomy(scene)
+    assert np.array_equal(np.sort(anatomy.mesh.volumes), np.sort(read_mesh(out).volumes))
+    assert len(anatomy.demonstration_lesions()) == 1
+
+
+def test_what_does_not_go_with_tets(tmp_path, refusal):
+    file = tmp_path / "organ.vtu"
+    write_mesh(file, block(((3, "kidney"), (7, "tumour"))))
+    assert "--mend goes with" in refusal("organ", file, "--mend")
+    assert "tets with --remesh" in refusal("organ", file, "--cell-size", "0.01")
+    surface = tmp_path / "surface.vtk"
+    Mesh(np.eye(3), [("triangle", np.array([[0, 1, 2]]))]).write(surface)
+    said = refusal("organ", surface, "--length-unit", "m")
+    assert "holds a surface (1 triangle)" in said and "STL, OBJ or PLY" in said
+    (tmp_path / "part.step").write_text("ISO-10303-21;")
+    said = refusal("organ", tmp_path / "part.step")
+    assert "unknown extension '.step'" in said and ".nii.gz" in said and ".stl" in said and ".vtu" in said

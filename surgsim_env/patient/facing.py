@@ -13,6 +13,7 @@ from surgsim_env.scene.model import Scene, Vector
 DIRECTIONS = 500
 # Lesions within this angle of the border of the palpable face are near its rim, where no site lies [degrees].
 MARGIN_DEG = 15.0
+ROUNDING = 1e-9
 
 
 def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) -> Vector:
@@ -30,8 +31,12 @@ def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) 
     inward = _inward_normals(patient)
     if len(inward) == 0:
         return usual
-    least = np.cos(np.radians(face_angle_deg - MARGIN_DEG))
-    tried = np.concatenate([first[None], _sphere()])
+    least = np.cos(np.radians(face_angle_deg - MARGIN_DEG)) - ROUNDING
+    # Between two lesions a direction may face both that no direction of the lattice does.
+    between = (inward[:, None] + inward[None]).reshape(-1, 3)
+    length = np.linalg.norm(between, axis=1)
+    between = between[length > ROUNDING] / length[length > ROUNDING, None]
+    tried = np.concatenate([first[None], between, _sphere()])
     faced = (tried @ inward.T >= least).sum(axis=1)
     best = np.flatnonzero(faced == faced.max())
     chosen = tried[best[int(np.argmax(tried[best] @ first))]]

@@ -1,16 +1,14 @@
-"""Held forces on two organs of our own in fat beside finite elements with the same support, quadratic tets."""
+"""The held force on an organ of our own in fat beside finite elements with the same support, quadratic tets."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import LinearOperator, cg, spilu
 
-from msdm_core.meshing.lattice_meshing import mesh_surface
 from surgsim_env.palpation.job import plan_sites
 from surgsim_env.palpation.press import scan
 from surgsim_env.palpation.surface_scene import soft_bed
@@ -22,7 +20,7 @@ pytest.importorskip("skfem", reason="scikit-fem, a development dependency, solve
 
 DOWN = (0.0, 0.0, -1.0)
 TIP, DEPTH = 0.008, 0.0045
-# What the issue of this test asks for. The lattice is too stiff by up to 17 % under loads of a few cells.
+# Asked for. Measured at this site: +22 %; the lattice is too stiff by up to 17 % under loads of a few cells.
 TOLERANCE = 0.25
 
 
@@ -43,67 +41,62 @@ class HeldSolid:
         rows = np.repeat(dofs[:, :, None], 3, axis=2).ravel()
         columns = np.repeat(dofs[:, None, :], 3, axis=1).ravel()
         held = csc_array((organ.foundation_stiffness.ravel(), (rows, columns)), shape=stiffness.shape)
-        self.order = reverse_cuthill_mckee(csr_array(stiffness + held), symmetric_mode=True)
-        whole = coo_array(csr_array(stiffness + held)[self.order][:, self.order])
-        lower = whole.row >= whole.col
-        band = np.zeros((int((whole.row - whole.col).max()) + 1, self.basis.N))
-        band[(whole.row - whole.col)[lower], whole.col[lower]] = whole.data[lower]
-        self.factors = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
+        whole = csr_array(stiffness + held)
+        self.order = reverse_cuthill_mckee(whole, symmetric_mode=True)
+        self.place_in_order = np.argsort(self.order)
+        self.stiffness = whole
+        # Incomplete factors precondition well; complete ones of a solid take minutes.
+        self.incomplete = spilu(
+            csc_array(whole[self.order][:, self.order]), drop_tol=3e-3, fill_factor=6.0, permc_spec="NATURAL",
+            diag_pivot_thresh=0.0, options={"SymmetricMode": True},
+        )  # fmt: skip
+
+    def precondition(self, load: NDArray) -> NDArray:
+        """Approximate displacement [m] under a load [N], (n,) each."""
+        return self.incomplete.solve(load[self.order])[self.place_in_order]
 
     def force(self, site: NDArray, normal: NDArray, contact_stiffness: float) -> float:
         """Force along the normal of a frictionless ball pressed in to DEPTH [N].
 
         A point of the surface at a distance r from the ball's centre is pushed away from it by k_p (R - r) per
-        undeformed area. All that contact needs of the solid is the compliance of its degrees of freedom.
+        undeformed area. Newton's method without the turn of that force; conjugate gradients solve each step.
         """
         from skfem import FacetBasis
 
         mesh = self.basis.mesh
         middles = mesh.p[:, mesh.facets].mean(axis=1).T
         facets = mesh.boundary_facets()
-        near = facets[np.linalg.norm(middles[facets] - site, axis=1) < 1.2 * TIP]
+        near = facets[np.linalg.norm(middles[facets] - site, axis=1) < 1.5 * TIP]
         surface = FacetBasis(mesh, self.basis.elem, facets=near, intorder=6)
-        dofs = np.unique(surface.element_dofs)
-        unit = np.zeros((self.basis.N, len(dofs)))
-        unit[dofs, np.arange(len(dofs))] = 1.0
-        solved = np.empty_like(unit)
-        solved[self.order] = cho_solve_banded((self.factors, True), unit[self.order], check_finite=False)
-        compliance = solved[dofs]
-        local = np.searchsorted(dofs, surface.element_dofs)
+        dofs = surface.element_dofs
         values = np.array([np.broadcast_to(np.array(one[0]), (3, *surface.dx.shape)) for one in surface.basis])
         place = np.asarray(surface.global_coordinates())
         centre = (site + (TIP - DEPTH) * normal)[:, None, None]
-        u = np.zeros(len(dofs))
-        for _ in range(60):
-            moved = place - centre + np.einsum("ikeq,ie->keq", values, u[local])
+        near_inverse = LinearOperator(self.stiffness.shape, self.precondition, dtype=np.float64)
+        u, force = np.zeros(self.basis.N), 0.0
+        for _ in range(30):
+            moved = place - centre + np.einsum("ikeq,ie->keq", values, u[dofs])
             distance = np.linalg.norm(moved, axis=0)
             gap, out = np.maximum(TIP - distance, 0.0), moved / distance
-            push = np.zeros(len(dofs))
-            np.add.at(push, local, np.einsum("ikeq,keq,eq->ie", values, contact_stiffness * gap * out, surface.dx))
-            across = np.eye(3)[:, :, None, None] - out[:, None] * out[None]
-            slope = -contact_stiffness * ((gap > 0.0) * out[:, None] * out[None] - gap / distance * across)
-            tangent = np.zeros((len(dofs), len(dofs)))
-            each = np.einsum("ikeq,kleq,jleq,eq->ije", values, slope, values, surface.dx, optimize=True)
-            np.add.at(tangent, (local[:, None, :], local[None, :, :]), each)
-            # Newton's step on u - C f(u) = 0.
-            change = np.linalg.solve(np.eye(len(dofs)) - compliance @ tangent, compliance @ push - u)
-            u += min(1.0, 1e-3 / np.abs(change).max()) * change
-            if np.abs(change).max() < 1e-9:
-                total = np.einsum("keq,eq->k", contact_stiffness * gap * out, surface.dx)
-                return float(-total @ normal)
+            push = np.zeros(self.basis.N)
+            pressure = contact_stiffness * gap * out * surface.dx
+            np.add.at(push, dofs, np.einsum("ikeq,keq->ie", values, pressure))
+            previous, force = force, float(-pressure.sum(axis=(1, 2)) @ normal)
+            if abs(force - previous) <= 1e-3 * force:
+                return force
+            along = np.einsum("ikeq,keq->ieq", values, out)
+            each = np.einsum("ieq,jeq->ije", along * (contact_stiffness * (gap > 0.0) * surface.dx), along)
+            rows, columns = np.broadcast_arrays(dofs[:, None, :], dofs[None, :, :])
+            held = coo_array((each.ravel(), (rows.ravel(), columns.ravel())), shape=self.stiffness.shape)
+            whole = csr_array(self.stiffness + held)
+            change, failed = cg(whole, push - self.stiffness @ u, rtol=1e-4, M=near_inverse, maxiter=500)
+            assert not failed
+            u += change
         raise AssertionError("the reference did not converge")
 
 
-def spleen(cell: float = 0.006):
-    """A spleen-like slab of 110 x 70 x 30 mm with round edges, bulged upwards."""
-    ball = trimesh.creation.icosphere(3, 1.0)
-    x, y, z = (np.sign(ball.vertices) * np.abs(ball.vertices) ** [0.9, 0.9, 0.8] * [0.055, 0.035, 0.015]).T
-    return mesh_surface(np.column_stack([x, y, z - 0.006 * (x / 0.055) ** 2]), ball.faces, cell_size=cell)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("organ", [kidney, spleen])
-def test_held_forces_are_those_of_finite_elements(organ) -> None:
+def test_a_held_force_is_that_of_finite_elements() -> None:
     liver = make_scene("liver")
     scene = replace(
         liver,
@@ -117,12 +110,8 @@ def test_held_forces_are_those_of_finite_elements(organ) -> None:
             liver.palpation, press_depth=DEPTH, face_margin=TIP, thickness_smallest=0.0, site_spacing=0.016
         ),
     )
-    anatomy = anatomy_of(scene, organ())
+    anatomy = anatomy_of(scene, kidney())
     sites, normals, _ = plan_sites(anatomy)
-    chosen = np.linspace(0, len(sites) - 1, 3).round().astype(int)
-    sites, normals = sites[chosen], normals[chosen]
-    solid = HeldSolid(anatomy)
-    expected = [solid.force(site, normal, scene.contact.stiffness) for site, normal in zip(sites, normals, strict=True)]
-    found = [press.force for press in scan(anatomy, anatomy.organ(), sites, normals)]
-    print(organ.__name__, np.round(found, 3), np.round(expected, 3), np.round(np.array(found) / expected, 3))
-    np.testing.assert_allclose(found, expected, rtol=TOLERANCE)
+    expected = HeldSolid(anatomy).force(sites[0], normals[0], scene.contact.stiffness)
+    (press,) = scan(anatomy, anatomy.organ(), sites[:1], normals[:1])
+    assert press.force == pytest.approx(expected, rel=TOLERANCE)

@@ -40,9 +40,7 @@ class Foundation:
             )
 
 
-def foundation_fields(
-    foundations: Sequence[Foundation], mesh: TetMesh, anchored: NDArray[np.bool_]
-) -> dict[str, NDArray[Any]]:
+def foundation_fields(foundations: Sequence[Foundation], mesh: TetMesh, anchored: NDArray[np.bool_]) -> dict[str, Any]:
     """The fields of an OrganModel that describe its foundations.
 
     A node has the stiffness K = sum over the surface triangles around it of (A / 3) (k_t I + (k_n - k_t) n n^T), with
@@ -72,7 +70,7 @@ def foundation_fields(
             inside = held[triangles[:, corner]]
             np.add.at(blocks, triangles[inside, corner], each[inside])
     nodes = np.flatnonzero(blocks.any(axis=(1, 2)) & ~anchored)
-    fields: dict[str, NDArray[Any]] = {
+    fields = {
         "foundation_nodes": nodes.astype(np.int32),
         "foundation_position": mesh.points[nodes].astype(np.float64),
         "foundation_stiffness": blocks[nodes],

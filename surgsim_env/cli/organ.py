@@ -51,8 +51,8 @@ class Organ:
     """lattice (default), or tetwild for conforming region surfaces (extra `tetwild`)."""
 
     healthy_map: bool = True
-    """Press the healthy organ at every site and write the map, with which SurgSim/PalpateSites-v0 starts at once;
-    --no-healthy-map leaves it to the first `gym.make`."""
+    """Press the healthy organ at every site and write the map, with which SurgSim/PalpateSites-v0 starts at once.
+    Without it the first `gym.make` presses these sites."""
 
     @property
     def command_line(self) -> str:

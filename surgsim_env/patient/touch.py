@@ -68,7 +68,8 @@ class TouchPlan:
         count = NODES_PER_CELL * self.volume / (self.coarsening * self.cell_size) ** 3
         if self.coarsening > 1:
             count += FACE_NODES * FACE_SHARE * self.volume ** (2.0 / 3.0) / self.cell_size**2
-        return int(float(f"{count:.2g}"))
+        # A broken surface may enclose nothing, which its mesher finds.
+        return max(int(float(f"{count:.2g}")), 1)
 
     def real_time_factor(self, material: Material) -> float:
         """Estimate of simulated time over the processor time of one core, with the modulus and density of a tissue."""
@@ -95,7 +96,7 @@ def plan_touch(volume: float, options: SurfaceOptions, *, cell_size: float | Non
     tip = options.tip_radius or next(radius for largest, radius in TIPS if volume <= largest)
     depth = options.press_depth or depth_for_tip(tip)
     cell = round(math.floor(CELL_PER_CONTACT_RADIUS * contact_radius(tip, depth) / CELL_STEP) * CELL_STEP, 7)
-    across = volume ** (1.0 / 3.0) / CELLS_ACROSS
+    across = max(volume, 0.0) ** (1.0 / 3.0) / CELLS_ACROSS
     coarsening = next((one for one in COARSENINGS if one * cell <= across), 1) if graded else 1
     return TouchPlan(tip, depth, cell, coarsening, volume, is_given=False)
 

@@ -310,7 +310,11 @@ def test_nothing_is_painted_where_no_point_was_tried(evaluation):
     arms = {
         side: replace(
             getattr(evaluation, side),
-            **{name: value[kept] for name, value in vars(getattr(evaluation, side)).items() if name != "name"},
+            **{
+                name: value[kept]
+                for name, value in vars(getattr(evaluation, side)).items()
+                if name not in ("name", "touches")
+            },
         )
         for side in ("left", "right")
     }

@@ -58,7 +58,7 @@ def found(phantom):
 
 
 def arm_figures(arm: ArmReach):
-    return {name: getattr(arm, name) for name in vars(arm) if name not in ("name", "joints")}
+    return {name: getattr(arm, name) for name in vars(arm) if name not in ("name", "joints", "touches")}
 
 
 def test_shapes_and_targets(found, phantom):

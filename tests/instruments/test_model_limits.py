@@ -14,6 +14,7 @@ from surgsim_env.instruments.arm import model_limits
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.instruments.arm.model_limits import check_model, read_xml
 from surgsim_env.scene.load import list_arms, scenes_folder
+from tests.instruments.test_refusals import URDF, URDF_TABLE
 
 INSTRUMENTS = scenes_folder() / "instruments"
 BODY = '<body><geom size="0.1"/></body>'
@@ -241,43 +242,22 @@ def test_what_a_child_finds_wrong_is_said(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-STICK = """<robot name="r"><link name="base"/><link name="stick">{shapes}</link>
-<joint name="slide" type="prismatic"><parent link="base"/><child link="stick"/><axis xyz="0 0 1"/>
-<limit lower="0.1" upper="{upper}" effort="1" velocity="1"/></joint></robot>"""
-BALL = '<collision name="ball"><geometry><sphere radius="0.1"/></geometry></collision>'
+BALL = '<collision name="ball"><origin xyz="0 0 -0.2"/><geometry><sphere radius="0.006"/></geometry></collision>'
 
 
 @pytest.mark.parametrize(
-    ("shapes", "upper", "message"),
+    ("part", "changed", "message"),
     [
-        (2 * BALL, 0.2, "a second shape is named 'ball'; it has no name"),
-        (BALL, 0.1, "MuJoCo: .* equal lower and upper limits"),
+        (BALL, 2 * BALL, "a second shape is named 'ball'; it has no name"),
+        ('lower="0" upper="0.2"', 'lower="0.2" upper="0.2"', "MuJoCo: .* equal lower and upper limits"),
     ],
+    ids=["a name twice", "equal limits"],
 )
-def test_what_mujoco_would_print_is_a_warning(shapes, upper, message, tmp_path, capfd):
-    table = """model = "stick.urdf"
-kind = "palpator"
-joints = ["slide"]
-contact = ["ball"]
-[tip]
-body = "stick"
-direction = [0.0, 0.0, -1.0]
-ball = "ball"
-[trocar]
-shaft_body = "stick"
-shaft_axis = [0.0, 0.0, -1.0]
-fixed = true
-[control]
-mode = "servo"
-speed_limit = [0.2]
-stiffness = [2000.0]
-damping = [60.0]
-effort = [20.0]
-[home]
-slide = 0.1
-"""
-    (tmp_path / "stick.toml").write_text(table)
-    (tmp_path / "stick.urdf").write_text(STICK.format(shapes=shapes, upper=upper))
+def test_what_mujoco_would_print_is_a_warning(part, changed, message, tmp_path, capfd):
+    model = URDF.replace("VISUAL", '<sphere radius="0.01"/>')
+    assert part in model
+    (tmp_path / "stick.toml").write_text(URDF_TABLE)
+    (tmp_path / "stick.urdf").write_text(model.replace(part, changed))
     with pytest.warns(UserWarning, match=message), contextlib.suppress(ValueError):
         load_arm(tmp_path / "stick.toml")
     assert capfd.readouterr() == ("", "")

@@ -411,7 +411,7 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
         console.print(verdict(one))
         for miss in palpation.misses:
             if miss.map_name == one.name:
-                console.print(f"  {miss.lesion}: {miss.text}", highlight=False)
+                console.print(f"  {miss.lesion}: {miss.text}", highlight=False, markup=False)
     fewest = min(one.healthy_count for one in palpation.maps)
     if fewest < HEALTHY_FEWEST:
         console.print(
@@ -421,7 +421,8 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
     if palpation.hold is not None:
         console.print(f"held: {palpation.hold.text}", highlight=False)
         for fault in palpation.hold.faults:
-            console.print(f"not held well: {fault}", highlight=False)
+            # Markup would take [[anchors]] for a style.
+            console.print(f"not held well: {fault}", highlight=False, markup=False)
     early = int((~palpation.used).sum())
     every = (*palpation.presses, *palpation.model_presses)
     console.print(

@@ -75,7 +75,7 @@ FAULTS = {
 # Entries of `info` that name an end which is no fault.
 ENDS = ("success", "hard_limit", "torn", "collided", "declared")
 # Runs until the kinds of environments of a seed repeat: by then all that is kept by scene or kernel is there.
-KINDS = 60
+KINDS = 30
 # How much more memory a process may hold from then on [bytes].
 GROWTH_MOST = 20e6
 

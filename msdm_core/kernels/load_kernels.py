@@ -85,3 +85,19 @@ def add_gradients(rest, position, tets, gradient):
                 gradient[node, row, 0] += x
                 gradient[node, row, 1] += y
                 gradient[node, row, 2] += z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_volume_ratios(position, tets, rest_volume, ratio):
+    """Volume of every tet over its volume at rest, negative where it is inside out.
+
+    In:  position: of the nodes [m] (n_node, 3), tets (n_tet, 4), rest_volume [m^3] (n_tet,)
+    Out: ratio (n_tet,)
+    """
+    for tet in range(tets.shape[0]):
+        i, j, k, m = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
+        ax, ay, az = position[j, 0] - position[i, 0], position[j, 1] - position[i, 1], position[j, 2] - position[i, 2]
+        bx, by, bz = position[k, 0] - position[i, 0], position[k, 1] - position[i, 1], position[k, 2] - position[i, 2]
+        cx, cy, cz = position[m, 0] - position[i, 0], position[m, 1] - position[i, 1], position[m, 2] - position[i, 2]
+        volume = (ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)) / 6.0
+        ratio[tet] = volume / rest_volume[tet]

@@ -14,12 +14,12 @@ from msdm_core.kernels.contact_kernels import (
 )
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
 from msdm_core.kernels.guard_kernels import GUARD_SHARE, closest_in_triangle
-from msdm_core.kernels.load_kernels import add_gradients, add_pressures
+from msdm_core.kernels.load_kernels import add_gradients, add_pressures, fill_volume_ratios
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_support_forces
 from msdm_core.material.tissue_law import ARM_COUNT
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, tet_volumes
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
 # Of strains, as a margin.
 ROUNDING = 1e-12
@@ -266,7 +266,9 @@ def angular_momentum(model: OrganModel, state: OrganState, point: ArrayLike) -> 
 
 def volume_ratios(model: OrganModel, state: OrganState) -> FloatArray:
     """Volume of each tet over its volume at rest, J = V / V0, negative where it is inside out, shape (n_tet,)."""
-    return tet_volumes(state.node_position, model.tet_nodes) / model.tet_rest_volume
+    ratio = np.empty(len(model.tet_nodes))
+    fill_volume_ratios(state.node_position, model.tet_nodes, model.tet_rest_volume, ratio)
+    return ratio
 
 
 def inverted_tets(model: OrganModel, state: OrganState) -> IntArray:

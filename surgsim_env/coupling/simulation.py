@@ -11,11 +11,12 @@ import numpy as np
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
-from msdm_core.kernels.structure_kernels import SCRATCH_FIELDS, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, SCRATCH_FIELDS, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import blank_state, relax_arms, rest_state
-from msdm_core.organ.measure import TissueLoad, tissue_load
+from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
 from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.stepping import describe_fault
 from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
 from surgsim_env.coupling.mujoco_library import runs_compiled
 from surgsim_env.instruments.instrument import Grasp, Instrument, read_grasp
@@ -280,9 +281,15 @@ class Simulation:
         self._taken = taken
 
     def end_control_step(self) -> bool:
-        """Update the instrument's poses and read MuJoCo's warnings; False if there is one."""
+        """Update the instrument's poses; False, with `fault` saying why, at an inverted tet or a warning of MuJoCo.
+
+        A substep checks the tets as they are at its start: those that the last one leaves are checked here.
+        """
         self.instrument.refresh()
-        self.fault = self.instrument.warning()
+        if inverted_tets(self.organ_model, self.organ_state).size:
+            self.fault = describe_fault(self.organ_model, self.organ_state, FAULT_INVERTED_TET)
+        else:
+            self.fault = self.instrument.warning()
         return not self.fault
 
     def get_state(self) -> dict[str, np.ndarray]:

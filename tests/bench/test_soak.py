@@ -97,10 +97,10 @@ def test_kinds_of_environments_repeat_with_other_actions():
 
 def test_memory_is_compared_once_kinds_repeat():
     """Runs of one kind with each other: kinds hold different amounts."""
-    kind = {number: 1e9 * (number % soak.KINDS) for number in range(180)}
-    worker = soak.Worker(None, None, memory={n: kind[n] + 1e6 * max(n - soak.KINDS, 0) for n in range(0, 180, 2)})
-    assert worker.growth() == pytest.approx(60e6)
-    assert soak.Worker(None, None, memory=dict.fromkeys(range(124), 1e6)).growth() is None
+    count, kinds = 3 * soak.KINDS, soak.KINDS
+    memory = {number: 1e9 * (number % kinds) + 1e6 * max(number - kinds, 0) for number in range(0, count, 2)}
+    assert soak.Worker(None, None, memory=memory).growth() == pytest.approx(1e6 * kinds)
+    assert soak.Worker(None, None, memory=dict.fromkeys(range(2 * kinds + 4), 1e6)).growth() is None
 
 
 def freed(blocks):

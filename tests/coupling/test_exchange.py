@@ -271,6 +271,22 @@ def test_mujocos_warnings_surface(name: str, value: float):
     assert simulated.end_control_step()
 
 
+def test_a_tet_that_the_last_substep_inverts_is_named_at_the_end_of_the_control_step():
+    """No further substep looks at it: an episode may end here, by a torn grasp for one."""
+    simulated = simulation()
+    run(simulated, (0.0, 0.0, -0.01), 3)
+    assert simulated.end_control_step()
+    model, position = simulated.organ_model, simulated.organ_state.node_position
+    tet = model.tet_nodes[100]
+    free = next(node for node in tet if model.node_inverse_mass[node] > 0.0)
+    position[free] = 2.5 * position[[node for node in tet if node != free]].mean(axis=0) - 1.5 * position[free]
+    assert not simulated.end_control_step()
+    assert "turned inside out: volume ratio -" in simulated.fault
+    simulated.restart(ABOVE)
+    run(simulated, (0.0, 0.0, -0.01), 3)
+    assert simulated.end_control_step()
+
+
 def test_a_fault_is_told_and_a_restart_is_clean():
     """An organ gone bad: haptic_step says no and why; after `restart` it runs as a fresh one does, to the bit."""
     simulated = simulation()

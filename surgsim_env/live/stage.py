@@ -13,8 +13,8 @@ from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.palpation.touches import Indenter
 from surgsim_env.rendering.cameras import Camera, scene_cameras
+from surgsim_env.rendering.embedding import boundary_surface, organ_surface
 from surgsim_env.rendering.scene_model import geom_colour, mesh_rows
-from surgsim_env.rendering.surface import TRIANGLES_MOST, drawn_surface
 from surgsim_env.rendering.tissue import lesion_ball
 from surgsim_env.scene.anatomy import Anatomy
 
@@ -60,7 +60,7 @@ COLOURS = (
     (240, 117, 48),
     (205, 46, 46),
 )
-# Most triangles in plain mode, unless the simulation's surface has more.
+# Most triangles in plain mode, which draws the simulation's boundary, unless that has more.
 PLAIN_TRIANGLES_MOST = 5_000
 # Offset of the paint above the surface [m].
 PAINT_ABOVE = 0.0004
@@ -180,8 +180,8 @@ class OrganView:
         """Add the organ at rest."""
         self._scene, self._mesh, self._points = scene, anatomy.mesh, anatomy.mesh.points
         self._surfaces = {
-            plain: drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles, most)
-            for plain, most in ((False, TRIANGLES_MOST), (True, PLAIN_TRIANGLES_MOST))
+            False: organ_surface(anatomy),
+            True: boundary_surface(anatomy, PLAIN_TRIANGLES_MOST),
         }
         self.plain = self._drawn_plain = False
         self._opacity: float | None = None
@@ -234,9 +234,8 @@ class OrganView:
         value = np.full(len(self._points), np.nan)
         known = felt.felt
         value[felt.nodes[known]] = felt.contrast[known]
-        corner = value[self._surface.corner_node]
-        vertex = self._surface.weights @ np.nan_to_num(corner)
-        vertex[self._surface.weights @ np.isnan(corner).astype(np.float64) > 1e-9] = np.nan
+        vertex = self._surface.interpolate(np.nan_to_num(value))
+        vertex[self._surface.interpolate(np.isnan(value).astype(np.float64)) > 1e-9] = np.nan
         face = vertex[self._surface.faces].mean(axis=1)
         level = colour_levels(face)
         for index, paint in enumerate(self._paint):

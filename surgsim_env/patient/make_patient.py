@@ -19,12 +19,15 @@ from surgsim_env.palpation.hold import check_hold
 from surgsim_env.palpation.job import plan_sites
 from surgsim_env.palpation.surface_scene import PATTERN, SurfaceOptions, check_options
 from surgsim_env.patient.facing import facing_approach
+from surgsim_env.patient.fine_surface import SurfaceFit, surface_file
 from surgsim_env.patient.label_image import FORM, LabelImage, is_image, parse_labels, read_label_image
 from surgsim_env.patient.materials import is_lesion, organ_material
 from surgsim_env.patient.meshers import (
     Cells,
     PatientMesh,
     PatientSurfaces,
+    file_surface,
+    image_surface,
     image_volume,
     mesh_image,
     mesh_surfaces,
@@ -145,6 +148,8 @@ def make_patient(
         options, cells = replace(options, approach=approach), replace(cells, approach=approach)
     with progress.step("filling it with tets"):
         mesh = _meshed(given, first.name, cells, mesher, mend)
+    with progress.step("fitting its own surface to the tets"):
+        mesh = replace(mesh, surface=_own_surface(given, mesh, mend))
     with progress.step("choosing sites, lesions and the step"):
         return patient_scene(mesh, out, touch=touch, options=options, moduli=moduli or {})
 
@@ -166,6 +171,13 @@ def _meshed(
     if isinstance(given, PatientSurfaces):
         return mesh_surfaces(given, cells=cells, mesher=mesher)
     return mesh_image(given, source, cells=cells, mesher=mesher, mend=mend)
+
+
+def _own_surface(given: LabelImage | PatientSurfaces | PatientTets, mesh: PatientMesh, mend: bool) -> SurfaceFit | None:
+    """The surface that is drawn; None for tets of a file, whose boundary is the organ's surface."""
+    if isinstance(given, PatientTets):
+        return None
+    return file_surface(given, mesh) if isinstance(given, PatientSurfaces) else image_surface(given, mesh, mend=mend)
 
 
 def _has_lesions(given: LabelImage | PatientSurfaces | PatientTets) -> bool:
@@ -190,7 +202,7 @@ def write_patient(
     healthy_map: bool,
     progress: StepProgress,
 ) -> list[Path]:
-    """Write the mesh, its scene, report.html, the files of a retraction scene and the healthy map; all or none.
+    """Write the mesh, its scene, its surface, report.html, the retraction's files and the healthy map; all or none.
 
     Args:
         found: the organ with its scene.
@@ -211,8 +223,8 @@ def write_patient(
     # Left by an earlier run for an organ that is now replaced.
     older = [turned.name, lifted.name] if lifted.exists() and _begins(lifted, FIRST_LINE) else []
     healthy = healthy_file(out.with_suffix(".toml")).name
-    if (out.parent / healthy).exists():
-        older.append(healthy)
+    others = (healthy, surface_file(out).name, surface_file(turned).name)
+    older += [name for name in others if (out.parent / name).exists()]
     with output_folder(out.parent, older) as files:
         with progress.step("drawing the report"):
             names = write_organ(found, files, out.name, command, retraction)
@@ -259,6 +271,10 @@ def write_organ(
     (files / REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
     load_scene(files / scene_file)
     written = [name, scene_file, REPORT_NAME]
+    own = found.patient.surface
+    if own is not None:
+        written.append(surface_file(Path(name)).name)
+        own.write(files / written[-1])
     if isinstance(retraction, RetractScene):
         turned = _retract_file(Path(name)).name
         lifted = Path(turned).with_suffix(".toml").name
@@ -266,6 +282,9 @@ def write_organ(
         (files / lifted).write_text(retract_text(found, retraction), encoding="utf-8", newline="\n")
         load_scene(files / lifted)
         written += [turned, lifted]
+        if own is not None:
+            written.append(surface_file(Path(turned)).name)
+            own.turned(retraction.origin, retraction.rim.frame).write(files / written[-1])
     return written
 
 
@@ -280,6 +299,8 @@ def check_targets(out: Path) -> None:
     turned = _retract_file(out)
     scene, others = turned.with_suffix(".toml"), "choose another place or remove it"
     foreign = [turned] if turned.exists() and not scene.exists() else []
+    for own, its_scene in ((out, out.with_suffix(".toml")), (turned, scene)):
+        foreign += [surface_file(own)] if surface_file(own).exists() and not its_scene.exists() else []
     for path, mark in ((out.with_suffix(".toml"), FIRST_LINE), (scene, FIRST_LINE), (out.with_name(REPORT_NAME), MARK)):
         if path.is_dir():
             raise ValueError(f"--out {out}: {path.name} is a folder there; {others}")
@@ -319,6 +340,8 @@ def print_patient(found: PatientScene, console: Console) -> None:
         "springs": f"{len(organ.spring_nodes)}",
         "volume": f"{quality.volume * 1e6:.1f} ml (error {patient.volume_error:+.2%})",
     }
+    if patient.surface is not None:
+        rows["drawn surface"] = patient.surface.text
     if found.hold is not None:
         rows["held"] = found.hold.text
     for one in patient.volumes[1:]:
@@ -356,6 +379,7 @@ def scene_text(found: PatientScene) -> str:
     comments = {
         "retract_scene": "used by the retraction environments",
         **found.anchor_sources,
+        "mesh.fine_surface": "what pictures and the live page draw; delete it to see the boundary of the tets",
         "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
         "contact.damping": "[N s/m^3] as in the scene liver",
         "contact.friction": "as in the scene liver",

@@ -23,10 +23,12 @@ from msdm_core.meshing.segmentation_meshing import (
     SmoothedShare,
     fill_labels,
     label_share,
+    largest_part,
     smoothed_share,
     tag_tets,
     voxels_at,
 )
+from surgsim_env.patient.fine_surface import SurfaceFit, fitted_surface, level_surface, surface_area
 from surgsim_env.patient.label_image import CleanLabels, LabelImage, clean_labels
 from surgsim_env.patient.label_readers import CONVENTION
 from surgsim_env.patient.materials import check_name, is_lesion
@@ -87,6 +89,7 @@ class PatientMesh:
         is_scan: whether the axes are the patient's (LPS)
         smoothing, smoothing_change: width of the labels' smoothing [m] and relative change of the volume by it; None
             for surfaces
+        surface: of the scan, for pictures; None where the mesh's boundary is all there is
         notes: remarks on what was dropped, repaired or is unusual
     """
 
@@ -102,6 +105,7 @@ class PatientMesh:
     is_scan: bool
     smoothing: float | None = None
     smoothing_change: float | None = None
+    surface: SurfaceFit | None = None
 
     @property
     def organ_name(self) -> str:
@@ -212,6 +216,18 @@ def _mesh_labels(
     )
 
 
+def image_surface(image: LabelImage, mesh: PatientMesh, *, mend: bool) -> SurfaceFit:
+    """The level set of an image's labels that has their volume, in LPS, fitted to the mesh made of them."""
+    labels = clean_labels(image, cell_size=mesh.cell_size, mend=mend)
+    area = surface_area(mesh.mesh.points, mesh.mesh.boundary_triangles)
+    vertices, triangles = level_surface(_smoothed(labels, 1, mesh.cell_size), mesh.volumes[0].source, area)
+    placed = image.geometry.places(vertices)
+    # The image's axes may be left-handed.
+    if surface_volume(placed, triangles) < 0.0:
+        triangles = triangles[:, ::-1]
+    return fitted_surface(placed, triangles, mesh.mesh, mesh.cell_size)
+
+
 def _fine_face(cells: Cells, axes: FloatArray) -> FineFace | None:
     """The face at which cells are fine, in an image whose axes are the columns of (3, 3); None for one size."""
     if cells.coarsening == 1:
@@ -318,6 +334,19 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
         )
 
     return well_shaped(make, cells)
+
+
+def file_surface(given: PatientSurfaces, mesh: PatientMesh) -> SurfaceFit:
+    """An organ's surface as its file has it, or rebuilt from voxels where it is broken, fitted to its mesh."""
+    organ = given.organ
+    if isinstance(organ, ClosedSurface):
+        return fitted_surface(organ.vertices, organ.triangles, mesh.mesh, mesh.cell_size)
+    tags, step, start, _ = mended_voxels(organ, mesh.cell_size)
+    inside, corner, _ = largest_part(tags, [1])
+    area = surface_area(mesh.mesh.points, mesh.mesh.boundary_triangles)
+    field = smoothed_share(inside, corner, step, mesh.cell_size)
+    vertices, triangles = level_surface(field, mesh.volumes[0].source, area)
+    return fitted_surface(vertices + start, triangles, mesh.mesh, mesh.cell_size)
 
 
 def _named(text: str) -> tuple[str, Path]:

@@ -18,6 +18,7 @@ from surgsim_env.palpation.surface_scene import (
     with_substeps,
 )
 from surgsim_env.patient.facing import faced_note, facing_approach
+from surgsim_env.patient.fine_surface import mesh_source
 from surgsim_env.patient.lesion_room import lack_of_room, sample_face
 from surgsim_env.patient.materials import TissueMaterial, organ_material, region_material, without_number
 from surgsim_env.patient.meshers import PatientMesh
@@ -28,10 +29,8 @@ from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import (
     LesionDraw,
     Limits,
-    MeshSource,
     PalpationSettings,
     Scene,
-    TetFile,
     TissueRegion,
     Vector,
 )
@@ -147,7 +146,7 @@ def _first_scene(
         name=out.stem,
         description=described,
         folder=out.parent,
-        mesh=MeshSource(tets=TetFile(out.name, "m")),
+        mesh=mesh_source(out, patient.surface),
         material=material,
         contact=replace(liver.contact, stiffness=_digits(CONTACT_MODULI_PER_CELL * material.youngs_modulus / cell, 3)),
         limits=_limits(material, tip, depth),

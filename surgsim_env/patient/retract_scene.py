@@ -15,6 +15,7 @@ from msdm_core.mesh.quality import surface_cell
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.support import Support
 from surgsim_env.palpation.surface_scene import with_substeps
+from surgsim_env.patient.fine_surface import mesh_source
 from surgsim_env.patient.patient_scene import PatientScene
 from surgsim_env.patient.surface_files import voxels_inside
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
@@ -24,12 +25,10 @@ from surgsim_env.scene.model import (
     Box,
     Endoscope,
     Flap,
-    MeshSource,
     PalpationSettings,
     Port,
     Retraction,
     Scene,
-    TetFile,
     Vector,
 )
 from surgsim_env.tasks.visibility import Disc, uncovered
@@ -347,7 +346,7 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
         name=out.stem,
         description=f"{patient.description}: a thin edge, its underside level, to be lifted",
         folder=out.parent,
-        mesh=MeshSource(tets=TetFile(out.name, "m")),
+        mesh=mesh_source(out, found.patient.surface),
         material=patient.material,
         capsule=patient.capsule,
         damping=patient.damping,

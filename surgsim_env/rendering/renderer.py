@@ -161,7 +161,8 @@ class OrganRenderer:
         shapes = tissue.shapes(nodes)
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
-            shapes["shadow"] = ground_shadow(nodes, stage.surface.triangles, scene.light, scene.ground, up)
+            triangles = simulation.anatomy.mesh.boundary_triangles
+            shapes["shadow"] = ground_shadow(nodes, triangles, scene.light, scene.ground, up)
         lesions = list(zip(tissue.lesion_centres(nodes), axes)) if options.show_lesion else []
         stage.show(camera, shapes, simulation.instrument.data, lesions, self.target)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_PREFIX
 from surgsim_env.rendering.cameras import cut_direction
+from surgsim_env.rendering.embedding import EmbeddedSurface
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.surface import DrawnSurface, Shape
 from surgsim_env.rendering.tissue import SECTION_SPLITS, most_tets_cut
@@ -136,7 +137,7 @@ class SceneModel:
 
 
 def build_scene(
-    anatomy: Anatomy, surface: DrawnSurface, instrument: mujoco.MjModel, options: RenderOptions
+    anatomy: Anatomy, surface: DrawnSurface | EmbeddedSurface, instrument: mujoco.MjModel, options: RenderOptions
 ) -> SceneModel:
     """The scene of an anatomy and an instrument's model, with room for the meshes that the options need."""
     spec = empty_scene(options.width, options.height, BACKGROUND_COLOUR, samples=4 if options.smooth_edges else 0)
@@ -200,7 +201,9 @@ def compile_scene(
     return model, data, drawn
 
 
-def _room(anatomy: Anatomy, surface: DrawnSurface, options: RenderOptions) -> dict[str, tuple[int, int]]:
+def _room(
+    anatomy: Anatomy, surface: DrawnSurface | EmbeddedSurface, options: RenderOptions
+) -> dict[str, tuple[int, int]]:
     """Largest number of vertices and of triangles of each mesh of the scene."""
     many = 2 if options.cut_away else 1
     whole = many * surface.vertex_count, many * len(surface.faces)
@@ -211,7 +214,7 @@ def _room(anatomy: Anatomy, surface: DrawnSurface, options: RenderOptions) -> di
         room |= {"section": (6 * small, 2 * small), "section_lesion": (6 * small, 2 * small)}
     elif not (options.shadows or options.show_lesion or anatomy.scene.supports):
         # An organ on supports does not lie on the drape and casts no shadow on it.
-        room["shadow"] = (anatomy.mesh.node_count, len(surface.triangles))
+        room["shadow"] = (anatomy.mesh.node_count, len(anatomy.mesh.boundary_triangles))
     return room
 
 

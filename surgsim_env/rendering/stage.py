@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera
+from surgsim_env.rendering.embedding import boundary_surface, organ_surface
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, PREFIX, TARGET_COLOUR, build_scene
-from surgsim_env.rendering.surface import DrawnSurface, Shape, drawn_surface
+from surgsim_env.rendering.surface import Shape
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
 
@@ -138,7 +139,8 @@ class Stage:
     def __init__(self, anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> None:
         """Make the scene and load it into a context."""
         self.users = 0
-        self.surface: DrawnSurface = drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+        # A section is of tets: in a cut-open view their boundary is drawn, which meets it.
+        self.surface = boundary_surface(anatomy) if options.cut_away else organ_surface(anatomy)
         self.scene = build_scene(anatomy, self.surface, instrument, options)
         self.canvas = Canvas(
             self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1, shadows=options.shadows

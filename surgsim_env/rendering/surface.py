@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -79,6 +80,14 @@ class DrawnSurface:
         out = self.bend * (np.einsum("vij,vj->vi", mixed[:, :9].reshape(-1, 3, 3), flat) - mixed[:, 9:12])
         out *= np.minimum(1.0, BEND_MOST / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300))
         return flat - out, _unit(mixed[:, 12:])
+
+    def interpolate(self, values: FloatArray) -> FloatArray:
+        """Values at the vertices (n_vertex,) of those at the nodes (n_node,)."""
+        return self.weights @ values[self.corner_node]
+
+    def faces_among(self, nodes: IntArray) -> NDArray[np.bool_]:
+        """Which small triangles are of a triangle whose nodes are all among some, (n_face,)."""
+        return np.repeat(np.isin(self.triangles, nodes).all(axis=1), self.splits**2)
 
 
 def drawn_surface(points: FloatArray, triangles: IntArray, triangles_most: int = TRIANGLES_MOST) -> DrawnSurface:

@@ -13,6 +13,7 @@ from msdm_core.material.regions import Lesion, lesion_extent
 from msdm_core.mesh.surface import triangle_lattice
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.rendering.cameras import cut_direction
+from surgsim_env.rendering.embedding import EmbeddedSurface
 from surgsim_env.rendering.surface import DrawnSurface, Shape, smooth_normals
 from surgsim_env.scene.anatomy import Anatomy
 
@@ -36,12 +37,13 @@ class LesionBall:
 class Tissue:
     """The shapes of an organ with given lesions as functions of its node positions."""
 
-    def __init__(self, anatomy: Anatomy, surface: DrawnSurface, lesions: Sequence[Lesion], cut_away: bool) -> None:
+    def __init__(
+        self, anatomy: Anatomy, surface: DrawnSurface | EmbeddedSurface, lesions: Sequence[Lesion], cut_away: bool
+    ) -> None:
         # Lesions are drawn as ellipsoids, tagged regions of the mesh too (`msdm_core.material.regions.lesion_extent`).
         self._rest, self._surface = anatomy.mesh.points, surface
         self.lesions = [lesion_ball(anatomy.mesh, lesion) for lesion in lesions]
-        held = np.isin(surface.triangles, anatomy.anchors).all(axis=1)
-        held = np.repeat(held, surface.splits**2)
+        held = surface.faces_among(anatomy.anchors)
         self._faces = {"organ": surface.faces[~held], "held": surface.faces[held]}
         self._cut = _CutAway(anatomy, surface, self.lesions, self._faces) if cut_away else None
 
@@ -63,7 +65,7 @@ class _CutAway:
     def __init__(
         self,
         anatomy: Anatomy,
-        surface: DrawnSurface,
+        surface: DrawnSurface | EmbeddedSurface,
         lesions: Sequence[LesionBall],
         faces: dict[str, IntArray],
     ) -> None:

@@ -31,6 +31,10 @@ SUPPORT_TIP_RADII = 2.0
 SIDE_ROUNDING = 1e-9
 
 
+# Vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3).
+Surface = tuple[FloatArray, IntArray]
+
+
 @dataclass(frozen=True, eq=False)
 class Anatomy:
     """A scene with its mesh, anchored nodes [n_anchor], palpable face and the elastic foundations that hold it."""
@@ -40,6 +44,21 @@ class Anatomy:
     anchors: IntArray
     face: PalpableFace
     foundations: tuple[Foundation, ...] = ()
+
+    @cached_property
+    def fine_surface(self) -> Surface | None:
+        """The scene's fine surface, read when it is first drawn; None for a scene without one.
+
+        Raises:
+            MeshError: the file cannot be read as a surface.
+        """
+        source = self.scene.mesh.fine_surface
+        if source is None:
+            return None
+        # Imports trimesh: only where something is drawn.
+        from msdm_core.mesh_files.surface_io import read_surface
+
+        return read_surface(self.scene.folder / source.file, length_unit=source.length_unit)
 
     @cached_property
     def foundation_nodes(self) -> IntArray:
@@ -245,14 +264,14 @@ def load_anatomy(scene: Scene) -> Anatomy:
 
     Warns once if the cells of its palpable face are larger than the contact radius: the mesh would be felt.
     """
-    source = scene.mesh.surface or scene.mesh.tets
-    file = None if source is None else scene.folder / source.file
-    return _load_anatomy(scene, file.stat().st_mtime_ns if file is not None and file.is_file() else None)
+    sources = (scene.mesh.surface, scene.mesh.tets, scene.mesh.fine_surface)
+    files = [scene.folder / source.file for source in sources if source is not None]
+    return _load_anatomy(scene, tuple(file.stat().st_mtime_ns if file.is_file() else None for file in files))
 
 
 @lru_cache(maxsize=8)
-def _load_anatomy(scene: Scene, file_time: int | None) -> Anatomy:
-    """`load_anatomy`, cached until the mesh file's modification time changes [ns]."""
+def _load_anatomy(scene: Scene, file_times: tuple[int | None, ...]) -> Anatomy:
+    """`load_anatomy`, cached until the modification time of one of its files changes [ns]."""
     anatomy = anatomy_of(scene, _load_mesh(scene))
     # The organ of a retraction is not palpated.
     if scene.retract is None:

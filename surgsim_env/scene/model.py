@@ -74,12 +74,25 @@ class TetFile:
 
 
 @dataclass(frozen=True)
+class FineSurface:
+    """A closed surface file (STL, OBJ, PLY) and its length unit, in the axes of the tets."""
+
+    file: str
+    length_unit: str | float
+
+
+@dataclass(frozen=True)
 class MeshSource:
-    """Where the organ's tets come from: exactly one of block, surface, tets."""
+    """Where the organ's tets come from: exactly one of block, surface, tets.
+
+    Pictures and the live page draw the fine_surface, which moves with the tets; without one the tets' boundary,
+    smoothed. It changes no force and nothing that is touched.
+    """
 
     block: BlockMesh | None = None
     surface: SurfaceMesh | None = None
     tets: TetFile | None = None
+    fine_surface: FineSurface | None = None
 
     def __post_init__(self) -> None:
         if sum(part is not None for part in (self.block, self.surface, self.tets)) != 1:

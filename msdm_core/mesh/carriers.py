@@ -1,0 +1,113 @@
+"""What carries points near the boundary of a body of tets: the nearest point of the boundary, and gradients there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import KDTree
+
+from msdm_core.mesh.geodesic import nearest_weights
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+
+# A point is carried to this share of the longest edge of the tet behind its nearest boundary triangle.
+REACH = 0.75
+# Triangles of a size that are tried first near a point, and points that are tried at once.
+NEAR_FIRST, POINTS_AT_ONCE = 8, 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Carriers:
+    """For each of some points the nearest point of a mesh's boundary.
+
+    Fields:
+        triangle: the boundary triangle                                             (n_point,)
+        weights: of its corners at the nearest point, none below 0                  (n_point, 3)
+        nearest: that point [m]                                                     (n_point, 3)
+        distance: from it [m]                                                       (n_point,)
+        reach: largest distance at which a point is carried there [m]               (n_point,)
+    """
+
+    triangle: IntArray
+    weights: FloatArray
+    nearest: FloatArray
+    distance: FloatArray
+    reach: FloatArray
+
+    @property
+    def beyond(self) -> NDArray[np.bool_]:
+        """Which points are too far from the boundary to be carried, (n_point,)."""
+        return self.distance > self.reach
+
+
+def find_carriers(points: FloatArray, mesh: TetMesh) -> Carriers:
+    """What carries points [m] (n_point, 3) near the boundary of a mesh."""
+    corners = mesh.points[mesh.boundary_triangles]
+    triangle, weights = _nearest_triangles(points, corners)
+    nearest = np.einsum("pi,pij->pj", weights, corners[triangle])
+    tets = mesh.points[mesh.tets[mesh.boundary_tets[triangle]]]
+    longest = np.linalg.norm(tets[:, :, None] - tets[:, None], axis=3).max(axis=(1, 2))
+    return Carriers(triangle, weights, nearest, np.linalg.norm(points - nearest, axis=1), REACH * longest)
+
+
+def node_gradients(mesh: TetMesh, nodes: IntArray) -> csr_array:
+    """Gradients at nodes (n,) of functions given at all nodes: the mean over the tets around each, by volume.
+
+    Exact where the function is linear. In a tet with corners x_a and volume V the gradient of corner a's function is
+    the area vector of the face opposite over 3 V (Zienkiewicz and Taylor, The Finite Element Method, linear tets).
+
+    Returns:
+        The operator [1/m]: rows 3 i to 3 i + 2 give the gradient's components at nodes[i], (3 n, n_node).
+    """
+    place = np.full(mesh.node_count, -1)
+    place[nodes] = np.arange(len(nodes))
+    tet, corner = np.nonzero(place[mesh.tets] >= 0)
+    x = mesh.points[mesh.tets]
+    # Rows of the inverse of the edges are the gradients of the last three corners' functions.
+    last = np.linalg.inv(np.swapaxes(x[:, 1:] - x[:, :1], 1, 2))
+    slopes = np.concatenate([-last.sum(axis=1, keepdims=True), last], axis=1)
+    at = place[mesh.tets[tet, corner]]
+    around = np.bincount(at, mesh.volumes[tet], len(nodes))
+    entries = (mesh.volumes[tet] / around[at])[:, None, None] * slopes[tet]
+    rows = np.broadcast_to(3 * at[:, None, None] + np.arange(3), entries.shape)
+    columns = np.broadcast_to(mesh.tets[tet][:, :, None], entries.shape)
+    flat = entries.ravel(), (rows.ravel(), columns.ravel())
+    return csr_array(coo_array(flat, shape=(3 * len(nodes), mesh.node_count)))
+
+
+def _nearest_triangles(points: FloatArray, corners: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The triangle nearest to each point, and weights of its corners at its nearest point."""
+    triangle, weights = np.zeros(len(points), dtype=np.int32), np.zeros((len(points), 3))
+    gap = np.full(len(points), np.inf)
+    centre = corners.mean(axis=1)
+    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    # Triangles of about one size, the small ones first: those of a graded mesh differ by a factor of 4.
+    size = np.floor(2.0 * np.log2(radius / radius.min())).astype(np.int64)
+    for one in np.unique(size):
+        some = np.flatnonzero(size == one)
+        tree, reach, count = KDTree(centre[some]), float(radius[some].max()), min(NEAR_FIRST, len(some))
+        sought = np.arange(len(points))
+        while len(sought):
+            left = []
+            for first in range(0, len(sought), POINTS_AT_ONCE):
+                now = sought[first : first + POINTS_AT_ONCE]
+                away, near = tree.query(points[now], k=np.arange(1, count + 1))
+                # A triangle is nearer than its centre by its radius at most.
+                useful = away - reach < gap[now, None]
+                row, column = np.nonzero(useful)
+                tried = some[near[row, column]]
+                mixed = nearest_weights(corners[tried], points[now[row]])
+                found = np.full(away.shape, np.inf)
+                found[useful] = np.linalg.norm(
+                    np.einsum("ti,tij->tj", mixed, corners[tried]) - points[now[row]], axis=1
+                )
+                best = found.argmin(axis=1)
+                nearer = np.flatnonzero(found[np.arange(len(now)), best] < gap[now])
+                place = (np.cumsum(useful).reshape(useful.shape) - 1)[nearer, best[nearer]]
+                gap[now[nearer]] = found[nearer, best[nearer]]
+                triangle[now[nearer]], weights[now[nearer]] = tried[place], mixed[place]
+                left.append(now[away[:, -1] - reach < gap[now]])
+            if count == len(some):
+                break
+            sought, count = np.concatenate(left), min(4 * count, len(some))
+    return triangle, weights

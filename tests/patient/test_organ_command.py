@@ -1,4 +1,4 @@
-"""`surgsim organ` from a scan: the three files it writes, and what loads and steps them."""
+"""`surgsim organ` from a scan: the four files it writes, and what loads and steps them."""
 
 import re
 import tomllib
@@ -25,8 +25,9 @@ def anatomy(written):
     return load_anatomy(load_scene(written / "patient.toml"))
 
 
-def test_three_files_and_no_more(written):
-    assert {path.name for path in written.iterdir()} == {"patient.vtu", "patient.toml", "report.html"}
+def test_four_files_and_no_more(written):
+    expected = {"patient.vtu", "patient.toml", "patient_surface.ply", "report.html"}
+    assert {path.name for path in written.iterdir()} == expected
 
 
 def test_the_mesh_has_the_scan_s_volume_place_and_regions(written):

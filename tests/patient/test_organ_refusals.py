@@ -27,7 +27,7 @@ def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, ref
     assert not list(out.iterdir())
     for _ in range(2):
         assert main([str(one) for one in given]) == 0
-    assert {path.name for path in out.iterdir()} == {"a.vtu", "a.toml", "report.html"}
+    assert {path.name for path in out.iterdir()} == {"a.vtu", "a.toml", "a_surface.ply", "report.html"}
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,8 @@ def test_palpate_goes_from_a_scan_to_a_map_in_one_command(tmp_path, capsys):
     assert summary["truth"][0]["radius_m"] == pytest.approx(0.009, rel=0.1)
     np.testing.assert_allclose(summary["truth"][0]["centre_m"], 1e-3 * (MIDDLE + LESIONS[0][0]), atol=1.5e-3)
     assert summary["volume_ratio_smallest"] > 0.0
-    expected = {"ct.vtu", "ct.toml", "report.html", "palpation.csv", "summary.json", "stiffness_map.png"}
+    expected = {"ct.vtu", "ct.toml", "ct_surface.ply", "report.html"}
+    expected |= {"palpation.csv", "summary.json", "stiffness_map.png"}
     assert {path.name for path in out.iterdir()} == expected
     # Healthy sites would be felt as 1.
     assert summary["maps"]["pre-operative model"]["lesions"][0]["contrast"] > 1.1

@@ -10,6 +10,7 @@ import trimesh
 
 import surgsim_env  # noqa: F401
 from msdm_core.mesh_files.mesh_io import read_mesh
+from msdm_core.mesh_files.surface_io import read_surface
 from msdm_core.meshing.lattice_meshing import mesh_surface
 from surgsim_env.cli.main import main
 from surgsim_env.patient.make_patient import FIRST_LINE, check_targets
@@ -63,7 +64,8 @@ def test_the_patient_s_scene_names_its_scene_of_retraction(folder, scene):
     assert load_scene(folder / "patient.toml").retract_scene == "patient_retract.toml"
     assert scene.name == "patient_retract"
     assert {path.name for path in folder.iterdir()} == {
-        *("patient.vtu", "patient.toml", "report.html", "patient_retract.vtu", "patient_retract.toml")
+        *("patient.vtu", "patient.toml", "patient_surface.ply", "report.html"),
+        *("patient_retract.vtu", "patient_retract.toml", "patient_retract_surface.ply"),
     }
     assert "is lifted along" in (folder / "report.html").read_text(encoding="utf-8")
 
@@ -80,6 +82,8 @@ def test_it_is_the_same_organ_turned_by_what_the_file_says(folder, scene):
     # Nodes are numbered anew: compare what does not depend on it, to the digits of the file's comment.
     there = (plain.points - origin) @ rotation.T
     np.testing.assert_allclose(np.sort(there, axis=0), np.sort(turned.points, axis=0), atol=1e-6)
+    own, moved = (read_surface(folder / f"{one}_surface.ply", length_unit="m")[0] for one in ("patient", scene.name))
+    np.testing.assert_allclose((own - origin) @ rotation.T, moved, atol=1e-6)
     for tag, name in plain.region_names:
         volume = plain.volumes[plain.region == tag].sum()
         assert turned.volumes[turned.region == turned.region_tag(name)].sum() == pytest.approx(volume, rel=1e-9)

@@ -1,0 +1,43 @@
+"""What carries points near a body's boundary: the nearest boundary points, and gradients at nodes."""
+
+import numpy as np
+import pytest
+
+from msdm_core.mesh.carriers import REACH, find_carriers, node_gradients
+from msdm_core.mesh.geodesic import NearestTriangle
+from msdm_core.meshing.lattice_meshing import box_mesh
+from tests.patient.organs import kidney
+
+GRADED = box_mesh((0.04, 0.04, 0.04), (16, 16, 16), coarsening=4, fine_depth=0.008)
+
+
+@pytest.mark.parametrize("mesh", [GRADED, kidney(0.008)], ids=["graded", "kidney"])
+def test_nearest_boundary_points_are_those_of_all_triangles(mesh):
+    rng = np.random.default_rng(0)
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    points = rng.uniform(low - 0.01, high + 0.01, (200, 3))
+    found = find_carriers(points, mesh)
+    corners = mesh.points[mesh.boundary_triangles]
+    np.testing.assert_allclose(found.distance, NearestTriangle(corners).distances(points), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.einsum("pi,pij->pj", found.weights, corners[found.triangle]), found.nearest)
+    assert (found.weights >= 0.0).all()
+    np.testing.assert_allclose(found.weights.sum(axis=1), 1.0)
+
+
+def test_a_point_is_carried_to_a_share_of_its_tet_s_longest_edge():
+    mesh = box_mesh((0.04, 0.04, 0.04), (4, 4, 4))
+    tets = mesh.points[mesh.tets]
+    longest = np.linalg.norm(tets[:, :, None] - tets[:, None], axis=3).max()
+    above = np.array([[0.021, 0.017, 0.04]])
+    gaps = REACH * longest * np.array([0.99, 1.01])
+    found = find_carriers(above + gaps[:, None] * np.array([0.0, 0.0, 1.0]), mesh)
+    np.testing.assert_allclose(found.distance, gaps)
+    assert found.beyond.tolist() == [False, True]
+
+
+def test_gradients_of_a_linear_function_are_exact_at_every_node():
+    mesh = kidney(0.008)
+    slope = np.array([[1.5, -0.3, 0.2], [0.1, 0.7, -0.9], [-0.4, 0.6, 1.1]])
+    nodes = mesh.boundary_nodes[::3]
+    found = (node_gradients(mesh, nodes) @ (mesh.points @ slope + 0.02)).reshape(-1, 3, 3)
+    np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), rtol=0, atol=1e-12)

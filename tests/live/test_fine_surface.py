@@ -1,0 +1,88 @@
+"""The page's organ with a scan's own surface: what is sent to a browser, and the paint on it. No browser is needed."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from surgsim_env.live.stage import SCALE, FeltMap, OrganView
+from surgsim_env.patient.fine_surface import split_edges
+from surgsim_env.rendering.embedding import EmbeddedSurface, organ_surface
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import FineSurface
+
+
+class Sent:
+    """What a viser scene is given: meshes by name, the last one of each."""
+
+    def __init__(self) -> None:
+        self.meshes = {}
+
+    def add_mesh_simple(self, name, vertices, faces, **look):
+        self.meshes[name] = SimpleNamespace(vertices=vertices, faces=faces, visible=True, **look)
+        return self.meshes[name]
+
+
+@pytest.fixture(scope="module")
+def anatomy(tmp_path_factory):
+    """The small phantom with a finer surface of its own block."""
+    scene = make_scene("phantom_small")
+    points = load_anatomy(scene).mesh.points
+    low, high = points.min(axis=0), points.max(axis=0)
+    box = trimesh.creation.box(high - low)
+    vertices, faces = split_edges(np.array(box.vertices) + 0.5 * (low + high), np.array(box.faces), 0.0015)
+    file = tmp_path_factory.mktemp("own") / "own.ply"
+    trimesh.Trimesh(vertices, faces, process=False).export(file)
+    return load_anatomy(replace(scene, mesh=replace(scene.mesh, fine_surface=FineSurface(str(file), "m"))))
+
+
+@pytest.fixture
+def view(anatomy):
+    sent = Sent()
+    return OrganView(sent, anatomy), sent
+
+
+def test_its_vertices_are_sent_and_follow_the_nodes(anatomy, view):
+    organ, sent = view
+    surface = organ_surface(anatomy)
+    assert isinstance(surface, EmbeddedSurface)
+    np.testing.assert_array_equal(sent.meshes["/organ"].faces, surface.faces)
+    pushed = anatomy.mesh.points * [1.0, 1.0, 0.9]
+    organ.follow(pushed)
+    np.testing.assert_allclose(sent.meshes["/organ"].vertices, SCALE * surface.follow(pushed)[0], rtol=0, atol=1e-6)
+
+
+def test_touches_paint_it_where_they_were_felt_and_nowhere_else(anatomy, view):
+    organ, sent = view
+    felt, scene = FeltMap(anatomy), anatomy.scene
+    top = anatomy.mesh.points[anatomy.face.triangles].mean(axis=(0, 1))
+    depth = scene.palpation.press_depth
+    tip = top + (depth - scene.instrument.tip_radius) * anatomy.face.approach
+    organ.paint(felt)
+    organ.follow(anatomy.mesh.points)
+    assert not any(name.startswith("/felt") for name in sent.meshes)
+    for _ in range(20):
+        felt.feel(tip, depth, 0.3)
+    assert felt.felt.any() and not felt.felt.all()
+    organ.paint(felt)
+    organ.follow(anatomy.mesh.points)
+    painted = np.concatenate([one.vertices for name, one in sent.meshes.items() if name.startswith("/felt")]) / SCALE
+    assert len(painted)
+    # A vertex is painted only where all corners of its triangle were felt.
+    nodes = anatomy.mesh.points[felt.nodes[felt.felt]]
+    reach = np.linalg.norm(nodes - top, axis=1).max()
+    assert np.linalg.norm(painted - top, axis=1).max() < reach + 0.001
+
+
+def test_plain_pictures_draw_the_boundary_of_the_tets(anatomy, view):
+    organ, sent = view
+    before = len(sent.meshes["/organ"].faces)
+    organ.plain = True
+    organ.follow(anatomy.mesh.points)
+    assert len(sent.meshes["/organ"].faces) < before
+    organ.plain = False
+    organ.follow(anatomy.mesh.points)
+    assert len(sent.meshes["/organ"].faces) == before

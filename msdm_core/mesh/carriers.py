@@ -91,7 +91,7 @@ def _nearest_triangles(points: FloatArray, corners: FloatArray) -> tuple[IntArra
             left = []
             for first in range(0, len(sought), POINTS_AT_ONCE):
                 now = sought[first : first + POINTS_AT_ONCE]
-                away, near = tree.query(points[now], k=np.arange(1, count + 1))
+                away, near = (np.reshape(one, (-1, count)) for one in tree.query(points[now], k=count))
                 # A triangle is nearer than its centre by its radius at most.
                 useful = away - reach < gap[now, None]
                 row, column = np.nonzero(useful)

@@ -163,7 +163,7 @@ def split_edges(vertices: FloatArray, triangles: Triangles, longest: float) -> t
 
 def _halves(vertices: FloatArray, triangles: Triangles, edges: Triangles) -> FloatArray:
     """A point for the middle of each edge (n, 2) [m], (n, 3)."""
-    normals = smooth_normals(vertices, triangles)
+    normals = smooth_normals(vertices, triangles.astype(np.int32))
     corners = vertices[triangles]
     facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     along = np.einsum("tj,tij->ti", facing, normals[triangles])
@@ -236,9 +236,10 @@ def level_surface(
 def _surface_net(values: NDArray[np.float32]) -> tuple[FloatArray, Triangles]:
     """Vertices in grid coordinates (n, 3) and quadrangles (m, 4) of the net where values change their sign."""
     inside = values > 0.0
-    count = np.zeros(np.array(values.shape) - 1, dtype=np.int8)
+    a, b, c = (side - 1 for side in values.shape)
+    count = np.zeros((a, b, c), dtype=np.int8)
     for x, y, z in CORNERS:
-        count += inside[x : x + count.shape[0], y : y + count.shape[1], z : z + count.shape[2]]
+        count += inside[x : x + a, y : y + b, z : z + c]
     cells = np.argwhere((count > 0) & (count < 8))
     number = np.full(count.shape, -1, dtype=np.int64)
     number[tuple(cells.T)] = np.arange(len(cells))

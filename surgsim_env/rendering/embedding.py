@@ -29,6 +29,7 @@ class EmbeddedSurface:
         node_weights: of the nodes at each vertex's nearest point           (n_vertex, n_node)
         corners: vertices of the triangles, outward                         (3, n_face)
         vertex_faces: sums the area vectors of the triangles at each vertex (n_vertex, n_face)
+        node_count: n_node                                                  scalar
     """
 
     gradients: csr_array
@@ -36,6 +37,7 @@ class EmbeddedSurface:
     node_weights: csr_array
     corners: IntArray
     vertex_faces: csr_array
+    node_count: int
 
     @property
     def faces(self) -> IntArray:
@@ -62,9 +64,9 @@ class EmbeddedSurface:
 
     def faces_among(self, nodes: IntArray) -> NDArray[np.bool_]:
         """Which triangles lie on a part of the boundary whose nodes are all among some, (n_face,)."""
-        among = np.zeros(self.node_weights.shape[1])
+        among = np.zeros(self.node_count)
         among[nodes] = 1.0
-        return (self.interpolate(among) > 1.0 - 1e-9)[self.faces].all(axis=1)
+        return np.asarray((self.interpolate(among) > 1.0 - 1e-9)[self.faces].all(axis=1))
 
 
 def embedded_surface(vertices: FloatArray, faces: IntArray, mesh: TetMesh) -> EmbeddedSurface:
@@ -102,6 +104,7 @@ def embedded_surface(vertices: FloatArray, faces: IntArray, mesh: TetMesh) -> Em
         node_weights=node_weights,
         corners=np.ascontiguousarray(faces.T, dtype=np.int32),
         vertex_faces=csr_array(coo_array((np.ones(faces.size), (faces.ravel(), face)), (len(vertices), len(faces)))),
+        node_count=mesh.node_count,
     )
 
 

@@ -49,6 +49,32 @@ def load_shared(lanes, like, values, item):
 
 
 @njit(forceinline=True, error_model="numpy")
+def load_column(lanes, values, width, item, column):
+    """One number of an item's row, or the vector of all organs' numbers, of an array (n_item, width, n_lane).
+
+    An organ alone may have wider rows than `width`.
+    """
+    if len(lanes) == 0:
+        return values[item, column]
+    return load_lanes(lanes, values, width * np.intp(item) + column)
+
+
+@njit(forceinline=True, error_model="numpy")
+def store_column(lanes, values, width, item, column, value):
+    """Write what `load_column` reads."""
+    if len(lanes) == 0:
+        values[item, column] = value
+    else:
+        store_lanes(values, width * np.intp(item) + column, value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def add_to_column(lanes, values, width, item, column, value):
+    """Add to what `load_column` reads."""
+    store_column(lanes, values, width, item, column, load_column(lanes, values, width, item, column) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
 def parts_of(lanes):
     """How many registers hold a node's x, y and z."""
     if len(lanes) == 0:
@@ -149,6 +175,15 @@ def add_to_corners(lanes, total, tets, tet, value):
     for corner in range(4):
         node = tets[tet, corner]
         store_item(lanes, total, node, load_item(lanes, total, node) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def corner_mean_of_pairs(lanes, pairs, tets, tet):
+    """Mean of the first numbers of pairs at the corners of a tet."""
+    return 0.25 * (
+        load_column(lanes, pairs, 2, tets[tet, 0], 0) + load_column(lanes, pairs, 2, tets[tet, 1], 0)
+        + load_column(lanes, pairs, 2, tets[tet, 2], 0) + load_column(lanes, pairs, 2, tets[tet, 3], 0)
+    )  # fmt: skip
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -304,9 +304,9 @@ def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatA
     for unit in np.eye(state.node_velocity.size):
         velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
         hold_steep(
-            state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes, model.spring_stiffness,
-            state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes), every, len(every), 1, sweeps,
-            state.steep_places, state.steep_rows, state.steep_speed, dt,
+            (), state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes,
+            model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes),
+            every, len(every), 1, sweeps, sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
         )  # fmt: skip
         columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
     return np.array(columns).T

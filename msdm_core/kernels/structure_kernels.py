@@ -314,8 +314,9 @@ class LaneState(NamedTuple):
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
-        node_pairs: scratch: as in OrganState                                    (n_node, 2, n_lane), (0, 2, n_lane)
-        node_steepness, spring_lengths: scratch: as in OrganState                (n, n_lane), (0, n_lane)
+        node_pairs: scratch: as in OrganState                                    (2, n_node, n_lane), (2, 0, n_lane)
+        node_steepness: scratch: as in OrganState                                (n_node, n_lane), (0, n_lane)
+        spring_lengths: not used                                                 (0,)
         steep_springs: scratch: springs that are steep in a lane                 (n_spring,), (0,) if none stiffens
         steep_places: scratch: springs that are steep in any lane                (n_spring,), likewise
         steep_rows: scratch: as in OrganState                                    (n_spring, STEEP_WIDTH, n_lane)
@@ -348,7 +349,7 @@ class LaneState(NamedTuple):
     squeezed_tets: NDArray[np.int32]
     node_pairs: LaneArray
     node_steepness: LaneArray
-    spring_lengths: LaneArray
+    spring_lengths: FloatArray
     steep_springs: NDArray[np.int32]
     steep_places: NDArray[np.int32]
     steep_rows: LaneArray
@@ -426,7 +427,7 @@ class SpringLaw(NamedTuple):
     """How springs depart from linear ones in one substep: fields of model and state, and what the arms lose.
 
     Fields:
-        measured: `stiffens` of the model: node_pairs and spring_lengths of the state are set
+        measured: `stiffens` of the model: node_pairs and, of an organ alone, spring_lengths of the state are set
         stiffens: whether springs of any node have a factor other than 1
         steepens: whether any node has a steepness above STEEP_EXCESS
         pairs, lengths, steep: `node_pairs`, `spring_lengths`, `steep_springs` of the state
@@ -441,7 +442,7 @@ class SpringLaw(NamedTuple):
     stiffens: bool
     steepens: bool
     pairs: LaneArray
-    lengths: LaneArray
+    lengths: FloatArray
     steep: NDArray[np.int32]
     steep_sum: float
     relaxes: bool

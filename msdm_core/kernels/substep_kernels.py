@@ -144,10 +144,11 @@ def _evaluate(model, state, fades, fade_duration):
     lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
     position, velocity, force, tension = state.node_position, state.node_velocity, state.node_force, state.node_tension
     averages, stiffens = _averages(lanes, model.averages_volume), model.stiffens
-    tension[:] = 0.0
     pairs, lengths = state.node_pairs, state.spring_lengths
     if stiffens:
         pairs[:] = 0.0
+    else:
+        tension[:] = 0.0
     if averages or stiffens:
         sum_at_nodes(
             lanes, position, tension, pairs, lengths, tets, model.spring_stiffness, model.spring_rest_length, stiffens

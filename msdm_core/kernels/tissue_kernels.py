@@ -31,18 +31,18 @@ from msdm_core.kernels.group_kernels import (
     sum_tet_groups,
 )
 from msdm_core.kernels.layout_kernels import (
-    add_to_column,
+    add_half,
     add_to_corners,
     add_to_node,
     corner_mean,
     corner_mean_of_pairs,
     difference,
-    load_column,
+    load_half,
     load_item,
     load_part,
     load_shared,
     parts_of,
-    store_column,
+    store_half,
     store_item,
     store_part,
     store_sum,
@@ -122,7 +122,7 @@ def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
 @njit(forceinline=True, error_model="numpy")
 def _end_sum(lanes, pairs, items, item):
     """Sum of the second numbers of the pairs of a spring's two ends."""
-    return load_column(lanes, pairs, 2, items[item, 0], 1) + load_column(lanes, pairs, 2, items[item, 1], 1)
+    return load_half(lanes, pairs, items[item, 0], 1) + load_half(lanes, pairs, items[item, 1], 1)
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -134,13 +134,31 @@ def _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, r
 
 
 @njit(forceinline=True, error_model="numpy")
+def _keep_length(lanes, lengths, spring, length):
+    """Note the length of a spring of an organ alone.
+
+    Organs side by side measure again: memory limits them, and to load all their lengths takes longer than the roots.
+    """
+    if len(lanes) == 0:
+        lengths[spring] = length
+
+
+@njit(forceinline=True, error_model="numpy")
+def _kept_length(lanes, lengths, spring, x, y, z):
+    """What `_keep_length` noted; measured where it notes nothing."""
+    if len(lanes) == 0:
+        return lengths[spring]
+    return spring_length(x, y, z)
+
+
+@njit(forceinline=True, error_model="numpy")
 def _measure(lanes, position, pairs, lengths, items, item, stiffness, rest_length, edge):
     """Note the length of a spring along an edge and add `spring_energy` at its ends."""
     length = spring_length(edge[0], edge[1], edge[2])
-    store_item(lanes, lengths, item, length)
+    _keep_length(lanes, lengths, item, length)
     twice = spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
-    add_to_column(lanes, pairs, 2, items[item, 0], 1, twice)
-    add_to_column(lanes, pairs, 2, items[item, 1], 1, twice)
+    add_half(lanes, pairs, items[item, 0], 1, twice)
+    add_half(lanes, pairs, items[item, 1], 1, twice)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -148,7 +166,8 @@ def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length,
     """Twice the energy of linear springs from number `begin` on, k (l - l0)^2, at both ends of each.
 
     In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin
-    Out: pairs: the energies are added to the second numbers [J] (n_node, 2), lengths [m] (n_spring,)
+    Out: pairs: the energies are added to the second numbers [J] (n_node, 2), lengths: of an organ alone [m]
+         (n_spring,)
     """
     for spring in range(
         _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin), nodes.shape[0]
@@ -179,8 +198,8 @@ def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, e
     first, stiffens, steepens = _set_groups_of_node_laws(
         lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness
     )
-    for node in range(first, pairs.shape[0]):
-        six, energy = load_column(lanes, pairs, 2, node, 0), load_column(lanes, pairs, 2, node, 1)
+    for node in range(first, steepness.shape[0]):
+        six, energy = load_half(lanes, pairs, node, 0), load_half(lanes, pairs, node, 1)
         tension = node_tension(six, load_shared(lanes, pairs, inverse_volume, node), load_item(lanes, bulk, node))
         square = strain_square(energy, load_item(lanes, softness, node))
         begin = load_shared(lanes, pairs, onset, node)
@@ -193,8 +212,8 @@ def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, e
             stiffens = True
             if any_below(STEEP_EXCESS - steeper, 0.0):
                 steepens = True
-        store_column(lanes, pairs, 2, node, 0, tension)
-        store_column(lanes, pairs, 2, node, 1, half)
+        store_half(lanes, pairs, node, 0, tension)
+        store_half(lanes, pairs, node, 1, half)
         store_item(lanes, steepness, node, steeper)
     return stiffens, steepens
 
@@ -258,7 +277,7 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
     for spring in range(first, nodes.shape[0]):
         x, y, z = difference(lanes, position, nodes, spring, 1)
         if measured:
-            length = load_item(lanes, lengths, spring)
+            length = _kept_length(lanes, lengths, spring, x, y, z)
         else:
             length = spring_length(x, y, z)
         share = load_shared(lanes, position, rest_length, spring) / length
@@ -310,7 +329,7 @@ def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_l
 
     In:  position [m] (n_node, 4), tets (n_tet, 4), stiffness [N/m], rest_length [m] (n_spring,), stiffens
     Out: total: volumes [m^3], added to (n_node,); where springs stiffen instead pairs: volumes [m^3] and energies [J],
-         added to (n_node, 2), and lengths [m] (n_spring,)
+         added to (n_node, 2), and lengths as in `add_energies`
     """
     for tet in range(
         _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens),
@@ -320,7 +339,7 @@ def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_l
         _, six = tet_shape(edge, third, fourth)
         if stiffens:
             for corner in range(4):
-                add_to_column(lanes, pairs, 2, tets[tet, corner], 0, six)
+                add_half(lanes, pairs, tets[tet, corner], 0, six)
             _measure(lanes, position, pairs, lengths, tets, tet, stiffness, rest_length, edge)
         else:
             add_to_corners(lanes, total, tets, tet, six)
@@ -351,7 +370,7 @@ def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffe
         six = beta * six_rates(*three_edges(lanes, velocity, tets, tet), gradients)
         if stiffens:
             for corner in range(4):
-                add_to_column(lanes, pairs, 2, tets[tet, corner], 0, six)
+                add_half(lanes, pairs, tets[tet, corner], 0, six)
         else:
             add_to_corners(lanes, total, tets, tet, six)
 
@@ -421,7 +440,8 @@ def add_tet_forces(
                 squeezed[count] = entry
                 count += 1
         if measured:
-            averaged, length = corner_mean_of_pairs(lanes, pairs, tets, tet), load_item(lanes, lengths, tet)
+            averaged = corner_mean_of_pairs(lanes, pairs, tets, tet)
+            length = _kept_length(lanes, lengths, tet, edge[0], edge[1], edge[2])
         else:
             averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(edge[0], edge[1], edge[2])
         scale = tet_scale(ratio, load_item(lanes, bulk, tet), load_item(lanes, averaged_bulk, tet), averaged)

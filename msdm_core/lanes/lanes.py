@@ -33,7 +33,6 @@ from msdm_core.organ.compile import rest_state, steep_scratch, support_shape
 from msdm_core.organ.stepping import unyielding
 
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
-LAW_FIELDS = ("node_pairs", "node_steepness", "spring_lengths")
 ARM_FIELDS = ("spring_arm_tension", "spring_relief")
 CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch")
 
@@ -237,7 +236,9 @@ def lanes_of(
         support_stretch=np.zeros((count, support_nodes, supports, 3)),
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
-        **{name: aligned_zeros((*getattr(states[0], name).shape, count), dtype) for name in LAW_FIELDS},
+        node_pairs=aligned_zeros((2, len(first.node_softness), count), dtype),
+        node_steepness=aligned_zeros((len(first.node_softness), count), dtype),
+        spring_lengths=np.zeros(0),
         **steep_scratch(first, (count,), dtype),
         **{name: aligned_zeros((len(getattr(states[0], name)), count), dtype) for name in ARM_FIELDS},
         moving=aligned_zeros((1, count), dtype),
@@ -297,7 +298,9 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
     return OrganState(
         **{name: np.array(getattr(state, name)[:, :, lane], dtype=np.float64, order="C") for name in NODE_FIELDS},
         **{name: getattr(state, name)[:, lane].astype(np.float64) for name in ARM_FIELDS},
-        **{name: np.zeros(getattr(state, name).shape[:-1]) for name in LAW_FIELDS},
+        node_pairs=aligned_zeros((len(state.node_steepness), 2)),
+        node_steepness=np.zeros(len(state.node_steepness)),
+        spring_lengths=np.zeros(len(state.steep_springs)),
         steep_springs=np.zeros_like(state.steep_springs),
         steep_places=np.zeros_like(state.steep_places),
         steep_rows=np.zeros(state.steep_rows.shape[:-1]),

@@ -8,11 +8,12 @@ import pytest
 from msdm_core.errors import OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
-from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
 from msdm_core.lanes.lanes import (
     advance_lanes,
     get_lane,
     lane_responses,
+    lane_shapes,
     lanes_of,
     put_lane,
     stack_organs,
@@ -32,7 +33,7 @@ from msdm_core.organ.measure import (
     spring_tensions,
 )
 from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
-from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ, round_shapes
 
 LIVER = Stiffening(onset_strain=0.03, cap_strain=0.12, tangent_cap=20.0)
 ARMS = Relaxation(relative_moduli=(0.3, 0.2, 0.4), times=(0.05, 0.5, 5.0))
@@ -228,6 +229,36 @@ def test_lanes_move_as_organs_alone(dtype: type):
     np.testing.assert_array_equal(
         get_lane(together, 1).spring_relief.astype(dtype), states[0].spring_relief.astype(dtype)
     )
+
+
+def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
+    """One lane without steep springs, one that needs the fewest sweeps, one the most: wrench and state to the bit."""
+    law = replace(LIVER, tangent_cap=36.0)
+    organs = [block(law, poisson_ratio=0.4, youngs_modulus=modulus) for modulus in (5000.0, 6000.0, 7000.0)]
+    states = [blank_state(organ, shape_count=1) for organ in organs]
+    for organ, state, size in zip(organs, states, (0.0, 0.04, 0.2), strict=True):
+        state.node_position[:] = strained(organ, size).node_position
+    ball = round_shapes([[[0.02, 0.02, SIZE[2] + 0.003]] * 2], [0.004], twist=[[0.0, 0.0, -0.02, 0.0, 0.0, 0.0]])
+    contact = ContactLaw(stiffness=2e7, damping=500.0, friction=0.4, tangential_stiffness=1e7)
+    lanes, together, count = stack_organs(organs), lanes_of(states, organs[0]), 8
+    shapes, pushes = stack_shapes([ball] * 3), np.zeros((count, 1, 6))
+    dt = 0.5 * min(stable_dt(organ, contact) for organ in organs)
+    presses, needed = [lane_shapes(stack_shapes([ball]), 0) for _ in organs], np.zeros(3)
+    for _ in range(8):
+        faults = advance_lanes(lanes, together, shapes, contact, dt, 5, pushes)
+        assert not faults[:3].any()
+        for lane, (organ, state) in enumerate(zip(organs, states, strict=True)):
+            wrench = np.zeros((1, 6))
+            assert advance_organ(organ, state, presses[lane], contact, dt, 5, wrench) == FAULT_NONE
+            np.testing.assert_array_equal(pushes[lane], wrench)
+            tangent = 1.0 + float(state.node_steepness[organ.spring_nodes].mean(axis=1).max())
+            needed[lane] = max(needed[lane], steep_sweeps(tangent) if tangent > 1.0 + STEEP_EXCESS else 0)
+    assert (np.diff(needed) > 0.0).all()
+    assert (pushes[:3, 0, 2] > 0.0).all()
+    for lane, state in enumerate(states):
+        copy = get_lane(together, lane)
+        for name, value in saved(state).items():
+            np.testing.assert_array_equal(getattr(copy, name), value, err_msg=f"lane {lane}: {name}")
 
 
 def test_organs_with_and_without_a_law_do_not_share_lanes():

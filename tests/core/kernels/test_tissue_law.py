@@ -237,11 +237,11 @@ def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
     states = [blank_state(organ, shape_count=1) for organ in organs]
     for organ, state, size in zip(organs, states, (0.0, 0.04, 0.2), strict=True):
         state.node_position[:] = strained(organ, size).node_position
-    highest = [state.node_position[state.node_position[:, 2].argmax()] for state in states]
-    balls = [
-        round_shapes([[place + [0.0, 0.0, 0.0035]] * 2], [0.004], twist=[[0.0, 0.0, -0.02, 0.0, 0.0, 0.0]])
-        for place in highest
-    ]
+    balls = []
+    for organ, state in zip(organs, states, strict=True):
+        middles = state.node_position[organ.surface_triangles].mean(axis=1)
+        above = middles[middles[:, 2].argmax()] + np.array([0.0, 0.0, 0.003])
+        balls.append(round_shapes([[above, above]], [0.004], twist=[[0.0, 0.0, -0.02, 0.0, 0.0, 0.0]]))
     contact = ContactLaw(stiffness=2e7, damping=500.0, friction=0.4, tangential_stiffness=1e7)
     lanes, together, count = stack_organs(organs), lanes_of(states, organs[0]), 8
     shapes, pushes = stack_shapes(balls), np.zeros((count, 1, 6))

@@ -44,36 +44,29 @@ def spring_energy(length, rest_length, stiffness):
 
 
 @njit(forceinline=True, error_model="numpy")
-def node_strain(energy, softness):
-    """Equivalent strain of a node, s = sqrt(5 sum k (l - l0)^2 / sum k l0^2) over its springs (`Stiffening`).
+def strain_square(energy, softness):
+    """Square of the equivalent strain of a node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs (`Stiffening`).
 
     In: energy: sum k (l - l0)^2 [J], softness: 5 / sum k l0^2 [1/J]
     """
-    return root(energy * softness)
+    return energy * softness
 
 
 @njit(forceinline=True, error_model="numpy")
-def node_law(strain, onset, growth, excess):
-    """What stiffening adds around a node, over what linear springs have, to tension and to tangent.
+def node_law(square, onset, growth, excess):
+    """Half the factor w'(s) / s of a node's springs on their linear tension, and what their tangent w'' is above 1.
 
-    (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) / s and (c - 1) v^2, with u = (s - e0) / (e1 - e0) and v its part within 0, 1.
+    (1 + (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) / s) / 2 and (c - 1) v^2, with u = (s - e0) / (e1 - e0) and v its part
+    within 0, 1.
 
-    In: strain s, onset e0, growth 1 / (e1 - e0), excess (c - 1) (e1 - e0)
+    In: square s^2, onset e0, growth 1 / (e1 - e0), excess (c - 1) (e1 - e0)
     """
+    strain = root(square)
     beyond = (strain - onset) * growth
     over = beyond - below_zero(beyond)
     ramp = 1.0 + below_zero(over - 1.0)
     size = ramp * ramp * ramp * (1.0 / 3.0) + (over - ramp)
-    return excess * size / (strain + STRAIN_LEAST), excess * growth * ramp * ramp
-
-
-@njit(forceinline=True, error_model="numpy")
-def stiffened(scale, rises):
-    """Force over length of a spring whose ends stiffen, T (1 + (r_a + r_b) / 2) / l.
-
-    In: scale: of the linear spring, T / l [N/m], rises: r_a + r_b of its two ends
-    """
-    return scale * (1.0 + 0.5 * rises)
+    return 0.5 + 0.5 * (excess * size / (strain + STRAIN_LEAST)), excess * growth * ramp * ramp
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -9,13 +9,14 @@ from numba import njit
 
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
+    STEEP_EXCESS,
     node_law,
-    node_strain,
+    node_tension,
     six_volumes,
     spring_energy,
     spring_length,
     spring_scale,
-    stiffened,
+    strain_square,
     tet_gradients,
     tet_scale,
     volume_ratio,
@@ -27,10 +28,12 @@ from msdm_core.kernels.vector_kernels import (
     define_shuffle,
     keep_lower,
     load_full,
+    load_pair,
     load_row,
     pack,
     spread_like,
     store_full,
+    store_pair,
     store_row,
 )
 
@@ -43,6 +46,9 @@ _low_halves = define_shuffle([0, 1, 2, 3, 8, 9, 10, 11])
 _high_halves = define_shuffle([4, 5, 6, 7, 12, 13, 14, 15])
 _mesh_low = define_shuffle([0, 8, 1, 9, 2, 10, 3, 11])
 _mesh_high = define_shuffle([4, 12, 5, 13, 6, 14, 7, 15])
+_pair_0, _pair_1, _pair_2, _pair_3 = (define_shuffle([2 * place, 2 * place + 1]) for place in range(4))
+_firsts = define_shuffle([0, 2, 4, 6, 8, 10, 12, 14])
+_seconds = define_shuffle([1, 3, 5, 7, 9, 11, 13, 15])
 _row_0 = define_shuffle([0, 1, 8, 9])
 _row_1 = define_shuffle([2, 3, 10, 11])
 _row_2 = define_shuffle([4, 5, 12, 13])
@@ -124,38 +130,109 @@ def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _rises(rise, items, first):
-    """Sum of a number of the two ends of eight springs."""
+def _end_sum(pairs, items, item):
+    """Sum of the second numbers of the pairs of a spring's two ends."""
+    return pairs[items[item, 0], 1] + pairs[items[item, 1], 1]
+
+
+@njit(forceinline=True, error_model="numpy")
+def _end_sums(pairs, items, first):
+    """The same of eight springs."""
     return pack(
-        rise[items[first, 0]] + rise[items[first, 1]], rise[items[first + 1, 0]] + rise[items[first + 1, 1]],
-        rise[items[first + 2, 0]] + rise[items[first + 2, 1]], rise[items[first + 3, 0]] + rise[items[first + 3, 1]],
-        rise[items[first + 4, 0]] + rise[items[first + 4, 1]], rise[items[first + 5, 0]] + rise[items[first + 5, 1]],
-        rise[items[first + 6, 0]] + rise[items[first + 6, 1]], rise[items[first + 7, 0]] + rise[items[first + 7, 1]],
+        _end_sum(pairs, items, first), _end_sum(pairs, items, first + 1),
+        _end_sum(pairs, items, first + 2), _end_sum(pairs, items, first + 3),
+        _end_sum(pairs, items, first + 4), _end_sum(pairs, items, first + 5),
+        _end_sum(pairs, items, first + 6), _end_sum(pairs, items, first + 7),
     )  # fmt: skip
 
 
 @njit(forceinline=True, error_model="numpy")
-def _add_to_ends(total, items, item, value):
-    """Add a number to both ends of a spring."""
-    total[items[item, 0]] += value
-    total[items[item, 1]] += value
+def _corner_sums(pairs, tets, tet):
+    """Sum of the pairs of a tet's first two corners, the ends of its spring, and of all four."""
+    ends = load_pair(pairs, tets[tet, 0]) + load_pair(pairs, tets[tet, 1])
+    return ends, ends + load_pair(pairs, tets[tet, 2]) + load_pair(pairs, tets[tet, 3])
 
 
 @njit(forceinline=True, error_model="numpy")
-def _add_energies(energy, items, first, value):
+def _corner_means(tension, tets, first):
+    """`corner_mean` of eight tets."""
+    return pack(
+        corner_mean((), tension, tets, first), corner_mean((), tension, tets, first + 1),
+        corner_mean((), tension, tets, first + 2), corner_mean((), tension, tets, first + 3),
+        corner_mean((), tension, tets, first + 4), corner_mean((), tension, tets, first + 5),
+        corner_mean((), tension, tets, first + 6), corner_mean((), tension, tets, first + 7),
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def _means_and_end_sums(pairs, tets, first):
+    """Of eight tets the mean of the first numbers of the pairs at their corners, and `_end_sums` of their springs."""
+    ends_0, all_0 = _corner_sums(pairs, tets, first)
+    ends_1, all_1 = _corner_sums(pairs, tets, first + 1)
+    ends_2, all_2 = _corner_sums(pairs, tets, first + 2)
+    ends_3, all_3 = _corner_sums(pairs, tets, first + 3)
+    ends_4, all_4 = _corner_sums(pairs, tets, first + 4)
+    ends_5, all_5 = _corner_sums(pairs, tets, first + 5)
+    ends_6, all_6 = _corner_sums(pairs, tets, first + 6)
+    ends_7, all_7 = _corner_sums(pairs, tets, first + 7)
+    totals = pack(
+        _at_0(all_0), _at_0(all_1), _at_0(all_2), _at_0(all_3), _at_0(all_4), _at_0(all_5), _at_0(all_6), _at_0(all_7)
+    )
+    ends = pack(
+        _at_1(ends_0), _at_1(ends_1), _at_1(ends_2), _at_1(ends_3),
+        _at_1(ends_4), _at_1(ends_5), _at_1(ends_6), _at_1(ends_7),
+    )  # fmt: skip
+    return 0.25 * totals, ends
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_to_ends(pairs, items, item, value):
+    """Add to the second numbers of the pairs of a spring's ends."""
+    pairs[items[item, 0], 1] += value
+    pairs[items[item, 1], 1] += value
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_energies(pairs, items, first, value):
     """Add the numbers of eight springs to their ends."""
-    _add_to_ends(energy, items, first, _at_0(value))
-    _add_to_ends(energy, items, first + 1, _at_1(value))
-    _add_to_ends(energy, items, first + 2, _at_2(value))
-    _add_to_ends(energy, items, first + 3, _at_3(value))
-    _add_to_ends(energy, items, first + 4, _at_4(value))
-    _add_to_ends(energy, items, first + 5, _at_5(value))
-    _add_to_ends(energy, items, first + 6, _at_6(value))
-    _add_to_ends(energy, items, first + 7, _at_7(value))
+    _add_to_ends(pairs, items, first, _at_0(value))
+    _add_to_ends(pairs, items, first + 1, _at_1(value))
+    _add_to_ends(pairs, items, first + 2, _at_2(value))
+    _add_to_ends(pairs, items, first + 3, _at_3(value))
+    _add_to_ends(pairs, items, first + 4, _at_4(value))
+    _add_to_ends(pairs, items, first + 5, _at_5(value))
+    _add_to_ends(pairs, items, first + 6, _at_6(value))
+    _add_to_ends(pairs, items, first + 7, _at_7(value))
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_pairs(pairs, tets, tet, at_ends, elsewhere):
+    """Add one pair to the first two corners of a tet and another to the other two."""
+    a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
+    store_pair(pairs, a, load_pair(pairs, a) + at_ends)
+    store_pair(pairs, b, load_pair(pairs, b) + at_ends)
+    store_pair(pairs, c, load_pair(pairs, c) + elsewhere)
+    store_pair(pairs, d, load_pair(pairs, d) + elsewhere)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _add_volumes_and_energies(pairs, tets, first, six, energy):
+    """Add six times the volumes of eight tets at their corners, and twice the energies of their springs at the ends."""
+    nothing = spread_like(pairs, 0.0)
+    low, low_six = _mesh_low(six, energy), _mesh_low(six, nothing)
+    high, high_six = _mesh_high(six, energy), _mesh_high(six, nothing)
+    _add_pairs(pairs, tets, first, _pair_0(low, low), _pair_0(low_six, low_six))
+    _add_pairs(pairs, tets, first + 1, _pair_1(low, low), _pair_1(low_six, low_six))
+    _add_pairs(pairs, tets, first + 2, _pair_2(low, low), _pair_2(low_six, low_six))
+    _add_pairs(pairs, tets, first + 3, _pair_3(low, low), _pair_3(low_six, low_six))
+    _add_pairs(pairs, tets, first + 4, _pair_0(high, high), _pair_0(high_six, high_six))
+    _add_pairs(pairs, tets, first + 5, _pair_1(high, high), _pair_1(high_six, high_six))
+    _add_pairs(pairs, tets, first + 6, _pair_2(high, high), _pair_2(high_six, high_six))
+    _add_pairs(pairs, tets, first + 7, _pair_3(high, high), _pair_3(high_six, high_six))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_energy_groups(position, energy, nodes, stiffness, rest_length, begin):
+def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """Energies of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_energies`.
 
     Returns the first spring that is in no whole group.
@@ -164,28 +241,37 @@ def add_energy_groups(position, energy, nodes, stiffness, rest_length, begin):
     for first in range(begin, whole, GROUP):
         x, y, z = _edges(position, nodes, first, 1)
         length = spring_length(x, y, z)
+        store_full(lengths, first, length)
         _add_energies(
-            energy, nodes, first, spring_energy(length, load_full(rest_length, first), load_full(stiffness, first))
+            pairs, nodes, first, spring_energy(length, load_full(rest_length, first), load_full(stiffness, first))
         )
     return whole
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def set_rise_groups(energy, softness, onset, growth, excess, rise, steepness):
-    """`tissue_kernels.set_rises` of whole groups of nodes; returns the first node in none, whether one has a rise."""
-    whole = energy.shape[0] // GROUP * GROUP
-    stiffens = False
+def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
+    """`tissue_kernels.set_node_laws` of whole groups of nodes.
+
+    Returns the first node in none, whether one stiffens and whether one is steep.
+    """
+    whole = pairs.shape[0] // GROUP * GROUP
+    stiffens = steepens = False
     for first in range(0, whole, GROUP):
-        strain = node_strain(load_full(energy, first), load_full(softness, first))
-        more, steeper = strain * 0.0, strain * 0.0
-        if any_below(load_full(onset, first) - strain, 0.0):
-            more, steeper = node_law(
-                strain, load_full(onset, first), load_full(growth, first), load_full(excess, first)
-            )
+        low, high = load_full(pairs, 2 * first), load_full(pairs, 2 * first + GROUP)
+        tension = node_tension(_firsts(low, high), load_full(inverse_volume, first), load_full(bulk, first))
+        square = strain_square(_seconds(low, high), load_full(softness, first))
+        begin = load_full(onset, first)
+        steeper = square * 0.0
+        half = steeper + 0.5
+        if any_below(begin * begin - square, 0.0):
+            half, steeper = node_law(square, begin, load_full(growth, first), load_full(excess, first))
             stiffens = True
-        store_full(rise, first, more)
+            if any_below(STEEP_EXCESS - steeper, 0.0):
+                steepens = True
+        store_full(pairs, 2 * first, _mesh_low(tension, half))
+        store_full(pairs, 2 * first + GROUP, _mesh_high(tension, half))
         store_full(steepness, first, steeper)
-    return whole, stiffens
+    return whole, stiffens, steepens
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -194,7 +280,8 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
 
     Returns the first spring that is in no whole group, and how many entries `law.steep` has.
     """
-    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
+    measured, lengths, pairs = law.measured, law.lengths, law.pairs
+    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     springs = nodes.shape[0]
@@ -205,14 +292,17 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
         r4, r5 = _edge(position, nodes, first + 4, 1), _edge(position, nodes, first + 5, 1)
         r6, r7 = _edge(position, nodes, first + 6, 1), _edge(position, nodes, first + 7, 1)
         x, y, z = _columns(r0, r1, r2, r3, r4, r5, r6, r7)
-        rest, length = load_full(rest_length, first), spring_length(x, y, z)
-        share = rest / length
+        if measured:
+            length = load_full(lengths, first)
+        else:
+            length = spring_length(x, y, z)
+        share = load_full(rest_length, first) / length
         rigidity = load_full(stiffness, first)
         scale = spring_scale(share, rigidity)
         if stiffens:
-            rises = _rises(rise, nodes, first)
-            scale = stiffened(scale, rises)
-            if any_below(rises * -1.0, -steep_rise):
+            factor = _end_sums(pairs, nodes, first)
+            scale = scale * factor
+            if steepens and any_below(factor * -1.0, -steep_sum):
                 steep[steep_count] = first
                 steep_count += 1
         if relaxes:
@@ -231,7 +321,7 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sum_tet_groups(position, total, energy, tets, stiffness, rest_length, averages, stiffens):
+def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """Sums at nodes over whole groups of tets; arguments as in `tissue_kernels.sum_at_nodes`.
 
     Returns the first tet that is in no whole group.
@@ -239,11 +329,16 @@ def sum_tet_groups(position, total, energy, tets, stiffness, rest_length, averag
     whole = tets.shape[0] // GROUP * GROUP
     for first in range(0, whole, GROUP):
         bx, by, bz = _edges(position, tets, first, 1)
-        if averages:
-            cx, cy, cz = _edges(position, tets, first, 2)
-            dx, dy, dz = _edges(position, tets, first, 3)
-            g = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
-            six = six_volumes(bx, by, bz, g[0], g[1], g[2])
+        cx, cy, cz = _edges(position, tets, first, 2)
+        dx, dy, dz = _edges(position, tets, first, 3)
+        g = tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz)
+        six = six_volumes(bx, by, bz, g[0], g[1], g[2])
+        if stiffens:
+            length = spring_length(bx, by, bz)
+            store_full(lengths, first, length)
+            energy = spring_energy(length, load_full(rest_length, first), load_full(stiffness, first))
+            _add_volumes_and_energies(pairs, tets, first, six, energy)
+        else:
             add_to_corners((), total, tets, first, _at_0(six))
             add_to_corners((), total, tets, first + 1, _at_1(six))
             add_to_corners((), total, tets, first + 2, _at_2(six))
@@ -252,11 +347,6 @@ def sum_tet_groups(position, total, energy, tets, stiffness, rest_length, averag
             add_to_corners((), total, tets, first + 5, _at_5(six))
             add_to_corners((), total, tets, first + 6, _at_6(six))
             add_to_corners((), total, tets, first + 7, _at_7(six))
-        if stiffens:
-            length = spring_length(bx, by, bz)
-            _add_energies(
-                energy, tets, first, spring_energy(length, load_full(rest_length, first), load_full(stiffness, first))
-            )
     return whole
 
 
@@ -270,7 +360,8 @@ def add_tet_groups(
     Returns the first tet that is in no whole group, how many groups have a squeezed tet, and how many entries
     `law.steep` has.
     """
-    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
+    measured, lengths, pairs = law.measured, law.lengths, law.pairs
+    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     springs = stiffness.shape[0]
@@ -287,21 +378,19 @@ def add_tet_groups(
         if any_below(ratio, SQUEEZED_RATIO):
             squeezed[count] = first
             count += 1
-        averaged = pack(
-            corner_mean((), tension, tets, first), corner_mean((), tension, tets, first + 1),
-            corner_mean((), tension, tets, first + 2), corner_mean((), tension, tets, first + 3),
-            corner_mean((), tension, tets, first + 4), corner_mean((), tension, tets, first + 5),
-            corner_mean((), tension, tets, first + 6), corner_mean((), tension, tets, first + 7),
-        )  # fmt: skip
+        if measured:
+            averaged, factor = _means_and_end_sums(pairs, tets, first)
+            length = load_full(lengths, first)
+        else:
+            averaged, length = _corner_means(tension, tets, first), spring_length(bx, by, bz)
+            factor = length
         scale = tet_scale(ratio, load_full(bulk, first), load_full(averaged_bulk, first), averaged)
-        rest, length = load_full(rest_length, first), spring_length(bx, by, bz)
-        share = rest / length
+        share = load_full(rest_length, first) / length
         rigidity = load_full(stiffness, first)
         pull = spring_scale(share, rigidity)
         if stiffens:
-            rises = _rises(rise, tets, first)
-            pull = stiffened(pull, rises)
-            if any_below(rises * -1.0, -steep_rise):
+            pull = pull * factor
+            if steepens and any_below(factor * -1.0, -steep_sum):
                 steep[steep_count] = first
                 steep_count += 1
         if relaxes:

@@ -49,6 +49,59 @@ def load_shared(lanes, like, values, item):
 
 
 @njit(forceinline=True, error_model="numpy")
+def load_half(lanes, pairs, node, half):
+    """The first (0) or the second (1) of a node's two numbers, in an array (n_node, 2) or (2, n_node, n_lane).
+
+    Of an organ alone both load as one register; of organs side by side each is a line of the cache, and those that are
+    read together stand together.
+    """
+    if len(lanes) == 0:
+        return pairs[node, half]
+    return load_lanes(lanes, pairs, half * pairs.shape[1] + np.intp(node))
+
+
+@njit(forceinline=True, error_model="numpy")
+def store_half(lanes, pairs, node, half, value):
+    """Write what `load_half` reads."""
+    if len(lanes) == 0:
+        pairs[node, half] = value
+    else:
+        store_lanes(pairs, half * pairs.shape[1] + np.intp(node), value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def add_half(lanes, pairs, node, half, value):
+    """Add to what `load_half` reads."""
+    store_half(lanes, pairs, node, half, load_half(lanes, pairs, node, half) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def load_column(lanes, values, width, item, column):
+    """One number of an item's row, or the vector of all organs' numbers, of an array (n_item, width, n_lane).
+
+    An organ alone may have wider rows than `width`.
+    """
+    if len(lanes) == 0:
+        return values[item, column]
+    return load_lanes(lanes, values, width * np.intp(item) + column)
+
+
+@njit(forceinline=True, error_model="numpy")
+def store_column(lanes, values, width, item, column, value):
+    """Write what `load_column` reads."""
+    if len(lanes) == 0:
+        values[item, column] = value
+    else:
+        store_lanes(values, width * np.intp(item) + column, value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def add_to_column(lanes, values, width, item, column, value):
+    """Add to what `load_column` reads."""
+    store_column(lanes, values, width, item, column, load_column(lanes, values, width, item, column) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
 def parts_of(lanes):
     """How many registers hold a node's x, y and z."""
     if len(lanes) == 0:
@@ -149,6 +202,15 @@ def add_to_corners(lanes, total, tets, tet, value):
     for corner in range(4):
         node = tets[tet, corner]
         store_item(lanes, total, node, load_item(lanes, total, node) + value)
+
+
+@njit(forceinline=True, error_model="numpy")
+def corner_mean_of_pairs(lanes, pairs, tets, tet):
+    """Mean of the first numbers of pairs at the corners of a tet."""
+    return 0.25 * (
+        load_half(lanes, pairs, tets[tet, 0], 0) + load_half(lanes, pairs, tets[tet, 1], 0)
+        + load_half(lanes, pairs, tets[tet, 2], 0) + load_half(lanes, pairs, tets[tet, 3], 0)
+    )  # fmt: skip
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -40,7 +40,7 @@ class OrganModel(NamedTuple):
         node_growth: 1 / (e1 - e0)                                               likewise
         node_excess: (c - 1) (e1 - e0)                                           likewise
         steep_rise: the least rise of a node with a steepness of STEEP_EXCESS    scalar
-        steep_sweeps: of `hold_steep`                                            scalar
+        steep_sweeps: the most of `hold_steep`                                   scalar
         relaxes: whether any spring has Maxwell arms                             scalar
         spring_gain: tension at once over that at equilibrium, 1 + sum g_i       (n_spring,), (0,) if none relaxes
         spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring,), likewise
@@ -140,8 +140,10 @@ class OrganState(NamedTuple):
         row_velocity: scratch: likewise                                          (n_node, 4)
         row_force: scratch: likewise                                             (n_node, 4)
         squeezed_tets: scratch: where tets are squeezed below SQUEEZED_RATIO     (n_tet,)
-        node_energy: scratch: sum of k (l - l0)^2 over a node's springs [J]      (n_node,), (0,) if none stiffens
-        node_rise, node_steepness: scratch: `element_kernels.node_law`           likewise
+        node_pairs: scratch: sums of volumes [m^3] and energies [J] around nodes, then tension [Pa] and half the factor
+            on springs, see tissue_kernels.set_node_laws                         (n_node, 2), (0, 2) if none stiffens
+        node_steepness: scratch: what the springs' tangent is above 1            (n_node,), (0,) if none stiffens
+        spring_lengths: scratch: [m]                                             (n_spring,), likewise
         steep_springs: scratch: where springs are steep                          (n_spring,), (0,) if none stiffens
         steep_places: scratch: those springs, see squeeze_kernels                (n_spring,), likewise
         steep_rows: scratch: likewise                                            (n_spring, STEEP_WIDTH), likewise
@@ -162,6 +164,7 @@ class OrganState(NamedTuple):
         finite_sum: scratch: finite where positions and velocities are           (1,)
         candidate_count: scratch: candidates of the busiest shape                (1,)
         contact_kept: scratch: 0 where the surface passed through an axis        (1,)
+        contact_count: scratch: rows of contact_rows and contact_places in use   (1,)
     """
 
     node_position: FloatArray
@@ -172,9 +175,9 @@ class OrganState(NamedTuple):
     row_velocity: FloatArray
     row_force: FloatArray
     squeezed_tets: NDArray[np.int32]
-    node_energy: FloatArray
-    node_rise: FloatArray
+    node_pairs: FloatArray
     node_steepness: FloatArray
+    spring_lengths: FloatArray
     steep_springs: NDArray[np.int32]
     steep_places: NDArray[np.int32]
     steep_rows: FloatArray
@@ -195,14 +198,15 @@ class OrganState(NamedTuple):
     finite_sum: FloatArray
     candidate_count: NDArray[np.int32]
     contact_kept: NDArray[np.uint8]
+    contact_count: NDArray[np.int32]
 
 
 # Written anew in every call: need not be saved.
 SCRATCH_FIELDS = (
     *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets"),
-    *("node_energy", "node_rise", "node_steepness", "steep_springs", "steep_places", "steep_rows", "steep_speed"),
+    *("node_pairs", "node_steepness", "spring_lengths", "steep_springs", "steep_places", "steep_rows", "steep_speed"),
     *("contact_candidates", "contact_rows", "contact_places", "contact_hold"),
-    *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept"),
+    *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept", "contact_count"),
 )
 
 
@@ -303,14 +307,20 @@ class LaneState(NamedTuple):
         contact_engaged: 1 where a quadrature point is held off by a shape       (n_lane, n_shape, n_surface * 4)
         contact_stretch: tangential stretch of sticking friction [m]             (n_lane, n_shape, n_surface * 4, 3)
         contact_candidates: scratch: triangles in reach, shape by shape          (n_lane, n_shape, n_surface)
-        contact_rows, contact_places, contact_hold: scratch of one lane after the other, as in OrganState
+        contact_rows, contact_places: scratch: as in OrganState, of each lane if organs stiffen, else of one lane after
+            the other                                                            (n_lane or 1, n_row, ROW_WIDTH), ...
+        contact_hold: scratch of one lane after the other, as in OrganState
         contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
-        node_energy, node_rise, node_steepness: scratch: as in OrganState        (n_node, n_lane), (0, n_lane)
+        node_pairs: scratch: as in OrganState                                    (2, n_node, n_lane), (2, 0, n_lane)
+        node_steepness: scratch: as in OrganState                                (n_node, n_lane), (0, n_lane)
+        spring_lengths: not used                                                 (0,)
         steep_springs: scratch: springs that are steep in a lane                 (n_spring,), (0,) if none stiffens
-        steep_places, steep_rows, steep_speed: scratch of one lane after the other, as in OrganState
+        steep_places: scratch: springs that are steep in any lane                (n_spring,), likewise
+        steep_rows: scratch: as in OrganState                                    (n_spring, STEEP_WIDTH, n_lane)
+        steep_speed: scratch: as in OrganState [m/s]                             (n_node, 3, n_lane)
         spring_arm_tension: as in OrganState [N/m]                               (3 * n_spring, n_lane)
         spring_relief: as in OrganState [N/m]                                    (n_spring, n_lane)
         kept_force: scratch: node_force of the lanes that do not move [N]        (n_node, 3, n_lane)
@@ -318,6 +328,7 @@ class LaneState(NamedTuple):
         finite_sum: scratch: finite where a lane's positions and velocities are  (1, n_lane)
         candidate_count: scratch: candidates of the busiest shape                (n_lane,)
         contact_kept: scratch: 0 where the surface passed through an axis        (n_lane,)
+        contact_count: scratch: rows of contact_rows and contact_places in use   (n_lane,)
         surface_count, support_count: how much of the memory belongs to a lane   (n_lane,)
     """
 
@@ -336,13 +347,13 @@ class LaneState(NamedTuple):
     support_stretch: FloatArray
     node_tension: LaneArray
     squeezed_tets: NDArray[np.int32]
-    node_energy: LaneArray
-    node_rise: LaneArray
+    node_pairs: LaneArray
     node_steepness: LaneArray
+    spring_lengths: FloatArray
     steep_springs: NDArray[np.int32]
     steep_places: NDArray[np.int32]
-    steep_rows: FloatArray
-    steep_speed: FloatArray
+    steep_rows: LaneArray
+    steep_speed: LaneArray
     spring_arm_tension: LaneArray
     spring_relief: LaneArray
     kept_force: LaneArray
@@ -350,6 +361,7 @@ class LaneState(NamedTuple):
     finite_sum: LaneArray
     candidate_count: NDArray[np.int32]
     contact_kept: NDArray[np.uint8]
+    contact_count: NDArray[np.int32]
     surface_count: NDArray[np.int32]
     support_count: NDArray[np.int32]
 
@@ -415,19 +427,24 @@ class SpringLaw(NamedTuple):
     """How springs depart from linear ones in one substep: fields of model and state, and what the arms lose.
 
     Fields:
-        stiffens: whether any node has a rise
-        rise, steep: `node_rise`, `steep_springs` of the state
-        steep_rise: of the model
+        measured: `stiffens` of the model: node_pairs and, of an organ alone, spring_lengths of the state are set
+        stiffens: whether springs of any node have a factor other than 1
+        steepens: whether any node has a steepness above STEEP_EXCESS
+        pairs, lengths, steep: `node_pairs`, `spring_lengths`, `steep_springs` of the state
+        steep_sum: least sum of the halves of a spring's two ends where it may be steep
         relaxes, gain, arm_modulus: `relaxes`, `spring_gain` and `spring_arm_modulus` of the model
         arm_tension, relief: `spring_arm_tension` and `spring_relief` of the state
         fades: whether the arms give way in this substep
         fade: share of its tension that each arm then loses
     """
 
+    measured: bool
     stiffens: bool
-    rise: LaneArray
+    steepens: bool
+    pairs: LaneArray
+    lengths: FloatArray
     steep: NDArray[np.int32]
-    steep_rise: float
+    steep_sum: float
     relaxes: bool
     gain: FloatArray
     arm_modulus: FloatArray
@@ -573,10 +590,11 @@ def touched_of(lanes, state, lane):
             state.contact_engaged, state.contact_stretch, state.contact_candidates,
             state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         )  # fmt: skip
+    room = lane if state.contact_rows.shape[0] > 1 else 0
     return _Touched(
         state.node_position[:, :, lane], state.node_velocity[:, :, lane], state.node_force[:, :, lane],
         state.contact_engaged[lane], state.contact_stretch[lane], state.contact_candidates[lane],
-        state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed[lane],
+        state.contact_rows[room], state.contact_places[room], state.contact_hold, state.contact_passed[lane],
     )  # fmt: skip
 
 
@@ -610,11 +628,12 @@ def in_rows(lanes, state):
     return OrganState(
         state.row_position, state.row_velocity, state.row_force, state.node_tension,
         state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
-        state.node_energy, state.node_rise, state.node_steepness,
+        state.node_pairs, state.node_steepness, state.spring_lengths,
         state.steep_springs, state.steep_places, state.steep_rows, state.steep_speed,
         state.spring_arm_tension, state.spring_relief,
         state.contact_engaged, state.contact_stretch, state.contact_candidates,
         state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         state.support_stretch, state.volume_ratio_smallest,
         state.lane_fault, state.moving, state.finite_sum, state.candidate_count, state.contact_kept,
+        state.contact_count,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from numba import njit
 from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
-from msdm_core.kernels.squeeze_kernels import hold_squeezed, hold_steep
+from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
     FAULT_INVERTED_TET,
@@ -39,12 +39,13 @@ from msdm_core.kernels.tissue_kernels import (
     add_spring_forces,
     add_tet_forces,
     add_volume_damping,
-    average_volumes,
+    add_volume_rates,
     group_width,
     integrate,
     put_back,
     set_gravity,
-    set_rises,
+    set_node_laws,
+    set_node_tension,
     sum_at_nodes,
 )
 
@@ -143,26 +144,31 @@ def _evaluate(model, state, fades, fade_duration):
     lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
     position, velocity, force, tension = state.node_position, state.node_velocity, state.node_force, state.node_tension
     averages, stiffens = _averages(lanes, model.averages_volume), model.stiffens
-    tension[:] = 0.0
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    if stiffens:
+        pairs[:] = 0.0
+    else:
+        tension[:] = 0.0
     if averages or stiffens:
-        state.node_energy[:] = 0.0
         sum_at_nodes(
-            lanes, position, tension, state.node_energy, tets, model.spring_stiffness, model.spring_rest_length,
-            averages, stiffens,
-        )  # fmt: skip
-    if averages:
-        average_volumes(lanes, position, velocity, tension, tets, model.node_inverse_volume, model.node_bulk, beta)
+            lanes, position, tension, pairs, lengths, tets, model.spring_stiffness, model.spring_rest_length, stiffens
+        )
+    if averages and beta > 0.0:
+        add_volume_rates(lanes, position, velocity, tension, pairs, tets, beta, stiffens)
+    steepens = False
     if stiffens:
         add_energies(
-            lanes, position, state.node_energy, model.spring_nodes, model.spring_stiffness, model.spring_rest_length,
+            lanes, position, pairs, lengths, model.spring_nodes, model.spring_stiffness, model.spring_rest_length,
             tets.shape[0],
         )  # fmt: skip
-        stiffens = set_rises(
-            lanes, state.node_energy, model.node_softness, model.node_onset, model.node_growth, model.node_excess,
-            state.node_rise, state.node_steepness,
+        stiffens, steepens = set_node_laws(
+            lanes, pairs, model.node_inverse_volume, model.node_bulk, model.node_softness, model.node_onset,
+            model.node_growth, model.node_excess, state.node_steepness,
         )  # fmt: skip
+    elif averages:
+        set_node_tension(lanes, tension, model.node_inverse_volume, model.node_bulk)
     law = SpringLaw(
-        stiffens, state.node_rise, state.steep_springs, model.steep_rise,
+        model.stiffens, stiffens, steepens, pairs, lengths, state.steep_springs, 1.0 + 0.5 * model.steep_rise,
         model.relaxes, model.spring_gain, model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief,
         fades, fade,
     )  # fmt: skip
@@ -266,9 +272,37 @@ def _begin(lanes, model, state, shapes, response, duration):
 
 
 @njit(forceinline=True, error_model="numpy")
+def _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrench, lane):
+    """Contact and guard of one lane; notes the points in contact."""
+    surface, touched = surface_of(lanes, model, lane), touched_of(lanes, state, lane)
+    moved, count = shapes_of(lanes, shapes, lane), state.candidate_count[lane]
+    about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
+    state.contact_count[lane] = add_contact_forces(surface, touched, moved, law, dt, count, about, push)
+    answer = response_of(lanes, response, lane)
+    if not guard_axes(surface, touched, moved, law, answer, dt, count, about, push):
+        state.contact_kept[lane] = 0
+
+
+@njit(forceinline=True, error_model="numpy")
+def _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane):
+    """What contact and squeezed tets of one lane hold with at the end of the substep."""
+    surface, touched = surface_of(lanes, model, lane), touched_of(lanes, state, lane)
+    hold_contact(
+        surface, touched, shapes_of(lanes, shapes, lane), law, dt, decay, state.contact_count[lane],
+        part_of(lanes, reference, lane), part_of(lanes, wrench, lane),
+    )  # fmt: skip
+    hold_squeezed(
+        touched.node_position, touched.node_velocity, touched.node_force, surface.node_inverse_mass, model.tet_nodes,
+        column_of(model.tet_inverse_volume, lane), column_of(model.tet_averaged_bulk, lane),
+        state.squeezed_tets, squeezed_count, group_width(lanes), dt,
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
 def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench):
     """What holds an organ, contact, guard, steep springs, squeezed tets, lane by lane; returns how many lanes move.
 
+    Steep springs are held in all lanes at once, after what comes before them and before what comes after in each.
     An inverted tet stops its lane before anything moves: the state shows which tet it was.
     """
     moving = 0
@@ -289,29 +323,21 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
             add_foundation_forces(
                 model.foundation_nodes, model.foundation_position, model.foundation_stiffness, position, force
             )
-        count = state.candidate_count[lane]
-        if count == 0 and squeezed_count == 0 and steep_count == 0:
+        if state.candidate_count[lane] == 0 and squeezed_count == 0 and steep_count == 0:
             continue
-        surface, moved = surface_of(lanes, model, lane), shapes_of(lanes, shapes, lane)
-        about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
-        points = add_contact_forces(surface, touched, moved, law, dt, count, about, push)
-        answer = response_of(lanes, response, lane)
-        if not guard_axes(surface, touched, moved, law, answer, dt, count, about, push):
-            state.contact_kept[lane] = 0
-        if steep_count > 0:
-            hold_steep(
-                position, velocity, force, surface.node_inverse_mass, model.spring_nodes,
-                column_of(model.spring_stiffness, lane), column_of(state.node_steepness, lane), model.spring_gain,
-                model.relaxes, model.tet_nodes.shape[0],
-                state.steep_springs, steep_count, group_width(lanes), model.steep_sweeps,
-                state.steep_places, state.steep_rows, state.steep_speed, dt,
-            )  # fmt: skip
-        hold_contact(surface, touched, moved, law, dt, decay, points, about, push)
-        hold_squeezed(
-            position, velocity, force, surface.node_inverse_mass, model.tet_nodes,
-            column_of(model.tet_inverse_volume, lane), column_of(model.tet_averaged_bulk, lane),
-            state.squeezed_tets, squeezed_count, group_width(lanes), dt,
+        _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrench, lane)
+        if steep_count == 0:
+            _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)
+    if steep_count > 0 and moving > 0:
+        hold_steep(
+            lanes, state.node_position, state.node_velocity, state.node_force, model.node_inverse_mass,
+            model.spring_nodes, model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes,
+            model.tet_nodes.shape[0], state.steep_springs, steep_count, group_width(lanes),
+            SWEEPS_LEAST, model.steep_sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
         )  # fmt: skip
+        for lane in range(_lane_count(lanes)):
+            if state.lane_fault[lane] == FAULT_NONE:
+                _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)
     return moving
 
 

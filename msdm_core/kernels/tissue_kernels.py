@@ -9,15 +9,15 @@ from numba import njit
 
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
+    STEEP_EXCESS,
     node_law,
-    node_strain,
     node_tension,
     six_rates,
     spring_drag,
     spring_energy,
     spring_length,
     spring_scale,
-    stiffened,
+    strain_square,
     tet_scale,
     tet_shape,
     volume_ratio,
@@ -27,18 +27,22 @@ from msdm_core.kernels.group_kernels import (
     add_energy_groups,
     add_spring_groups,
     add_tet_groups,
-    set_rise_groups,
+    set_node_law_groups,
     sum_tet_groups,
 )
 from msdm_core.kernels.layout_kernels import (
+    add_half,
     add_to_corners,
     add_to_node,
     corner_mean,
+    corner_mean_of_pairs,
     difference,
+    load_half,
     load_item,
     load_part,
     load_shared,
     parts_of,
+    store_half,
     store_item,
     store_part,
     store_sum,
@@ -116,79 +120,102 @@ def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _end_sum(lanes, values, items, item):
-    """Sum of the numbers of a spring's two ends."""
-    return load_item(lanes, values, items[item, 0]) + load_item(lanes, values, items[item, 1])
+def _end_sum(lanes, pairs, items, item):
+    """Sum of the second numbers of the pairs of a spring's two ends."""
+    return load_half(lanes, pairs, items[item, 0], 1) + load_half(lanes, pairs, items[item, 1], 1)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _add_to_ends(lanes, total, items, item, value):
-    """Add a number to both ends of a spring."""
-    for end in range(2):
-        node = items[item, end]
-        store_item(lanes, total, node, load_item(lanes, total, node) + value)
-
-
-@njit(forceinline=True, error_model="numpy")
-def _add_groups_of_energies(lanes, position, energy, nodes, stiffness, rest_length, begin):
+def _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """`add_energy_groups` for an organ alone; returns the first spring that is left over."""
     if len(lanes) == 0:
-        return add_energy_groups(position, energy, nodes, stiffness, rest_length, begin)
+        return add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin)
     return begin
 
 
 @njit(forceinline=True, error_model="numpy")
-def _energy(lanes, position, items, item, stiffness, rest_length, edge):
-    """`spring_energy` of a spring along an edge."""
-    rest = load_shared(lanes, position, rest_length, item)
-    return spring_energy(spring_length(edge[0], edge[1], edge[2]), rest, load_item(lanes, stiffness, item))
+def _keep_length(lanes, lengths, spring, length):
+    """Note the length of a spring of an organ alone.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_energies(lanes, position, energy, nodes, stiffness, rest_length, begin):
-    """Twice the energy of linear springs from number `begin` on, k (l - l0)^2, at both ends of each.
-
-    In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin
-    Out: energy, added to [J] (n_node,)
+    Organs side by side measure again: memory limits them, and to load all their lengths takes longer than the roots.
     """
-    for spring in range(
-        _add_groups_of_energies(lanes, position, energy, nodes, stiffness, rest_length, begin), nodes.shape[0]
-    ):
-        edge = difference(lanes, position, nodes, spring, 1)
-        twice = _energy(lanes, position, nodes, spring, stiffness, rest_length, edge)
-        _add_to_ends(lanes, energy, nodes, spring, twice)
+    if len(lanes) == 0:
+        lengths[spring] = length
 
 
 @njit(forceinline=True, error_model="numpy")
-def _set_groups_of_rises(lanes, energy, softness, onset, growth, excess, rise, steepness):
-    """`set_rise_groups` for an organ alone; returns the first node left over and whether any rise is above 0."""
+def _kept_length(lanes, lengths, spring, x, y, z):
+    """What `_keep_length` noted; measured where it notes nothing."""
     if len(lanes) == 0:
-        return set_rise_groups(energy, softness, onset, growth, excess, rise, steepness)
-    return 0, False
+        return lengths[spring]
+    return spring_length(x, y, z)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _measure(lanes, position, pairs, lengths, items, item, stiffness, rest_length, edge):
+    """Note the length of a spring along an edge and add `spring_energy` at its ends."""
+    length = spring_length(edge[0], edge[1], edge[2])
+    _keep_length(lanes, lengths, item, length)
+    twice = spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
+    add_half(lanes, pairs, items[item, 0], 1, twice)
+    add_half(lanes, pairs, items[item, 1], 1, twice)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def set_rises(lanes, energy, softness, onset, growth, excess, rise, steepness):
-    """What stiffening adds around each node, over what linear springs have, to tension and to tangent (`node_law`).
+def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
+    """Twice the energy of linear springs from number `begin` on, k (l - l0)^2, at both ends of each.
 
-    In:  energy: sum of k (l - l0)^2 over a node's springs [J], softness [1/J], onset, growth, excess (n_node,) as in
-         `OrganModel`
-    Out: rise, steepness (n_node,)
-    Returns whether any rise is above 0.
+    In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin
+    Out: pairs: the energies are added to the second numbers [J] (n_node, 2), lengths: of an organ alone [m]
+         (n_spring,)
     """
-    first, stiffens = _set_groups_of_rises(lanes, energy, softness, onset, growth, excess, rise, steepness)
-    for node in range(first, energy.shape[0]):
-        strain = node_strain(load_item(lanes, energy, node), load_item(lanes, softness, node))
-        begin = load_shared(lanes, energy, onset, node)
-        more, steeper = strain * 0.0, strain * 0.0
-        if any_below(begin - strain, 0.0):
-            more, steeper = node_law(
-                strain, begin, load_shared(lanes, energy, growth, node), load_shared(lanes, energy, excess, node)
+    for spring in range(
+        _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin), nodes.shape[0]
+    ):
+        edge = difference(lanes, position, nodes, spring, 1)
+        _measure(lanes, position, pairs, lengths, nodes, spring, stiffness, rest_length, edge)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
+    """`set_node_law_groups` for an organ alone; returns the first node left over, and what `set_node_laws` does."""
+    if len(lanes) == 0:
+        return set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness)
+    return 0, False, False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
+    """From the sums of volumes and energies around nodes to the tension of the averaged volumes and to `node_law`.
+
+    One loop for both, as the root and the quotient of the law take longer than all else of a node.
+
+    In:  inverse_volume [1/m^3], bulk [Pa], softness [1/J], onset, growth, excess (n_node,) as in `OrganModel`
+    Out: pairs: sums of six times the volumes [m^3] and of k (l - l0)^2 [J] before, tension [Pa] and half the factor on
+         springs after (n_node, 2), steepness (n_node,)
+    Returns whether any factor is not 1 and whether any steepness is above STEEP_EXCESS.
+    """
+    first, stiffens, steepens = _set_groups_of_node_laws(
+        lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness
+    )
+    for node in range(first, steepness.shape[0]):
+        six, energy = load_half(lanes, pairs, node, 0), load_half(lanes, pairs, node, 1)
+        tension = node_tension(six, load_shared(lanes, pairs, inverse_volume, node), load_item(lanes, bulk, node))
+        square = strain_square(energy, load_item(lanes, softness, node))
+        begin = load_shared(lanes, pairs, onset, node)
+        steeper = square * 0.0
+        half = steeper + 0.5
+        if any_below(begin * begin - square, 0.0):
+            half, steeper = node_law(
+                square, begin, load_shared(lanes, pairs, growth, node), load_shared(lanes, pairs, excess, node)
             )
             stiffens = True
-        store_item(lanes, rise, node, more)
+            if any_below(STEEP_EXCESS - steeper, 0.0):
+                steepens = True
+        store_half(lanes, pairs, node, 0, tension)
+        store_half(lanes, pairs, node, 1, half)
         store_item(lanes, steepness, node, steeper)
-    return stiffens
+    return stiffens, steepens
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -241,21 +268,25 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
          which one is strained beyond STEEP_SHARE
     Returns how many entries `law.steep` has.
     """
-    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
+    measured, lengths, pairs = law.measured, law.lengths, law.pairs
+    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     first, steep_count = _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, 0)
     width = group_width(lanes)
     for spring in range(first, nodes.shape[0]):
         x, y, z = difference(lanes, position, nodes, spring, 1)
-        rest, length = load_shared(lanes, position, rest_length, spring), spring_length(x, y, z)
-        share = rest / length
+        if measured:
+            length = _kept_length(lanes, lengths, spring, x, y, z)
+        else:
+            length = spring_length(x, y, z)
+        share = load_shared(lanes, position, rest_length, spring) / length
         rigidity = load_item(lanes, stiffness, spring)
         scale = spring_scale(share, rigidity)
         if stiffens:
-            rises = _end_sum(lanes, rise, nodes, spring)
-            scale = stiffened(scale, rises)
-            if any_below(rises * -1.0, -steep_rise):
+            factor = _end_sum(lanes, pairs, nodes, spring)
+            scale = scale * factor
+            if steepens and any_below(factor * -1.0, -steep_sum):
                 entry = begin + (spring - begin) // width * width
                 if steep_count == 0 or steep[steep_count - 1] != entry:
                     steep[steep_count] = entry
@@ -285,31 +316,33 @@ def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta)
 
 
 @njit(forceinline=True, error_model="numpy")
-def _sum_groups_of_tets(lanes, position, total, energy, tets, stiffness, rest_length, averages, stiffens):
+def _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """`sum_tet_groups` for an organ alone; returns the first tet that is left over."""
     if len(lanes) == 0:
-        return sum_tet_groups(position, total, energy, tets, stiffness, rest_length, averages, stiffens)
+        return sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens)
     return 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sum_at_nodes(lanes, position, total, energy, tets, stiffness, rest_length, averages, stiffens):
-    """Six times the volume of each tet added up at its corners, and twice the energy of its spring at its ends.
+def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
+    """Six times the volume of each tet added up at its corners; where springs stiffen, with twice its spring's energy.
 
-    In:  position [m] (n_node, 4), tets (n_tet, 4), stiffness [N/m], rest_length [m] (n_spring,), averages, stiffens:
-         which of the two
-    Out: total [m^3], energy [J], added to (n_node,)
+    In:  position [m] (n_node, 4), tets (n_tet, 4), stiffness [N/m], rest_length [m] (n_spring,), stiffens
+    Out: total: volumes [m^3], added to (n_node,); where springs stiffen instead pairs: volumes [m^3] and energies [J],
+         added to (n_node, 2), and lengths as in `add_energies`
     """
     for tet in range(
-        _sum_groups_of_tets(lanes, position, total, energy, tets, stiffness, rest_length, averages, stiffens),
+        _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens),
         tets.shape[0],
     ):
-        if averages:
-            _, six = tet_shape(*three_edges(lanes, position, tets, tet))
-            add_to_corners(lanes, total, tets, tet, six)
+        edge, third, fourth = three_edges(lanes, position, tets, tet)
+        _, six = tet_shape(edge, third, fourth)
         if stiffens:
-            edge = difference(lanes, position, tets, tet, 1)
-            _add_to_ends(lanes, energy, tets, tet, _energy(lanes, position, tets, tet, stiffness, rest_length, edge))
+            for corner in range(4):
+                add_half(lanes, pairs, tets[tet, corner], 0, six)
+            _measure(lanes, position, pairs, lengths, tets, tet, stiffness, rest_length, edge)
+        else:
+            add_to_corners(lanes, total, tets, tet, six)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -326,19 +359,20 @@ def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def average_volumes(lanes, position, velocity, tension, tets, node_inverse_volume, node_bulk, beta):
-    """Tension of the volumes averaged at nodes, K_a (J_a - 1), with beta's share of their rates.
+def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffens):
+    """Beta's share of the averaged volume term: beta times the rates of volumes, to what `sum_at_nodes` adds up.
 
-    In:  position [m], velocity [m/s] (n_node, 4), tets (n_tet, 4), node_inverse_volume [1/m^3], node_bulk [Pa]
-         (n_node,), beta [s]
-    Out: tension: the sums of `sum_at_nodes` before [m^3], [Pa] after (n_node,)
+    In:  position [m], velocity [m/s] (n_node, 4), tets (n_tet, 4), beta [s], stiffens
+    Out: total or the first numbers of pairs [m^3], as in `sum_at_nodes`
     """
-    if beta > 0.0:
-        for tet in range(tets.shape[0]):
-            gradients, _ = tet_shape(*three_edges(lanes, position, tets, tet))
-            six_rate = six_rates(*three_edges(lanes, velocity, tets, tet), gradients)
-            add_to_corners(lanes, tension, tets, tet, beta * six_rate)
-    set_node_tension(lanes, tension, node_inverse_volume, node_bulk)
+    for tet in range(tets.shape[0]):
+        gradients, _ = tet_shape(*three_edges(lanes, position, tets, tet))
+        six = beta * six_rates(*three_edges(lanes, velocity, tets, tet), gradients)
+        if stiffens:
+            for corner in range(4):
+                add_half(lanes, pairs, tets[tet, corner], 0, six)
+        else:
+            add_to_corners(lanes, total, tets, tet, six)
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -385,7 +419,8 @@ def add_tet_forces(
          `add_spring_forces`
     Returns how many entries `squeezed` and `law.steep` have.
     """
-    stiffens, rise, steep, steep_rise = law.stiffens, law.rise, law.steep, law.steep_rise
+    measured, lengths, pairs = law.measured, law.lengths, law.pairs
+    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
     relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
     arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
     first, count, steep_count = _add_groups_of_tets(
@@ -404,16 +439,19 @@ def add_tet_forces(
             if count == 0 or squeezed[count - 1] != entry:
                 squeezed[count] = entry
                 count += 1
-        averaged = corner_mean(lanes, tension, tets, tet)
+        if measured:
+            averaged = corner_mean_of_pairs(lanes, pairs, tets, tet)
+            length = _kept_length(lanes, lengths, tet, edge[0], edge[1], edge[2])
+        else:
+            averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(edge[0], edge[1], edge[2])
         scale = tet_scale(ratio, load_item(lanes, bulk, tet), load_item(lanes, averaged_bulk, tet), averaged)
-        rest, length = load_shared(lanes, position, rest_length, tet), spring_length(edge[0], edge[1], edge[2])
-        share = rest / length
+        share = load_shared(lanes, position, rest_length, tet) / length
         rigidity = load_item(lanes, stiffness, tet)
         pull = spring_scale(share, rigidity)
         if stiffens:
-            rises = _end_sum(lanes, rise, tets, tet)
-            pull = stiffened(pull, rises)
-            if any_below(rises * -1.0, -steep_rise):
+            factor = _end_sum(lanes, pairs, tets, tet)
+            pull = pull * factor
+            if steepens and any_below(factor * -1.0, -steep_sum):
                 entry = tet // width * width
                 if steep_count == 0 or steep[steep_count - 1] != entry:
                     steep[steep_count] = entry

@@ -224,9 +224,12 @@ def _full_width(dtype: Any) -> int:
 # A full register from place `index` of an array; the four numbers of row `index` of an array (n, 4).
 load_full = _define_load(_full_width, lambda _: 1)
 load_row = _define_load(lambda _: 4, lambda _: 4)
+# The two numbers of row `index` of an array (n, 2).
+load_pair = _define_load(lambda _: 2, lambda _: 2)
 # The `index`-th vector of an array that is made of them.
 store_lanes = _define_store(lambda width: width)
 store_row = _define_store(lambda _: 4)
+store_pair = _define_store(lambda _: 2)
 # What `load_full` reads.
 store_full = _define_store(lambda _: 1)
 

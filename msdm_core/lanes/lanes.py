@@ -33,7 +33,6 @@ from msdm_core.organ.compile import rest_state, steep_scratch, support_shape
 from msdm_core.organ.stepping import unyielding
 
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
-LAW_FIELDS = ("node_energy", "node_rise", "node_steepness")
 ARM_FIELDS = ("spring_arm_tension", "spring_relief")
 CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch")
 
@@ -220,6 +219,9 @@ def lanes_of(
         rooms = surface_rooms(first)
         surface, support_nodes = rooms["surface_triangles"], rooms["support_nodes"]
     vectors = {name: aligned_zeros((nodes, 3, count), dtype) for name in (*NODE_FIELDS, "kept_force")}
+    points = shape_count * surface * QUADRATURE_COUNT
+    # Steep springs are held in all lanes at once, between what makes these rows in each lane and what reads them.
+    rooms_of_rows = count if first.stiffens else 1
     state = LaneState(
         **vectors,
         volume_ratio_smallest=aligned_zeros((1, count), dtype),
@@ -227,20 +229,23 @@ def lanes_of(
         contact_engaged=np.zeros((count, shape_count, surface * QUADRATURE_COUNT), dtype=np.uint8),
         contact_stretch=np.zeros((count, shape_count, surface * QUADRATURE_COUNT, 3)),
         contact_candidates=np.zeros((count, shape_count, surface), dtype=np.int32),
-        contact_rows=np.zeros((shape_count * surface * QUADRATURE_COUNT, ROW_WIDTH)),
-        contact_places=np.zeros((shape_count * surface * QUADRATURE_COUNT, PLACE_WIDTH), dtype=np.int32),
+        contact_rows=np.zeros((rooms_of_rows, points, ROW_WIDTH)),
+        contact_places=np.zeros((rooms_of_rows, points, PLACE_WIDTH), dtype=np.int32),
         contact_hold=np.zeros(nodes),
         contact_passed=np.zeros((count, 2), dtype=np.int32),
         support_stretch=np.zeros((count, support_nodes, supports, 3)),
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
-        **{name: aligned_zeros((len(first.node_softness), count), dtype) for name in LAW_FIELDS},
-        **steep_scratch(first),
+        node_pairs=aligned_zeros((2, len(first.node_softness), count), dtype),
+        node_steepness=aligned_zeros((len(first.node_softness), count), dtype),
+        spring_lengths=np.zeros(0),
+        **steep_scratch(first, (count,), dtype),
         **{name: aligned_zeros((len(getattr(states[0], name)), count), dtype) for name in ARM_FIELDS},
         moving=aligned_zeros((1, count), dtype),
         finite_sum=aligned_zeros((1, count), dtype),
         candidate_count=np.zeros(count, dtype=np.int32),
         contact_kept=np.ones(count, dtype=np.uint8),
+        contact_count=np.zeros(count, dtype=np.int32),
         surface_count=np.full(count, surface, dtype=np.int32),
         support_count=np.full(count, support_nodes, dtype=np.int32),
     )
@@ -293,11 +298,13 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
     return OrganState(
         **{name: np.array(getattr(state, name)[:, :, lane], dtype=np.float64, order="C") for name in NODE_FIELDS},
         **{name: getattr(state, name)[:, lane].astype(np.float64) for name in ARM_FIELDS},
-        **{name: np.zeros(len(getattr(state, name))) for name in LAW_FIELDS},
+        node_pairs=aligned_zeros((len(state.node_steepness), 2)),
+        node_steepness=np.zeros(len(state.node_steepness)),
+        spring_lengths=np.zeros(len(state.steep_springs)),
         steep_springs=np.zeros_like(state.steep_springs),
         steep_places=np.zeros_like(state.steep_places),
-        steep_rows=np.zeros_like(state.steep_rows),
-        steep_speed=np.zeros_like(state.steep_speed),
+        steep_rows=np.zeros(state.steep_rows.shape[:-1]),
+        steep_speed=np.zeros(state.steep_speed.shape[:-1]),
         contact_engaged=state.contact_engaged[lane][points].copy(),
         contact_stretch=state.contact_stretch[lane][points].copy(),
         contact_passed=state.contact_passed[lane].copy(),
@@ -315,6 +322,7 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
         finite_sum=np.zeros(1),
         candidate_count=np.zeros(1, dtype=np.int32),
         contact_kept=np.ones(1, dtype=np.uint8),
+        contact_count=np.zeros(1, dtype=np.int32),
     )
 
 

@@ -170,9 +170,9 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         row_velocity=aligned_zeros((len(model.node_mass), 4)),
         row_force=aligned_zeros((len(model.node_mass), 4)),
         squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
-        node_energy=np.zeros_like(model.node_softness),
-        node_rise=np.zeros_like(model.node_softness),
+        node_pairs=aligned_zeros((len(model.node_softness), 2)),
         node_steepness=np.zeros_like(model.node_softness),
+        spring_lengths=np.zeros(len(model.spring_nodes) if model.stiffens else 0),
         **steep_scratch(model),
         spring_arm_tension=np.zeros_like(model.spring_arm_modulus),
         spring_relief=np.zeros_like(model.spring_gain),
@@ -190,17 +190,24 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         finite_sum=np.zeros(1),
         candidate_count=np.zeros(1, dtype=np.int32),
         contact_kept=np.ones(1, dtype=np.uint8),
+        contact_count=np.zeros(1, dtype=np.int32),
     )
 
 
-def steep_scratch(model: OrganModel) -> dict[str, NDArray[Any]]:
-    """The scratch fields of a state for `hold_steep`; empty where no spring stiffens."""
+def steep_scratch(model: OrganModel, lanes: tuple[int, ...] = (), dtype: Any = np.float64) -> dict[str, NDArray[Any]]:
+    """The scratch fields of a state for `hold_steep`; empty where no spring stiffens.
+
+    Args:
+        model: the organ.
+        lanes: last index of the numbers of organs side by side, (n_lane,).
+        dtype: of those numbers.
+    """
     springs = len(model.spring_nodes) if model.stiffens else 0
     return {
         "steep_springs": np.zeros(springs, dtype=np.int32),
         "steep_places": np.zeros(springs, dtype=np.int32),
-        "steep_rows": np.zeros((springs, STEEP_WIDTH)),
-        "steep_speed": np.zeros((len(model.node_mass) if springs else 0, 3)),
+        "steep_rows": aligned_zeros((springs, STEEP_WIDTH, *lanes), dtype),
+        "steep_speed": aligned_zeros((len(model.node_mass) if springs else 0, 3, *lanes), dtype),
     }
 
 

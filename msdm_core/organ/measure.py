@@ -76,7 +76,7 @@ def node_strains(model: OrganModel, length: FloatArray) -> FloatArray:
 
 
 def _node_rises(model: OrganModel, strain: FloatArray) -> FloatArray:
-    """`element_kernels.node_law`: what stiffening adds to tension over that of linear springs, (n_node,)."""
+    """What stiffening adds to tension over that of linear springs (`element_kernels.node_law`), (n_node,)."""
     beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
     ramp = np.minimum(beyond, 1.0)
     return model.node_excess * (ramp**3 / 3.0 + (beyond - ramp)) / np.maximum(strain, STRAIN_LEAST)

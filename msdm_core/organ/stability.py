@@ -13,18 +13,16 @@ from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import SWEEPS
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
 from msdm_core.kernels.linear_kernels import multiply_stiffness
+from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, SWEEPS_PER_TANGENT
 from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 
 # Relative accuracy of the largest eigenvalue: 1 % of the step. Lanczos converges from below, so it is added back.
 EIGENVALUE_TOLERANCE = 0.02
 LANCZOS_VECTORS = 12
-# What stiffening adds to the tangent is integrated implicitly, by so many sweeps per tangent over that at rest, at
-# least and at most as many. Measured on bars with all springs beyond the cap strain (stretched by 30 %, compressed
-# by 15 %, sheared by 40 %, slowly or at once, and let go): the step at rest holds tangents of 14, 20, 29 and 38 times
-# that at rest with 4, 6, 8 and 12 sweeps. Larger ones shorten the step.
-SWEEPS_PER_TANGENT = 1.0 / 3.0
-SWEEPS_LEAST, SWEEPS_MOST = 4, 12
+# What stiffening adds to the tangent is integrated implicitly, by so many sweeps at most; larger tangents than these
+# hold shorten the step.
+SWEEPS_MOST = 12
 HELD_TANGENT = SWEEPS_MOST / SWEEPS_PER_TANGENT
 
 

@@ -8,7 +8,7 @@ import pytest
 from msdm_core.errors import OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
-from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
 from msdm_core.lanes.lanes import (
     advance_lanes,
     get_lane,
@@ -32,7 +32,7 @@ from msdm_core.organ.measure import (
     spring_tensions,
 )
 from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
-from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ, round_shapes
 
 LIVER = Stiffening(onset_strain=0.03, cap_strain=0.12, tangent_cap=20.0)
 ARMS = Relaxation(relative_moduli=(0.3, 0.2, 0.4), times=(0.05, 0.5, 5.0))
@@ -230,6 +230,41 @@ def test_lanes_move_as_organs_alone(dtype: type):
     )
 
 
+def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
+    """One lane without steep springs, one that needs the fewest sweeps, one the most: wrench and state to the bit."""
+    law = replace(LIVER, tangent_cap=36.0)
+    organs = [block(law, poisson_ratio=0.4, youngs_modulus=modulus) for modulus in (5000.0, 6000.0, 7000.0)]
+    states = [blank_state(organ, shape_count=1) for organ in organs]
+    for organ, state, size in zip(organs, states, (0.0, 0.04, 0.2), strict=True):
+        state.node_position[:] = strained(organ, size).node_position
+    balls = []
+    for organ, state in zip(organs, states, strict=True):
+        middles = state.node_position[organ.surface_triangles].mean(axis=1)
+        above = middles[middles[:, 2].argmax()] + np.array([0.0, 0.0, 0.003])
+        balls.append(round_shapes([[above, above]], [0.004], twist=[[0.0, 0.0, -0.02, 0.0, 0.0, 0.0]]))
+    contact = ContactLaw(stiffness=2e7, damping=500.0, friction=0.4, tangential_stiffness=1e7)
+    lanes, together, count = stack_organs(organs), lanes_of(states, organs[0]), 8
+    shapes, pushes = stack_shapes(balls), np.zeros((count, 1, 6))
+    dt = 0.5 * min(stable_dt(organ, contact) for organ in organs)
+    needed, highest_push = np.zeros(3), np.zeros(3)
+    for _ in range(8):
+        faults = advance_lanes(lanes, together, shapes, contact, dt, 5, pushes)
+        assert not faults[:3].any()
+        highest_push = np.maximum(highest_push, pushes[:3, 0, 2])
+        for lane, (organ, state) in enumerate(zip(organs, states, strict=True)):
+            wrench = np.zeros((1, 6))
+            assert advance_organ(organ, state, balls[lane], contact, dt, 5, wrench) == FAULT_NONE
+            np.testing.assert_array_equal(pushes[lane], wrench)
+            tangent = 1.0 + float(state.node_steepness[organ.spring_nodes].mean(axis=1).max())
+            needed[lane] = max(needed[lane], steep_sweeps(tangent) if tangent > 1.0 + STEEP_EXCESS else 0)
+    assert (np.diff(needed) > 0.0).all()
+    assert (highest_push > 0.01).all()
+    for lane, state in enumerate(states):
+        copy = get_lane(together, lane)
+        for name, value in saved(state).items():
+            np.testing.assert_array_equal(getattr(copy, name), value, err_msg=f"lane {lane}: {name}")
+
+
 def test_organs_with_and_without_a_law_do_not_share_lanes():
     with pytest.raises(OrganError, match="another stiffens"):
         stack_organs([block(LIVER), block()])
@@ -304,9 +339,9 @@ def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatA
     for unit in np.eye(state.node_velocity.size):
         velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
         hold_steep(
-            state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes, model.spring_stiffness,
-            state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes), every, len(every), 1, sweeps,
-            state.steep_places, state.steep_rows, state.steep_speed, dt,
+            (), state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes,
+            model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes),
+            every, len(every), 1, sweeps, sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
         )  # fmt: skip
         columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
     return np.array(columns).T

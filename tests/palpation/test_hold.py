@@ -10,7 +10,7 @@ from surgsim_env.palpation.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST, SIT
 from surgsim_env.palpation.job import plan_sites
 from surgsim_env.palpation.surface_scene import soft_bed
 from surgsim_env.scene.anatomy import anatomy_of
-from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.load import make_material, make_scene
 from surgsim_env.scene.model import Anchor, Bed
 from surgsim_env.scene.palpable_surface import hertz_force
 from tests.patient.organs import kidney
@@ -26,6 +26,7 @@ def bean(anchor):
     scene = replace(
         liver,
         name="bean",
+        material=make_material("liver_linear").material,
         anchors=(anchor,),
         capsule=None,
         lesion=None,

@@ -1,8 +1,8 @@
 """Fixed-seed episodes and organs whose numbers must not change by one bit, compared with recorded hashes.
 
 The hashes are in `unchanged_hashes.json`, one set for each family of machines: compilers and libraries round
-differently on another processor or in another version. On a family without a set the tests skip. From the repository's
-root:
+differently on another processor or in another version. What changes on purpose is recorded where it is changed and
+dropped from other families: a case without a hash of a family skips there. From the repository's root:
 
     python -m tests.test_unchanged --record                adds (or replaces) the hashes of this machine's family
     python -m tests.test_unchanged --record CASE ...       those of the named cases alone, after a deliberate change
@@ -513,10 +513,11 @@ def recorded() -> dict[str, dict[str, dict[str, str]]]:
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CASES])
 def test_numbers_are_what_they_were(name: str):
-    known = recorded().get(family())
-    if known is None:
-        pytest.skip(f"no hashes of machines like this one ({family()}); to record them: {RECORD}")
-    assert name in known, f"{name!r} was not recorded: {RECORD} {name!r}"
+    everything = recorded()
+    assert any(name in one for one in everything.values()), f"{name!r} was recorded nowhere: {RECORD} {name!r}"
+    known = everything.get(family(), {})
+    if name not in known:
+        pytest.skip(f"no hash of {name!r} for machines like this one ({family()}); to record it: {RECORD} {name!r}")
     found = hashes(CASES[name]())
     changed = sorted(part for part in found.keys() | known[name].keys() if found.get(part) != known[name].get(part))
     assert not changed, (
@@ -527,7 +528,9 @@ def test_numbers_are_what_they_were(name: str):
 
 @pytest.mark.parametrize("name", ["Palpate-v0 phantom_small random", "Retract-v0 lobe random"])
 def test_plain_and_compiled_loop_gave_the_same(name: str):
-    for known in recorded().values():
+    both = [known for known in recorded().values() if name in known and f"{name}, plain loop" in known]
+    assert both
+    for known in both:
         assert known[f"{name}, plain loop"] == known[name]
 
 

@@ -1,4 +1,4 @@
-"""A scene for any closed surface file; values that are not given are the shipped liver's."""
+"""A scene for any closed surface file; values that are not given are the shipped liver's, but for its stiffening."""
 
 import math
 from collections.abc import Sequence
@@ -55,7 +55,7 @@ class SurfaceOptions:
 
 
 def surface_scene(file: Path, *, length_unit: LengthUnit, cell_size: float, options: SurfaceOptions) -> Scene:
-    """The shipped liver's scene with another surface.
+    """The shipped liver's scene with another surface, on linear tissue: which organ it is, nobody knows.
 
     Raises:
         ValueError: an invalid length or direction (names it).
@@ -66,6 +66,7 @@ def surface_scene(file: Path, *, length_unit: LengthUnit, cell_size: float, opti
     contact = CONTACT_MODULI_PER_CELL * scene.material.youngs_modulus / cell_size
     return replace(
         scene,
+        material=replace(scene.material, stiffening=None),
         name=file.stem,
         description=f"the surface {file.name}",
         folder=Path.cwd(),

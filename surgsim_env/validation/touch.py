@@ -256,13 +256,19 @@ def contrast(cells: int, hidden: Hidden) -> Iterator[Row]:
     )  # fmt: skip
 
 
-def liver_contrast() -> Iterator[Row]:
-    """Contrast of a slab with the scene liver's tissue, capsule, cells and contact, against a rigid tip.
-
-    Sphere of 20 mm under 5 mm, 6 times as stiff, tip 12 mm, pressed 3, 5 and 7 mm; then what the contact of the scene
-    hides of it by the same elements.
-    """
+def linear_liver() -> Scene:
+    """The scene liver with springs that do not stiffen: the reference is neo-Hookean."""
     scene = make_scene("liver")
+    return replace(scene, material=replace(scene.material, stiffening=None))
+
+
+def liver_contrast() -> Iterator[Row]:
+    """Contrast of a slab with the scene liver's tissue without stiffening, its capsule, cells and contact.
+
+    Against a rigid tip: sphere of 20 mm under 5 mm, 6 times as stiff, tip 12 mm, pressed 3, 5 and 7 mm; then what the
+    contact of the scene hides of it by the same elements.
+    """
+    scene = linear_liver()
     assert scene.mesh.surface is not None and scene.capsule is not None
     tip, cell = scene.instrument.tip_radius, scene.mesh.surface.cell_size
     measured = _slab_forces(scene, cell, LIVER_SPHERE) / _slab_forces(scene, cell, None) - 1.0
@@ -289,7 +295,7 @@ def liver_contrast() -> Iterator[Row]:
 
 @lru_cache(maxsize=8)
 def _liver_reference(hidden: Hidden | None, contact_stiffness: float) -> tuple[float, ...]:
-    scene = make_scene("liver")
+    scene = linear_liver()
     assert scene.capsule is not None and scene.capsule.thickness is not None
     membrane = scene.capsule.youngs_modulus * scene.capsule.thickness
     field, mesh = modulus_field(scene.material.youngs_modulus, hidden), layer_mesh(0.08, 0.08, 1e-3, (0.016, 0.012))

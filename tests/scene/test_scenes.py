@@ -44,7 +44,7 @@ def test_the_shipped_scenes_are_listed():
 def test_every_scene_loads_with_its_palpable_face_and_sites(name):
     scene = make_scene(name)
     anatomy = load_anatomy(scene)
-    assert len(anatomy.anchors) > 10
+    assert len(anatomy.anchors) + len(anatomy.foundation_nodes) > 10
     points, normals = anatomy.face.raster(scene.palpation.site_spacing)
     assert len(points) > 20
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)

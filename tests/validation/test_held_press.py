@@ -13,7 +13,7 @@ from surgsim_env.palpation.job import plan_sites
 from surgsim_env.palpation.press import scan
 from surgsim_env.palpation.surface_scene import soft_bed
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
-from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.load import make_material, make_scene
 from tests.patient.organs import kidney
 
 pytest.importorskip("skfem", reason="scikit-fem, a development dependency, solves the reference")
@@ -101,6 +101,7 @@ def test_a_held_force_is_that_of_finite_elements() -> None:
     scene = replace(
         liver,
         name="organ",
+        material=make_material("liver_linear").material,
         anchors=(soft_bed(DOWN),),
         capsule=None,
         lesion=None,

@@ -1,8 +1,8 @@
 """Prescribed motion of what holds an organ, as by breathing: anchored nodes, foundations and supports follow signals.
 
 A motion m displaces the ground at a place X by s_m(t) d_m(X). The state holds its signal s_m and rate, which whoever
-advances the organ sets with `steer`; the kernels move the ground in each substep and count the work that it does. Damping by mass (alpha) acts on velocities
-relative to the ground, as the tissue around an organ moves with it.
+advances the organ sets with `steer`; kernels move the ground in each substep and count the work that it does. Damping
+by mass (alpha) acts on velocities relative to the ground, as the tissue around an organ moves with it.
 """
 
 import math

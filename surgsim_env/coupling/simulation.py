@@ -286,6 +286,10 @@ class Simulation:
         self.fault = taken.fault or self.fault
         self._taken = taken
 
+    def draw_motion(self, rng: np.random.Generator) -> None:
+        """Draw the course of the organ's motions from now on; without motions nothing is drawn."""
+        self.drive = draw_drive(self.anatomy.scene.motions, self.haptic_dt, rng)
+
     def begin_motion(self) -> None:
         """Let the drive of motions go on from the present time."""
         self.drive.step_count[0] = self._step

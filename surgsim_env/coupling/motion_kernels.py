@@ -1,6 +1,5 @@
 """Signals of an organ's motions over time, cycle by cycle: breaths and heartbeats."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +13,9 @@ class MotionDrive(NamedTuple):
     """The signals of an organ's motions (`msdm_core.organ.motion`) in an episode.
 
     A cycle rises from 0 to its size, falls to 0 and rests until the next one: with the share u of its duration that has
-    passed, s = A (1 - cos(pi u / u_r)) / 2 up to u_r, A (1 + cos(pi (u - u_r) / u_f)) / 2 up to u_r + u_f, and 0 from
-    there on. Signal and rate are continuous. After the last cycle the first one follows.
+    passed, s = A p(u / u_r) up to u_r, A p(1 - (u - u_r) / u_f) up to u_r + u_f, and 0 from there on, where
+    p(x) = x^3 (10 - 15 x + 6 x^2). Signal, rate and acceleration are continuous. After the last cycle
+    comes the first.
 
     Fields:
         cycle_start: of each cycle, and the end of the last one [s]              (n_motion, n_cycle + 1)
@@ -35,6 +35,12 @@ class MotionDrive(NamedTuple):
     step_count: NDArray[np.int64]
 
 
+@njit(forceinline=True, error_model="numpy")
+def smooth_rise(x):
+    """From 0 at 0 to 1 at 1, rate and acceleration 0 at both."""
+    return x * x * x * (10.0 + x * (6.0 * x - 15.0))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def signal_at(drive, number, time):
     """Signal of one motion at a time since the reset [s]."""
@@ -50,9 +56,9 @@ def signal_at(drive, number, time):
     share = (time - start[cycle]) / (start[cycle + 1] - start[cycle])
     size, rise, fall = drive.cycle_size[number, cycle], drive.rise[number], drive.fall[number]
     if share < rise:
-        return 0.5 * size * (1.0 - math.cos(math.pi * share / rise))
+        return size * smooth_rise(share / rise)
     if share < rise + fall:
-        return 0.5 * size * (1.0 + math.cos(math.pi * (share - rise) / fall))
+        return size * smooth_rise(1.0 - (share - rise) / fall)
     return 0.0
 
 

@@ -48,10 +48,10 @@ def test_cycles_rise_fall_and_rest():
             assert signal_at(drive, number, begin + 0.99 * length) == pytest.approx(0.0, abs=1e-12)
         time = np.arange(0.0, 3.0, 1e-4)
         speed = np.diff([signal_at(drive, number, one) for one in time]) / 1e-4
-        # The steepest change of speed of a raised cosine: A pi^2 / (2 (u_r T)^2) a second.
-        bend = size.max() * np.pi**2 / (2.0 * (min(motion.rise, motion.fall) * lengths.min()) ** 2)
+        # The largest acceleration: |p''| is at most 10 / sqrt(3).
+        bend = size.max() * 10.0 / (np.sqrt(3.0) * (min(motion.rise, motion.fall) * lengths.min()) ** 2)
         assert np.abs(np.diff(speed)).max() < 1.05 * bend * 1e-4
-        assert (np.ptp(lengths) > 0.0) == (np.ptp(size) > 0.0) == (motion.variation > 0.0)
+        assert (np.ptp(lengths) > 1e-9) == (np.ptp(size) > 1e-9) == (motion.variation > 0.0)
 
 
 def test_the_ground_is_where_the_signals_say_after_each_haptic_step(scene):
@@ -60,7 +60,7 @@ def test_the_ground_is_where_the_signals_say_after_each_haptic_step(scene):
     simulation.draw_motion(np.random.default_rng(2))
     at_rest = simulation.organ_state.node_position[anatomy.anchors].copy()
     farthest = 0.0
-    for _ in range(400):
+    for _ in range(900):
         assert simulation.haptic_step()
         signals = [signal_at(simulation.drive, number, simulation.time) for number in range(2)]
         shift = sum(s * one.ground.shift(at_rest) for s, one in zip(signals, scene.motions, strict=True))

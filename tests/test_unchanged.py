@@ -254,13 +254,22 @@ def play_greedy(scene: str, presses: int, seed: int = 3, **settings: object) -> 
     return parts
 
 
+def constants(organ: msdm_core.OrganModel) -> tuple[object, ...]:
+    """The arrays of an organ, without those of motions, which these do not have."""
+    assert not len(organ.motion_node_shift)
+    return tuple(value for name, value in zip(organ._fields, organ, strict=True) if not name.startswith("motion_"))
+
+
 def scene_organ(env_id: str, scene: str, **settings: object) -> Parts:
     """The arrays of a scene's organ, healthy and as an episode draws it, with its stable step."""
     env = make(env_id, scene, **settings)
     simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
-    parts: Parts = {"organ": [simulation.organ_model], "stable_dt": [msdm_core.stable_dt(simulation.organ_model)]}
+    parts: Parts = {
+        "organ": [constants(simulation.organ_model)],
+        "stable_dt": [msdm_core.stable_dt(simulation.organ_model)],
+    }
     env.reset(seed=3)
-    parts["organ"].append(simulation.organ_model)
+    parts["organ"].append(constants(simulation.organ_model))
     parts["stable_dt"].append(msdm_core.stable_dt(simulation.organ_model))
     env.close()
     return parts
@@ -296,7 +305,7 @@ def block_organ() -> Parts:
         free = organ.node_inverse_mass > 0.0
         state.node_velocity[free] = np.random.default_rng(5).uniform(-0.1, 0.1, (int(free.sum()), 3))
         msdm_core.advance(organ, state, dt=0.5 * step, substep_count=200)
-        parts.setdefault("organ", []).append(organ)
+        parts.setdefault("organ", []).append(constants(organ))
         parts.setdefault("stable_dt", []).append(step)
         parts.setdefault("motion", []).extend([state.node_position, state.node_velocity])
     return parts

@@ -69,6 +69,9 @@ class OrganModel(NamedTuple):
         foundation_nodes: nodes that elastic foundations hold                    (n_held,)
         foundation_position: where those nodes are without force [m]             (n_held, 3)
         foundation_stiffness: force per displacement, all foundations together [N/m] (n_held, 3, 3)
+        motion_node_shift: how far a unit of a motion's signal moves the ground [m]  (n_motion, n_node, 3)
+        motion_foundation_shift: the same of foundations, at the nodes they hold [m] (n_motion, n_held, 3)
+        motion_support_shift: the same of supports [m]                           (n_motion, n_support, 3)
         gravity: [m/s^2]                                                         (3,)
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
@@ -117,6 +120,9 @@ class OrganModel(NamedTuple):
     foundation_nodes: NDArray[np.int32]
     foundation_position: FloatArray
     foundation_stiffness: FloatArray
+    motion_node_shift: FloatArray
+    motion_foundation_shift: FloatArray
+    motion_support_shift: FloatArray
     gravity: FloatArray
     alpha: float
     beta: float
@@ -158,6 +164,10 @@ class OrganState(NamedTuple):
         contact_hold: scratch: what contact holds a node with, times dt^2 [kg]   (n_node,)
         contact_passed: the shape and the triangle it passed through, after such a fault  (2,)
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_support_node, n_support, 3)
+        motion: signal, its rate, rate of the substep before [1/s], work of the ground on the organ [J] (n_motion, 4)
+        ground_foundation: scratch: where foundations hold nodes now [m]         (n_held, 3)
+        ground_support: scratch: position [m] and velocity [m/s] of supports now (n_support, 2, 3)
+        ground_load: scratch: force of each support on the organ [N]             (n_support, 3)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
         lane_fault: scratch: FAULT_ code of the last call                        (1,)
         moving: scratch: 1 until a fault stops the organ, then 0                 (1,)
@@ -192,6 +202,10 @@ class OrganState(NamedTuple):
     contact_hold: FloatArray
     contact_passed: NDArray[np.int32]
     support_stretch: FloatArray
+    motion: FloatArray
+    ground_foundation: FloatArray
+    ground_support: FloatArray
+    ground_load: FloatArray
     volume_ratio_smallest: FloatArray
     lane_fault: NDArray[np.int32]
     moving: FloatArray
@@ -206,6 +220,7 @@ SCRATCH_FIELDS = (
     *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets"),
     *("node_pairs", "node_steepness", "spring_lengths", "steep_springs", "steep_places", "steep_rows", "steep_speed"),
     *("contact_candidates", "contact_rows", "contact_places", "contact_hold"),
+    *("ground_foundation", "ground_support", "ground_load"),
     *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept", "contact_count"),
 )
 
@@ -241,6 +256,7 @@ class LaneModel(NamedTuple):
         support_count: how many of them each lane has                            (n_lane,)
         support_kind and the other support_ fields: as in OrganModel
         foundation_nodes and the other foundation_ fields: as in OrganModel
+        motion_node_shift and the other motion_ fields: as in OrganModel
         gravity: [m/s^2]                                                         (3,)
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
@@ -289,6 +305,9 @@ class LaneModel(NamedTuple):
     foundation_nodes: NDArray[np.int32]
     foundation_position: FloatArray
     foundation_stiffness: FloatArray
+    motion_node_shift: FloatArray
+    motion_foundation_shift: FloatArray
+    motion_support_shift: FloatArray
     gravity: FloatArray
     alpha: float
     beta: float
@@ -312,6 +331,10 @@ class LaneState(NamedTuple):
         contact_hold: scratch of one lane after the other, as in OrganState
         contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
         support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
+        motion: as in OrganState                                                 (n_lane, n_motion, 4)
+        ground_foundation: scratch: as in OrganState                             (n_lane, n_held, 3)
+        ground_support: scratch: as in OrganState                                (n_lane, n_support, 2, 3)
+        ground_load: scratch: as in OrganState                                   (n_lane, n_support, 3)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
         node_pairs: scratch: as in OrganState                                    (2, n_node, n_lane), (2, 0, n_lane)
@@ -345,6 +368,10 @@ class LaneState(NamedTuple):
     contact_hold: FloatArray
     contact_passed: NDArray[np.int32]
     support_stretch: FloatArray
+    motion: FloatArray
+    ground_foundation: FloatArray
+    ground_support: FloatArray
+    ground_load: FloatArray
     node_tension: LaneArray
     squeezed_tets: NDArray[np.int32]
     node_pairs: LaneArray
@@ -633,7 +660,8 @@ def in_rows(lanes, state):
         state.spring_arm_tension, state.spring_relief,
         state.contact_engaged, state.contact_stretch, state.contact_candidates,
         state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
-        state.support_stretch, state.volume_ratio_smallest,
+        state.support_stretch,
+        state.motion, state.ground_foundation, state.ground_support, state.ground_load, state.volume_ratio_smallest,
         state.lane_fault, state.moving, state.finite_sum, state.candidate_count, state.contact_kept,
         state.contact_count,
     )  # fmt: skip

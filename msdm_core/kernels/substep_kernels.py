@@ -32,7 +32,14 @@ from msdm_core.kernels.structure_kernels import (
     surface_of,
     touched_of,
 )
-from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
+from msdm_core.kernels.support_kernels import (
+    add_foundation_forces,
+    add_support_forces,
+    carry_anchors,
+    follow_ground,
+    move_ground,
+    place_ground,
+)
 from msdm_core.kernels.tissue_kernels import (
     add_energies,
     add_spring_damping,
@@ -261,6 +268,13 @@ def _begin(lanes, model, state, shapes, response, duration):
             stands = True
             continue
         set_entry(state.moving, lane, 1.0)
+        if model.motion_node_shift.shape[0] > 0:
+            motion = part_of(lanes, state.motion, lane)
+            velocity = touched_of(lanes, state, lane).node_velocity
+            carry_anchors(model, column_of(model.node_inverse_mass, lane), motion, velocity)
+            place_ground(
+                model, motion, part_of(lanes, state.ground_foundation, lane), part_of(lanes, state.ground_support, lane)
+            )
         answer = response_of(lanes, response, lane)
         answer.tool_wrench[:, :] = 0.0
         answer.tool_lag[:, :] = 0.0
@@ -317,12 +331,15 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
         touched = touched_of(lanes, state, lane)
         position, velocity, force = touched.node_position, touched.node_velocity, touched.node_force
         if model.support_kind.shape[0] > 0:
-            stretch = part_of(lanes, state.support_stretch, lane)
-            add_support_forces(supports_of(lanes, model, lane), position, velocity, force, stretch, dt)
+            add_support_forces(
+                supports_of(lanes, model, lane), part_of(lanes, state.ground_support, lane), position, velocity, force,
+                part_of(lanes, state.support_stretch, lane), part_of(lanes, state.ground_load, lane), dt,
+            )  # fmt: skip
         if model.foundation_nodes.shape[0] > 0:
             add_foundation_forces(
-                model.foundation_nodes, model.foundation_position, model.foundation_stiffness, position, force
-            )
+                model.foundation_nodes, part_of(lanes, state.ground_foundation, lane), model.foundation_stiffness,
+                position, force,
+            )  # fmt: skip
         if state.candidate_count[lane] == 0 and squeezed_count == 0 and steep_count == 0:
             continue
         _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrench, lane)
@@ -339,6 +356,24 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
             if state.lane_fault[lane] == FAULT_NONE:
                 _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)
     return moving
+
+
+@njit(forceinline=True, error_model="numpy")
+def _move_ground(lanes, model, state, dt, decay):
+    """Move what holds the organs that move: anchored nodes by the integration that follows, the rest at once."""
+    if model.motion_node_shift.shape[0] == 0:
+        return
+    for lane in range(_lane_count(lanes)):
+        if state.lane_fault[lane] != FAULT_NONE:
+            continue
+        touched, mass = touched_of(lanes, state, lane), column_of(model.node_inverse_mass, lane)
+        motion, foundation = part_of(lanes, state.motion, lane), part_of(lanes, state.ground_foundation, lane)
+        move_ground(
+            model, mass, touched.node_position, touched.node_force, foundation,
+            part_of(lanes, state.ground_load, lane), motion, dt,
+        )  # fmt: skip
+        follow_ground(model, mass, motion, touched.node_velocity, decay)
+        place_ground(model, motion, foundation, part_of(lanes, state.ground_support, lane))
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -411,6 +446,7 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
             == 0
         ):
             break
+        _move_ground(lanes, model, rows, dt, decay)
         integrate(
             lanes, rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay,
             rows.moving, rows.finite_sum,

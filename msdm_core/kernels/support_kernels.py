@@ -1,4 +1,4 @@
-"""What holds an organ: contact with fixed solids (pressure, stick-slip friction) and elastic foundations."""
+"""What holds an organ: contact with solids (pressure, stick-slip friction), elastic foundations, and their motion."""
 
 import math
 
@@ -10,23 +10,27 @@ PLANE, SPHERE, CAPSULE, BOX = 0, 1, 2, 3
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_support_forces(model, position, velocity, force, stretch, dt):
+def add_support_forces(model, ground, position, velocity, force, stretch, load, dt):
     """Push every surface node out of the supports that it is in; two supports both push.
 
     A node of area A, d deep, is held off along the solid's outward normal n with A max(0, k_p d - c n . v), and across
     it by a spring of k_t A whose stretch follows the node and is cut where it would pull more than mu times that. The
     stretch belongs to node and support, is zero while the node is outside, and turns with the normal.
 
+    Velocities are relative to the solid's.
+
     Model: model
-    In:    position, velocity (n_node, 3), dt [s]
-    Out:   force, added to [N] (n_node, 3), stretch [m] (n_support_node, n_support, 3)
+    In:    ground: position [m], velocity [m/s] of the solids (n_support, 2, 3), position, velocity (n_node, 3), dt [s]
+    Out:   force, added to [N] (n_node, 3), stretch [m] (n_support_node, n_support, 3), load: of each solid on the organ
+           [N] (n_support, 3)
     """
-    nodes, areas, kinds, centre = model.support_nodes, model.support_area, model.support_kind, model.support_position
+    nodes, areas, kinds = model.support_nodes, model.support_area, model.support_kind
     rotation, size, frictions = model.support_rotation, model.support_size, model.support_friction
     stiffness, damping, across = model.support_stiffness, model.support_damping, model.support_tangential_stiffness
     for support in range(kinds.shape[0]):
         kind, friction = kinds[support], frictions[support]
-        cx, cy, cz = centre[support, 0], centre[support, 1], centre[support, 2]
+        cx, cy, cz = ground[support, 0, 0], ground[support, 0, 1], ground[support, 0, 2]
+        load[support] = 0.0
         ax, ay, az = rotation[support, 0, 0], rotation[support, 1, 0], rotation[support, 2, 0]
         bx, by, bz = rotation[support, 0, 1], rotation[support, 1, 1], rotation[support, 2, 1]
         ex, ey, ez = rotation[support, 0, 2], rotation[support, 1, 2], rotation[support, 2, 2]
@@ -48,39 +52,149 @@ def add_support_forces(model, position, velocity, force, stretch, dt):
             nx = ax * lx + bx * ly + ex * lz
             ny = ay * lx + by * ly + ey * lz
             nz = az * lx + bz * ly + ez * lz
-            vx = velocity[node, 0]
-            vy = velocity[node, 1]
-            vz = velocity[node, 2]
-            load = stiffness * depth - damping * (nx * vx + ny * vy + nz * vz)
-            if load < 0.0:
-                load = 0.0
+            vx = velocity[node, 0] - ground[support, 1, 0]
+            vy = velocity[node, 1] - ground[support, 1, 1]
+            vz = velocity[node, 2] - ground[support, 1, 2]
+            pressure = stiffness * depth - damping * (nx * vx + ny * vy + nz * vz)
+            if pressure < 0.0:
+                pressure = 0.0
             ux, uy, uz = stretch[item, support, 0], stretch[item, support, 1], stretch[item, support, 2]
-            ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, friction * load / across)
+            ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, friction * pressure / across)
             stretch[item, support, 0] = ux
             stretch[item, support, 1] = uy
             stretch[item, support, 2] = uz
             area = areas[item]
-            force[node, 0] += area * (load * nx - across * ux)
-            force[node, 1] += area * (load * ny - across * uy)
-            force[node, 2] += area * (load * nz - across * uz)
+            x = area * (pressure * nx - across * ux)
+            y = area * (pressure * ny - across * uy)
+            z = area * (pressure * nz - across * uz)
+            force[node, 0] += x
+            force[node, 1] += y
+            force[node, 2] += z
+            load[support, 0] += x
+            load[support, 1] += y
+            load[support, 2] += z
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_foundation_forces(nodes, rest, stiffness, position, force):
+def add_foundation_forces(nodes, ground, stiffness, position, force):
     """Hold nodes elastically where they are without force: f = -K (x - x0).
 
-    In:  nodes (n_held,), rest: x0 [m] (n_held, 3), stiffness: K [N/m] (n_held, 3, 3), position [m] (n_node, 3)
+    In:  nodes (n_held,), ground: x0 [m] (n_held, 3), stiffness: K [N/m] (n_held, 3, 3), position [m] (n_node, 3)
     Out: force, added to [N] (n_node, 3)
     """
     for item in range(nodes.shape[0]):
         node = nodes[item]
-        x = position[node, 0] - rest[item, 0]
-        y = position[node, 1] - rest[item, 1]
-        z = position[node, 2] - rest[item, 2]
+        x = position[node, 0] - ground[item, 0]
+        y = position[node, 1] - ground[item, 1]
+        z = position[node, 2] - ground[item, 2]
         for axis in range(3):
             force[node, axis] -= (
                 stiffness[item, axis, 0] * x + stiffness[item, axis, 1] * y + stiffness[item, axis, 2] * z
             )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def place_ground(model, motion, foundation, support):
+    """Where the ground is now: x0 + sum of s_m d_m, at the speed sum of ds_m/dt d_m, over the motions m.
+
+    Model: model: shifts d_m
+    In:    motion: signals s_m and their rates [1/s] (n_motion, 4)
+    Out:   foundation [m] (n_held, 3), support: position [m] and velocity [m/s] (n_support, 2, 3)
+    """
+    for item in range(foundation.shape[0]):
+        for axis in range(3):
+            place = model.foundation_position[item, axis]
+            for number in range(motion.shape[0]):
+                place += motion[number, 0] * model.motion_foundation_shift[number, item, axis]
+            foundation[item, axis] = place
+    for item in range(support.shape[0]):
+        for axis in range(3):
+            place, speed = model.support_position[item, axis], 0.0
+            for number in range(motion.shape[0]):
+                place += motion[number, 0] * model.motion_support_shift[number, item, axis]
+                speed += motion[number, 1] * model.motion_support_shift[number, item, axis]
+            support[item, 0, axis] = place
+            support[item, 1, axis] = speed
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def carry_anchors(model, inverse_mass, motion, velocity):
+    """Give anchored nodes the speed of the ground, v = sum of ds_m/dt d_m.
+
+    Model: model: shifts d_m
+    In:    inverse_mass [1/kg] (n_node,), motion: signals s_m and their rates [1/s] (n_motion, 4)
+    Out:   velocity [m/s] (n_node, 3)
+    """
+    for node in range(inverse_mass.shape[0]):
+        if inverse_mass[node] == 0.0:
+            for axis in range(3):
+                speed = 0.0
+                for number in range(motion.shape[0]):
+                    speed += motion[number, 1] * model.motion_node_shift[number, node, axis]
+                velocity[node, axis] = speed
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def follow_ground(model, inverse_mass, motion, velocity, decay):
+    """Let the integration that follows, v' = decay v + ..., damp velocities relative to the ground's.
+
+    With its speed w = sum of ds_m/dt d_m: v' = decay (v - w) + w + ..., and v' = w where the node is anchored.
+
+    Model: model: shifts d_m
+    In:    inverse_mass [1/kg] (n_node,), motion: signals s_m and their rates [1/s] (n_motion, 4), decay
+    Out:   velocity [m/s] (n_node, 3)
+    """
+    more = (1.0 - decay) / decay
+    for node in range(inverse_mass.shape[0]):
+        anchored = inverse_mass[node] == 0.0
+        if more == 0.0 and not anchored:
+            continue
+        for axis in range(3):
+            speed = 0.0
+            for number in range(motion.shape[0]):
+                speed += motion[number, 1] * model.motion_node_shift[number, node, axis]
+            if anchored:
+                velocity[node, axis] = speed / decay
+            else:
+                velocity[node, axis] += more * speed
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def move_ground(model, inverse_mass, position, force, foundation, load, motion, dt):
+    """Count the work of the ground on the organ, and advance the signals by a step.
+
+    What the ground pushes with does the work F . d_m ds_m: F = -f at an anchored node, whose forces it balances,
+    K (x0 - x) below a foundation, and a support's load. A signal's change up to a state and the one after it count
+    half each, the trapezoidal rule: with the rates before and after, dW_m = F . d_m (r_m + r'_m) dt / 2.
+
+    Model: model: shifts d_m
+    In:    inverse_mass [1/kg] (n_node,), position [m] (n_node, 3), force [N] (n_node, 3), foundation [m] (n_held, 3),
+           load [N] (n_support, 3), dt [s]
+    Out:   motion (n_motion, 4)
+    """
+    for number in range(motion.shape[0]):
+        shift = model.motion_node_shift[number]
+        power = 0.0
+        for node in range(inverse_mass.shape[0]):
+            if inverse_mass[node] == 0.0:
+                for axis in range(3):
+                    power -= force[node, axis] * shift[node, axis]
+        shift = model.motion_foundation_shift[number]
+        for item in range(foundation.shape[0]):
+            node = model.foundation_nodes[item]
+            for axis in range(3):
+                push = 0.0
+                for other in range(3):
+                    stretch = foundation[item, other] - position[node, other]
+                    push += model.foundation_stiffness[item, axis, other] * stretch
+                power += push * shift[item, axis]
+        shift = model.motion_support_shift[number]
+        for item in range(load.shape[0]):
+            for axis in range(3):
+                power += load[item, axis] * shift[item, axis]
+        motion[number, 3] += 0.5 * power * (motion[number, 1] + motion[number, 2]) * dt
+        motion[number, 2] = motion[number, 1]
+        motion[number, 0] += motion[number, 1] * dt
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -34,7 +34,8 @@ from msdm_core.organ.stepping import unyielding
 
 NODE_FIELDS = ("node_position", "node_velocity", "node_force")
 ARM_FIELDS = ("spring_arm_tension", "spring_relief")
-CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch")
+CONTACT_FIELDS = ("contact_engaged", "contact_stretch", "contact_passed", "support_stretch", "motion")
+GROUND_FIELDS = ("ground_foundation", "ground_support", "ground_load")
 
 # Of an organ's arrays, those that each lane has of its own; all others are shared.
 OWN_FIELDS = (
@@ -234,6 +235,8 @@ def lanes_of(
         contact_hold=np.zeros(nodes),
         contact_passed=np.zeros((count, 2), dtype=np.int32),
         support_stretch=np.zeros((count, support_nodes, supports, 3)),
+        motion=np.zeros((count, *states[0].motion.shape)),
+        **{name: np.stack([getattr(states[0], name)] * count) for name in GROUND_FIELDS},
         node_tension=aligned_zeros((nodes, count), dtype),
         squeezed_tets=np.zeros(len(first.tet_nodes), dtype=np.int32),
         node_pairs=aligned_zeros((2, len(first.node_softness), count), dtype),
@@ -309,6 +312,8 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
         contact_stretch=state.contact_stretch[lane][points].copy(),
         contact_passed=state.contact_passed[lane].copy(),
         support_stretch=state.support_stretch[lane, :supports].copy(),
+        motion=state.motion[lane].copy(),
+        **{name: getattr(state, name)[lane].copy() for name in GROUND_FIELDS},
         **rows,
         node_tension=np.zeros(nodes),
         squeezed_tets=np.zeros_like(state.squeezed_tets),

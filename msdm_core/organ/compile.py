@@ -40,6 +40,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.foundation import Foundation, foundation_fields
 from msdm_core.organ.measure import spring_tensions
+from msdm_core.organ.motion import Motion, motion_fields
 from msdm_core.organ.stability import own_step, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
@@ -72,6 +73,7 @@ class OrganSpec:
         supports: fixed solids that it rests on.
         support_law: their contact law.
         foundations: elastic ones that hold its surface.
+        motions: of anchors, supports and foundations (`organ.motion`).
     """
 
     mesh: TetMesh
@@ -86,6 +88,7 @@ class OrganSpec:
     supports: tuple[Support, ...] = ()
     support_law: SupportLaw = field(default_factory=SupportLaw)
     foundations: tuple[Foundation, ...] = ()
+    motions: tuple[Motion, ...] = ()
 
 
 def compile_organ(spec: OrganSpec) -> OrganModel:
@@ -113,6 +116,8 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
     corners = mesh.points[surface]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    supports = support_fields(spec.supports, spec.support_law, mesh, surface, anchored)
+    foundations = foundation_fields(spec.foundations, mesh, anchored)
     model = OrganModel(
         node_rest_position=_read_only(mesh.points),
         node_mass=_read_only(mass),
@@ -132,8 +137,9 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         averages_volume=bool(node_bulk.any()),
         surface_triangles=_read_only(np.ascontiguousarray(surface)),
         surface_rest_area=_read_only(area),
-        **support_fields(spec.supports, spec.support_law, mesh, surface, anchored),
-        **foundation_fields(spec.foundations, mesh, anchored),
+        **supports,
+        **foundations,
+        **motion_fields(spec.motions, mesh.points, foundations["foundation_nodes"], supports["support_position"]),
         gravity=_read_only(_checked_gravity(spec.gravity)),
         alpha=float(spec.damping.alpha),
         beta=float(spec.damping.beta),
@@ -184,6 +190,10 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         contact_hold=np.zeros_like(model.node_mass),
         contact_passed=np.zeros(2, dtype=np.int32),
         support_stretch=np.zeros(support_shape(model)),
+        motion=np.zeros((len(model.motion_node_shift), 4)),
+        ground_foundation=model.foundation_position.copy(),
+        ground_support=np.stack([model.support_position, np.zeros_like(model.support_position)], axis=1),
+        ground_load=np.zeros_like(model.support_position),
         volume_ratio_smallest=np.ones(1),
         lane_fault=np.zeros(1, dtype=np.int32),
         moving=np.ones(1),
@@ -262,10 +272,11 @@ def _relax(model: OrganModel, state: OrganState) -> None:
             raise OrganDivergedError("under gravity, " + describe_fault(relaxed, state, fault))
         evaluate_forces(relaxed, state)
         add_support_forces(
-            relaxed, state.node_position, state.node_velocity, state.node_force, state.support_stretch, 0.0
-        )
+            relaxed, state.ground_support, state.node_position, state.node_velocity, state.node_force,
+            state.support_stretch, state.ground_load, 0.0,
+        )  # fmt: skip
         add_foundation_forces(
-            relaxed.foundation_nodes, relaxed.foundation_position, relaxed.foundation_stiffness,
+            relaxed.foundation_nodes, state.ground_foundation, relaxed.foundation_stiffness,
             state.node_position, state.node_force,
         )  # fmt: skip
         if np.linalg.norm(state.node_force[free], axis=1).sum() <= FORCE_TOLERANCE * weight:

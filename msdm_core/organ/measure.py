@@ -17,9 +17,10 @@ from msdm_core.kernels.guard_kernels import GUARD_SHARE, closest_in_triangle
 from msdm_core.kernels.load_kernels import add_gradients, add_pressures, fill_volume_ratios
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
-from msdm_core.kernels.support_kernels import add_support_forces
+from msdm_core.kernels.support_kernels import add_support_forces, place_ground
 from msdm_core.material.tissue_law import ARM_COUNT
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.organ.motion import foundation_places
 
 # Of strains, as a margin.
 ROUNDING = 1e-12
@@ -54,7 +55,7 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(model.node_mass)) / model.node_rest_volume
     volume += 0.5 * float((model.node_bulk * model.node_rest_volume) @ (averaged - 1.0) ** 2)
     lift = (state.node_position - model.node_rest_position) @ model.gravity
-    moved = state.node_position[model.foundation_nodes] - model.foundation_position
+    moved = state.node_position[model.foundation_nodes] - foundation_places(model, state)
     held = 0.5 * float(np.einsum("ni,nij,nj->", moved, model.foundation_stiffness, moved))
     return springs + volume + held - float(model.node_mass @ lift)
 
@@ -300,17 +301,9 @@ def support_forces(model: OrganModel, state: OrganState) -> FloatArray:
 
     The load on the support is its negative.
     """
-    total = np.zeros((len(model.support_kind), 3))
-    for support in range(len(total)):
-        one = slice(support, support + 1)
-        alone = model._replace(
-            support_kind=model.support_kind[one],
-            support_position=model.support_position[one],
-            support_rotation=model.support_rotation[one],
-            support_size=model.support_size[one],
-            support_friction=model.support_friction[one],
-        )
-        force, stretch = np.zeros_like(state.node_position), np.ascontiguousarray(state.support_stretch[:, one])
-        add_support_forces(alone, state.node_position, state.node_velocity, force, stretch.copy(), 0.0)
-        total[support] = force.sum(axis=0)
-    return total
+    force, load, ground = np.zeros_like(state.node_position), state.ground_load.copy(), state.ground_support.copy()
+    place_ground(model, state.motion, state.ground_foundation.copy(), ground)
+    add_support_forces(
+        model, ground, state.node_position, state.node_velocity, force, state.support_stretch.copy(), load, 0.0
+    )
+    return load

@@ -17,6 +17,8 @@ from surgsim_env.coupling.haptic_kernels import (
     StepPlan,
     advance_haptic_steps,
 )
+from surgsim_env.coupling.motion import still
+from surgsim_env.coupling.motion_kernels import MotionDrive
 from surgsim_env.instruments.tool_bodies import ToolBodies
 
 
@@ -48,6 +50,7 @@ def haptic_steps(
     wrench: FloatArray,
     count: int = 1,
     *,
+    drive: MotionDrive | None = None,
     force_limit: float = math.inf,
     pull_limit: float = math.inf,
     compiled: bool = False,
@@ -83,7 +86,9 @@ def haptic_steps(
     outcome = step_outcome(1, instrument.tool_count)._replace(wrench=wrench[None])
     advance = advance_haptic_steps if compiled else advance_haptic_steps.py_func
     tools = instrument.views(compiled=compiled)
-    advance(model, state, contact, instrument.shapes, instrument.response, tools, plan, outcome)
+    if drive is None:
+        drive = still(dt * substep_count)
+    advance(model, state, contact, instrument.shapes, instrument.response, tools, drive, plan, outcome)
     return steps_taken(model, state, outcome, 0)
 
 

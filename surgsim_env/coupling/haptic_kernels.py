@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LANE_EMPTY, response_of, shapes_of
 from msdm_core.kernels.substep_kernels import advance_substeps
+from surgsim_env.coupling.motion_kernels import steer_motion
 from surgsim_env.instruments.mujoco_kernels import mj_step1, mj_step2
 from surgsim_env.instruments.tool_kernels import drive_servo, read_response, read_shapes
 
@@ -72,11 +73,14 @@ class StepOutcome(NamedTuple):
 
 
 @register_jitable(error_model="numpy")
-def begin_step(tools, shapes, response, reference):
-    """A haptic step up to the organ's substeps: mj_step1, the servo, what the organ sees of the tools.
+def begin_step(tools, drive, shapes, response, motion, reference):
+    """A haptic step up to the organ's substeps: mj_step1, the servo, what the organ sees of the tools, its motions.
 
-    Out: shapes, response, reference: centres of mass, about which the step's torques are taken [m] (n_tool, 3)
+    In:  drive: of the motions
+    Out: shapes, response, motion: of the organ's state, reference: centres of mass, about which the step's torques are
+         taken [m] (n_tool, 3)
     """
+    steer_motion(drive, motion)
     mj_step1(tools.model, tools.data)
     drive_servo(tools)
     read_shapes(tools, shapes)
@@ -163,17 +167,17 @@ def end_step(tools, fault, plan, outcome, lane):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance_haptic_steps(model, state, law, shapes, response, tools, plan, outcome):
+def advance_haptic_steps(model, state, law, shapes, response, tools, drive, plan, outcome):
     """Advance an organ and its tools by `plan.step_count` haptic steps, fewer at a fault or beyond a limit.
 
     Model: model, law
     In:    plan
-    Out:   state, shapes, response, tools, outcome: of one lane
+    Out:   state, shapes, response, tools, drive, outcome: of one lane
     """
     reference, mean = outcome.reference[0], outcome.mean[0]
     clear_outcome(outcome, 0)
     for _ in range(plan.step_count):
-        begin_step(tools, shapes, response, reference)
+        begin_step(tools, drive, shapes, response, state.motion, reference)
         fault = advance_substeps(
             model, state, shapes, law, response, plan.dt, plan.decay, plan.substep_count, reference, mean
         )
@@ -183,11 +187,11 @@ def advance_haptic_steps(model, state, law, shapes, response, tools, plan, outco
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance_lane_haptic_steps(model, state, law, shapes, response, tools, plan, outcome):
+def advance_lane_haptic_steps(model, state, law, shapes, response, tools, drives, plan, outcome):
     """Advance organs side by side and their tools by `plan.step_count` haptic steps; a lane that ends early stops.
 
     Model: model, law
-    In:    plan, tools: one ToolViews a lane
+    In:    plan, tools, drives: one ToolViews and one MotionDrive a lane
     Out:   state, shapes, response, tools, outcome, whose `stopped` is `state.lane_fault`
     """
     stopped = outcome.stopped
@@ -198,8 +202,10 @@ def advance_lane_haptic_steps(model, state, law, shapes, response, tools, plan, 
             if stopped[lane] == FAULT_NONE:
                 begin_step(
                     tools[lane],
+                    drives[lane],
                     shapes_of(model.lanes, shapes, lane),
                     response_of(model.lanes, response, lane),
+                    state.motion[lane],
                     outcome.reference[lane],
                 )
         advance_substeps(

@@ -64,11 +64,21 @@ class LaneGroup:
         views = [one.instrument.views(compiled=True) for one in self.simulations]
         # Always as many as there are lanes: numba would compile another number anew.
         views += [views[-1]] * (len(self._outcome.step_count) - len(views))
+        drives = [one.drive for one in self.simulations]
+        drives += [drives[-1]] * (len(self._outcome.step_count) - len(drives))
         decay = math.exp(-self._model.alpha * first.substep_dt)
         plan = StepPlan(first.substep_dt, decay, first.substep_count, count, force_limit, pull_limit)
         outcome = self._outcome._replace(stopped=self._state.lane_fault)
         advance_lane_haptic_steps(
-            self._model, self._state, first.contact, self._shapes, self._response, tuple(views), plan, outcome
+            self._model,
+            self._state,
+            first.contact,
+            self._shapes,
+            self._response,
+            tuple(views),
+            tuple(drives),
+            plan,
+            outcome,
         )
         for lane in np.flatnonzero(active):
             self._unload(int(lane))
@@ -89,6 +99,7 @@ class LaneGroup:
             set_lane(self._model, lane, simulation.organ_model)
             self._organs[lane] = simulation.organ_model
         put_lane(self._state, lane, simulation.organ_state)
+        simulation.begin_motion()
         self._outcome.wrench[lane] = simulation.contact_wrench
 
     def _unload(self, lane: int) -> None:

@@ -18,6 +18,7 @@ from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import describe_fault
 from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
+from surgsim_env.coupling.motion import draw_drive
 from surgsim_env.coupling.mujoco_library import runs_compiled
 from surgsim_env.instruments.instrument import Grasp, Instrument, read_grasp
 from surgsim_env.instruments.make import make_instrument
@@ -27,6 +28,8 @@ from surgsim_env.scene.model import substeps_needed
 
 # The fields of an organ's state that are saved.
 KEPT_FIELDS = tuple(name for name in OrganState._fields if name not in SCRATCH_FIELDS)
+# What is drawn of an organ's motions, and saved.
+DRAWN_FIELDS = ("cycle_start", "cycle_size", "delay")
 # Haptic steps of a saved state lie below this, so that a float holds each.
 STEP_MOST = 2**53
 # Largest value in the state of an episode without a fault: products of three stay finite.
@@ -101,6 +104,7 @@ class Simulation:
     """An organ and an instrument in contact; advanced by `control_step` or `haptic_step`, read by tasks.
 
     Fields:
+        drive: the course of the organ's motions since the reset
         compiled: whether haptic steps run compiled or in Python, with the same bits
         pull_peak: largest pull of a jaw in the last control step [N]
         fault: what ended the last steps, or ""
@@ -133,6 +137,7 @@ class Simulation:
         self.pull_peak = 0.0
         self._taken: StepsTaken | None = None
         self._record: HapticRecord | None = None
+        self.drive = draw_drive(scene.motions, self.haptic_dt, np.random.default_rng(0))
         self.organ_model: OrganModel
         self.organ_state: OrganState
         self.reset(healthy, self.instrument.parked)
@@ -209,6 +214,7 @@ class Simulation:
         state.contact_engaged[:] = 0
         state.contact_stretch[:] = 0.0
         state.contact_passed[:] = 0
+        state.motion[:] = 0.0
         state.volume_ratio_smallest[:] = 1.0
         self.instrument.place(tip_position)
         self._wrench[:] = 0.0
@@ -280,6 +286,14 @@ class Simulation:
         self.fault = taken.fault or self.fault
         self._taken = taken
 
+    def draw_motion(self, rng: np.random.Generator) -> None:
+        """Draw the course of the organ's motions from now on; without motions nothing is drawn."""
+        self.drive = draw_drive(self.anatomy.scene.motions, self.haptic_dt, rng)
+
+    def begin_motion(self) -> None:
+        """Let the drive of motions go on from the present time."""
+        self.drive.step_count[0] = self._step
+
     def end_control_step(self) -> bool:
         """Update the instrument's poses; False, with `fault` saying why, at an inverted tet or a warning of MuJoCo.
 
@@ -294,9 +308,11 @@ class Simulation:
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that changes, as arrays by name; the caller keeps the organ's model."""
-        arrays = {f"organ_{name}": getattr(self.organ_state, name).copy() for name in KEPT_FIELDS}
+        arrays = {f"organ_{name}": getattr(self.organ_state, name).copy() for name in self._kept_fields}
+        cycles = {f"motion_{name}": getattr(self.drive, name).copy() for name in DRAWN_FIELDS}
         return {
             **arrays,
+            **(cycles if self.anatomy.scene.motions else {}),
             "instrument": self.instrument.get_state(),
             "rest_position": self._rest_position.copy(),
             "rest_stretch": self._rest_stretch.copy(),
@@ -324,7 +340,10 @@ class Simulation:
         if not all(map(np.array_equal, organ_model, self.organ_model)):
             self._check_step(organ_model)
         self.organ_model = organ_model
-        self.organ_state = blank._replace(**{name: arrays[f"organ_{name}"].copy() for name in KEPT_FIELDS})
+        self.organ_state = blank._replace(**{name: arrays[f"organ_{name}"].copy() for name in self._kept_fields})
+        if self.anatomy.scene.motions:
+            drawn = {name: arrays[f"motion_{name}"].copy() for name in DRAWN_FIELDS}
+            self.drive = self.drive._replace(**drawn)
         self.instrument.set_state(arrays["instrument"])
         self._rest_position = arrays["rest_position"].copy()
         self._rest_stretch = arrays["rest_stretch"].copy()
@@ -334,8 +353,14 @@ class Simulation:
         self.fault = str(arrays["fault"])
         self._taken = None
 
+    @property
+    def _kept_fields(self) -> tuple[str, ...]:
+        """KEPT_FIELDS, without those of motions where nothing moves the organ."""
+        return KEPT_FIELDS if self.anatomy.scene.motions else tuple(name for name in KEPT_FIELDS if name != "motion")
+
     def _advance(self, count: int, force_limit: float, pull_limit: float) -> StepsTaken:
         """Advance by up to `count` haptic steps; after a fault the wrench of the last good step stays."""
+        self.begin_motion()
         taken = haptic_steps(
             self.organ_model,
             self.organ_state,
@@ -348,6 +373,7 @@ class Simulation:
             force_limit=force_limit,
             pull_limit=pull_limit,
             compiled=self.compiled,
+            drive=self.drive,
         )
         self._step += taken.step_count
         self.fault = taken.fault or self.fault
@@ -357,7 +383,7 @@ class Simulation:
 
     def _check_state(self, arrays: Mapping[str, np.ndarray], blank: OrganState) -> None:
         """Refuse arrays that `get_state` does not give with an organ whose blank state is given."""
-        like = self.get_state() | {f"organ_{name}": getattr(blank, name) for name in KEPT_FIELDS}
+        like = self.get_state() | {f"organ_{name}": getattr(blank, name) for name in self._kept_fields}
         check_entries(arrays, {**like, "rest_position": blank.node_position, "rest_stretch": blank.support_stretch})
         # What diverged need not be finite, and is not stepped again.
         if not str(arrays["fault"]):

@@ -264,6 +264,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         for _ in range(DRAWS_MOST):
             start = self.task.reset(self.np_random)
             self.simulation.reset(start.organ, start.tip_position)
+            self.simulation.draw_motion(self.np_random)
             if self.task.accepts(self.simulation):
                 return
         raise ValueError(

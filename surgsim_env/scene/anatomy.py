@@ -127,6 +127,7 @@ class Anatomy:
             gravity=scene.gravity,
             supports=scene.supports,
             support_law=scene.support_law or SupportLaw(scene.contact.stiffness, scene.contact.damping),
+            motions=tuple(one.ground for one in scene.motions),
         )
 
     def compiled(self, specification: OrganSpec) -> OrganModel:

@@ -10,6 +10,7 @@ from msdm_core.kernels.structure_kernels import ContactLaw
 from msdm_core.material.regions import Capsule, Damping, Lesion, Material
 from msdm_core.material.stiffness import check_stiffness_rule
 from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.motion import Motion
 from msdm_core.organ.support import Support, SupportLaw
 
 Vector = tuple[float, float, float]
@@ -590,6 +591,52 @@ class Retraction:
 
 
 @dataclass(frozen=True)
+class CyclicMotion:
+    """A motion of anchors, foundations and supports that repeats, drawn anew for each episode.
+
+    Args:
+        name: as "breathing".
+        displacement: of the ground at the top of a cycle of size 1 [m].
+        period: range of the mean duration of a cycle [s].
+        rise, fall: shares of a cycle in which the ground moves there and back; it rests in what is left.
+        size: range of the factor on the displacement.
+        variation: standard deviation of the durations and sizes of cycles, as a share of their mean.
+        centre: of the part of the ground that moves [m]; None: all of it moves alike.
+        reach: distance from the centre beyond which nothing moves [m].
+    """
+
+    name: str
+    displacement: Vector
+    period: Range
+    rise: float
+    fall: float
+    size: Range = (1.0, 1.0)
+    variation: float = 0.0
+    centre: Vector | None = None
+    reach: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.period[0] <= self.period[1] < math.inf:
+            raise ValueError(f"motion {self.name!r}: period is {self.period} s; the rule is 0 < low <= high")
+        if not 0.0 <= self.size[0] <= self.size[1] < math.inf:
+            raise ValueError(f"motion {self.name!r}: size is {self.size}; the rule is 0 <= low <= high")
+        if not (self.rise > 0.0 and self.fall > 0.0 and self.rise + self.fall <= 1.0):
+            raise ValueError(
+                f"motion {self.name!r}: rise is {self.rise:g}, fall {self.fall:g}; both are shares of a cycle above 0, "
+                "together at most 1"
+            )
+        if not 0.0 <= self.variation <= 0.3:
+            raise ValueError(f"motion {self.name!r}: variation is {self.variation:g}; it must be from 0 to 0.3")
+        # What is wrong with place and direction is said there.
+        _ = self.ground
+
+    @property
+    def ground(self) -> Motion:
+        """How a unit of the signal moves the ground."""
+        return Motion(self.name, self.displacement, self.centre, self.reach)
+
+
+@dataclass(frozen=True)
 class Scene:
     """A scene.
 
@@ -621,6 +668,7 @@ class Scene:
         regions: of the mesh, with materials of their own.
         retract_scene: file of the scene in which this organ is retracted.
         retract_refusal: why this organ cannot be retracted.
+        motions: of what holds the organ, in every episode.
     """
 
     name: str
@@ -650,6 +698,7 @@ class Scene:
     regions: tuple[TissueRegion, ...] = ()
     retract_scene: str | None = None
     retract_refusal: str | None = None
+    motions: tuple[CyclicMotion, ...] = ()
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)

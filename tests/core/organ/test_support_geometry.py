@@ -25,6 +25,14 @@ def organ(*supports: Support, law: SupportLaw = LAW, anchors: object = ()) -> Or
     return compile_organ(OrganSpec(mesh, oracle.TISSUE, supports=supports, support_law=law, anchors=anchors))
 
 
+def push(model: OrganModel, position, velocity, force, stretch, dt) -> None:
+    """`add_support_forces` of solids that stand still."""
+    ground = np.stack([model.support_position, np.zeros_like(model.support_position)], axis=1)
+    load, before = np.zeros_like(model.support_position), force.sum(axis=0)
+    add_support_forces(model, ground, position, velocity, force, stretch, load, dt)
+    np.testing.assert_allclose(load.sum(axis=0), force.sum(axis=0) - before, atol=1e-12 * np.abs(force).sum())
+
+
 def outline(support: Support, random: np.random.Generator, count: int = 20000) -> np.ndarray:
     """Random points all over a solid's surface in its own frame [m], shape (count, 3)."""
     directions = random.normal(size=(count, 3))
@@ -77,7 +85,7 @@ def test_nodes_are_pushed_out_the_nearest_way(kind, sizes, place, turn, seed):
     )
     model = organ(support)
     force, stretch = np.zeros_like(model.node_rest_position), np.zeros((len(model.support_nodes), 1, 3))
-    add_support_forces(model, model.node_rest_position, np.zeros_like(force), force, stretch, 1e-4)
+    push(model, model.node_rest_position, np.zeros_like(force), force, stretch, 1e-4)
     assert not stretch.any()
     w, x, y, z = turn
     back = Rotation.from_quat([x, y, z, w]).inv()
@@ -106,13 +114,13 @@ def test_what_parts_from_a_support_forgets_where_it_stuck():
     sideways[:, 0] = 0.1
     low = position[model.support_nodes, 2] < 0.001
     for count in range(1, 4):
-        add_support_forces(model, position, sideways, force, stretch, 1e-3)
+        push(model, position, sideways, force, stretch, 1e-3)
         np.testing.assert_allclose(stretch[low, 0], [[1e-4 * count, 0.0, 0.0]] * int(low.sum()), atol=1e-15)
     assert not stretch[~low].any()
     # 1 mm deep: mu k_p d / k_t = 0.5 x 2 x 1 mm.
-    add_support_forces(model, position, 100.0 * sideways, force, stretch, 1e-3)
+    push(model, position, 100.0 * sideways, force, stretch, 1e-3)
     np.testing.assert_allclose(stretch[low, 0, 0], 1e-3, rtol=1e-12)
-    add_support_forces(model, position + np.array([0.0, 0.0, 0.002]), sideways, force, stretch, 1e-3)
+    push(model, position + np.array([0.0, 0.0, 0.002]), sideways, force, stretch, 1e-3)
     assert not stretch.any()
 
 
@@ -124,7 +132,7 @@ def test_damping_pushes_what_comes_and_pulls_nothing_back(speed: float, share: f
     force, velocity = np.zeros_like(model.node_rest_position), np.zeros_like(model.node_rest_position)
     velocity[:, 2] = speed
     stretch = np.zeros((len(model.support_nodes), 1, 3))
-    add_support_forces(model, model.node_rest_position, velocity, force, stretch, 1e-4)
+    push(model, model.node_rest_position, velocity, force, stretch, 1e-4)
     low = model.node_rest_position[model.support_nodes, 2] < 0.001
     np.testing.assert_allclose(force[model.support_nodes, 2], np.where(low, share * 1e4 * model.support_area, 0.0))
     assert not force[:, :2].any()

@@ -1,0 +1,108 @@
+"""Prescribed motion of what holds an organ, as by breathing: anchored nodes, foundations and supports follow signals.
+
+A motion m displaces the ground at a place X by s_m(t) d_m(X). The state holds its signal s_m and rate, which whoever
+advances the organ sets with `steer`; kernels move the ground in each substep and count the work that it does. Damping
+by mass (alpha) acts on velocities relative to the ground, as the tissue around an organ moves with it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msdm_core.errors import OrganError
+from msdm_core.kernels.structure_kernels import OrganModel, OrganState
+from msdm_core.mesh.tet_mesh import FloatArray
+
+# Columns of `OrganState.motion`.
+SIGNAL, RATE, RATE_BEFORE, WORK = range(4)
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion of the ground, per unit of its signal.
+
+    Args:
+        name: used in messages.
+        displacement: d_m where the motion is largest [m].
+        centre: of the part that moves [m]; None where all of the ground moves alike.
+        reach: distance from the centre beyond which nothing moves [m]: d_m falls as (1 - r^2 / reach^2)^2.
+    """
+
+    name: str
+    displacement: Vector
+    centre: Vector | None = None
+    reach: float = math.inf
+
+    def __post_init__(self) -> None:
+        for entry in ("displacement", "centre"):
+            value = getattr(self, entry)
+            if value is not None and (len(value) != 3 or not all(math.isfinite(number) for number in value)):
+                raise OrganError(f"motion {self.name!r}: {entry} is {value}; it must be 3 finite numbers [m]")
+        if not self.reach > 0.0:
+            raise OrganError(f"motion {self.name!r}: reach is {self.reach:g} m; it must be above 0")
+        if (self.centre is None) != math.isinf(self.reach):
+            raise OrganError(
+                f"motion {self.name!r}: centre is {self.centre}, reach {self.reach:g} m; give both for a part of the "
+                "ground, neither for all of it"
+            )
+
+    def shift(self, points: ArrayLike) -> FloatArray:
+        """Displacement of the ground at points [m] (n, 3) per unit of the signal [m], (n, 3)."""
+        places = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        share = np.ones(len(places))
+        if self.centre is not None:
+            share = np.maximum(1.0 - ((places - np.array(self.centre)) ** 2).sum(axis=1) / self.reach**2, 0.0) ** 2
+        return share[:, None] * np.array(self.displacement)
+
+
+def motion_fields(
+    motions: Sequence[Motion], points: FloatArray, foundation_nodes: ArrayLike, support_position: FloatArray
+) -> dict[str, Any]:
+    """The fields of an OrganModel that describe how its ground moves.
+
+    Args:
+        motions: of the ground.
+        points: rest positions of the nodes [m], shape (n_node, 3).
+        foundation_nodes: nodes that foundations hold, shape (n_held,).
+        support_position: of the supports [m], shape (n_support, 3).
+
+    Raises:
+        OrganError: two motions of one name.
+    """
+    names = [motion.name for motion in motions]
+    for name in names:
+        if names.count(name) > 1:
+            raise OrganError(f"two motions are named {name!r}; names must differ: rename one")
+    places = {
+        "motion_node_shift": points,
+        "motion_foundation_shift": points[np.asarray(foundation_nodes)],
+        "motion_support_shift": support_position,
+    }
+    fields = {
+        field: np.array([motion.shift(where) for motion in motions]).reshape(len(motions), len(where), 3)
+        for field, where in places.items()
+    }
+    for array in fields.values():
+        array.setflags(write=False)
+    return fields
+
+
+def steer(state: OrganState, signal: ArrayLike, duration: float) -> None:
+    """Let each motion's signal change evenly to a value (n_motion,) over the next `duration` [s] of steps."""
+    state.motion[:, RATE] = (np.asarray(signal, dtype=np.float64) - state.motion[:, SIGNAL]) / duration
+
+
+def ground_work(state: OrganState) -> FloatArray:
+    """Work that each motion of the ground has done on the organ [J], shape (n_motion,)."""
+    return state.motion[:, WORK].copy()
+
+
+def foundation_places(model: OrganModel, state: OrganState) -> FloatArray:
+    """Where the organ's foundations hold their nodes now [m], shape (n_held, 3)."""
+    return model.foundation_position + np.einsum("m,mni->ni", state.motion[:, SIGNAL], model.motion_foundation_shift)

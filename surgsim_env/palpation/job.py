@@ -152,6 +152,16 @@ def run_palpation(
     truths = tuple(seen_from_surface(hidden, anatomy))
     maps = _maps(anatomy, presses, model_presses, (reading, model_reading), used, truths)
     pressed = PressedSites(sites[used], sites[~used], scene.palpation.site_spacing)
+    with press_progress(console) as bar:
+        misses = explain_misses(
+            anatomy,
+            organ,
+            hidden,
+            truths,
+            maps,
+            pressed,
+            progress=lambda count: progress_task(bar, "over missed lesions", count),
+        )
     return PalpationResult(
         anatomy=anatomy,
         lesions=hidden,
@@ -161,7 +171,7 @@ def run_palpation(
         reading=reading,
         used=used,
         maps=maps,
-        misses=explain_misses(anatomy, organ, hidden, truths, maps, pressed),
+        misses=misses,
         hold=hold_of(anatomy, model_presses, modulus_factor=factor),
         model_modulus_factor=factor,
         support_count=support_count,

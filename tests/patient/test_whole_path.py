@@ -1,0 +1,127 @@
+"""The whole path of a kidney, a spleen and a liver: organ made, held, pressed over lesions, mapped, reported."""
+
+import csv
+import html
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from surgsim_env.cli.main import main
+from surgsim_env.palpation.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST
+from surgsim_env.palpation.job import MODEL, plan_sites
+from surgsim_env.patient.supports import held_text
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.load import load_scene
+from tests.patient.organs import kidney_surface, liver_surface
+from tests.patient.scans import SPLEEN_CROWN, spleen
+
+# Tips that leave some 1500 nodes: fewer, coarser presses of the same kind as the default's.
+KIDNEY_TIP, SPLEEN_TIP, LIVER_TIP = 0.007, 0.008, 0.0095
+LESION_RATIO = 8.0
+
+
+def stl(surface: trimesh.Trimesh, path: Path) -> Path:
+    """A surface in metres as a file in millimetres."""
+    surface.copy().apply_scale(1e3).export(path)
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """What a command prints, from which nothing must be missing or amiss."""
+    capsys.readouterr()
+    assert main([str(one) for one in arguments]) == 0
+    said = capsys.readouterr()
+    return said.out + said.err
+
+
+def far_apart(anatomy: Anatomy, count: int) -> list[int]:
+    """Sites of the raster away from its rim and from each other."""
+    sites, _, _ = plan_sites(anatomy)
+    rim = np.array([anatomy.face.rim_distance(site) for site in sites])
+    inner = np.flatnonzero(rim >= np.median(rim))
+    chosen = [int(inner[np.argmax(np.linalg.norm(sites[inner] - sites.mean(axis=0), axis=1))])]
+    while len(chosen) < count:
+        distance = np.linalg.norm(sites[inner][:, None] - sites[chosen], axis=2).min(axis=1)
+        chosen.append(int(inner[np.argmax(distance)]))
+    return chosen
+
+
+def check_held(summary: dict) -> None:
+    held = summary["held"]
+    assert held["faults"] == []
+    assert max(held["far_travel_over_depth"]) <= FAR_SHARE_LARGEST
+    assert np.median(held["healthy_force_over_hertz"]) >= FORCE_SHARE_LEAST
+
+
+def check_found(summary: dict, count: int) -> None:
+    """The model map shows every lesion, and either map says why it misses one."""
+    assert len(summary["truth"]) == count
+    one = summary["maps"][MODEL]
+    assert one["felt"] == count and one["false_alarms"] == 0, one
+    for found in summary["maps"].values():
+        for lesion in found["lesions"]:
+            assert lesion["felt"] or (lesion["miss"] and lesion["why"]), lesion
+
+
+def check_files(out: Path, summary: dict) -> None:
+    with (out / "palpation.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == summary["sites"]["pressed"]
+    complete = [row for row in rows if not row["ended_early"]]
+    assert len(complete) == summary["sites"]["in_maps"] > 0
+    assert all(math.isfinite(float(row[name])) for row in complete for name in ("force", "stiffness", "contrast_model"))
+    assert (out / "stiffness_map.png").read_bytes()[-8:-4] == b"IEND"
+
+
+def check_report(folder: Path, name: str) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.rstrip().endswith("</html>")
+    assert "data:image/png;base64," in page
+    assert all(held_text(one) in html.unescape(page) for one in load_scene(folder / f"{name}.toml").anchors)
+
+
+@pytest.mark.parametrize(
+    ("name", "surface", "tip", "depth", "radius"),
+    [
+        ("kidney", kidney_surface(), KIDNEY_TIP, 0.013, 0.009),
+        ("liver", liver_surface(0.6), LIVER_TIP, 0.017, 0.012),
+    ],
+)
+def test_from_a_surface_to_lesions_on_a_map(name, surface, tip, depth, radius, tmp_path, capsys):
+    file, folder = stl(surface, tmp_path / f"{name}.stl"), tmp_path / "patient"
+    given = ["organ", file, "--length-unit", "mm", "--tip-radius", tip, "--out", folder / f"{name}.vtu"]
+    said = run(capsys, *given, "--no-healthy-map")
+    assert "sways" not in said and "of Hertz's force" in said
+    check_report(folder, name)
+    scene, out = folder / f"{name}.toml", tmp_path / "palpated"
+    hidden = [
+        f"--lesion-below={site},{depth},{radius},{LESION_RATIO}"
+        for site in far_apart(load_anatomy(load_scene(scene)), 2)
+    ]
+    said = run(capsys, "palpate", "--organ", scene, *hidden, "--out", out)
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    check_held(summary)
+    check_found(summary, 2)
+    check_files(out, summary)
+    assert "pre-operative model: all 2 lesions felt" in said
+
+
+def test_from_a_scan_with_its_lesions_to_a_map(tmp_path, capsys):
+    """Cells as by default, fine at the pressed face, so that the probe is turned before they are made."""
+    out = tmp_path / "out"
+    given = ["palpate", "--segmentation", spleen(tmp_path / "spleen.nii.gz"), "--labels", "spleen=1,lesion=2"]
+    said = run(capsys, *given, "--tip-radius", SPLEEN_TIP, "--out", out)
+    assert "turning the probe to the lesions" in said and "does not face" not in said
+    assert "times as long elsewhere" in said
+    scene = load_scene(out / "spleen.toml")
+    assert -np.dot(scene.instrument.approach, SPLEEN_CROWN) > 0.7
+    assert [one.name for one in scene.anchors] == ["surrounding fat and wall", "hilum"]
+    check_report(out, "spleen")
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    check_held(summary)
+    check_found(summary, 2)
+    check_files(out, summary)

@@ -4,6 +4,7 @@ import csv
 import html
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,41 @@ import trimesh
 from surgsim_env.cli.main import main
 from surgsim_env.palpation.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST
 from surgsim_env.palpation.job import MODEL, plan_sites
+from surgsim_env.palpation.surface_scene import SurfaceOptions, with_options
 from surgsim_env.patient.supports import held_text
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import load_scene
 from tests.patient.organs import kidney_surface, liver_surface
 from tests.patient.scans import SPLEEN_CROWN, spleen
 
-# Tips that leave some 1500 nodes: fewer, coarser presses of the same kind as the default's.
-KIDNEY_TIP, SPLEEN_TIP, LIVER_TIP = 0.007, 0.008, 0.0095
 LESION_RATIO = 8.0
+
+
+@dataclass(frozen=True)
+class Touch:
+    """A tip that leaves 1500 to 2100 nodes, and a raster of 25 to 35 sites: coarser than by default, of the same kind.
+
+    Fields:
+        tip, spacing: radius of the ball and distance of the sites [m]
+    """
+
+    tip: float
+    spacing: float
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """Lesions to be hidden below sites.
+
+    Fields:
+        depth, radius: of the middle below the surface, and of the ball [m]
+    """
+
+    depth: float
+    radius: float
+
+
+KIDNEY, SPLEEN, LIVER = Touch(0.008, 0.009), Touch(0.008, 0.0095), Touch(0.010, 0.014)
 
 
 def stl(surface: trimesh.Trimesh, path: Path) -> Path:
@@ -85,24 +112,25 @@ def check_report(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "surface", "tip", "depth", "radius"),
+    ("name", "surface", "touch", "lesion"),
     [
-        ("kidney", kidney_surface(), KIDNEY_TIP, 0.013, 0.009),
-        ("liver", liver_surface(0.6), LIVER_TIP, 0.017, 0.012),
+        ("kidney", kidney_surface(), KIDNEY, Hidden(0.013, 0.009)),
+        ("liver", liver_surface(0.6), LIVER, Hidden(0.017, 0.012)),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_from_a_surface_to_lesions_on_a_map(name, surface, tip, depth, radius, tmp_path, capsys):
+def test_from_a_surface_to_lesions_on_a_map(name, surface, touch, lesion, tmp_path, capsys):
     file, folder = stl(surface, tmp_path / f"{name}.stl"), tmp_path / "patient"
-    given = ["organ", file, "--length-unit", "mm", "--tip-radius", tip, "--out", folder / f"{name}.vtu"]
+    given = ["organ", file, "--length-unit", "mm", "--tip-radius", touch.tip, "--out", folder / f"{name}.vtu"]
     said = run(capsys, *given, "--no-healthy-map")
     assert "sways" not in said and "of Hertz's force" in said
     check_report(folder, name)
     scene, out = folder / f"{name}.toml", tmp_path / "palpated"
     hidden = [
-        f"--lesion-below={site},{depth},{radius},{LESION_RATIO}"
-        for site in far_apart(load_anatomy(load_scene(scene)), 2)
+        f"--lesion-below={site},{lesion.depth},{lesion.radius},{LESION_RATIO}"
+        for site in far_apart(load_anatomy(with_options(load_scene(scene), SurfaceOptions(spacing=touch.spacing))), 2)
     ]
-    said = run(capsys, "palpate", "--organ", scene, *hidden, "--out", out)
+    said = run(capsys, "palpate", "--organ", scene, "--spacing", touch.spacing, *hidden, "--out", out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     check_held(summary)
     check_found(summary, 2)
@@ -114,7 +142,7 @@ def test_from_a_scan_with_its_lesions_to_a_map(tmp_path, capsys):
     """Cells as by default, fine at the pressed face, so that the probe is turned before they are made."""
     out = tmp_path / "out"
     given = ["palpate", "--segmentation", spleen(tmp_path / "spleen.nii.gz"), "--labels", "spleen=1,lesion=2"]
-    said = run(capsys, *given, "--tip-radius", SPLEEN_TIP, "--out", out)
+    said = run(capsys, *given, "--tip-radius", SPLEEN.tip, "--spacing", SPLEEN.spacing, "--out", out)
     assert "turning the probe to the lesions" in said and "does not face" not in said
     assert "times as long elsewhere" in said
     scene = load_scene(out / "spleen.toml")

@@ -65,16 +65,23 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return said.out + said.err
 
 
-def far_apart(anatomy: Anatomy, count: int) -> list[int]:
-    """Sites of the raster away from its rim and from each other."""
-    sites, _, _ = plan_sites(anatomy)
+def fits(anatomy: Anatomy, point: np.ndarray, radius: float) -> bool:
+    """Whether a lesion lies inside the organ."""
+    try:
+        anatomy.check_inside(anatomy.lesion_at(tuple(point.tolist()), radius, LESION_RATIO, "tried"))
+    except ValueError:
+        return False
+    return True
+
+
+def far_apart(anatomy: Anatomy, lesion: Hidden) -> list[int]:
+    """Two sites of the raster away from its rim and from each other, below which a lesion fits."""
+    sites, normals, _ = plan_sites(anatomy)
     rim = np.array([anatomy.face.rim_distance(site) for site in sites])
-    inner = np.flatnonzero(rim >= np.median(rim))
-    chosen = [int(inner[np.argmax(np.linalg.norm(sites[inner] - sites.mean(axis=0), axis=1))])]
-    while len(chosen) < count:
-        distance = np.linalg.norm(sites[inner][:, None] - sites[chosen], axis=2).min(axis=1)
-        chosen.append(int(inner[np.argmax(distance)]))
-    return chosen
+    inner = [int(one) for one in np.flatnonzero(rim >= np.median(rim))]
+    inner = [one for one in inner if fits(anatomy, sites[one] - lesion.depth * normals[one], lesion.radius)]
+    distance = np.linalg.norm(sites[inner][:, None] - sites[inner], axis=2)
+    return [inner[one] for one in np.unravel_index(np.argmax(distance), distance.shape)]
 
 
 def check_held(summary: dict) -> None:
@@ -126,9 +133,9 @@ def test_from_a_surface_to_lesions_on_a_map(name, surface, touch, lesion, tmp_pa
     assert "sways" not in said and "of Hertz's force" in said
     check_report(folder, name)
     scene, out = folder / f"{name}.toml", tmp_path / "palpated"
+    anatomy = load_anatomy(with_options(load_scene(scene), SurfaceOptions(spacing=touch.spacing)))
     hidden = [
-        f"--lesion-below={site},{lesion.depth},{lesion.radius},{LESION_RATIO}"
-        for site in far_apart(load_anatomy(with_options(load_scene(scene), SurfaceOptions(spacing=touch.spacing))), 2)
+        f"--lesion-below={site},{lesion.depth},{lesion.radius},{LESION_RATIO}" for site in far_apart(anatomy, lesion)
     ]
     said = run(capsys, "palpate", "--organ", scene, "--spacing", touch.spacing, *hidden, "--out", out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))

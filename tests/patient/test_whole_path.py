@@ -26,7 +26,7 @@ LESION_RATIO = 8.0
 
 @dataclass(frozen=True)
 class Touch:
-    """A tip that leaves 1500 to 2100 nodes, and a raster of 25 to 35 sites: coarser than by default, of the same kind.
+    """A tip that leaves 1500 to 2100 nodes, and a raster of 30 to 40 sites: coarser than by default, of the same kind.
 
     Fields:
         tip, spacing: radius of the ball and distance of the sites [m]
@@ -48,7 +48,7 @@ class Hidden:
     radius: float
 
 
-KIDNEY, SPLEEN, LIVER = Touch(0.008, 0.009), Touch(0.008, 0.0095), Touch(0.010, 0.014)
+KIDNEY, SPLEEN, LIVER = Touch(0.008, 0.009), Touch(0.008, 0.0095), Touch(0.010, 0.011)
 
 
 def stl(surface: trimesh.Trimesh, path: Path) -> Path:

@@ -124,20 +124,22 @@ class Palpate:
             if file is not None:
                 scene = _patient_scene(self, file, files, console)
             assert scene is not None
-            anatomy = load_anatomy(scene)
-            lesions = anatomy.demonstration_lesions()
-            if asked or below:
-                places = [*asked, *(_below_site(anatomy, *one) for one in below)]
-                lesions = [anatomy.lesion_at(*one, f"lesion {number}") for number, one in enumerate(places, start=1)]
-                for lesion in lesions:
-                    anatomy.check_inside(lesion)
-            anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
+            with StepProgress(console) as progress, progress.step("preparing the organ"):
+                anatomy = load_anatomy(scene)
+                lesions = anatomy.demonstration_lesions()
+                if asked or below:
+                    places = [*asked, *(_below_site(anatomy, *one) for one in below)]
+                    lesions = [anatomy.lesion_at(*one, f"lesion {n}") for n, one in enumerate(places, start=1)]
+                    for lesion in lesions:
+                        anatomy.check_inside(lesion)
+                anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
             found = run_palpation(
                 anatomy, lesions=lesions, around=around, seed=self.seed, workers=self.workers, console=console
             )
-            write_csv(found, files / CSV_NAME)
-            write_summary(found, files / SUMMARY_NAME, vars(self))
-            write_stiffness_map(found, files / PICTURE_NAME)
+            with StepProgress(console) as progress, progress.step("drawing the map"):
+                write_csv(found, files / CSV_NAME)
+                write_summary(found, files / SUMMARY_NAME, vars(self))
+                write_stiffness_map(found, files / PICTURE_NAME)
         print_report(found, console)
         console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
         return 0

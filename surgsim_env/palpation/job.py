@@ -138,20 +138,29 @@ def run_palpation(
         )
         step = progress_task(bar, "its pre-operative model", len(sites))
         model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
-    reading = _read(presses, scene.sensor, rng)
-    model_reading = _read(model_presses, scene.sensor, rng)
-    complete = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])
-    # Bias and noise may exceed the force of a weak press; such a site has no stiffness.
-    used = complete & (reading > 0.0) & (model_reading > 0.0)
-    if not used.any():
-        why = presses[0].end or model_presses[0].end or "a force reading that is not above 0"
-        raise ValueError(
-            f"no press gave a stiffness at the set depth of {scene.palpation.press_depth * 1e3:g} mm; the first ended "
-            f"by: {why}: change the press depth, limits.hard_force or the sensor"
+        reading = _read(presses, scene.sensor, rng)
+        model_reading = _read(model_presses, scene.sensor, rng)
+        complete = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])
+        # Bias and noise may exceed the force of a weak press; such a site has no stiffness.
+        used = complete & (reading > 0.0) & (model_reading > 0.0)
+        if not used.any():
+            why = presses[0].end or model_presses[0].end or "a force reading that is not above 0"
+            depth = scene.palpation.press_depth * 1e3
+            raise ValueError(
+                f"no press gave a stiffness at the set depth of {depth:g} mm; the first ended by: {why}: change the "
+                "press depth, limits.hard_force or the sensor"
+            )
+        truths = tuple(seen_from_surface(hidden, anatomy))
+        maps = _maps(anatomy, presses, model_presses, (reading, model_reading), used, truths)
+        misses = explain_misses(
+            anatomy,
+            organ,
+            hidden,
+            truths,
+            maps,
+            PressedSites(sites[used], sites[~used], scene.palpation.site_spacing),
+            progress=lambda count: progress_task(bar, "over missed lesions", count),
         )
-    truths = tuple(seen_from_surface(hidden, anatomy))
-    maps = _maps(anatomy, presses, model_presses, (reading, model_reading), used, truths)
-    pressed = PressedSites(sites[used], sites[~used], scene.palpation.site_spacing)
     return PalpationResult(
         anatomy=anatomy,
         lesions=hidden,
@@ -161,7 +170,7 @@ def run_palpation(
         reading=reading,
         used=used,
         maps=maps,
-        misses=explain_misses(anatomy, organ, hidden, truths, maps, pressed),
+        misses=misses,
         hold=hold_of(anatomy, model_presses, modulus_factor=factor),
         model_modulus_factor=factor,
         support_count=support_count,

@@ -1,6 +1,6 @@
 """Why a hidden lesion was not felt: for each one a reason, with the numbers that show it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +63,7 @@ def explain_misses(
     truths: Sequence[Truth],
     maps: Sequence[ContrastMap],
     pressed: PressedSites,
+    progress: Callable[[int], Callable[[], None]] | None = None,
 ) -> tuple[Miss, ...]:
     """The reason for each lesion that a map does not show; presses once with and once without each of those.
 
@@ -73,15 +74,18 @@ def explain_misses(
         truths: their places, as in the maps' scores.
         maps: with scores.
         pressed: sites of the maps.
+        progress: called with the number of presses; gives back what is called after each.
     """
     missed = [index for index in range(len(lesions)) if not all(one.scores[index].felt for one in maps)]
+    advance = progress(2 * len(missed)) if progress and missed else lambda: None
     misses = []
     for index in missed:
         truth = truths[index]
         hidden = _hidden(anatomy, lesions[index], truth)
         bare = anatomy.organ([lesion for number, lesion in enumerate(lesions) if number != index])
         force, force_without = (
-            scan(anatomy, model, truth.point[None], truth.normal[None], workers=1)[0].force for model in (organ, bare)
+            scan(anatomy, model, truth.point[None], truth.normal[None], workers=1, progress=advance)[0].force
+            for model in (organ, bare)
         )
         reach = LesionReach(force, force_without, anatomy.scene.sensor.noise)
         for one in maps:

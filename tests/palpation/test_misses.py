@@ -117,3 +117,25 @@ def test_a_weak_baseline_is_said_so(monkeypatch):
 def test_forces_and_noise_are_in_the_text(monkeypatch):
     (miss,) = missed(monkeypatch, lesion(0.034, 0.042, 0.030), forces=(0.219, 0.2))
     assert "0.219 N, 0.200 N without the lesion (contrast 1.09); the sensor's noise is 0.01 N" in miss.text
+
+
+def test_presses_over_missed_lesions_are_counted(monkeypatch):
+    """Two for each lesion that a map misses, told before the first and counted after each."""
+    told, done = [], []
+
+    def scan(*args, progress, **options):
+        assert told == [2]
+        progress()
+        return [SimpleNamespace(force=0.2)]
+
+    monkeypatch.setattr(misses, "scan", scan)
+    truths = seen_from_surface((ABOVE,), ANATOMY)
+    one = score_map("m", SITES, np.ones(len(SITES)), [], truths, ANATOMY.along_surface, spacing=SPACING)
+    pressed = PressedSites(SITES, NOWHERE, SPACING)
+
+    def progress(count):
+        told.append(count)
+        return lambda: done.append(1)
+
+    explain_misses(ANATOMY, ANATOMY.organ((ABOVE,)), (ABOVE,), truths, (one,), pressed, progress)
+    assert len(done) == 2

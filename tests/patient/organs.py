@@ -5,9 +5,10 @@ import trimesh
 
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import mesh_surface
+from surgsim_env.scene.load import scenes_folder
 
 
-def kidney(cell: float = 0.006) -> TetMesh:
+def kidney_surface() -> trimesh.Trimesh:
     """A kidney-like bean 110 mm long, its long axis along x, its hilum towards -y, its poles raised.
 
     An ellipsoid, bent by x^2 towards -y and z: it lies on the middle of its back and rocks.
@@ -15,4 +16,16 @@ def kidney(cell: float = 0.006) -> TetMesh:
     ball = trimesh.creation.icosphere(3, 1.0)
     x, y, z = (ball.vertices * [0.055, 0.027, 0.018]).T
     bend = (x / 0.055) ** 2
-    return mesh_surface(np.column_stack([x, y - 0.012 * bend, z + 0.012 * bend]), ball.faces, cell_size=cell)
+    return trimesh.Trimesh(np.column_stack([x, y - 0.012 * bend, z + 0.012 * bend]), ball.faces, process=False)
+
+
+def kidney(cell: float = 0.006) -> TetMesh:
+    """That bean, filled."""
+    surface = kidney_surface()
+    return mesh_surface(surface.vertices, surface.faces, cell_size=cell)
+
+
+def liver_surface(scale: float) -> trimesh.Trimesh:
+    """The shipped liver (scenes/meshes/make_liver.py), smaller."""
+    liver = trimesh.load(scenes_folder() / "meshes" / "liver.ply", process=False)
+    return trimesh.Trimesh(scale * liver.vertices, liver.faces, process=False)

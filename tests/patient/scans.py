@@ -87,3 +87,25 @@ def wedge(path: Path, spacing: float = 1.5) -> Path:
     affine = np.diag([-spacing, -spacing, spacing, 1.0])
     affine[:3, 3] = -x[0], -y[0], z[0]
     return write_nifti(path, np.where(ill, 2, inside).astype(np.uint8), affine)
+
+
+# A spleen as a cap: half its width and length across its crown and half its thickness, how far its rim bends back, and
+# the direction of its crown, to the patient's left and the front [mm], LPS.
+SPLEEN_AXES, SPLEEN_BEND = np.array([36.0, 54.0, 22.0]), 12.0
+SPLEEN_CROWN = np.array([0.8, -0.6, 0.0])
+# Its lesions: across the crown and along its length, below the mid surface's height, radius [mm].
+SPLEEN_LESIONS = ((np.array([2.0, 22.0, 6.0]), 10.0), (np.array([-4.0, -20.0, 6.0]), 10.0))
+
+
+def spleen(path: Path, spacing: float = 2.0) -> Path:
+    """A cap, convex to the left and front, hollow towards the spine, with two lesions below its crown."""
+    line = np.arange(-66.0, 66.0, spacing)
+    place = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
+    up = np.array([0.0, 0.0, 1.0])
+    across = np.stack([place @ np.cross(SPLEEN_CROWN, up), place @ up, place @ SPLEEN_CROWN], axis=-1)
+    across[..., 2] += SPLEEN_BEND * ((across[..., :2] / SPLEEN_AXES[:2]) ** 2).sum(axis=-1)
+    inside = ((across / SPLEEN_AXES) ** 2).sum(axis=-1) <= 1.0
+    ill = [((across - centre) ** 2).sum(axis=-1) <= radius**2 for centre, radius in SPLEEN_LESIONS]
+    affine = np.diag([-spacing, -spacing, spacing, 1.0])
+    affine[:3, 3] = -line[0], -line[0], line[0]
+    return write_nifti(path, np.where(inside & np.any(ill, axis=0), 2, inside).astype(np.uint8), affine)

@@ -254,10 +254,10 @@ def play_greedy(scene: str, presses: int, seed: int = 3, **settings: object) -> 
     return parts
 
 
-def constants(organ: msdm_core.OrganModel) -> tuple[object, ...]:
+def constants(organ: msdm_core.OrganModel) -> dict[str, object]:
     """The arrays of an organ, without those of motions, which these do not have."""
     assert not len(organ.motion_node_shift)
-    return tuple(value for name, value in zip(organ._fields, organ, strict=True) if not name.startswith("motion_"))
+    return {name: value for name, value in organ._asdict().items() if not name.startswith("motion_")}
 
 
 def scene_organ(env_id: str, scene: str, **settings: object) -> Parts:

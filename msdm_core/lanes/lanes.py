@@ -271,10 +271,12 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
     shapes, points = memory[0]
     has_room = shapes == lane_memory[0][0] and points <= lane_memory[0][1]
     has_room &= memory[1][0] <= lane_memory[1][0] and memory[1][1:] == lane_memory[1][1:]
+    has_room &= organ.motion.shape == state.motion.shape[1:]
     if organ.node_position.shape != state.node_position.shape[:2] or not has_room:
         raise OrganError(
-            f"the state has {len(organ.node_position)} nodes and memory of contact and supports {memory}, lane {lane} "
-            f"{len(state.node_position)} and {lane_memory}: make it with rest_state(model, shape_count=...)"
+            f"the state has {len(organ.node_position)} nodes, memory of contact and supports {memory} and "
+            f"{len(organ.motion)} motions, lane {lane} {len(state.node_position)}, {lane_memory} and "
+            f"{state.motion.shape[1]}: make it with rest_state(model, shape_count=...)"
         )
     for name in NODE_FIELDS:
         getattr(state, name)[:, :, lane] = getattr(organ, name)
@@ -407,6 +409,9 @@ def _check_fit(
         "node_position": (state.node_position, (nodes, 3, len(model.lanes))),
         "contact_engaged": (state.contact_engaged, (lanes, count, surface * QUADRATURE_COUNT)),
         "support_stretch": (state.support_stretch, (lanes, support_nodes, len(model.support_kind), 3)),
+        "motion": (state.motion, (lanes, len(model.motion_node_shift), 4)),
+        "ground_foundation": (state.ground_foundation, (lanes, *model.foundation_position.shape)),
+        "ground_support": (state.ground_support, (lanes, len(model.support_kind), 2, 3)),
         "shape_ends": (shapes.shape_ends, (len(state.lane_fault), count, 2, 3)),
         "shape_span": (shapes.shape_span, (lanes, count, 3)),
         "shape_friction": (shapes.shape_friction, (lanes, count)),

@@ -114,12 +114,15 @@ def _check_state(model: OrganModel, state: OrganState, shapes: ContactShapes) ->
     nodes = model.node_rest_position.shape
     arrays = (state.node_position, state.node_velocity, state.node_force)
     supports = (len(model.support_nodes), len(model.support_kind), 3)
+    motion = (len(model.motion_node_shift), 4)
     fits = state.contact_engaged.shape[1] == points and state.support_stretch.shape == supports
+    fits &= state.motion.shape == motion and state.ground_foundation.shape == model.foundation_position.shape
     if any(array.shape != nodes for array in arrays) or not fits:
         raise OrganError(
             f"the state has {len(state.node_position)} nodes with {state.contact_engaged.shape[1]} contact points and "
-            f"memory of supports {state.support_stretch.shape}, the organ {len(model.node_mass)}, {points} and "
-            f"{supports}: make the state with rest_state(model, ...)"
+            f"memory of supports {state.support_stretch.shape}, motions {state.motion.shape} and foundations "
+            f"{state.ground_foundation.shape}, the organ {len(model.node_mass)}, {points}, {supports}, {motion} and "
+            f"{model.foundation_position.shape}: make the state with rest_state(model, ...)"
         )
     if len(shapes.shape_radius) > len(state.contact_engaged):
         raise OrganError(

@@ -8,7 +8,7 @@ import pytest
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
-from msdm_core.lanes.lanes import advance_lanes, get_lane, rest_lanes, stack_organs, stack_shapes
+from msdm_core.lanes.lanes import advance_lanes, get_lane, put_lane, rest_lanes, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Material
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
@@ -16,7 +16,7 @@ from msdm_core.organ.foundation import Foundation
 from msdm_core.organ.measure import kinetic_energy, potential_energy, support_forces
 from msdm_core.organ.motion import Motion, ground_work, steer
 from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 from msdm_core.organ.support import Support
 
 SIZE = (0.06, 0.03, 0.03)
@@ -186,3 +186,15 @@ def test_motions_that_are_impossible_are_refused(given, words):
 def test_two_motions_of_one_name_are_refused():
     with pytest.raises(OrganError, match="two motions are named 'breathing'"):
         compile_organ(replace(HELD, motions=(BREATH, BREATH)))
+
+
+def test_a_state_of_an_organ_that_moves_otherwise_is_refused():
+    """Compiled code would read beyond its arrays."""
+    moved, still = (compile_organ(replace(HELD, motions=motions)) for motions in ((BREATH,), ()))
+    with pytest.raises(OrganError, match=r"motions \(0, 4\) .* \(1, 4\)"):
+        advance(moved, rest_state(still), dt=1e-5)
+    with pytest.raises(OrganError, match=r"motion has shape \(8, 0, 4\)"):
+        shapes, wrench = stack_shapes([NO_SHAPES]), np.zeros((8, 0, 6))
+        advance_lanes(stack_organs([moved]), rest_lanes([still]), shapes, NO_CONTACT, 1e-5, 1, wrench=wrench)
+    with pytest.raises(OrganError, match="1 motions"):
+        put_lane(rest_lanes([still]), 0, rest_state(moved))

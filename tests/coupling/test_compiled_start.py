@@ -31,7 +31,9 @@ def steps_of(env, count):
     plan = StepPlan(sim.substep_dt, decay, sim.substep_count, count, np.inf, np.inf)
 
     def call():
-        advance_haptic_steps(sim.organ_model, sim.organ_state, sim.contact, shapes, response, tools, plan, outcome)
+        advance_haptic_steps(
+            sim.organ_model, sim.organ_state, sim.contact, shapes, response, tools, sim.drive, plan, outcome
+        )
         return outcome.step_count[0], outcome.fault[0]
 
     return call

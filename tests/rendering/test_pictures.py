@@ -8,6 +8,7 @@ import pytest
 
 from msdm_core.mesh.geodesic import NearestTriangle
 from surgsim_env.rendering import stage
+from surgsim_env.rendering.embedding import organ_surface
 from surgsim_env.rendering.options import CAMERAS, RenderOptions
 from surgsim_env.rendering.renderer import ARROW_COLOUR, OrganRenderer, contact_point
 from surgsim_env.rendering.stage import LABELS
@@ -96,9 +97,7 @@ def test_depth_of_visible_nodes_is_their_distance(press, draw, camera):
     depth, view = renderer.depth(), renderer.cameras[camera]
     assert depth.shape == (480, 640) and depth.dtype == np.float32
     anatomy = press.simulation.anatomy
-    vertices, normals = stage.drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles).follow(
-        press.simulation.organ_state.node_position
-    )
+    vertices, normals = organ_surface(anatomy).follow(press.simulation.organ_state.node_position)
     # Facing the camera within 60 degrees, so that a pixel's width does not matter.
     towards = view.position - vertices
     facing = (normals * towards).sum(axis=1) > 0.5 * np.linalg.norm(towards, axis=1)

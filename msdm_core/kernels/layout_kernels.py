@@ -220,3 +220,39 @@ def corner_mean(lanes, values, tets, tet):
         load_item(lanes, values, tets[tet, 0]) + load_item(lanes, values, tets[tet, 1])
         + load_item(lanes, values, tets[tet, 2]) + load_item(lanes, values, tets[tet, 3])
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def spread_order(items, base, gap, waiting, last, order):
+    """The base order, changed so that items that share a node stand apart.
+
+    Each place takes the first of the next n_waiting items whose nodes were used at least `gap` places before; else the
+    one whose nodes were used longest ago.
+
+    In:  items: their nodes (n_item, 2 or 4), base: an order (n_item,), gap
+    Out: waiting: scratch (n_waiting,), last: the place where each node was used last, initially -gap (n_node,),
+         order (n_item,)
+    """
+    count, held = base.shape[0], min(waiting.shape[0], base.shape[0])
+    waiting[:held] = base[:held]
+    for place in range(count):
+        chosen, widest = 0, -1
+        for entry in range(held):
+            apart = gap + place
+            for corner in range(items.shape[1]):
+                apart = min(apart, place - last[items[waiting[entry], corner]])
+            if apart > widest:
+                chosen, widest = entry, apart
+                if apart >= gap:
+                    break
+        item = waiting[chosen]
+        for entry in range(chosen, held - 1):
+            waiting[entry] = waiting[entry + 1]
+        held -= 1
+        for corner in range(items.shape[1]):
+            last[items[item, corner]] = place
+        order[place] = item
+        following = place + waiting.shape[0]
+        if following < count:
+            waiting[held] = base[following]
+            held += 1

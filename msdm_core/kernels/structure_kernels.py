@@ -69,7 +69,8 @@ class OrganModel(NamedTuple):
         foundation_nodes: nodes that elastic foundations hold                    (n_held,)
         foundation_position: where those nodes are without force [m]             (n_held, 3)
         foundation_stiffness: force per displacement, all foundations together [N/m] (n_held, 3, 3)
-        motion_node_shift: how far a unit of a motion's signal moves the ground [m]  (n_motion, n_node, 3)
+        motion_node_shift: how far a unit of a motion's signal moves the ground [m], and 0 (n_motion, n_node, 4)
+        motion_anchored_nodes: anchored nodes of an organ whose ground moves     (n_anchored,)
         motion_foundation_shift: the same of foundations, at the nodes they hold [m] (n_motion, n_held, 3)
         motion_support_shift: the same of supports [m]                           (n_motion, n_support, 3)
         gravity: [m/s^2]                                                         (3,)
@@ -121,6 +122,7 @@ class OrganModel(NamedTuple):
     foundation_position: FloatArray
     foundation_stiffness: FloatArray
     motion_node_shift: FloatArray
+    motion_anchored_nodes: NDArray[np.intp]
     motion_foundation_shift: FloatArray
     motion_support_shift: FloatArray
     gravity: FloatArray
@@ -168,6 +170,7 @@ class OrganState(NamedTuple):
         ground_foundation: scratch: where foundations hold nodes now [m]         (n_held, 3)
         ground_support: scratch: position [m] and velocity [m/s] of supports now (n_support, 2, 3)
         ground_load: scratch: force of each support on the organ [N]             (n_support, 3)
+        ground_rate: scratch: rates of the motions' signals [1/s]                (n_motion,)
         volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
         lane_fault: scratch: FAULT_ code of the last call                        (1,)
         moving: scratch: 1 until a fault stops the organ, then 0                 (1,)
@@ -206,6 +209,7 @@ class OrganState(NamedTuple):
     ground_foundation: FloatArray
     ground_support: FloatArray
     ground_load: FloatArray
+    ground_rate: FloatArray
     volume_ratio_smallest: FloatArray
     lane_fault: NDArray[np.int32]
     moving: FloatArray
@@ -220,7 +224,7 @@ SCRATCH_FIELDS = (
     *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets"),
     *("node_pairs", "node_steepness", "spring_lengths", "steep_springs", "steep_places", "steep_rows", "steep_speed"),
     *("contact_candidates", "contact_rows", "contact_places", "contact_hold"),
-    *("ground_foundation", "ground_support", "ground_load"),
+    *("ground_foundation", "ground_support", "ground_load", "ground_rate"),
     *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept", "contact_count"),
 )
 
@@ -306,6 +310,7 @@ class LaneModel(NamedTuple):
     foundation_position: FloatArray
     foundation_stiffness: FloatArray
     motion_node_shift: FloatArray
+    motion_anchored_nodes: NDArray[np.intp]
     motion_foundation_shift: FloatArray
     motion_support_shift: FloatArray
     gravity: FloatArray
@@ -335,6 +340,7 @@ class LaneState(NamedTuple):
         ground_foundation: scratch: as in OrganState                             (n_lane, n_held, 3)
         ground_support: scratch: as in OrganState                                (n_lane, n_support, 2, 3)
         ground_load: scratch: as in OrganState                                   (n_lane, n_support, 3)
+        ground_rate: scratch: as in OrganState                                   (n_motion, n_lane)
         node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
         squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
         node_pairs: scratch: as in OrganState                                    (2, n_node, n_lane), (2, 0, n_lane)
@@ -372,6 +378,7 @@ class LaneState(NamedTuple):
     ground_foundation: FloatArray
     ground_support: FloatArray
     ground_load: FloatArray
+    ground_rate: LaneArray
     node_tension: LaneArray
     squeezed_tets: NDArray[np.int32]
     node_pairs: LaneArray
@@ -661,7 +668,7 @@ def in_rows(lanes, state):
         state.contact_engaged, state.contact_stretch, state.contact_candidates,
         state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         state.support_stretch,
-        state.motion, state.ground_foundation, state.ground_support, state.ground_load, state.volume_ratio_smallest,
-        state.lane_fault, state.moving, state.finite_sum, state.candidate_count, state.contact_kept,
-        state.contact_count,
+        state.motion, state.ground_foundation, state.ground_support, state.ground_load, state.ground_rate,
+        state.volume_ratio_smallest, state.lane_fault, state.moving, state.finite_sum, state.candidate_count,
+        state.contact_kept, state.contact_count,
     )  # fmt: skip

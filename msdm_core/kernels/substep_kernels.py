@@ -36,7 +36,7 @@ from msdm_core.kernels.support_kernels import (
     add_foundation_forces,
     add_support_forces,
     carry_anchors,
-    follow_ground,
+    drag_along,
     move_ground,
     place_ground,
 )
@@ -270,8 +270,9 @@ def _begin(lanes, model, state, shapes, response, duration):
         set_entry(state.moving, lane, 1.0)
         if model.motion_node_shift.shape[0] > 0:
             motion = part_of(lanes, state.motion, lane)
-            velocity = touched_of(lanes, state, lane).node_velocity
-            carry_anchors(model, column_of(model.node_inverse_mass, lane), motion, velocity)
+            for number in range(motion.shape[0]):
+                column_of(state.ground_rate, lane)[number] = motion[number, 1]
+            carry_anchors(model, motion, touched_of(lanes, state, lane).node_velocity)
             place_ground(
                 model, motion, part_of(lanes, state.ground_foundation, lane), part_of(lanes, state.ground_support, lane)
             )
@@ -360,19 +361,19 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
 
 @njit(forceinline=True, error_model="numpy")
 def _move_ground(lanes, model, state, dt, decay):
-    """Move what holds the organs that move: anchored nodes by the integration that follows, the rest at once."""
+    """Move what holds the organs that move: anchored nodes by the integration that follows, the others at once."""
     if model.motion_node_shift.shape[0] == 0:
         return
+    drag_along(lanes, model.motion_node_shift, state.ground_rate, state.moving, decay, state.node_velocity)
     for lane in range(_lane_count(lanes)):
         if state.lane_fault[lane] != FAULT_NONE:
             continue
-        touched, mass = touched_of(lanes, state, lane), column_of(model.node_inverse_mass, lane)
+        touched = touched_of(lanes, state, lane)
         motion, foundation = part_of(lanes, state.motion, lane), part_of(lanes, state.ground_foundation, lane)
         move_ground(
-            model, mass, touched.node_position, touched.node_force, foundation,
+            model, touched.node_position, touched.node_force, foundation,
             part_of(lanes, state.ground_load, lane), motion, dt,
         )  # fmt: skip
-        follow_ground(model, mass, motion, touched.node_velocity, decay)
         place_ground(model, motion, foundation, part_of(lanes, state.ground_support, lane))
 
 

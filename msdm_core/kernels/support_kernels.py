@@ -5,6 +5,8 @@ import math
 from numba import njit
 
 from msdm_core.kernels.contact_kernels import stick_or_slip
+from msdm_core.kernels.layout_kernels import load_item, load_part, parts_of, store_part, where_moving
+from msdm_core.kernels.vector_kernels import load_row
 
 PLANE, SPHERE, CAPSULE, BOX = 0, 1, 2, 3
 
@@ -118,49 +120,56 @@ def place_ground(model, motion, foundation, support):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def carry_anchors(model, inverse_mass, motion, velocity):
+def carry_anchors(model, motion, velocity):
     """Give anchored nodes the speed of the ground, v = sum of ds_m/dt d_m.
 
     Model: model: shifts d_m
-    In:    inverse_mass [1/kg] (n_node,), motion: signals s_m and their rates [1/s] (n_motion, 4)
+    In:    motion: signals s_m and their rates [1/s] (n_motion, 4)
     Out:   velocity [m/s] (n_node, 3)
     """
-    for node in range(inverse_mass.shape[0]):
-        if inverse_mass[node] == 0.0:
-            for axis in range(3):
-                speed = 0.0
-                for number in range(motion.shape[0]):
-                    speed += motion[number, 1] * model.motion_node_shift[number, node, axis]
-                velocity[node, axis] = speed
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def follow_ground(model, inverse_mass, motion, velocity, decay):
-    """Let the integration that follows, v' = decay v + ..., damp velocities relative to the ground's.
-
-    With its speed w = sum of ds_m/dt d_m: v' = decay (v - w) + w + ..., and v' = w where the node is anchored.
-
-    Model: model: shifts d_m
-    In:    inverse_mass [1/kg] (n_node,), motion: signals s_m and their rates [1/s] (n_motion, 4), decay
-    Out:   velocity [m/s] (n_node, 3)
-    """
-    more = (1.0 - decay) / decay
-    for node in range(inverse_mass.shape[0]):
-        anchored = inverse_mass[node] == 0.0
-        if more == 0.0 and not anchored:
-            continue
+    for item in range(model.motion_anchored_nodes.shape[0]):
+        node = model.motion_anchored_nodes[item]
         for axis in range(3):
             speed = 0.0
             for number in range(motion.shape[0]):
                 speed += motion[number, 1] * model.motion_node_shift[number, node, axis]
-            if anchored:
-                velocity[node, axis] = speed / decay
-            else:
-                velocity[node, axis] += more * speed
+            velocity[node, axis] = speed
+
+
+@njit(forceinline=True, error_model="numpy")
+def _ground_shift(lanes, shift, number, node, part):
+    """What of a motion's shift belongs to a part of a node, see `layout_kernels.load_part`."""
+    if len(lanes) == 0:
+        return load_row(shift, number * shift.shape[1] + node)
+    return shift[number, node, part]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move_ground(model, inverse_mass, position, force, foundation, load, motion, dt):
+def drag_along(lanes, shift, rate, moving, decay, velocity):
+    """Let the integration that follows, v' = decay v + ..., damp velocities relative to the ground's.
+
+    With its speed w = sum of ds_m/dt d_m: v' = decay (v - w) + w + ..., so that anchored nodes keep the speed w.
+
+    In:  shift: d_m [m] (n_motion, n_node, 4), rate: ds_m/dt [1/s] (n_motion,), moving: 1 where an organ moves (1,),
+         decay
+    Out: velocity [m/s] (n_node, 4)
+    """
+    more, parts = (1.0 - decay) / decay, parts_of(lanes)
+    if more == 0.0:
+        return
+    for node in range(shift.shape[1]):
+        for part in range(parts):
+            before = load_part(lanes, velocity, parts * node + part)
+            after = before
+            for number in range(shift.shape[0]):
+                after = after + _ground_shift(lanes, shift, number, node, part) * (
+                    load_item(lanes, rate, number) * more
+                )
+            store_part(lanes, velocity, parts * node + part, where_moving(lanes, moving, after, before))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def move_ground(model, position, force, foundation, load, motion, dt):
     """Count the work of the ground on the organ, and advance the signals by a step.
 
     What the ground pushes with does the work F . d_m ds_m: F = -f at an anchored node, whose forces it balances,
@@ -168,17 +177,19 @@ def move_ground(model, inverse_mass, position, force, foundation, load, motion, 
     half each, the trapezoidal rule: with the rates before and after, dW_m = F . d_m (r_m + r'_m) dt / 2.
 
     Model: model: shifts d_m
-    In:    inverse_mass [1/kg] (n_node,), position [m] (n_node, 3), force [N] (n_node, 3), foundation [m] (n_held, 3),
-           load [N] (n_support, 3), dt [s]
+    In:    position [m] (n_node, 3), force [N] (n_node, 3), foundation [m] (n_held, 3), load [N] (n_support, 3), dt [s]
     Out:   motion (n_motion, 4)
     """
     for number in range(motion.shape[0]):
         shift = model.motion_node_shift[number]
-        power = 0.0
-        for node in range(inverse_mass.shape[0]):
-            if inverse_mass[node] == 0.0:
-                for axis in range(3):
-                    power -= force[node, axis] * shift[node, axis]
+        # Three sums do not wait for each other.
+        x, y, z = 0.0, 0.0, 0.0
+        for item in range(model.motion_anchored_nodes.shape[0]):
+            node = model.motion_anchored_nodes[item]
+            x -= force[node, 0] * shift[node, 0]
+            y -= force[node, 1] * shift[node, 1]
+            z -= force[node, 2] * shift[node, 2]
+        power = x + y + z
         shift = model.motion_foundation_shift[number]
         for item in range(foundation.shape[0]):
             node = model.foundation_nodes[item]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
+from msdm_core.kernels.layout_kernels import spread_order
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
 # Items that share a node are placed at least this far apart, where one of the next WINDOW items allows it.
@@ -55,30 +56,10 @@ def swept(points: FloatArray, items: NDArray[np.integer]) -> NDArray[np.intp]:
     edge = float(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1).mean())
     cells = np.floor((corners.mean(axis=1) - points.min(axis=0)) / edge + 0.25).astype(np.int64)
     along, across, within = np.argsort(-np.ptp(points, axis=0), kind="stable")
-    return _spaced(items, np.lexsort((cells[:, within], cells[:, across], cells[:, along])))
-
-
-def _spaced(items: NDArray[np.integer], base: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The base order, changed so that each place has the first item of the window without a recently used node."""
-    nodes = items.tolist()
-    last = [-GAP] * (int(items.max()) + 1)
-    waiting = base[:WINDOW].tolist()
-    order = []
-    for place in range(len(base)):
-        chosen, widest = 0, -1
-        for entry, item in enumerate(waiting):
-            gap = place - max([last[node] for node in nodes[item]])
-            if gap > widest:
-                chosen, widest = entry, gap
-                if gap >= GAP:
-                    break
-        item = waiting.pop(chosen)
-        for node in nodes[item]:
-            last[node] = place
-        order.append(item)
-        if place + WINDOW < len(base):
-            waiting.append(int(base[place + WINDOW]))
-    return np.array(order, dtype=np.intp)
+    base = np.lexsort((cells[:, within], cells[:, across], cells[:, along]))
+    order, last = np.empty(len(items), dtype=np.intp), np.full(len(points), -GAP)
+    spread_order(np.ascontiguousarray(items), base, GAP, np.empty(WINDOW, dtype=np.intp), last, order)
+    return order
 
 
 _ORDERS: WeakKeyDictionary[TetMesh, SpringOrder] = WeakKeyDictionary()

@@ -139,7 +139,9 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         surface_rest_area=_read_only(area),
         **supports,
         **foundations,
-        **motion_fields(spec.motions, mesh.points, foundations["foundation_nodes"], supports["support_position"]),
+        **motion_fields(
+            spec.motions, mesh.points, anchored, foundations["foundation_nodes"], supports["support_position"]
+        ),
         gravity=_read_only(_checked_gravity(spec.gravity)),
         alpha=float(spec.damping.alpha),
         beta=float(spec.damping.beta),
@@ -194,6 +196,7 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         ground_foundation=model.foundation_position.copy(),
         ground_support=np.stack([model.support_position, np.zeros_like(model.support_position)], axis=1),
         ground_load=np.zeros_like(model.support_position),
+        ground_rate=np.zeros(len(model.motion_node_shift)),
         volume_ratio_smallest=np.ones(1),
         lane_fault=np.zeros(1, dtype=np.int32),
         moving=np.ones(1),

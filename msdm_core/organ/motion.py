@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
@@ -62,13 +62,18 @@ class Motion:
 
 
 def motion_fields(
-    motions: Sequence[Motion], points: FloatArray, foundation_nodes: ArrayLike, support_position: FloatArray
+    motions: Sequence[Motion],
+    points: FloatArray,
+    anchored: NDArray[np.bool_],
+    foundation_nodes: ArrayLike,
+    support_position: FloatArray,
 ) -> dict[str, Any]:
     """The fields of an OrganModel that describe how its ground moves.
 
     Args:
         motions: of the ground.
         points: rest positions of the nodes [m], shape (n_node, 3).
+        anchored: the nodes held fixed, shape (n_node,).
         foundation_nodes: nodes that foundations hold, shape (n_held,).
         support_position: of the supports [m], shape (n_support, 3).
 
@@ -88,6 +93,8 @@ def motion_fields(
         field: np.array([motion.shift(where) for motion in motions]).reshape(len(motions), len(where), 3)
         for field, where in places.items()
     }
+    fields["motion_node_shift"] = np.pad(fields["motion_node_shift"], ((0, 0), (0, 0), (0, 1)))
+    fields["motion_anchored_nodes"] = np.flatnonzero(anchored if motions else False)
     for array in fields.values():
         array.setflags(write=False)
     return fields

@@ -5,14 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
 from surgsim_env.scene.model import Scene
 
-# Largest share of an organ's mass that may be added to save substeps, and the smallest number of substeps.
-ADDED_MASS_SHARE, SUBSTEPS_FEWEST = 0.01, 2
 SHOWN, HIDDEN, NONE = "as in the scene", "hidden", "none"
 
 
@@ -59,18 +56,8 @@ def live_scene(scene: Scene) -> Scene:
     Raises:
         ValueError: the mesh of the scene cannot be made.
     """
-    timing = replace(scene.timing, mass_scaling=True)
-    anatomy, choice = load_anatomy(replace(scene, timing=timing)), OrganChoice(lesions=lesion_kinds(scene)[0])
-    for count in range(SUBSTEPS_FEWEST, timing.substep_count):
-        fewer = replace(anatomy.scene, timing=replace(timing, substep_count=count))
-        try:
-            organ = chosen_organ(replace(anatomy, scene=fewer), choice)
-        except OrganError:
-            # It would need more than the limit of mass scaling.
-            continue
-        if organ.added_mass <= ADDED_MASS_SHARE * organ.node_mass.sum():
-            return fewer
-    return anatomy.scene
+    choice = OrganChoice(lesions=lesion_kinds(scene)[0])
+    return with_added_mass(load_anatomy(scene), lambda anatomy: chosen_organ(anatomy, choice)).scene
 
 
 def lesion_kinds(scene: Scene) -> tuple[str, ...]:

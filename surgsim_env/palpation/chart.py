@@ -23,7 +23,7 @@ from surgsim_env.palpation.press import SitePress, core_count, press_in_lanes, p
 from surgsim_env.palpation.surface_scene import with_substeps
 from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.reports.step_progress import StepProgress
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
@@ -240,14 +240,16 @@ def healthy_file(scene_file: Path) -> Path:
 def write_healthy_map(scene: Scene, path: Path, progress: StepProgress) -> None:
     """Press the healthy organ of a scene at every site of the chart's grid, and write its map to an npz file.
 
-    Organs advance in float32, twice as many side by side, and in as many substeps as healthy tissue needs: on the left
-    kidney of OpenHELP stiffness then differs by 3e-5 of itself.
+    Organs advance in float32, twice as many side by side, and with up to 1 % of mass added in fewer substeps: on the
+    left kidney of OpenHELP 4 in place of 8 change no stiffness by more than 3e-4 of itself.
 
     Raises:
         ValueError: as in `healthy_map`.
     """
     anatomy = load_anatomy(with_instrument(scene, "probe"))
-    grid = _pressed(with_substeps(anatomy, [anatomy.organ()]), progress, np.float32)
+    with progress.step("choosing the step of the healthy organ"):
+        quick = with_added_mass(with_substeps(anatomy, [anatomy.organ()]), lambda one: one.organ())
+    grid = _pressed(quick, progress, np.float32)
     np.savez_compressed(path, digest=np.array(_digest(anatomy)), grid=grid)
 
 

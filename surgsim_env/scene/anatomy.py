@@ -1,13 +1,14 @@
 """The anatomy of a scene: its organ's mesh, anchored nodes and palpable face, and organs compiled with lesions."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion, Material
 from msdm_core.mesh.geodesic import NearestTriangle, SurfaceDistance
@@ -18,15 +19,17 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 from msdm_core.organ.compile import OrganSpec, compile_organ
 from msdm_core.organ.foundation import Foundation
-from msdm_core.organ.stability import scale_mass
+from msdm_core.organ.stability import scale_mass, stable_dt
 from msdm_core.organ.support import SupportLaw
-from surgsim_env.scene.model import Anchor, LesionDraw, Scene, step_needed
+from surgsim_env.scene.model import Anchor, LesionDraw, Scene, scaled_step, substeps_needed
 from surgsim_env.scene.palpable_surface import PalpableFace, find_palpable_face, warn_of_coarse_cells
 
 # How exactly a drawn lesion's cover is met [m].
 COVER_TOLERANCE = 1e-4
 # A press within this many tip radii of a fixed node is dominated by it.
 SUPPORT_TIP_RADII = 2.0
+# Largest share of an organ's mass that may be added to save substeps, and the smallest number of substeps.
+ADDED_MASS_SHARE, SUBSTEPS_FEWEST = 0.01, 2
 # Cosines are exact to this where it is decided which way a surface faces.
 SIDE_ROUNDING = 1e-9
 
@@ -132,11 +135,13 @@ class Anatomy:
 
     def compiled(self, specification: OrganSpec) -> OrganModel:
         """The organ of a specification, with mass added as in `organ`."""
-        organ, timing = compile_organ(specification), self.scene.timing
-        if not timing.mass_scaling:
+        organ, timing, law = compile_organ(specification), self.scene.timing, self.scene.contact.law
+        if (
+            not timing.mass_scaling
+            or substeps_needed(timing.haptic_step, stable_dt(organ, law)) <= timing.substep_count
+        ):
             return organ
-        needed = step_needed(timing.haptic_step, timing.substep_count)
-        return scale_mass(organ, needed, self.scene.contact.law)
+        return scale_mass(organ, scaled_step(timing.haptic_step, timing.substep_count), law)
 
     def random_lesion(
         self, rng: np.random.Generator, draw: LesionDraw | None = None, *, modulus_factor: float = 1.0
@@ -280,6 +285,29 @@ def _load_anatomy(scene: Scene, file_times: tuple[int | None, ...]) -> Anatomy:
             f"scene {scene.name!r}", anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth
         )
     return anatomy
+
+
+def with_added_mass(anatomy: Anatomy, organ_of: Callable[[Anatomy], OrganModel]) -> Anatomy:
+    """The anatomy with mass scaling and the fewest substeps for which at most ADDED_MASS_SHARE of mass is added.
+
+    Static forces do not depend on masses: a press that comes to rest measures the same.
+
+    Args:
+        anatomy: its number of substeps is the largest that is taken.
+        organ_of: compiles the organ that must be stable.
+    """
+    timing = replace(anatomy.scene.timing, mass_scaling=True)
+    for count in range(SUBSTEPS_FEWEST, timing.substep_count):
+        scene = replace(anatomy.scene, timing=replace(timing, substep_count=count))
+        fewer = replace(anatomy, scene=scene)
+        try:
+            organ = organ_of(fewer)
+        except OrganError:
+            # It would need more than the limit of mass scaling.
+            continue
+        if organ.added_mass <= ADDED_MASS_SHARE * organ.node_mass.sum():
+            return fewer
+    return replace(anatomy, scene=replace(anatomy.scene, timing=timing))
 
 
 def anatomy_of(scene: Scene, mesh: TetMesh) -> Anatomy:

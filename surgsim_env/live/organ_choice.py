@@ -48,10 +48,10 @@ class OrganChoice:
 
 
 def live_scene(scene: Scene) -> Scene:
-    """The scene with mass scaling and the fewest substeps that at most 1 % of added mass allows.
+    """The scene with mass scaling and the fewest substeps that a little added mass allows (`with_added_mass`).
 
     Fewer substeps leave time in each haptic step for drawing; mass scaling (`timing.mass_scaling`) also covers the
-    stiffer organs that the sliders describe. The liver needs 2 substeps instead of 4 with 0.7 % of its mass added.
+    stiffer organs that the sliders describe.
 
     Raises:
         ValueError: the mesh of the scene cannot be made.

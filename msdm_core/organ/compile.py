@@ -405,7 +405,7 @@ def _spring_law(
     return fields
 
 
-def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray, springs: NDArray[np.intp]) -> float:
+def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray, springs: NDArray[np.int32]) -> float:
     """The least of what stiffening adds to the tension of springs (n, 2) where it adds STEEP_EXCESS to their tangent.
 
     Half the rise of a node, h, is a convex function of its steepness q: above its tangent at q = STEEP_EXCESS, of slope

@@ -205,6 +205,24 @@ def add_to_corners(lanes, total, tets, tet, value):
 
 
 @njit(forceinline=True, error_model="numpy")
+def add_volume_and_energy(lanes, pairs, tets, tet, volume, energy):
+    """Add to the first numbers of the pairs at a tet's corners, and to the second ones at the ends of its spring.
+
+    All are loaded before one is stored: compiled code keeps the order of what might be the same place.
+    """
+    a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
+    volume_a, volume_b = load_half(lanes, pairs, a, 0) + volume, load_half(lanes, pairs, b, 0) + volume
+    volume_c, volume_d = load_half(lanes, pairs, c, 0) + volume, load_half(lanes, pairs, d, 0) + volume
+    energy_a, energy_b = load_half(lanes, pairs, a, 1) + energy, load_half(lanes, pairs, b, 1) + energy
+    store_half(lanes, pairs, a, 0, volume_a)
+    store_half(lanes, pairs, b, 0, volume_b)
+    store_half(lanes, pairs, c, 0, volume_c)
+    store_half(lanes, pairs, d, 0, volume_d)
+    store_half(lanes, pairs, a, 1, energy_a)
+    store_half(lanes, pairs, b, 1, energy_b)
+
+
+@njit(forceinline=True, error_model="numpy")
 def corner_mean_of_pairs(lanes, pairs, tets, tet):
     """Mean of the first numbers of pairs at the corners of a tet."""
     return 0.25 * (

@@ -10,12 +10,13 @@ from msdm_core.kernels.element_kernels import (
     volume_ratio,
 )
 from msdm_core.kernels.layout_kernels import (
-    add_to_column,
+    add_to_node,
     difference,
     load_column,
     load_item,
     load_shared,
     store_column,
+    take_from_node,
 )
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
@@ -86,11 +87,13 @@ def hold_squeezed(
 
 @njit(forceinline=True, error_model="numpy")
 def _change_speeds(lanes, speed, inverse_mass, dt, i, j, along, pull):
-    """Change the speeds of a spring's ends by its pull [N] for one substep."""
+    """Change the speeds of a spring's ends by its pull [N] for one substep.
+
+    No loop over x, y and z: LLVM does not unroll it here, and sends the direction of many lanes through the stack.
+    """
     for_i, for_j = pull * dt * load_item(lanes, inverse_mass, i), pull * dt * load_item(lanes, inverse_mass, j)
-    for axis in range(3):
-        add_to_column(lanes, speed, 3, i, axis, for_i * along[axis])
-        store_column(lanes, speed, 3, j, axis, load_column(lanes, speed, 3, j, axis) - for_j * along[axis])
+    add_to_node(lanes, speed, i, for_i * along[0], for_i * along[1], for_i * along[2])
+    take_from_node(lanes, speed, j, for_j * along[0], for_j * along[1], for_j * along[2])
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -103,12 +106,19 @@ def _direction(lanes, rows, row):
 
 
 @njit(forceinline=True, error_model="numpy")
+def _set_axis(lanes, speed, velocity, force, rate, node, axis):
+    """One axis of `_set_speed`."""
+    after = load_column(lanes, velocity, 3, node, axis) + rate * load_column(lanes, force, 3, node, axis)
+    store_column(lanes, speed, 3, node, axis, after)
+
+
+@njit(forceinline=True, error_model="numpy")
 def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
     """The speed that a node gets to by all forces so far."""
     rate = dt * load_item(lanes, inverse_mass, node)
-    for axis in range(3):
-        after = load_column(lanes, velocity, 3, node, axis) + rate * load_column(lanes, force, 3, node, axis)
-        store_column(lanes, speed, 3, node, axis, after)
+    _set_axis(lanes, speed, velocity, force, rate, node, 0)
+    _set_axis(lanes, speed, velocity, force, rate, node, 1)
+    _set_axis(lanes, speed, velocity, force, rate, node, 2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -186,9 +196,9 @@ def hold_steep(
     for row in range(held):
         i, j = nodes[places[row], 0], nodes[places[row], 1]
         along, pull = _direction(lanes, rows, row), load_column(lanes, rows, STEEP_WIDTH, row, 5)
-        for axis in range(3):
-            add_to_column(lanes, force, 3, i, axis, pull * along[axis])
-            store_column(lanes, force, 3, j, axis, load_column(lanes, force, 3, j, axis) - pull * along[axis])
+        x, y, z = pull * along[0], pull * along[1], pull * along[2]
+        add_to_node(lanes, force, i, x, y, z)
+        take_from_node(lanes, force, j, x, y, z)
 
 
 @njit(forceinline=True, error_model="numpy")

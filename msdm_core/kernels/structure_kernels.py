@@ -39,7 +39,7 @@ class OrganModel(NamedTuple):
         node_onset: e0 of its `Stiffening`                                       likewise
         node_growth: 1 / (e1 - e0)                                               likewise
         node_excess: (c - 1) (e1 - e0)                                           likewise
-        steep_rise: the least rise of a node with a steepness of STEEP_EXCESS    scalar
+        steep_rise: the least rise of a spring with a steepness of STEEP_EXCESS  scalar
         steep_sweeps: the most of `hold_steep`                                   scalar
         relaxes: whether any spring has Maxwell arms                             scalar
         spring_gain: tension at once over that at equilibrium, 1 + sum g_i       (n_spring,), (0,) if none relaxes

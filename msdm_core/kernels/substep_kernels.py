@@ -175,7 +175,7 @@ def _evaluate(model, state, fades, fade_duration):
     elif averages:
         set_node_tension(lanes, tension, model.node_inverse_volume, model.node_bulk)
     law = SpringLaw(
-        model.stiffens, stiffens, steepens, pairs, lengths, state.steep_springs, 1.0 + 0.5 * model.steep_rise,
+        model.stiffens, stiffens, steepens, pairs, lengths, state.steep_springs, 1.0 + model.steep_rise,
         model.relaxes, model.spring_gain, model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief,
         fades, fade,
     )  # fmt: skip

@@ -34,6 +34,7 @@ from msdm_core.kernels.layout_kernels import (
     add_half,
     add_to_corners,
     add_to_node,
+    add_volume_and_energy,
     corner_mean,
     corner_mean_of_pairs,
     difference,
@@ -152,13 +153,11 @@ def _kept_length(lanes, lengths, spring, x, y, z):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _measure(lanes, position, pairs, lengths, items, item, stiffness, rest_length, edge):
-    """Note the length of a spring along an edge and add `spring_energy` at its ends."""
+def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
+    """Note the length of a spring along an edge; returns its `spring_energy`."""
     length = spring_length(edge[0], edge[1], edge[2])
     _keep_length(lanes, lengths, item, length)
-    twice = spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
-    add_half(lanes, pairs, items[item, 0], 1, twice)
-    add_half(lanes, pairs, items[item, 1], 1, twice)
+    return spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -173,7 +172,9 @@ def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length,
         _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin), nodes.shape[0]
     ):
         edge = difference(lanes, position, nodes, spring, 1)
-        _measure(lanes, position, pairs, lengths, nodes, spring, stiffness, rest_length, edge)
+        twice = _measure(lanes, position, lengths, spring, stiffness, rest_length, edge)
+        add_half(lanes, pairs, nodes[spring, 0], 1, twice)
+        add_half(lanes, pairs, nodes[spring, 1], 1, twice)
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -338,9 +339,8 @@ def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_l
         edge, third, fourth = three_edges(lanes, position, tets, tet)
         _, six = tet_shape(edge, third, fourth)
         if stiffens:
-            for corner in range(4):
-                add_half(lanes, pairs, tets[tet, corner], 0, six)
-            _measure(lanes, position, pairs, lengths, tets, tet, stiffness, rest_length, edge)
+            twice = _measure(lanes, position, lengths, tet, stiffness, rest_length, edge)
+            add_volume_and_energy(lanes, pairs, tets, tet, six, twice)
         else:
             add_to_corners(lanes, total, tets, tet, six)
 

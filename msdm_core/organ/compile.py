@@ -400,7 +400,7 @@ def _spring_law(
         fields["node_onset"] = _read_only(onset)
         fields["node_growth"] = _read_only(1.0 / width)
         fields["node_excess"] = _read_only(rise * width)
-        fields["steep_rise"] = _steep_rise(onset, width, rise)
+        fields["steep_rise"] = _steep_rise(onset, width, rise, nodes)
     if fields["relaxes"]:
         moduli = np.stack([mean(arm) for arm in law.arm_modulus])
         fields["spring_gain"] = _read_only(1.0 + moduli.sum(axis=0))
@@ -408,13 +408,22 @@ def _spring_law(
     return fields
 
 
-def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray) -> float:
-    """The least of what stiffening adds to the tension of nodes where it adds STEEP_EXCESS to their tangent."""
+def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray, springs: NDArray[np.int32]) -> float:
+    """The least of what stiffening adds to the tension of springs (n, 2) where it adds STEEP_EXCESS to their tangent.
+
+    Half the rise of a node, h, is a convex function of its steepness q: above its tangent at q = STEEP_EXCESS, of slope
+    m. So the sum for ends whose mean steepness is that is at least h1 + h2 - STEEP_EXCESS |m1 - m2|; and one end has
+    that steepness, so that it is at least the lesser of both. A node whose cap is below has no such steepness.
+    """
     steep = rise > STEEP_EXCESS
-    ramp = np.sqrt(STEEP_EXCESS / rise[steep])
-    at = rise[steep] * width[steep] * ramp**3 / 3.0 / (onset[steep] + ramp * width[steep])
+    ramp = np.sqrt(STEEP_EXCESS / np.maximum(rise, STEEP_EXCESS))
+    strain = onset + ramp * width
+    half = np.where(steep, rise * width * ramp**3 / (6.0 * strain), math.inf)[springs]
+    slope = (width * ramp * (3.0 * onset + 2.0 * ramp * width) / (12.0 * strain**2))[springs]
+    both = half.sum(axis=1) - STEEP_EXCESS * np.abs(slope[:, 0] - slope[:, 1])
+    least = np.where(steep[springs].all(axis=1), np.maximum(both, half.min(axis=1)), half.min(axis=1))
     # Lanes in float32 round.
-    return 0.999 * float(at.min(initial=math.inf))
+    return 0.99 * float(least.min(initial=math.inf))
 
 
 def _arm_times(spec: OrganSpec) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels.element_kernels import STEEP_EXCESS
+from msdm_core.kernels.element_kernels import STEEP_EXCESS, STRAIN_LEAST, node_law
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
 from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
 from msdm_core.lanes.lanes import (
@@ -386,6 +386,32 @@ def test_stiffening_costs_at_most_half_as_many_substeps_again():
 
 def test_sweeps_follow_from_the_cap():
     assert [steep_sweeps(cap) for cap in (1.0, 12.0, 12.1, 24.0, 36.0, 100.0)] == [4, 4, 6, 8, 12, 12]
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [LIVER, replace(LIVER, tangent_cap=60.0), Stiffening(0.1, 0.4, 3.0), Stiffening(0.0, 0.5, 1.12), None],
+)
+def test_no_steep_spring_rises_less_than_the_model_says(inside: Stiffening | None):
+    """All pairs of steepness at the ends of each spring, also of two laws, with the mean at which it is steep."""
+    model = block(LIVER, lesions=(Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, inside)),))
+    cap = model.node_excess * model.node_growth
+    ends = model.spring_nodes
+    least = np.inf
+    for share in np.linspace(0.0, 2.0, 401):
+        steepness = STEEP_EXCESS * np.array([share, 2.0 - share])
+        reached = (steepness <= cap[ends]).all(axis=1)
+        ramp = np.sqrt(steepness / np.maximum(cap[ends[reached]], STRAIN_LEAST))
+        strain = model.node_onset[ends[reached]] + ramp / model.node_growth[ends[reached]]
+        half = np.array([
+            [node_law(s * s, model.node_onset[node], model.node_growth[node], model.node_excess[node])[0]
+             for s, node in zip(*pair, strict=True)]
+            for pair in zip(strain, ends[reached], strict=True)
+        ]).reshape(-1, 2)  # fmt: skip
+        least = min(least, (half.sum(axis=1) - 1.0).min(initial=np.inf))
+    assert model.steep_rise < least
+    if inside == LIVER:
+        assert least < 1.02 * model.steep_rise
 
 
 @pytest.mark.parametrize("stiffening", [None, LIVER])

@@ -97,7 +97,7 @@ def test_stiff_draws_get_little_mass_and_need_no_more_substeps():
     anatomy = load_anatomy(level.scene(make_scene("phantom_small")))
     stiff = replace(level, background=(1.3, 1.3), radius=(1.0, 1.0), cover=(0.0, 0.0), modulus_ratio=(1.0, 1.0))
     organ = stiff.draw(anatomy, np.random.default_rng(1), lesion_count=2).compiled(anatomy)
-    assert 0.0 < organ.added_mass < 0.01 * organ.node_mass.sum()
+    assert 0.0 < organ.added_mass < 0.02 * organ.node_mass.sum()
 
 
 @pytest.mark.parametrize("name", ["harder", None, 3])

@@ -287,14 +287,17 @@ def _load_anatomy(scene: Scene, file_times: tuple[int | None, ...]) -> Anatomy:
     return anatomy
 
 
-def with_added_mass(anatomy: Anatomy, organ_of: Callable[[Anatomy], OrganModel]) -> Anatomy:
-    """The anatomy with mass scaling and the fewest substeps for which at most ADDED_MASS_SHARE of mass is added.
+def with_added_mass(
+    anatomy: Anatomy, organ_of: Callable[[Anatomy], OrganModel], share_most: float = ADDED_MASS_SHARE
+) -> Anatomy:
+    """The anatomy with mass scaling and the fewest substeps for which at most a share of the organ's mass is added.
 
     Static forces do not depend on masses: a press that comes to rest measures the same.
 
     Args:
         anatomy: its number of substeps is the largest that is taken.
         organ_of: compiles the organ that must be stable.
+        share_most: largest share.
     """
     timing = replace(anatomy.scene.timing, mass_scaling=True)
     for count in range(SUBSTEPS_FEWEST, timing.substep_count):
@@ -305,7 +308,7 @@ def with_added_mass(anatomy: Anatomy, organ_of: Callable[[Anatomy], OrganModel])
         except OrganError:
             # It would need more than the limit of mass scaling.
             continue
-        if organ.added_mass <= ADDED_MASS_SHARE * organ.node_mass.sum():
+        if organ.added_mass <= share_most * organ.node_mass.sum():
             return fewer
     return replace(anatomy, scene=replace(anatomy.scene, timing=timing))
 

@@ -54,7 +54,7 @@ class RandomPress:
 def draw(rng: Generator, anatomy: Anatomy, force_most: float) -> RandomPress:
     """Draw a press on the palpable face of a scene."""
     scene = anatomy.scene
-    face = find_palpable_face(anatomy.mesh, scene.instrument.approach, scene.palpation)
+    face = find_palpable_face(anatomy.mesh, scene.instrument.approach, scene.palpation, scene.instrument.tip_radius)
     point, normal = face.random_point(rng, 0.0)
     u, v = tangent_axes(normal)
     turn, tilt = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, TILT_MOST)

@@ -219,7 +219,8 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
     if not end and pressed.force_peak > scene.limits.hard_force:
         end = f"force limit {scene.limits.hard_force:g} N"
     curve = np.array([(depth, force @ normal) for force, depth in pressed.readings]).reshape(-1, 2)
-    last = curve[-1 if end else -round(AVERAGE_TIME / simulation.haptic_dt) :]
+    # Without a reading before a fault depth and force are 0, as in `SitePress.result`.
+    last = curve[-1 if end else -round(AVERAGE_TIME / simulation.haptic_dt) :] if len(curve) else np.zeros((1, 2))
     return Press(
         site=site,
         normal=normal,

@@ -317,7 +317,7 @@ def anatomy_of(scene: Scene, mesh: TetMesh) -> Anatomy:
     """The anatomy of a scene on a given mesh; the scene's own mesh is not read."""
     for region in scene.regions:
         mesh.region_tag(region.name)
-    face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation)
+    face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation, scene.instrument.tip_radius)
     fixed, foundations = _held(mesh, scene.anchors)
     return Anatomy(scene, mesh, fixed, face, foundations)
 

@@ -21,6 +21,10 @@ SITES_MOST = 100_000
 # A point is open if the face over it is higher by at most this [m]: rounding.
 OPEN_GAP = 1e-6
 
+# Radius of the probe's shaft [m], which points along the approach; the share of the tip's radius that must be free of
+# tissue around its centre when it touches a site.
+SHAFT_RADIUS, TIP_FREE = 0.004, 0.8
+
 # A ray that starts on the surface meets its own triangle nearer than this [m].
 HIT_LEAST = 1e-6
 
@@ -37,6 +41,8 @@ class PalpableFace:
         thickness: organ below each triangle along its inward normal [m]                            (n_face,)
         margin: least distance of raster sites from the rim [m]
         thickness_smallest: least thickness of the organ below a site [m]
+        solid: points of the organ's whole surface: nodes, middles of edges and triangles [m]        (n_solid, 3)
+        tip_radius: of the tip that presses [m]
     """
 
     points: FloatArray
@@ -47,6 +53,8 @@ class PalpableFace:
     thickness: FloatArray
     margin: float
     thickness_smallest: float
+    solid: FloatArray
+    tip_radius: float
 
     def project(self, point: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """The face's point nearest to a point [m] and the unit outward normal there, each (3,)."""
@@ -92,7 +100,7 @@ class PalpableFace:
             if self.thickness[face] < self.thickness_smallest:
                 continue
             point, normal = self._at(face, weights)
-            if self.rim_distance(point) >= rim_distance and self.is_open(point):
+            if self.rim_distance(point) >= rim_distance and self.is_open(point) and self.is_clear(point, normal):
                 return point, normal
         raise ValueError(
             f"no point of the palpable face is {rim_distance * 1000:.3g} mm from its border: "
@@ -135,17 +143,29 @@ class PalpableFace:
         return top is None or float((top[0] - point) @ -self.approach) <= OPEN_GAP
 
     def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
-        """`drop`, but None also where the organ is thin or the border is nearer than the margin less a slack [m]."""
+        """`drop`, but None also where no tool may press.
+
+        That is where the organ is thin, the border nearer than the margin less a slack [m], or other tissue in the way.
+        """
         hit = _drop(*self._plane, u, v)
         if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
             return None
         point, normal = self._at(*hit)
-        return (point, normal) if self.rim_distance(point) >= self.margin - slack else None
+        if self.rim_distance(point) < self.margin - slack or not self.is_clear(point, normal):
+            return None
+        return point, normal
+
+    def is_clear(self, point: FloatArray, normal: FloatArray) -> bool:
+        """Whether a tip that touches the face at a point [m] (3,), and its shaft, touch the organ nowhere else."""
+        away = self.solid - (point + self.tip_radius * normal)
+        along, square = away @ -self.approach, (away**2).sum(axis=1)
+        in_shaft = (along > 0.0) & (square - along**2 < SHAFT_RADIUS**2)
+        return not (in_shaft | (square < (TIP_FREE * self.tip_radius) ** 2)).any()
 
     def raster(self, spacing: float) -> tuple[FloatArray, FloatArray]:
         """Points on a square grid seen along the approach, dropped onto the face, and their normals, each (n_site, 3).
 
-        Points nearer to the border than the face's margin, or where the organ is too thin, are left out.
+        Points that may not be pressed (`site`) are left out.
         """
         plane = self._plane[0]
         lower, upper = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
@@ -154,8 +174,16 @@ class PalpableFace:
         return np.ascontiguousarray(points), np.ascontiguousarray(normals)
 
 
-def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: PalpationSettings) -> PalpableFace:
+def find_palpable_face(
+    mesh: TetMesh, approach: ArrayLike, palpation: PalpationSettings, tip_radius: float
+) -> PalpableFace:
     """The surface triangles whose inward normal is within the scene's angle of the approach direction.
+
+    Args:
+        mesh: of the organ.
+        approach: direction of the tool (3,).
+        palpation: the scene's.
+        tip_radius: of the tool [m].
 
     Raises:
         ValueError: no triangle faces the instrument.
@@ -186,7 +214,15 @@ def find_palpable_face(mesh: TetMesh, approach: ArrayLike, palpation: PalpationS
         thickness=thickness,
         margin=palpation.face_margin,
         thickness_smallest=palpation.thickness_smallest,
+        solid=np.concatenate([mesh.points[mesh.boundary_nodes], *_middles(corners)]),
+        tip_radius=tip_radius,
     )
+
+
+def _middles(corners: FloatArray) -> list[FloatArray]:
+    """Middles of the edges and of the triangles with given corners (n, 3, 3) [m], four arrays (n, 3)."""
+    edges = [0.5 * (corners[:, side] + corners[:, side - 1]) for side in range(3)]
+    return [*edges, corners.mean(axis=1)]
 
 
 def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -89,7 +89,7 @@ def motion_fields(
         "motion_foundation_shift": points[np.asarray(foundation_nodes)],
         "motion_support_shift": support_position,
     }
-    fields = {
+    fields: dict[str, Any] = {
         field: np.array([motion.shift(where) for motion in motions]).reshape(len(motions), len(where), 3)
         for field, where in places.items()
     }

@@ -57,7 +57,7 @@ def live_scene(scene: Scene) -> Scene:
         ValueError: the mesh of the scene cannot be made.
     """
     choice = OrganChoice(lesions=lesion_kinds(scene)[0])
-    return with_added_mass(load_anatomy(scene), lambda anatomy: chosen_organ(anatomy, choice)).scene
+    return with_added_mass(load_anatomy(scene), lambda anatomy: [chosen_organ(anatomy, choice)]).scene
 
 
 def lesion_kinds(scene: Scene) -> tuple[str, ...]:

@@ -251,7 +251,7 @@ def write_healthy_map(scene: Scene, path: Path, progress: StepProgress) -> None:
     """
     anatomy = load_anatomy(with_instrument(scene, "probe"))
     with progress.step("choosing the step of the healthy organ"):
-        quick = with_added_mass(with_substeps(anatomy, [anatomy.organ()]), Anatomy.organ, MASS_SHARE)
+        quick = with_added_mass(with_substeps(anatomy, [anatomy.organ()]), lambda one: [one.organ()], MASS_SHARE)
     grid = _pressed(quick, progress, np.float32)
     np.savez_compressed(path, digest=np.array(_digest(anatomy)), grid=grid)
 

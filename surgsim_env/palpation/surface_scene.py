@@ -1,7 +1,7 @@
 """A scene for any closed surface file; values that are not given are the shipped liver's, but for its stiffening."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.organ.stability import stable_dt
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import Anchor, Ball, MeshSource, Scene, Side, SurfaceMesh, Vector, substeps_needed
 
@@ -120,16 +120,20 @@ def check_options(options: SurfaceOptions) -> None:
 
 
 def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_factor_largest: float) -> Anatomy:
-    """The anatomy with enough organ substeps for the organ with lesions and for a stiffer one without.
+    """The anatomy with substeps for the organ with lesions and for a stiffer one without, fewer with a little more mass.
 
     Args:
         scene: its mesh, materials and timing.
         lesions: hidden in the organ.
         modulus_factor_largest: largest modulus of the pre-operative model over the scene's.
     """
+
+    def organs_of(one: Anatomy) -> Iterator[OrganModel]:
+        yield one.organ(lesions)
+        yield one.organ(modulus_factor=modulus_factor_largest)
+
     anatomy = load_anatomy(scene)
-    organs = [anatomy.organ(lesions), anatomy.organ(modulus_factor=modulus_factor_largest)]
-    return with_substeps(anatomy, organs, least=scene.timing.substep_count)
+    return with_added_mass(with_substeps(anatomy, [*organs_of(anatomy)], least=scene.timing.substep_count), organs_of)
 
 
 def with_substeps(

@@ -47,7 +47,7 @@ from surgsim_env.patient.tet_files import PatientTets, patient_of_tets, read_tet
 from surgsim_env.patient.touch import plan_text, plan_touch
 from surgsim_env.reports.output_folder import OutputFolder, output_folder
 from surgsim_env.reports.step_progress import StepProgress
-from surgsim_env.scene.anatomy import Anatomy, with_added_mass
+from surgsim_env.scene.anatomy import with_added_mass
 from surgsim_env.scene.load import load_scene, make_scene
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import share_text, warn_of_coarse_cells
@@ -159,7 +159,7 @@ def with_hold(found: PatientScene, progress: StepProgress) -> PatientScene:
     """The organ with a check of what holds it: a few healthy presses, with a bar; what is wrong is one of the notes."""
     sites, normals, _ = plan_sites(found.anatomy)
     with progress.step("pressing what holds it", min(HOLD_SITES, len(sites))) as advance:
-        quick = with_added_mass(found.anatomy, Anatomy.organ)
+        quick = with_added_mass(found.anatomy, lambda one: [one.organ()])
         hold = check_hold(quick, sites, normals, progress=lambda: advance(1))
     faults = ("no press of the healthy organ reached its depth",) if hold is None else hold.faults
     return replace(found, hold=hold, notes=(*found.notes, *faults))

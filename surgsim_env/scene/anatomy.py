@@ -1,7 +1,7 @@
 """The anatomy of a scene: its organ's mesh, anchored nodes and palpable face, and organs compiled with lesions."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -288,28 +288,26 @@ def _load_anatomy(scene: Scene, file_times: tuple[int | None, ...]) -> Anatomy:
 
 
 def with_added_mass(
-    anatomy: Anatomy, organ_of: Callable[[Anatomy], OrganModel], share_most: float = ADDED_MASS_SHARE
+    anatomy: Anatomy, organs_of: Callable[[Anatomy], Iterable[OrganModel]], share_most: float = ADDED_MASS_SHARE
 ) -> Anatomy:
-    """The anatomy with mass scaling and the fewest substeps for which at most a share of the organ's mass is added.
+    """The anatomy with mass scaling and the fewest substeps for which at most a share of each organ's mass is added.
 
     Static forces do not depend on masses: a press that comes to rest measures the same.
 
     Args:
         anatomy: its number of substeps is the largest that is taken.
-        organ_of: compiles the organ that must be stable.
+        organs_of: compiles the organs that must be stable, one after the other.
         share_most: largest share.
     """
     timing = replace(anatomy.scene.timing, mass_scaling=True)
     for count in range(SUBSTEPS_FEWEST, timing.substep_count):
-        scene = replace(anatomy.scene, timing=replace(timing, substep_count=count))
-        fewer = replace(anatomy, scene=scene)
+        fewer = replace(anatomy, scene=replace(anatomy.scene, timing=replace(timing, substep_count=count)))
         try:
-            organ = organ_of(fewer)
+            if all(organ.added_mass <= share_most * organ.node_mass.sum() for organ in organs_of(fewer)):
+                return fewer
         except OrganError:
-            # It would need more than the limit of mass scaling.
+            # One would need more than the limit of mass scaling.
             continue
-        if organ.added_mass <= share_most * organ.node_mass.sum():
-            return fewer
     return replace(anatomy, scene=replace(anatomy.scene, timing=timing))
 
 

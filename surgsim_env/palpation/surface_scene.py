@@ -120,7 +120,7 @@ def check_options(options: SurfaceOptions) -> None:
 
 
 def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_factor_largest: float) -> Anatomy:
-    """The anatomy with substeps for the organ with lesions and for a stiffer one without, fewer with a little more mass.
+    """The anatomy with substeps, fewer by a little added mass, for the organ with lesions and a stiffer one without.
 
     Args:
         scene: its mesh, materials and timing.

@@ -224,9 +224,9 @@ def healthy_map(scene: Scene) -> HealthyMap:
     """The map of a scene, from beside its file or the cache on disk, or by pressing its healthy organ at every site.
 
     `surgsim organ` writes it beside a patient's scene (`healthy_file`). One of another organ, instrument or version is
-    made anew, with progress on standard error: 5 s of processor time for `phantom`, 90 s for `phantom_wide`. The cache
-    is the folder named by SURGSIM_CACHE, else the user's cache folder; if it is not writable, each process computes the
-    map.
+    made anew in the same way, and a scene without one is pressed as it is, both with progress on standard error: 5 s of
+    processor time for `phantom`, 90 s for `phantom_wide`. The cache is the folder named by SURGSIM_CACHE, else the
+    user's cache folder; if it is not writable, each process computes the map.
 
     Raises:
         ValueError: a press on healthy tissue that ended in a fault or measured no force (says where).
@@ -250,16 +250,21 @@ def write_healthy_map(scene: Scene, path: Path, progress: StepProgress) -> None:
         ValueError: as in `healthy_map`.
     """
     anatomy = load_anatomy(with_instrument(scene, "probe"))
+    np.savez_compressed(path, digest=np.array(_digest(anatomy)), grid=_pressed_quickly(anatomy, progress))
+
+
+def _pressed_quickly(anatomy: Anatomy, progress: StepProgress) -> FloatArray:
+    """`_pressed` as in `write_healthy_map`."""
     with progress.step("choosing the step of the healthy organ"):
         quick = with_added_mass(with_substeps(anatomy, [anatomy.organ()]), lambda one: [one.organ()], MASS_SHARE)
-    grid = _pressed(quick, progress, np.float32)
-    np.savez_compressed(path, digest=np.array(_digest(anatomy)), grid=grid)
+    return _pressed(quick, progress, np.float32)
 
 
 @lru_cache(maxsize=8)
 def _healthy_map(anatomy: Anatomy) -> HealthyMap:
     scene, digest, folder = anatomy.scene, _digest(anatomy), _folder()
-    grid = _shipped(healthy_file(scene.folder / f"{scene.name}.toml"), digest)
+    beside = healthy_file(scene.folder / f"{scene.name}.toml")
+    grid = _shipped(beside, digest)
     if grid is not None:
         return HealthyMap(grid)
     path = None if folder is None else folder / f"healthy-{digest}.npy"
@@ -267,7 +272,7 @@ def _healthy_map(anatomy: Anatomy) -> HealthyMap:
         if path is not None:
             return HealthyMap(np.load(path, allow_pickle=False))
     with StepProgress(Console(stderr=True)) as progress:
-        grid = _pressed(anatomy, progress)
+        grid = (_pressed_quickly if beside.is_file() else _pressed)(anatomy, progress)
     if path is not None:
         _keep(path, grid)
     return HealthyMap(grid)

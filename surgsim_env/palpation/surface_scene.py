@@ -122,6 +122,8 @@ def check_options(options: SurfaceOptions) -> None:
 def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_factor_largest: float) -> Anatomy:
     """The anatomy with substeps, fewer by a little added mass, for the organ with lesions and a stiffer one without.
 
+    Tissue that stiffens keeps its substeps: its stable step is shorter under a press than at rest.
+
     Args:
         scene: its mesh, materials and timing.
         lesions: hidden in the organ.
@@ -133,7 +135,8 @@ def load_stable_anatomy(scene: Scene, lesions: Sequence[Lesion], *, modulus_fact
         yield one.organ(modulus_factor=modulus_factor_largest)
 
     anatomy = load_anatomy(scene)
-    return with_added_mass(with_substeps(anatomy, [*organs_of(anatomy)], least=scene.timing.substep_count), organs_of)
+    stable = with_substeps(anatomy, [*organs_of(anatomy)], least=scene.timing.substep_count)
+    return with_added_mass(stable, organs_of) if scene.material.stiffening is None else stable
 
 
 def with_substeps(

@@ -30,7 +30,7 @@ class Follower:
 
 @pytest.mark.slow
 def test_fewer_substeps_feel_the_same():
-    """A press into the liver in 3 substeps instead of 4, all the way in and half the way out."""
+    """A press into the liver in 3 substeps instead of 5, all the way in and half the way out."""
     scene = make_scene("liver")
     fewer = live_scene(scene)
     assert fewer.timing.substep_count < scene.timing.substep_count

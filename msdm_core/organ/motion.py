@@ -105,6 +105,18 @@ def steer(state: OrganState, signal: ArrayLike, duration: float) -> None:
     state.motion[:, RATE] = (np.asarray(signal, dtype=np.float64) - state.motion[:, SIGNAL]) / duration
 
 
+def place_on_ground(model: OrganModel, state: OrganState, signal: ArrayLike, rate: ArrayLike) -> None:
+    """Move an organ at rest with its ground to where signals (n_motion,) have it, at their rates (n_motion,) [1/s].
+
+    All nodes go with the ground below them: exact where all of the ground moves alike and evenly.
+    """
+    state.motion[:, SIGNAL] = signal
+    state.motion[:, RATE] = state.motion[:, RATE_BEFORE] = rate
+    shift = model.motion_node_shift[:, :, :3]
+    state.node_position[:] += np.einsum("m,mni->ni", state.motion[:, SIGNAL], shift)
+    state.node_velocity[:] += np.einsum("m,mni->ni", state.motion[:, RATE], shift)
+
+
 def ground_work(state: OrganState) -> FloatArray:
     """Work that each motion of the ground has done on the organ [J], shape (n_motion,)."""
     return state.motion[:, WORK].copy()

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from surgsim_env.coupling.motion_kernels import MotionDrive
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.motion_kernels import MotionDrive, signal_at
 from surgsim_env.scene.model import CyclicMotion
 
 # Cycles that are drawn; after the last one the first follows: 4 minutes of breaths, 50 s of heartbeats.
@@ -32,6 +33,36 @@ def draw_drive(motions: Sequence[CyclicMotion], haptic_step: float, rng: np.rand
         delay[number] = rng.uniform(0.0, period)
     rise, fall = (np.array([getattr(motion, share) for motion in motions]) for share in ("rise", "fall"))
     return MotionDrive(start, size, rise, fall, delay, haptic_step, np.zeros(1, dtype=np.int64))
+
+
+def signals(drive: MotionDrive, time: float) -> FloatArray:
+    """Signal of each motion at a time since they were drawn [s], shape (n_motion,)."""
+    return np.array([signal_at(drive, number, time) for number in range(len(drive.delay))])
+
+
+def hold(drive: MotionDrive, stopping: Sequence[int], time: float) -> MotionDrive:
+    """The drive whose motions `stopping` end the cycle of a time [s] as it began and then rest.
+
+    The ground never jumps: a breath that has begun ends.
+    """
+    size = drive.cycle_size.copy()
+    for number in stopping:
+        start = drive.cycle_start[number]
+        within = (time - drive.delay[number]) % start[-1]
+        present = int(np.searchsorted(start, within, side="right")) - 1
+        later = np.arange(size.shape[1]) != present
+        # Before the first cycle, and in the rest of a cycle, nothing has begun.
+        size[number, later | (signal_at(drive, number, time) == 0.0)] = 0.0
+    return drive._replace(cycle_size=size)
+
+
+def go_on(drive: MotionDrive, drawn_size: FloatArray, stopping: Sequence[int], time: float) -> MotionDrive:
+    """The drive of `hold` from a time [s] on, again with the sizes that were drawn (n_motion, n_cycle)."""
+    delay = drive.delay.copy()
+    for number in stopping:
+        if signal_at(drive, number, time) == 0.0:
+            delay[number] = time
+    return drive._replace(cycle_size=drawn_size.copy(), delay=delay)
 
 
 def still(haptic_step: float) -> MotionDrive:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
@@ -15,10 +16,11 @@ from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, SCRATCH_FIEL
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import blank_state, relax_arms, rest_state
 from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
+from msdm_core.organ.motion import SIGNAL, place_on_ground
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import describe_fault
 from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
-from surgsim_env.coupling.motion import draw_drive
+from surgsim_env.coupling.motion import draw_drive, go_on, hold, signals
 from surgsim_env.coupling.mujoco_library import runs_compiled
 from surgsim_env.instruments.instrument import Grasp, Instrument, read_grasp
 from surgsim_env.instruments.make import make_instrument
@@ -131,13 +133,13 @@ class Simulation:
         surface_area = float(healthy.surface_rest_area.sum())
         check_tool_masses(scene.name, self.instrument, self.contact, surface_area, self.substep_count)
         self._wrench = np.zeros((self.instrument.tool_count, 6))
-        self._step = 0
+        self._step = self._motion_start = 0
         self.fault = ""
         self.compiled = runs_compiled()
         self.pull_peak = 0.0
         self._taken: StepsTaken | None = None
         self._record: HapticRecord | None = None
-        self.drive = draw_drive(scene.motions, self.haptic_dt, np.random.default_rng(0))
+        self.draw_motion(np.random.default_rng(0))
         self.organ_model: OrganModel
         self.organ_state: OrganState
         self.reset(healthy, self.instrument.parked)
@@ -203,8 +205,13 @@ class Simulation:
         self._rest_stretch = self.organ_state.support_stretch.copy()
         self.restart(tip_position)
 
-    def restart(self, tip_position: FloatArray) -> None:
-        """Return the same organ to rest, place the tip at a position [m], and reset the clock."""
+    def restart(self, tip_position: FloatArray, *, elapsed: float = 0.0) -> None:
+        """Return the same organ to rest, place the tip at a position [m], and reset the clock.
+
+        Args:
+            tip_position: [m], shape (3,).
+            elapsed: time of the organ's motions since they were drawn [s]; the organ rests on its moving ground.
+        """
         state = self.organ_state
         state.node_position[:] = self._rest_position
         state.support_stretch[:] = self._rest_stretch
@@ -215,6 +222,8 @@ class Simulation:
         state.contact_stretch[:] = 0.0
         state.contact_passed[:] = 0
         state.motion[:] = 0.0
+        self._motion_start = round(elapsed / self.haptic_dt)
+        self._rest_on_ground()
         state.volume_ratio_smallest[:] = 1.0
         self.instrument.place(tip_position)
         self._wrench[:] = 0.0
@@ -289,10 +298,50 @@ class Simulation:
     def draw_motion(self, rng: np.random.Generator) -> None:
         """Draw the course of the organ's motions from now on; without motions nothing is drawn."""
         self.drive = draw_drive(self.anatomy.scene.motions, self.haptic_dt, rng)
+        self._cycle_size_drawn = self.drive.cycle_size.copy()
+
+    @property
+    def motion_time(self) -> float:
+        """Time since the motions were drawn [s]."""
+        return (self._motion_start + self._step) * self.haptic_dt
+
+    @property
+    def holds_breath(self) -> bool:
+        """Whether motions that stop in apnoea rest, or will after their present cycle."""
+        return not np.array_equal(self.drive.cycle_size, self._cycle_size_drawn)
+
+    def hold_breath(self, held: bool) -> None:
+        """Let the motions that stop in apnoea rest after their present cycle (True), or begin a new one (False)."""
+        stopping = [number for number, one in enumerate(self.anatomy.scene.motions) if one.stops_in_apnoea]
+        if held and not self.holds_breath:
+            self.drive = hold(self.drive, stopping, self.motion_time)
+        elif not held and self.holds_breath:
+            self.drive = go_on(self.drive, self._cycle_size_drawn, stopping, self.motion_time)
 
     def begin_motion(self) -> None:
         """Let the drive of motions go on from the present time."""
-        self.drive.step_count[0] = self._step
+        self.drive.step_count[0] = self._motion_start + self._step
+
+    def ground_shift(self, points: ArrayLike, elapsed: float | None = None) -> FloatArray:
+        """How far the motions have moved the ground from where it was at rest [m], of the shape of the points.
+
+        Args:
+            points: of the organ at rest [m], shape (n, 3) or (3,).
+            elapsed: time since the motions were drawn [s]; None: now.
+        """
+        now = self.organ_state.motion[:, SIGNAL] if elapsed is None else signals(self.drive, elapsed)
+        shift = np.zeros(np.shape(points))
+        for signal, motion in zip(now, self.anatomy.ground_motions, strict=True):
+            shift += signal * motion.shift(points).reshape(shift.shape)
+        return shift
+
+    def _rest_on_ground(self) -> None:
+        """Move the resting organ with its ground to where the motions have it at the start of the clock."""
+        if not self.anatomy.scene.motions:
+            return
+        start = self._motion_start * self.haptic_dt
+        now, soon = signals(self.drive, start), signals(self.drive, start + self.haptic_dt)
+        place_on_ground(self.organ_model, self.organ_state, now, (soon - now) / self.haptic_dt)
 
     def end_control_step(self) -> bool:
         """Update the instrument's poses; False, with `fault` saying why, at an inverted tet or a warning of MuJoCo.
@@ -309,10 +358,12 @@ class Simulation:
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that changes, as arrays by name; the caller keeps the organ's model."""
         arrays = {f"organ_{name}": getattr(self.organ_state, name).copy() for name in self._kept_fields}
-        cycles = {f"motion_{name}": getattr(self.drive, name).copy() for name in DRAWN_FIELDS}
+        motion = {f"motion_{name}": getattr(self.drive, name).copy() for name in DRAWN_FIELDS}
+        motion["motion_cycle_size_drawn"] = self._cycle_size_drawn.copy()
+        motion["motion_start"] = np.array(self._motion_start)
         return {
             **arrays,
-            **(cycles if self.anatomy.scene.motions else {}),
+            **(motion if self.anatomy.scene.motions else {}),
             "instrument": self.instrument.get_state(),
             "rest_position": self._rest_position.copy(),
             "rest_stretch": self._rest_stretch.copy(),
@@ -344,6 +395,8 @@ class Simulation:
         if self.anatomy.scene.motions:
             drawn = {name: arrays[f"motion_{name}"].copy() for name in DRAWN_FIELDS}
             self.drive = self.drive._replace(**drawn)
+            self._cycle_size_drawn = arrays["motion_cycle_size_drawn"].copy()
+            self._motion_start = int(arrays["motion_start"])
         self.instrument.set_state(arrays["instrument"])
         self._rest_position = arrays["rest_position"].copy()
         self._rest_stretch = arrays["rest_stretch"].copy()
@@ -397,7 +450,7 @@ class Simulation:
         shapes, triangles = blank.contact_candidates.shape
         passed = np.maximum([shapes, triangles], 1)
         ranges = {
-            "step": (arrays["step"], STEP_MOST),
+            **{name: (arrays[name], STEP_MOST) for name in ("step", "motion_start") if name in arrays},
             "pull_peak": (arrays["pull_peak"], math.inf),
             "organ_contact_engaged": (arrays["organ_contact_engaged"], 2),
             "organ_contact_passed": (arrays["organ_contact_passed"], passed),

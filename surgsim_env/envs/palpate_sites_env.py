@@ -39,7 +39,8 @@ class PalpateSitesEnv(SurgicalEnv):
     def begin_press(self, action: Action | FloatArray) -> SitePress:
         """Put the organ at rest and the tip over the site that an action names; the next `step` takes the press."""
         site = self.task.site(self._checked(action))
-        press = SitePress(self.simulation, site.point, site.normal)
+        seconds, tracks = self.task.felt.seconds, self.task.track_motion
+        press = SitePress(self.simulation, site.point, site.normal, elapsed=seconds, tracks=tracks)
         self._made = (site, press)
         return press
 

@@ -294,7 +294,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _shown(self) -> Shown:
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
-        return Shown(self.task.lesions, self.task.target, self.task.endoscope)
+        target = self.task.target
+        moved = None if target is None else target.moved(self.simulation.ground_shift(target.centre))
+        return Shown(self.task.lesions, moved, self.task.endoscope)
 
     def _show(self) -> None:
         if self.render_mode == "human":

@@ -13,6 +13,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import TissueLoad
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import Limits, Scene
 
@@ -49,7 +50,7 @@ class PressResult:
 
     Fields:
         force: of the tissue on the tip, mean of the readings at the end of the hold [N]           (3,)
-        depth: of the tip below the rest surface along the normal, mean of the same readings [m]
+        depth: of the tip below the rest surface (carried by its ground) along the normal, mean of the same readings [m]
         force_peak: largest contact force of any haptic step [N]
         stopped: the way in ended by force before it ended by depth
         fault: fault of the simulation, or an empty string
@@ -142,8 +143,25 @@ class SitePress:
     `readings` holds force [N] (3,) and depth [m] of each phase that is read, and of one that exceeds the hard limit.
     """
 
-    def __init__(self, simulation: Simulation, point: FloatArray, normal: FloatArray) -> None:
-        """Put the organ at rest and the tip above a surface point [m] (3,), along its unit outward normal (3,)."""
+    def __init__(
+        self,
+        simulation: Simulation,
+        point: FloatArray,
+        normal: FloatArray,
+        *,
+        elapsed: float = 0.0,
+        tracks: bool = True,
+    ) -> None:
+        """Put the organ at rest and the tip above a point of the resting surface, along its unit outward normal (3,).
+
+        Args:
+            simulation: of the organ and the tool.
+            point: [m], shape (3,).
+            normal: shape (3,).
+            elapsed: time of the organ's motions since they were drawn [s].
+            tracks: the tip goes with the surface that moves, as a camera's markers show it (`SurfaceTracker`); else it
+                presses where the point is at rest.
+        """
         scene = simulation.anatomy.scene
         self.simulation, self.point, self.normal = simulation, point, normal
         self.readings: list[tuple[FloatArray, float]] = []
@@ -151,7 +169,13 @@ class SitePress:
         self._radius = scene.instrument.tip_radius
         self._hard_force = scene.limits.hard_force
         self._stopped = self._over = self._limited = False
-        simulation.restart(point + normal * (self._radius + scene.palpation.clearance))
+        self._control_step = scene.timing.control_step
+        moves = tracks and bool(scene.motions)
+        start = point + simulation.ground_shift(point, elapsed) if moves else point
+        simulation.restart(start + normal * (self._radius + scene.palpation.clearance), elapsed=elapsed)
+        self._tracker = SurfaceTracker(simulation, np.unique(simulation.anatomy.face.triangles)) if moves else None
+        # How far the tip went with the surface [m], until when [s] and at which velocity it goes on [m/s].
+        self._carried, self._carried_until, self._velocity = start - point, 0.0, np.zeros(3)
 
     def begin(self, phase: PressPhase) -> bool:
         """Command the instrument for a phase; False where the press skips it: over, or stopped on the way in."""
@@ -159,8 +183,21 @@ class SitePress:
             return False
         # A velocity holds for one control step: an arm's joint speeds are solved anew.
         if phase.command:
-            self.simulation.instrument.command_velocity(-PRESS_SPEED * self.normal if phase.inward else np.zeros(3))
+            velocity = -PRESS_SPEED * self.normal if phase.inward else np.zeros(3)
+            self.simulation.instrument.command_velocity(velocity + self._surface_velocity())
         return True
+
+    def _surface_velocity(self) -> FloatArray:
+        """The velocity with which the tip goes with the surface for the next control step [m/s], (3,)."""
+        if self._tracker is None:
+            return self._velocity
+        now = self.simulation.time
+        self._carried = self._carried + (now - self._carried_until) * self._velocity
+        self._carried_until = now
+        if now > 0.0:
+            self._tracker.look()
+        self._velocity = (self._tracker.displacement(self._control_step) - self._carried) / self._control_step
+        return self._velocity
 
     def end(self, phase: PressPhase, force_peak: float) -> None:
         """Record an executed phase and its largest contact force [N]."""
@@ -172,7 +209,8 @@ class SitePress:
         self._stopped |= phase.inward and force_peak > phase.force_limit
         self._over = force_peak > self._hard_force
         if phase.read or self._over:
-            below = (self.point - self.simulation.instrument.tip_position) @ self.normal + self._radius
+            surface = self.point + self.simulation.ground_shift(self.point)
+            below = (surface - self.simulation.instrument.tip_position) @ self.normal + self._radius
             self.readings.append((self.simulation.contact_force, float(below)))
 
     def result(self) -> PressResult:
@@ -241,7 +279,8 @@ def _far_travel(simulation: Simulation, site: FloatArray) -> float:
     rest = simulation.anatomy.mesh.points
     distance = np.linalg.norm(rest - site, axis=1)
     far = distance >= np.median(distance)
-    return float(np.linalg.norm(simulation.organ_state.node_position[far] - rest[far], axis=1).max())
+    moved = simulation.organ_state.node_position[far] - rest[far] - simulation.ground_shift(rest[far])
+    return float(np.linalg.norm(moved, axis=1).max())
 
 
 def core_count() -> int:

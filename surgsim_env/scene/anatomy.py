@@ -19,6 +19,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 from msdm_core.organ.compile import OrganSpec, compile_organ
 from msdm_core.organ.foundation import Foundation
+from msdm_core.organ.motion import Motion
 from msdm_core.organ.stability import scale_mass, stable_dt
 from msdm_core.organ.support import SupportLaw
 from surgsim_env.scene.model import Anchor, LesionDraw, Scene, scaled_step, substeps_needed
@@ -62,6 +63,11 @@ class Anatomy:
         from msdm_core.mesh_files.surface_io import read_surface
 
         return read_surface(self.scene.folder / source.file, length_unit=source.length_unit)
+
+    @cached_property
+    def ground_motions(self) -> tuple[Motion, ...]:
+        """How a unit of each motion of the scene moves what holds the organ."""
+        return tuple(one.ground(self.mesh.points) for one in self.scene.motions)
 
     @cached_property
     def foundation_nodes(self) -> IntArray:
@@ -130,7 +136,7 @@ class Anatomy:
             gravity=scene.gravity,
             supports=scene.supports,
             support_law=scene.support_law or SupportLaw(scene.contact.stiffness, scene.contact.damping),
-            motions=tuple(one.ground for one in scene.motions),
+            motions=self.ground_motions,
         )
 
     def compiled(self, specification: OrganSpec) -> OrganModel:

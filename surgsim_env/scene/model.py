@@ -16,6 +16,8 @@ from msdm_core.organ.support import Support, SupportLaw
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
 
+# A motion of an end is centred at nodes within END_SHARE of the organ's length there; it reaches MOVING_SHARE of it.
+END_SHARE, MOVING_SHARE = 0.05, 0.5
 # Instruments and places in an organ are smaller and nearer than this [m]: MuJoCo's numbers stay far from overflow.
 LENGTH_LARGEST = 100.0
 
@@ -603,6 +605,8 @@ class CyclicMotion:
         variation: standard deviation of the durations and sizes of cycles, as a share of their mean.
         centre: of the part of the ground that moves [m]; None: all of it moves alike.
         reach: distance from the centre beyond which nothing moves [m].
+        side: in place of `centre` and `reach`: the direction of the organ's end around which half its length moves.
+        stops_in_apnoea: whether it rests while the breath is held.
     """
 
     name: str
@@ -614,6 +618,8 @@ class CyclicMotion:
     variation: float = 0.0
     centre: Vector | None = None
     reach: float = math.inf
+    side: Vector | None = None
+    stops_in_apnoea: bool = False
 
     def __post_init__(self) -> None:
         if not 0.0 < self.period[0] <= self.period[1] < math.inf:
@@ -627,13 +633,21 @@ class CyclicMotion:
             )
         if not 0.0 <= self.variation <= 0.3:
             raise ValueError(f"motion {self.name!r}: variation is {self.variation:g}; it must be from 0 to 0.3")
-        # What is wrong with place and direction is said there.
-        _ = self.ground
+        if self.side is not None:
+            require_direction(f"motion {self.name!r}: side", self.side)
+            if self.centre is not None:
+                raise ValueError(f"motion {self.name!r}: give a side, or centre and reach, not both")
+        # What is wrong with displacement and centre is said there.
+        Motion(self.name, self.displacement, self.centre, self.reach)
 
-    @property
-    def ground(self) -> Motion:
-        """How a unit of the signal moves the ground."""
-        return Motion(self.name, self.displacement, self.centre, self.reach)
+    def ground(self, points: FloatArray) -> Motion:
+        """How a unit of the signal moves the ground of an organ whose nodes rest at some points [m] (n_node, 3)."""
+        if self.side is None:
+            return Motion(self.name, self.displacement, self.centre, self.reach)
+        along = points @ (np.array(self.side) / np.linalg.norm(self.side))
+        length = float(np.ptp(along))
+        x, y, z = points[along >= along.max() - END_SHARE * length].mean(axis=0).tolist()
+        return Motion(self.name, self.displacement, (x, y, z), MOVING_SHARE * length)
 
 
 @dataclass(frozen=True)
@@ -669,6 +683,7 @@ class Scene:
         retract_scene: file of the scene in which this organ is retracted.
         retract_refusal: why this organ cannot be retracted.
         motions: of what holds the organ, in every episode.
+        cranial: direction of the patient's head.
     """
 
     name: str
@@ -699,6 +714,8 @@ class Scene:
     retract_scene: str | None = None
     retract_refusal: str | None = None
     motions: tuple[CyclicMotion, ...] = ()
+    cranial: Vector = (1.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
+        require_direction("cranial", self.cranial)

@@ -8,6 +8,7 @@ import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scripting.steps import (
@@ -22,6 +23,7 @@ from surgsim_env.scripting.steps import (
     PressSupport,
     PressUntil,
     Step,
+    Tracked,
     Until,
 )
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
@@ -70,14 +72,37 @@ BEFORE, MOUTH, OVER = (0.010, 0.018, 0.022), (0.002, 0.012, 0.010), 0.0015
 PRESSING_FORCE, REACHING_SPEED = 0.6, 0.015
 
 
-def oracle_script(env: gym.Env) -> list[Step]:
+def oracle_script(env: gym.Env, *, tracks: bool = False) -> list[Step]:
     """The script that solves this episode from the environment's present state; reset the environment first.
 
     A task of a user's own declares its oracle as a method `oracle(simulation)` that returns the steps.
 
+    Args:
+        env: that the script will play.
+        tracks: each step goes with the surface that moves, as markers show it (`Tracked`); else it goes where its
+            points are at rest.
+
     Raises:
         ValueError: nothing was reset yet, or no oracle is known for the environment.
     """
+    steps = _oracle_steps(env)
+    if not tracks:
+        return steps
+    simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
+    tracker = SurfaceTracker(simulation, markers(simulation.anatomy))
+    return [
+        MayEnd(Tracked(step.step, tracker)) if isinstance(step, MayEnd) else Tracked(step, tracker) for step in steps
+    ]
+
+
+def markers(anatomy: Anatomy) -> IntArray:
+    """The nodes that a script watches to track the surface: of the palpable face, or what holds a lifted lobe."""
+    if anatomy.scene.retract is None:
+        return np.unique(anatomy.face.triangles)
+    return anatomy.anchors if len(anatomy.anchors) else anatomy.foundation_nodes
+
+
+def _oracle_steps(env: gym.Env) -> list[Step]:
     inner = env.unwrapped
     if isinstance(inner, SurgicalEnv):
         if hasattr(inner.task, "oracle"):

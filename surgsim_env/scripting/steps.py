@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.haptics.trajectory import ROWS_LARGEST, TIP, read_motion
 from surgsim_env.instruments.instrument import Grasp
 from surgsim_env.tasks.task import Task
@@ -83,6 +84,24 @@ class View:
     def still(self, **commands: Any) -> Action:
         """The action that keeps the tip where it is."""
         return self.action(np.zeros(3), **commands)
+
+    def carried(self, action: Action, velocity: FloatArray) -> Action:
+        """An action with a velocity [m/s] (3,) added to that of each tip, within what an action can ask for."""
+        moved = np.array(action, dtype=np.float64)
+        for name in {"velocity", "right"} & set(self.task.action_slices):
+            part = self.task.action_slices[name]
+            moved[part] = np.clip(moved[part] + velocity / self.task.speed_limit, -1.0, 1.0)
+        return moved
+
+    def from_surface(self, shift: FloatArray, contact_shift: FloatArray) -> "View":
+        """The view as seen from a surface that moved by a shift [m] (3,) from rest, and by another at first contact."""
+        contact = self.contact_position
+        return replace(
+            self,
+            tip_position=self.tip_position - shift,
+            contact_position=None if contact is None else contact - contact_shift,
+            arms={name: view.from_surface(shift, contact_shift) for name, view in self.arms.items()},
+        )
 
     def grasped(self, step: object) -> Grasp:
         """What the jaw holds, for a step that needs one.
@@ -574,6 +593,30 @@ class Until(_Wrapped):
             action = next(plan)
             while not self.predicate(view := (yield action)):
                 action = plan.send(view)
+        except StopIteration:
+            return
+
+
+@dataclass(frozen=True)
+class Tracked(_Wrapped):
+    """Another step on a surface that moves: its points are those of the surface at rest, and all tips go with it."""
+
+    tracker: SurfaceTracker = field(repr=False)
+
+    def actions(self, view: View) -> Plan:
+        """The step's actions as seen from the surface, and the surface's velocity in the next control step."""
+        shift, contact_shift = self.tracker.displacement(), None
+        plan = self.step.actions(view.from_surface(shift, shift))
+        try:
+            action = next(plan)
+            while True:
+                velocity = (self.tracker.displacement(view.control_step) - shift) / view.control_step
+                view = yield view.carried(action, velocity)
+                self.tracker.look()
+                shift = self.tracker.displacement()
+                if contact_shift is None and view.contact_position is not None:
+                    contact_shift = shift
+                action = plan.send(view.from_surface(shift, shift if contact_shift is None else contact_shift))
         except StopIteration:
             return
 

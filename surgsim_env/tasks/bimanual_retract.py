@@ -242,7 +242,7 @@ class BimanualRetractTask(RetractTask):
         target = self.target
         assert target is not None
         lowest = _right(simulation).tip_position - target.normal * self.anatomy.scene.instrument.tip_radius
-        return lowest - target.centre
+        return lowest - target.moved(simulation.ground_shift(target.centre)).centre
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
         """As `RetractTask.info`, and what the right arm does; nothing of it after a reset or a fault."""

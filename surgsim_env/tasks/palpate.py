@@ -201,11 +201,12 @@ class PalpateTask(Task):
         self._declare_value = float(self.commanded(action, "declare")[0])
 
     def look(self, simulation: Simulation) -> None:
-        """Add the force reading to the memory, at the depth of the ball below the resting surface."""
+        """Add the force reading to the memory, at the depth of the ball below the surface at rest on its ground."""
         memory = self.memory
         if memory is None:
             return
         tip = simulation.instrument.tip_position
+        tip = tip - simulation.ground_shift(tip)
         surface, normal = self.anatomy.face.project(tip)
         depth = memory.indenter.radius - float((tip - surface) @ normal)
         memory.feel(memory.chart.place(surface), depth, float(self.sensed["contact_force"] @ normal))

@@ -21,6 +21,7 @@ from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
 from surgsim_env.scene.load import fill_json, make_scene, with_instrument
 from surgsim_env.scene.model import Vector
+from surgsim_env.scene.motions import STILL, with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import InfoValue, Start, Task, check_count, check_share, soft_force_share
 
@@ -175,7 +176,14 @@ class PalpateSitesTask(Task):
     drawn: DrawnOrgan | None
 
     def __init__(
-        self, anatomy: Anatomy, level: Level, healthy: HealthyMap, *, memory: bool = True, budget: int | None = None
+        self,
+        anatomy: Anatomy,
+        level: Level,
+        healthy: HealthyMap,
+        *,
+        memory: bool = True,
+        budget: int | None = None,
+        track_motion: bool = True,
     ) -> None:
         """Palpate an anatomy; a press is simulated or looked up, everything else is computed here.
 
@@ -194,13 +202,14 @@ class PalpateSitesTask(Task):
             healthy: stiffness of the scene's healthy organ over its chart.
             memory: observe all presses; else the last one alone.
             budget: presses of an episode; by default 25, or 60 where the chart's longer side is above ten tip radii.
+            track_motion: presses go with a surface that moves.
 
         Raises:
             ValueError: a budget that is no whole number above 0.
         """
         super().__init__(anatomy)
         scene = anatomy.scene
-        self.level, self.memory = level, memory
+        self.level, self.memory, self.track_motion = level, memory, track_motion
         self.charted = charted_face(anatomy)
         chart, tip = self.charted.chart, scene.instrument.tip_radius
         if budget is None:
@@ -231,6 +240,7 @@ class PalpateSitesTask(Task):
         scene: str,
         instrument: str | None = None,
         *,
+        motion: str | None = None,
         level: str | None = "standard",
         memory: bool = True,
         budget: int | None = None,
@@ -238,8 +248,8 @@ class PalpateSitesTask(Task):
     ) -> tuple[Simulation, Self]:
         """As `Task.make`, with the map of the scene's healthy organ."""
         chosen, plain = find_level(level or "standard"), make_scene(scene)
-        anatomy = load_anatomy(chosen.scene(with_instrument(plain, instrument)))
-        task = cls(anatomy, chosen, healthy_map(plain), memory=memory, budget=budget, **settings)
+        anatomy = load_anatomy(chosen.scene(with_motion(with_instrument(plain, instrument), motion)))
+        task = cls(anatomy, chosen, healthy_map(with_motion(plain, STILL)), memory=memory, budget=budget, **settings)
         return Simulation(anatomy), task
 
     def reset(self, rng: np.random.Generator) -> Start:

@@ -19,6 +19,7 @@ from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.levels import SAVED_MOST
 from surgsim_env.scene.load import fill_json, make_retract_scene, with_instrument
 from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera, Vector, require_number
+from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import (
     SPEED_FULL_SCALE,
@@ -233,9 +234,11 @@ class RetractTask(Task):
         self.visible_share = 0.0
 
     @classmethod
-    def make(cls, scene: str, instrument: str | None = None, **settings: Any) -> tuple[Simulation, Self]:
+    def make(
+        cls, scene: str, instrument: str | None = None, *, motion: str | None = None, **settings: Any
+    ) -> tuple[Simulation, Self]:
         """As `Task.make`, from the scene of retraction that a scene is or names; there are no levels."""
-        anatomy = load_anatomy(with_instrument(make_retract_scene(scene), instrument))
+        anatomy = load_anatomy(with_motion(with_instrument(make_retract_scene(scene), instrument), motion))
         simulation = Simulation(anatomy)
         return simulation, cls(anatomy, simulation.instrument, **settings)
 
@@ -246,7 +249,7 @@ class RetractTask(Task):
 
     @property
     def target(self) -> Disc | None:
-        """The disc to uncover; None before the first episode."""
+        """The disc to uncover, on its bed at rest; None before the first episode."""
         if self.drawn is None:
             return None
         return Disc(np.array(self.drawn.target), np.array([0.0, 0.0, 1.0]), self.table.target_radius)
@@ -352,8 +355,9 @@ class RetractTask(Task):
 
     def _look(self, simulation: Simulation, *, past_instruments: bool = True) -> float:
         """Share of the target that the endoscope sees; hidden by the organ alone where instruments do not count."""
-        instrument, target, drawn = simulation.instrument, self.target, self.drawn
-        assert target is not None and drawn is not None
+        instrument, drawn, target = simulation.instrument, self.drawn, self.target
+        assert drawn is not None and target is not None
+        target = target.moved(simulation.ground_shift(target.centre))
         triangles = self.anatomy.mesh.boundary_triangles
         nodes = simulation.organ_state.node_position
         hiding = self._hiding if past_instruments else self._hiding[:0]

@@ -23,6 +23,7 @@ from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.levels import DrawnOrgan, Level, find_level
 from surgsim_env.scene.load import fill_json, make_scene, with_instrument
 from surgsim_env.scene.model import Endoscope, ForceSensor, Vector
+from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward, check_declared
 from surgsim_env.tasks.visibility import Disc
 
@@ -137,18 +138,26 @@ class Task:
 
     @classmethod
     def make(
-        cls, scene: str, instrument: str | None = None, *, level: str | None = None, **settings: Any
+        cls,
+        scene: str,
+        instrument: str | None = None,
+        *,
+        motion: str | None = None,
+        level: str | None = None,
+        **settings: Any,
     ) -> tuple[Simulation, Self]:
         """The simulation and the task of an environment.
 
         Args:
             scene: name or file of a scene.
             instrument: name of an arm, or its TOML file; the scene's own by default.
+            motion: "none", "calm" or "free": how the patient breathes (`surgsim_env.scene.motions`); as the scene says
+                by default.
             level: "easy", "standard" or "hard": what the organ hides (`surgsim_env.scene.levels`).
             settings: the keyword-only parameters of `__init__`.
         """
         chosen = None if level is None else find_level(level)
-        described = with_instrument(make_scene(scene), instrument)
+        described = with_motion(with_instrument(make_scene(scene), instrument), motion)
         anatomy = load_anatomy(described if chosen is None else chosen.scene(described))
         simulation = Simulation(anatomy)
         task = cls(anatomy, simulation.instrument, **settings)

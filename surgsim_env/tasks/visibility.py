@@ -1,7 +1,7 @@
 """How much of a target an eye sees past an organ's surface and an instrument: rays to points, no picture."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -33,6 +33,10 @@ class Disc:
     centre: FloatArray
     normal: FloatArray
     radius: float
+
+    def moved(self, shift: FloatArray) -> "Disc":
+        """The disc elsewhere, by a shift [m] (3,)."""
+        return replace(self, centre=self.centre + shift)
 
     @property
     def rotation(self) -> FloatArray:

@@ -63,7 +63,7 @@ def test_the_ground_is_where_the_signals_say_after_each_haptic_step(scene):
     for _ in range(900):
         assert simulation.haptic_step()
         signals = [signal_at(simulation.drive, number, simulation.time) for number in range(2)]
-        shift = sum(s * one.ground.shift(at_rest) for s, one in zip(signals, scene.motions, strict=True))
+        shift = sum(s * one.shift(at_rest) for s, one in zip(signals, anatomy.ground_motions, strict=True))
         np.testing.assert_allclose(simulation.organ_state.node_position[anatomy.anchors], at_rest + shift, atol=1e-12)
         farthest = max(farthest, float(np.abs(shift).max()))
     assert farthest > 0.003

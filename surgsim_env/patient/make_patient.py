@@ -380,6 +380,7 @@ def scene_text(found: PatientScene) -> str:
     )
     comments = {
         "retract_scene": "used by the retraction environments",
+        "cranial": "where the head is, for motions" if patient.is_scan else "where the head is: chosen, for motions",
         **found.anchor_sources,
         "mesh.fine_surface": "what pictures and the live page draw; delete it to see the boundary of the tets",
         "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
@@ -422,6 +423,7 @@ def retract_text(found: PatientScene, made: RetractScene) -> str:
     )
     comments = {
         "gravity": "a scan shows the organ under its weight: that shape is its rest here",
+        "cranial": "where the head is, for motions",
         "anchors": "chosen: all but the flap is held",
         "supports": f"chosen: it ends {BED_INSIDE * 1e3:g} mm inside the edge, so that a jaw gets around the edge",
         "supports.position": f"[m] its top {BED_GAP * 1e3:g} mm below the lowest of the organ above it",

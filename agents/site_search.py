@@ -1,7 +1,7 @@
 """The methods for SurgSim/PalpateSites-v0 by name: site searches, and the reference scores, oracle and blind guess.
 
-Searches use observations and the size of the chart only (`SiteFacts`). A Gaussian process on log contrast is the belief of
-the searches `gp_*`.
+Searches use observations and the size of the chart only (`SiteFacts`). A Gaussian process on log contrast is the belief
+of the searches `gp_*`.
 """
 
 from collections.abc import Callable

@@ -154,9 +154,9 @@ HEADER = """# Leaderboard
 Written by `python -m agents.evaluate --leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
 Each figure is a mean over the episodes of its seeds, in brackets the 95 % bootstrap interval over them; "never" is a
 line that was not reached within the presses of an episode. Baselines and policies play the same organs. The rasters
-shown are the best of those tried, by presses to 5 mm, then by the error over all presses. An oracle knows the truth: its
-rows bound what an environment allows. Where the patient moves, tools go with the surface that markers show; a method
-whose name ends in `untracked` goes where places are at rest.
+shown are the best of those tried, by presses to 5 mm, then by the error over all presses. An oracle knows the truth:
+its rows bound what an environment allows. Where the patient moves, presses and oracles go with the surface that markers
+show; a method whose name ends in `untracked` goes where places are at rest.
 """
 
 

@@ -201,6 +201,17 @@ def test_an_organ_rests_on_its_moving_ground(breathing):
         assert put.motion_time == pytest.approx(brought.motion_time)
 
 
+def test_a_saved_simulation_goes_on_with_its_motion(breathing):
+    """Its clock began later than its motions, as in a press after others."""
+    first, second = Simulation(breathing), Simulation(breathing)
+    first.draw_motion(np.random.default_rng(3))
+    first.restart(first.instrument.parked, elapsed=float(first.drive.delay[0]) + 0.5)
+    second.set_state(first.organ_model, first.get_state())
+    for _ in range(50):
+        assert first.haptic_step() and second.haptic_step()
+    assert first.organ_state.node_position.tobytes() == second.organ_state.node_position.tobytes()
+
+
 def test_a_press_goes_with_the_surface(breathing, still):
     """Force and depth of a tracked press as on an organ that holds still; one that does not track misses in depth."""
     site, normal = still.face.project(np.array([0.020, 0.020, 0.020]))

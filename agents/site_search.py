@@ -20,8 +20,6 @@ from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 # Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
 UCB_BETA = 3.0
 LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
-# The oracle presses this far beside a lesion [tip radii], in four directions.
-RING = 0.75
 
 
 class RandomSites:
@@ -136,18 +134,20 @@ class GpLevelSet(GpVariance):
 
 
 class OracleSites(GpVariance):
-    """Presses at the true lesions and around them, then where the process is least certain.
+    """Presses the true lesions, then where the process is least certain.
 
     It bounds what presses and the common estimator allow an agent that knows where to press.
     """
 
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        super().reset(rng, facts)
+        self.places: list[NDArray[np.float32]] = []
+
     def see(self, task: PalpateSitesTask) -> None:
         """Take the truth of the episode that `reset` has begun."""
-        chart = task.charted.chart
-        middles = [chart.place(point) for point in task.truth]
-        aside = RING * task.estimator.tip_radius / (0.5 * chart.extent)
-        ring = [middle + aside * step for middle in middles for step in ([1, 0], [0, 1], [-1, 0], [0, -1])]
-        self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in middles + ring]
+        places = [task.charted.chart.place(point) for point in task.truth]
+        self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in places]
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
         """Where to press next."""

@@ -144,6 +144,7 @@ def evaluate_arms(
         "ports": json.loads(json.dumps(asdict(where))),
         "count": count,
     }
+    points, triangles = anatomy.outer_surface
     found = ArmsEvaluation(
         points=sites.points,
         normals=sites.normals,
@@ -155,8 +156,8 @@ def evaluate_arms(
         arm_distance_outside=both.outside,
         summary={},
         scene=anatomy.scene.name,
-        surface_points=mesh.points,
-        surface_triangles=mesh.boundary_triangles,
+        surface_points=points,
+        surface_triangles=triangles,
         pictures={},
         ports=where.frames,
     )

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from surgsim_env.haptics.pacing import Timeliness, timeliness
 from surgsim_env.cli.values import MaybeText
+from surgsim_env.haptics.pacing import Timeliness, timeliness
 from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.motions import with_motion
 

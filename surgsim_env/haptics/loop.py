@@ -94,8 +94,8 @@ class PressDepth:
     """Depth of a ball below the resting surface: r - n . (tip - c) [m].
 
     n and c are normal and centre of the touched triangle of the surface at rest that is nearest to the tip: exact for a
-    flat face, and up to the curvature within a triangle otherwise. 0 without contact. Where motions move the ground, the
-    surface at rest goes with it.
+    flat face, and up to the curvature within a triangle otherwise. 0 without contact. The surface at rest goes with the
+    ground where motions move that.
     """
 
     def __init__(self, simulation: Simulation, radius: float) -> None:

@@ -7,8 +7,7 @@ import numpy as np
 from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.device import require_positive
 
-# The bit of a device's second button, which holds the breath in `surgsim haptics` and `surgsim view`; the first closes a
-# jaw.
+# The bit of a device's second button, which holds the breath in `surgsim haptics` and `surgsim view`.
 BREATH_BIT = 1
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -99,8 +98,8 @@ class HapticSettings:
         approach_speed: speed of the tip on its way to a distant device [m/s].
         speed_largest: speed limit of the tip [m/s]; chosen above careful hand motions.
         jaw_button: bit of `DevicePose.buttons` that closes a jaw while it is pressed; None: none.
-        breath_button: bit that holds the breath of the patient while it is pressed, in a scene that has one; None: none,
-            and the breath stays as `Simulation.hold_breath` has it.
+        breath_button: bit that holds the breath of a patient who breathes while it is pressed; None: none, and the
+            breath stays as `Simulation.hold_breath` has it.
 
     Raises:
         ValueError: names the entry, its value and the rule.

@@ -146,8 +146,9 @@ def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
     """Physics to page, some 60 times a second.
 
     phase, organ (its number, from 1), recording and replaying, whether the breath is held, time [s] since the reset, a
-    message (a fault or a refusal), added_mass [kg]; for each arm: tip and target [m], the forces of tissue and device on it [N], the share
-    of the force that the watchdog passes, whether a limit acts; nodes [m]; positions [m] and rotations of geoms.
+    message (a fault or a refusal), added_mass [kg]; for each arm: tip and target [m], the forces of tissue and device
+    on it [N], the share of the force that the watchdog passes, whether a limit acts; nodes [m]; positions [m] and
+    rotations of geoms.
     """
     arms = (arm_count, 3)
     return np.dtype(

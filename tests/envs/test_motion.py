@@ -138,7 +138,7 @@ def test_organs_side_by_side_breathe_as_alone(env_id, scene_file):
     assert np.ptp(courses, axis=0).max() > 1e-3
 
 
-def breathing(anatomy, seed=3) -> Simulation:
+def patient(anatomy, seed=3) -> Simulation:
     simulation = Simulation(anatomy)
     simulation.draw_motion(np.random.default_rng(seed))
     return simulation
@@ -157,7 +157,7 @@ def course(simulation, count, switch=None) -> np.ndarray:
 
 def test_a_held_breath_ends_and_rests_and_the_heart_goes_on(anatomy):
     """Held and let go in the middle of a breath, in its rest, and twice in one breath: the ground never jumps."""
-    simulation = breathing(anatomy)
+    simulation = patient(anatomy)
     assert not simulation.holds_breath
     drive = simulation.drive
     # The breaths drawn first begin at 54 and 593 ms; that at 1700 ms is as long as the first.
@@ -180,13 +180,13 @@ def test_a_held_breath_ends_and_rests_and_the_heart_goes_on(anatomy):
 def test_a_breath_stays_held_when_the_drawn_cycles_come_again(scene):
     """After the last cycle comes the first: that one must not be breathed."""
     quick = replace(BREATH, displacement=(1e-5, 0.0, 0.0), period=(0.02, 0.02), variation=0.0)
-    simulation = breathing(load_anatomy(replace(scene, motions=(quick,))))
+    simulation = patient(load_anatomy(replace(scene, motions=(quick,))))
     signal = course(simulation, round(1.1 * CYCLE_COUNT * 0.02 / simulation.haptic_dt), {25: True})[:, 0]
     assert signal[20:40].max() > 0.01 and np.abs(signal[60:]).max() < 1e-15
 
 
 def test_a_restart_begins_the_drawn_course_again_with_the_breath_as_it_is(anatomy):
-    simulation = breathing(anatomy)
+    simulation = patient(anatomy)
     parked = simulation.instrument.parked
     drawn = course(simulation, 1000)
     simulation.restart(parked)
@@ -203,7 +203,7 @@ def test_a_restart_begins_the_drawn_course_again_with_the_breath_as_it_is(anatom
 
 def test_a_state_saved_in_a_held_breath_goes_on_to_the_bit(anatomy):
     """While the last breath ends, and while none is left; what was drawn is restored too."""
-    simulation, other = breathing(anatomy), breathing(anatomy, seed=5)
+    simulation, other = patient(anatomy), patient(anatomy, seed=5)
     for count in (250, 700):
         simulation.restart(simulation.instrument.parked)
         simulation.hold_breath(False)

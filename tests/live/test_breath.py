@@ -124,7 +124,7 @@ def test_the_map_is_told_where_on_the_organ_a_tip_touched(bench):
     tip = rest["tip"][:, 0]
     # The tip is where its hand holds it; of the organ it is that place less what the breath has moved.
     assert 0.8 * RISE < np.ptp(tip[:, 2]) < 1.5 * 1.3 * RISE
-    surface = bench.anatomy.face.project(bench.anatomy.mesh.points.mean(axis=0) + [0.0, 0.0, 1.0])[0][2]
+    surface = bench.anatomy.mesh.points[:, 2].max()
     touches = rest["depth"][:, 0] > 0.0
     assert touches.any()
     depth = surface + bench.scene.instrument.tip_radius - tip[touches, 2]

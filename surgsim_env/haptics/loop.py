@@ -10,6 +10,7 @@ import numpy as np
 from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.organ.motion import SIGNAL
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import check_coupling, coupling_for
 from surgsim_env.haptics.device import DevicePose, HapticDevice
@@ -103,6 +104,7 @@ class PressDepth:
         self._simulation, self._radius = simulation, radius
         self._model: OrganModel | None = None
         self._centres = self._normals = np.zeros((0, 3))
+        self._carried: list[FloatArray] = []
 
     def of(self, tip: FloatArray) -> float:
         """Depth of a tip at a position [m], (3,)."""
@@ -111,6 +113,8 @@ class PressDepth:
             self._model = model
             corners = simulation.rest_position[model.surface_triangles]
             self._centres = corners.mean(axis=1)
+            # How far a unit of each motion's signal moves them [m].
+            self._carried = [motion.shift(self._centres) for motion in simulation.anatomy.ground_motions]
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         engaged = simulation.organ_state.contact_engaged
@@ -118,7 +122,9 @@ class PressDepth:
         touched = np.flatnonzero(engaged.view(np.bool_)) % engaged.shape[1] // QUADRATURE_COUNT
         if not len(touched):
             return 0.0
-        across = tip - simulation.ground_shift(tip) - self._centres[touched]
+        across = tip - self._centres[touched]
+        for signal, carried in zip(simulation.organ_state.motion[:, SIGNAL].tolist(), self._carried, strict=True):
+            across -= signal * carried[touched]
         nearest = int(np.einsum("tx,tx->t", across, across).argmin())
         return self._radius - float(self._normals[touched[nearest]] @ across[nearest])
 

@@ -12,18 +12,20 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from surgsim_env.cli.values import MaybeText
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_env.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
-from surgsim_env.haptics.settings import ForceLimits, HapticSettings
+from surgsim_env.haptics.settings import BREATH_BIT, ForceLimits, HapticSettings
 from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.haptics.udp import PORT, UdpDevice
 from surgsim_env.instruments.arm.arm_instrument import parked_place
 from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, pair_names
+from surgsim_env.scene.motions import list_motions, with_motion
 
 TELEMETRY_NAME = "telemetry.csv"
 VECTORS = ("target", "tip", "coupling_force", "force", "contact_force")
@@ -40,6 +42,10 @@ class Haptics:
 
     scene: str = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
+    motion: MaybeText = None
+    """How the patient breathes: calm, free, or none (holds still); default: as the scene has it."""
+    apnoea: bool = False
+    """Hold the breath throughout; without it, the device's second button holds it while it is pressed."""
     port: int = PORT
     """UDP port on 127.0.0.1 to which the bridge sends its poses; 0 for a free one."""
     trajectory: Path | None = None
@@ -67,16 +73,21 @@ class Haptics:
         """Run the loop until its time is over, the trajectory ends, or Ctrl-C.
 
         Raises:
-            ValueError: an unknown scene, a bad trajectory, a coupling that is unstable with the device, two arms.
+            ValueError: an unknown scene or motion, a bad trajectory, a coupling that is unstable with the device, two
+                arms, apnoea of a patient who does not breathe.
             OSError: the port is taken, or a file cannot be read.
         """
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
             raise ValueError(f"--seconds is {self.seconds:g}; it must be finite and above 0")
-        scene = make_scene(self.scene)
+        scene = with_motion(make_scene(self.scene), self.motion)
+        if self.apnoea and not scene.has_breath:
+            breaths = " or ".join(list_motions()[1:])
+            raise ValueError(f"--apnoea: the patient of scene {scene.name!r} does not breathe; give --motion {breaths}")
         if pair_names(scene.instrument.model) is not None:
             raise ValueError(f"scene {scene.name!r} has two arms; one device holds one tip: choose a scene with one")
         simulation = Simulation(load_anatomy(scene))
         anatomy = simulation.anatomy
+        simulation.hold_breath(self.apnoea)
         simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
         with _device(self, simulation.haptic_dt) as device, _telemetry(self.out) as note:
             loop = HapticLoop(simulation, device, _settings(self))
@@ -173,7 +184,12 @@ def _settings(command: Haptics) -> HapticSettings:
         coupling = VirtualCoupling(command.stiffness, command.damping or 0.0)
     elif command.damping is not None:
         raise ValueError("--damping needs --stiffness: give both")
-    return HapticSettings(coupling, ForceLimits(command.force_largest), relative=not command.absolute)
+    return HapticSettings(
+        coupling,
+        ForceLimits(command.force_largest),
+        relative=not command.absolute,
+        breath_button=None if command.apnoea else BREATH_BIT,
+    )
 
 
 @contextmanager

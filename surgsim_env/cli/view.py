@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from surgsim_env.cli.values import MaybeText
 from surgsim_env.haptics.pacing import Timeliness, timeliness
 from surgsim_env.scene.load import make_scene, with_instrument
+from surgsim_env.scene.motions import with_motion
 
 if TYPE_CHECKING:
     from surgsim_env.live.page import Page
@@ -36,6 +38,8 @@ class View:
     """An arm or a TOML file (docs/arms.md); default: the scene's own."""
     bimanual: bool = False
     """Two arms: a jaw to lift, a ball to touch."""
+    motion: MaybeText = None
+    """How the patient breathes: calm, free, or none (holds still); default: as the scene has it."""
     host: str = "127.0.0.1"
     """Address to listen on."""
     port: int = 8080
@@ -75,7 +79,7 @@ class View:
             raise ValueError(f"--port is {self.port}; it must be from 0 (any free one) to 65535")
         name = self.scene or (BIMANUAL_SCENE if self.bimanual else "liver")
         instrument = self.instrument or (BIMANUAL_INSTRUMENT if self.bimanual else None)
-        scene = with_instrument(make_scene(name), instrument)
+        scene = with_motion(with_instrument(make_scene(name), instrument), self.motion)
         console.print(f"{scene.name}: meshing, and compiling if that was not done before ...", highlight=False)
         session = Session(scene)
         page = None

@@ -139,6 +139,8 @@ class Simulation:
         self.pull_peak = 0.0
         self._taken: StepsTaken | None = None
         self._record: HapticRecord | None = None
+        # The motions that stop in apnoea.
+        self._breath = [number for number, one in enumerate(scene.motions) if one.stops_in_apnoea]
         self.draw_motion(np.random.default_rng(0))
         self.organ_model: OrganModel
         self.organ_state: OrganState
@@ -190,8 +192,8 @@ class Simulation:
         weights = engaged * model.surface_rest_area[:, None]
         return np.einsum("tq,qc,tcx->x", weights, QUADRATURE_BARYCENTRIC, corners) / weights.sum()
 
-    def reset(self, organ_model: OrganModel, tip_position: FloatArray) -> None:
-        """Start with an organ at rest, and with the tip at rest at a position [m].
+    def reset(self, organ_model: OrganModel, tip_position: FloatArray, *, elapsed: float = 0.0) -> None:
+        """Start with an organ at rest, and with the tip at rest at a position [m]; arguments as of `restart`.
 
         Raises:
             OrganError: the scene's number of substeps is too small for this organ (says how many it needs); the
@@ -203,10 +205,12 @@ class Simulation:
         # The organ at rest, as scanned or settled under gravity, and its sticking friction on supports.
         self._rest_position = self.organ_state.node_position.copy()
         self._rest_stretch = self.organ_state.support_stretch.copy()
-        self.restart(tip_position)
+        self.restart(tip_position, elapsed=elapsed)
 
     def restart(self, tip_position: FloatArray, *, elapsed: float = 0.0) -> None:
         """Return the same organ to rest, place the tip at a position [m], and reset the clock.
+
+        The motions begin again as they were drawn; a breath that is held stays so.
 
         Args:
             tip_position: [m], shape (3,).
@@ -222,12 +226,12 @@ class Simulation:
         state.contact_stretch[:] = 0.0
         state.contact_passed[:] = 0
         state.motion[:] = 0.0
-        self._motion_start = round(elapsed / self.haptic_dt)
+        self._step, self._motion_start = 0, round(elapsed / self.haptic_dt)
+        self._begin_course()
         self._rest_on_ground()
         state.volume_ratio_smallest[:] = 1.0
         self.instrument.place(tip_position)
         self._wrench[:] = 0.0
-        self._step = 0
         self.fault = ""
         self.pull_peak = 0.0
         self._taken = None
@@ -297,8 +301,8 @@ class Simulation:
 
     def draw_motion(self, rng: np.random.Generator) -> None:
         """Draw the course of the organ's motions from now on; without motions nothing is drawn."""
-        self.drive = draw_drive(self.anatomy.scene.motions, self.haptic_dt, rng)
-        self._cycle_size_drawn = self.drive.cycle_size.copy()
+        self.drive = self._drawn = draw_drive(self.anatomy.scene.motions, self.haptic_dt, rng)
+        self._breath_ends = False
 
     @property
     def motion_time(self) -> float:
@@ -308,18 +312,20 @@ class Simulation:
     @property
     def holds_breath(self) -> bool:
         """Whether motions that stop in apnoea rest, or will after their present cycle."""
-        return not np.array_equal(self.drive.cycle_size, self._cycle_size_drawn)
+        return not np.array_equal(self.drive.cycle_size, self._drawn.cycle_size)
 
     def hold_breath(self, held: bool) -> None:
         """Let the motions that stop in apnoea rest after their present cycle (True), or begin a new one (False)."""
-        stopping = [number for number, one in enumerate(self.anatomy.scene.motions) if one.stops_in_apnoea]
         if held and not self.holds_breath:
-            self.drive = hold(self.drive, stopping, self.motion_time)
+            self._hold()
         elif not held and self.holds_breath:
-            self.drive = go_on(self.drive, self._cycle_size_drawn, stopping, self.motion_time)
+            self.drive = go_on(self.drive, self._drawn.cycle_size, self._breath, self.motion_time)
+            self._breath_ends = False
 
     def begin_motion(self) -> None:
         """Let the drive of motions go on from the present time."""
+        if self._breath_ends:
+            self._hold()
         self.drive.step_count[0] = self._motion_start + self._step
 
     def ground_shift(self, points: ArrayLike, elapsed: float | None = None) -> FloatArray:
@@ -334,6 +340,16 @@ class Simulation:
         for signal, motion in zip(now, self.anatomy.ground_motions, strict=True):
             shift += signal * motion.shift(points).reshape(shift.shape)
         return shift
+
+    def _hold(self) -> None:
+        """Let the breath end its present cycle; once that is over no cycle is left, as they all come again."""
+        self.drive = hold(self.drive, self._breath, self.motion_time)
+        self._breath_ends = bool(self.drive.cycle_size[self._breath].any())
+
+    def _begin_course(self) -> None:
+        """Begin the motions as they were drawn, with the breath held if it is."""
+        held, self.drive, self._breath_ends = self.holds_breath, self._drawn, False
+        self.hold_breath(held)
 
     def _rest_on_ground(self) -> None:
         """Move the resting organ with its ground to where the motions have it at the start of the clock."""
@@ -359,7 +375,8 @@ class Simulation:
         """Everything that changes, as arrays by name; the caller keeps the organ's model."""
         arrays = {f"organ_{name}": getattr(self.organ_state, name).copy() for name in self._kept_fields}
         motion = {f"motion_{name}": getattr(self.drive, name).copy() for name in DRAWN_FIELDS}
-        motion["motion_cycle_size_drawn"] = self._cycle_size_drawn.copy()
+        motion["motion_cycle_size_drawn"] = self._drawn.cycle_size.copy()
+        motion["motion_delay_drawn"] = self._drawn.delay.copy()
         motion["motion_start"] = np.array(self._motion_start)
         return {
             **arrays,
@@ -395,7 +412,10 @@ class Simulation:
         if self.anatomy.scene.motions:
             drawn = {name: arrays[f"motion_{name}"].copy() for name in DRAWN_FIELDS}
             self.drive = self.drive._replace(**drawn)
-            self._cycle_size_drawn = arrays["motion_cycle_size_drawn"].copy()
+            self._drawn = self.drive._replace(
+                cycle_size=arrays["motion_cycle_size_drawn"].copy(), delay=arrays["motion_delay_drawn"].copy()
+            )
+            self._breath_ends = self.holds_breath
             self._motion_start = int(arrays["motion_start"])
         self.instrument.set_state(arrays["instrument"])
         self._rest_position = arrays["rest_position"].copy()

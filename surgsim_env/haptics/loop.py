@@ -10,6 +10,7 @@ import numpy as np
 from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.organ.motion import SIGNAL
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import check_coupling, coupling_for
 from surgsim_env.haptics.device import DevicePose, HapticDevice
@@ -94,7 +95,8 @@ class PressDepth:
     """Depth of a ball below the resting surface: r - n . (tip - c) [m].
 
     n and c are normal and centre of the touched triangle of the surface at rest that is nearest to the tip: exact for a
-    flat face, and up to the curvature within a triangle otherwise. 0 without contact.
+    flat face, and up to the curvature within a triangle otherwise. 0 without contact. The surface at rest goes with the
+    ground where motions move that.
     """
 
     def __init__(self, simulation: Simulation, radius: float) -> None:
@@ -102,6 +104,7 @@ class PressDepth:
         self._simulation, self._radius = simulation, radius
         self._model: OrganModel | None = None
         self._centres = self._normals = np.zeros((0, 3))
+        self._carried: list[FloatArray] = []
 
     def of(self, tip: FloatArray) -> float:
         """Depth of a tip at a position [m], (3,)."""
@@ -110,6 +113,8 @@ class PressDepth:
             self._model = model
             corners = simulation.rest_position[model.surface_triangles]
             self._centres = corners.mean(axis=1)
+            # How far a unit of each motion's signal moves them [m].
+            self._carried = [motion.shift(self._centres) for motion in simulation.anatomy.ground_motions]
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         engaged = simulation.organ_state.contact_engaged
@@ -118,6 +123,8 @@ class PressDepth:
         if not len(touched):
             return 0.0
         across = tip - self._centres[touched]
+        for signal, carried in zip(simulation.organ_state.motion[:, SIGNAL].tolist(), self._carried, strict=True):
+            across -= signal * carried[touched]
         nearest = int(np.einsum("tx,tx->t", across, across).argmin())
         return self._radius - float(self._normals[touched[nearest]] @ across[nearest])
 
@@ -300,6 +307,12 @@ class HeldTip:
         self._clamped = self._slewed = False
         self._write(self._force)
 
+    @property
+    def holds_breath(self) -> bool | None:
+        """Whether the device's button holds the breath; None before the first pose, and without such a button."""
+        button = self.settings.breath_button
+        return None if button is None or self._pose is None else bool(self._pose.buttons >> button & 1)
+
     def telemetry(self, contact_force: FloatArray) -> TipTelemetry:
         """The record of the step; `contact_force` [N], (3,), is the tissue's in it."""
         tip = self.drive.tool.tip_position
@@ -420,6 +433,7 @@ class HapticLoop:
             self._tools = [instrument.tools_of(side) for side in SIDES]
         # The tissue's force on each tip in the last step [N].
         self._contacts = self._contact_forces()
+        self._has_breath = scene.has_breath
 
     def step(self) -> HapticTelemetry:
         """Advance by one haptic step; after a fault all forces are zero."""
@@ -427,6 +441,8 @@ class HapticLoop:
         if not self.fault:
             for held, contact in zip(self.held, self._contacts, strict=True):
                 held.step(contact)
+            if self._has_breath:
+                self._hold_breath()
             simulation.control_step(1)
             simulation.instrument.refresh()
             self.fault = simulation.fault
@@ -439,12 +455,15 @@ class HapticLoop:
         tips = tuple(held.telemetry(contact) for held, contact in zip(self.held, self._contacts, strict=True))
         return HapticTelemetry(simulation.time, self.fault, tips)
 
-    def reset(self, organ_model: OrganModel | None = None, tip_position: FloatArray | None = None) -> None:
+    def reset(
+        self, organ_model: OrganModel | None = None, tip_position: FloatArray | None = None, *, elapsed: float = 0.0
+    ) -> None:
         """Restart: forces are zero, and the tips approach the devices slowly from their new positions.
 
         Args:
             organ_model: another organ of the same scene; the same one by default.
             tip_position: [m], (3,), or (2, 3) for a pair; where the instrument parks by default.
+            elapsed: time of the patient's motions at which it begins [s].
 
         Raises:
             OrganError: the scene's number of substeps is too small for this organ; the loop keeps the previous one.
@@ -453,13 +472,19 @@ class HapticLoop:
         simulation = self.simulation
         place = simulation.instrument.parked if tip_position is None else np.asarray(tip_position, dtype=np.float64)
         if organ_model is None:
-            simulation.restart(place)
+            simulation.restart(place, elapsed=elapsed)
         else:
-            simulation.reset(organ_model, place)
+            simulation.reset(organ_model, place, elapsed=elapsed)
         self.fault = simulation.fault
         self._contacts = self._contact_forces()
         for held in self.held:
             held.restart()
+
+    def _hold_breath(self) -> None:
+        """Hold the breath while a device's button does; a device without a pose asks for nothing."""
+        asked = [held.holds_breath for held in self.held]
+        if any(one is not None for one in asked):
+            self.simulation.hold_breath(any(asked))
 
     def _contact_forces(self) -> list[FloatArray]:
         wrench = self.simulation.contact_wrench

@@ -7,6 +7,8 @@ import numpy as np
 from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.device import require_positive
 
+# The bit of a device's second button, which holds the breath in `surgsim haptics` and `surgsim view`.
+BREATH_BIT = 1
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -96,6 +98,8 @@ class HapticSettings:
         approach_speed: speed of the tip on its way to a distant device [m/s].
         speed_largest: speed limit of the tip [m/s]; chosen above careful hand motions.
         jaw_button: bit of `DevicePose.buttons` that closes a jaw while it is pressed; None: none.
+        breath_button: bit that holds the breath of a patient who breathes while it is pressed; None: none, and the
+            breath stays as `Simulation.hold_breath` has it.
 
     Raises:
         ValueError: names the entry, its value and the rule.
@@ -110,10 +114,15 @@ class HapticSettings:
     approach_speed: float = 0.05
     speed_largest: float = 1.0
     jaw_button: int | None = 0
+    breath_button: int | None = None
 
     def __post_init__(self) -> None:
         require_positive("haptic smoothing", self.smoothing or 0.0, "s", or_zero=True)
         require_positive("haptic approach_speed", self.approach_speed, "m/s")
         require_positive("haptic speed_largest", self.speed_largest, "m/s")
-        if self.jaw_button is not None and self.jaw_button not in range(32):
-            raise ValueError(f"haptic jaw_button is {self.jaw_button!r}; it must be a bit from 0 to 31, or None")
+        for name in ("jaw_button", "breath_button"):
+            bit = getattr(self, name)
+            if bit is not None and bit not in range(32):
+                raise ValueError(f"haptic {name} is {bit!r}; it must be a bit from 0 to 31, or None")
+        if self.jaw_button is not None and self.jaw_button == self.breath_button:
+            raise ValueError(f"haptic jaw_button and breath_button are both {self.jaw_button}; set one to another bit")

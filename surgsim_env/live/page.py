@@ -185,6 +185,7 @@ class Page:
             "paint": self._organ.show_paint,
             "clear_map": self.felt.clear,
             "close_jaw": session.close_jaw,
+            "hold_breath": session.hold_breath,
             "plain": self.show_plain,
         }
 
@@ -323,11 +324,19 @@ class Page:
         fps = (pictures - self._pictures_before) / wall
         self._before, self._pictures_before = now, pictures
         rows = status_rows(
-            frame, kept, skipped=int(now[0]["skipped"]), fps=fps, drawn=self._tabs.rate.slowest, said=self._said
+            frame,
+            kept,
+            skipped=int(now[0]["skipped"]),
+            fps=fps,
+            drawn=self._tabs.rate.slowest,
+            said=self._said,
+            has_breath=self.session.scene.has_breath,
         )
         self._panel.show_status(frame, rows)
         self._show_phase(frame)
 
     def _show_phase(self, frame: np.ndarray) -> None:
         recorded = self.session.exchange.recorded.count * self.session.scene.timing.haptic_step
-        self._panel.show_phase(frame, recorded, self.session.jaw_closed)
+        self._panel.show_phase(
+            frame, recorded, jaw_closed=self.session.jaw_closed, breath_held=self.session.breath_held
+        )

@@ -68,7 +68,7 @@ class Panel:
             arm_count: 1 or 2.
             has_jaw: whether the first arm has a jaw.
             calls: callbacks by name: pause(), record() and replay(), which toggle;
-                reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), plain(on).
+                reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), hold_breath(on), plain(on).
         """
         self._gui, self._message_filter, self._scene, self._calls = gui, message_filter, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
@@ -76,6 +76,8 @@ class Panel:
         self._status = gui.add_html(_status_html("starting", []))
         self._add_buttons()
         self._jaw = self._checkbox("Close the jaw", "close_jaw", visible=has_jaw)
+        hint = "the present breath ends, and no other begins; the heart goes on"
+        self._breath = self._checkbox("Hold the breath", "hold_breath", visible=scene.has_breath, hint=hint)
         with gui.add_folder("Force and depth"):
             self._force = _plot(gui, "N", arm_count)
             self._depth = _plot(gui, "mm", arm_count)
@@ -102,10 +104,11 @@ class Panel:
         """Show the state of the physics in a frame, and names with values."""
         self._status.content = _status_html(headline(frame), rows)
 
-    def show_phase(self, frame: NDArray[Any], recorded: float, jaw_closed: bool) -> None:
+    def show_phase(self, frame: NDArray[Any], recorded: float, *, jaw_closed: bool, breath_held: bool) -> None:
         """Label the buttons with what a click will do; `recorded` is the length of the recording [s]."""
         recording = bool(frame["recording"])
         _set(self._jaw, "value", jaw_closed)
+        _set(self._breath, "value", breath_held)
         _set(self._pause, "label", "Continue" if frame["phase"] == Phase.PAUSED else "Pause")
         _set(self._record, "label", f"End recording ({recorded:.0f} s)" if recording else "Record")
         _set(self._replay, "label", "End replay" if frame["replaying"] else f"Replay ({recorded:.1f} s)")
@@ -266,7 +269,14 @@ def headline(frame: NDArray[Any]) -> str:
 
 
 def status_rows(
-    frame: NDArray[Any], kept: Timeliness, *, skipped: int, fps: float, drawn: float | None, said: str
+    frame: NDArray[Any],
+    kept: Timeliness,
+    *,
+    skipped: int,
+    fps: float,
+    drawn: float | None,
+    said: str,
+    has_breath: bool = False,
 ) -> list[tuple[str, str]]:
     """Names with values, as HTML.
 
@@ -277,6 +287,7 @@ def status_rows(
         fps: pictures sent [1/s].
         drawn: pictures drawn by the slowest browser [1/s], None if unknown.
         said: message of the page, shown when the physics has none.
+        has_breath: whether the patient has a breath that can be held.
     """
     force = " / ".join(f"{float(np.linalg.norm(one)):.2f}" for one in frame["force"])
     rows = [
@@ -289,6 +300,8 @@ def status_rows(
         ("steps skipped so far", f"{skipped}"),
         ("pictures", f"{fps:.0f} /s" + ("" if drawn is None else f" (browser {drawn:.0f})")),
     ]
+    if has_breath:
+        rows.insert(2, ("breath", "held" if frame["breath_held"] else "goes on"))
     if float(frame["added_mass"]) > 0.0:
         rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))
     words = bytes(frame["said"]).decode("utf-8", "replace") or said

@@ -20,7 +20,7 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.device import DevicePose
 from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_env.haptics.pacing import Pacer, PaceSettings
-from surgsim_env.haptics.settings import HapticSettings
+from surgsim_env.haptics.settings import BREATH_BIT, HapticSettings
 from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
 from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Instrument
@@ -40,7 +40,7 @@ from surgsim_env.live.exchange_records import (
     encoded,
 )
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
-from surgsim_env.rendering.scene_model import shown_geoms
+from surgsim_env.rendering.scene_model import is_support, shown_geoms
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.model import Scene
 
@@ -165,9 +165,11 @@ class Physics:
         self._simulation.reset(self._organ, self._home)
         dt = self._simulation.haptic_dt
         self._hands = [BrowserDevice(exchange, arm, dt, place) for arm, place in enumerate(np.atleast_2d(self._home))]
-        settings = HapticSettings(approach_speed=APPROACH_SPEED, speed_largest=SPEED_LARGEST)
+        settings = HapticSettings(approach_speed=APPROACH_SPEED, speed_largest=SPEED_LARGEST, breath_button=BREATH_BIT)
         self._loop = HapticLoop(self._simulation, self._hands, settings)
         self._geoms = np.array(shown_geoms(instrument.model), dtype=np.int64)
+        # Which of them are supports; these go with the ground.
+        self._grounded = np.array([is_support(instrument.model, geom) for geom in self._geoms.tolist()], dtype=np.bool_)
         self._pacer = Pacer(pace, exchange.timing.peek)
         self._phase, self._said = Phase.RUNNING, ""
         self._recording = False
@@ -285,7 +287,9 @@ class Physics:
             self._replay_from(None)
             return
         if request.given or self._start_state is None:
-            self._loop.reset(None, self._home)
+            # The patient moves as at the first step's time.
+            start = float(self._exchange.recorded.steps["time"][0]) - self._simulation.haptic_dt
+            self._loop.reset(None, self._home, elapsed=max(0.0, start))
         else:
             self._simulation.set_state(self._organ, self._start_state)
             self._loop.fault = self._simulation.fault
@@ -315,7 +319,8 @@ class Physics:
                 row = trace["row"][int(trace["count"]) % TRACE_LENGTH]
                 row["time"] = told.time
                 for arm, tip in enumerate(told.tips):
-                    row["tip"][arm], row["depth"][arm], row["force"][arm] = tip.tip, tip.depth, tip.contact_force
+                    row["tip"][arm] = tip.tip - simulation.ground_shift(tip.tip)
+                    row["depth"][arm], row["force"][arm] = tip.depth, tip.contact_force
                 row["peak"] = self._peak
                 trace["count"] += 1
             self._peak[:] = 0.0
@@ -345,6 +350,7 @@ class Physics:
         with self._exchange.frame.writing() as frame:
             frame["phase"], frame["organ"] = int(self._phase), self._organ_number
             frame["recording"], frame["replaying"] = self._recording, self._replaying
+            frame["breath_held"] = simulation.holds_breath
             frame["time"], frame["said"] = simulation.time, encoded(self._said)
             frame["added_mass"] = self._organ.added_mass
             for arm, tip in enumerate(told.tips):
@@ -353,7 +359,9 @@ class Physics:
                 frame["pushed"][arm], frame["share"][arm] = tip.force, tip.share
                 frame["limited"][arm] = tip.clamped or tip.workspace_limited
             frame["node"] = simulation.organ_state.node_position[:, :3]
-            frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
+            places = data.geom_xpos[self._geoms]
+            places[self._grounded] += simulation.ground_shift(places[self._grounded])
+            frame["geom"], frame["turn"] = places, data.geom_xmat[self._geoms]
 
 
 # Unix niceness (scheduling priority); values below 0 need the right to set them.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.pacing import PaceSettings
+from surgsim_env.haptics.settings import BREATH_BIT
 from surgsim_env.live.exchange_records import (
     TRACE_LENGTH,
     Change,
@@ -35,8 +36,8 @@ from surgsim_env.scene.model import Scene
 BEAT_RATE, HELD = 100.0, 0.15
 # Speed of a target at full deflection [m/s].
 HAND_SPEED = 0.04
-# The button that closes a jaw, as `HapticSettings.jaw_button` has it.
-JAW_BUTTON = 1
+# The button that closes a jaw, as `HapticSettings.jaw_button` has it, and the first arm's that holds the breath.
+JAW_BUTTON, BREATH_BUTTON = 1, 1 << BREATH_BIT
 # Longest start, with an empty numba cache [s].
 START_TIMEOUT = 300.0
 
@@ -194,13 +195,21 @@ class Session:
 
     def close_jaw(self, closed: bool) -> None:
         """Close or open the first arm's jaw."""
-        with self._lock:
-            self._buttons[0] = JAW_BUTTON if closed else 0
+        self._press(JAW_BUTTON, closed)
 
     @property
     def jaw_closed(self) -> bool:
         """Whether the first arm's jaw is commanded to close."""
         return bool(self._buttons[0] & JAW_BUTTON)
+
+    def hold_breath(self, held: bool) -> None:
+        """Hold the patient's breath, or let it go on; it is recorded with the hand's buttons."""
+        self._press(BREATH_BUTTON, held)
+
+    @property
+    def breath_held(self) -> bool:
+        """Whether the page holds the breath; in a replay the recording does, or does not."""
+        return bool(self._buttons[0] & BREATH_BUTTON)
 
     def close(self) -> None:
         """End the physics' process."""
@@ -229,6 +238,11 @@ class Session:
                     moved = self._targets[arm] + passed * HAND_SPEED * (axes @ self.directions)
                     self._targets[arm] = np.clip(moved, self.instrument.lower, self.instrument.upper)
                 self._show_hands()
+
+    def _press(self, button: int, pressed: bool) -> None:
+        """Press a button of the first arm's hand, or let it go."""
+        with self._lock:
+            self._buttons[0] = self._buttons[0] | button if pressed else self._buttons[0] & ~button
 
     def _show_hands(self) -> None:
         with self.exchange.hand.writing() as hand:

@@ -293,7 +293,7 @@ def add_instrument(spec: mujoco.MjSpec, model: mujoco.MjModel, prefix: str = PRE
             type=mujoco.mjtGeom(kind),
             rgba=geom_colour(model, geom),
             material=_cloth(spec)
-            if _is_support(model, geom)
+            if is_support(model, geom)
             else _material(spec, model, int(model.geom_matid[geom]), prefix),
             contype=0,
             conaffinity=0,
@@ -318,16 +318,17 @@ def find_instrument(drawn: mujoco.MjModel, model: mujoco.MjModel, prefix: str = 
 
 
 def _is_drawn(model: mujoco.MjModel, geom: int) -> bool:
-    return int(model.geom_type[geom]) in _DRAWN_TYPES or _is_support(model, geom)
+    return int(model.geom_type[geom]) in _DRAWN_TYPES or is_support(model, geom)
 
 
-def _is_support(model: mujoco.MjModel, geom: int) -> bool:
+def is_support(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom is a support of the organ, which goes with its ground."""
     return int(model.geom_bodyid[geom]) == 0 and model.geom(geom).name.startswith(SUPPORT_PREFIX)
 
 
 def _name(model: mujoco.MjModel, geom: int, prefix: str) -> str:
     """A geom's name in the drawn scene: what begins with PREFIX is labelled as the instrument, supports are not."""
-    return f"{SUPPORT_PREFIX if _is_support(model, geom) else f'{prefix}_'}{geom}"
+    return f"{SUPPORT_PREFIX if is_support(model, geom) else f'{prefix}_'}{geom}"
 
 
 def _cloth(spec: mujoco.MjSpec) -> str:

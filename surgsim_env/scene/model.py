@@ -719,3 +719,8 @@ class Scene:
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)
         require_direction("cranial", self.cranial)
+
+    @property
+    def has_breath(self) -> bool:
+        """Whether a motion rests while the breath is held."""
+        return any(one.stops_in_apnoea for one in self.motions)

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from msdm_core.organ.motion import SIGNAL
 from surgsim_env.coupling.motion import CYCLE_COUNT, draw_drive
 from surgsim_env.coupling.motion_kernels import signal_at
 from surgsim_env.coupling.simulation import Simulation
@@ -19,7 +20,15 @@ from surgsim_env.scene.save import scene_toml
 from surgsim_env.scripting import Hold, oracle_script, run_script
 from surgsim_env.scripting.steps import Tracked
 
-BREATH = CyclicMotion("breathing", (0.004, 0.0, 0.001), period=(0.5, 0.7), rise=0.3, fall=0.5, variation=0.1)
+BREATH = CyclicMotion(
+    "breathing",
+    (0.004, 0.0, 0.001),
+    period=(0.5, 0.7),
+    rise=0.3,
+    fall=0.5,
+    variation=0.1,
+    stops_in_apnoea=True,
+)
 BEAT = CyclicMotion(
     "heartbeat", (0.0, 0.0, 0.002), period=(0.2, 0.3), rise=0.2, fall=0.3, centre=(0.0, 0.0, 0.0), reach=0.05
 )
@@ -29,6 +38,11 @@ IDS = ("SurgSim/Palpate-v0", "SurgSim/PalpateSites-v0")
 @pytest.fixture(scope="module")
 def scene():
     return replace(make_scene("phantom_small"), name="breathing", motions=(BREATH, BEAT))
+
+
+@pytest.fixture(scope="module")
+def anatomy(scene):
+    return load_anatomy(scene)
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +136,91 @@ def test_organs_side_by_side_breathe_as_alone(env_id, scene_file):
             assert env.step(action)[0].tobytes() == row.tobytes()
     courses = [env.unwrapped.simulation.organ_state.motion[:, 0] for env in one]
     assert np.ptp(courses, axis=0).max() > 1e-3
+
+
+def patient(anatomy, seed=3) -> Simulation:
+    simulation = Simulation(anatomy)
+    simulation.draw_motion(np.random.default_rng(seed))
+    return simulation
+
+
+def course(simulation, count, switch=None) -> np.ndarray:
+    """Signals (count, n_motion) after each of some haptic steps; `switch` holds the breath or lets it go on by step."""
+    rows = []
+    for step in range(count):
+        if switch and step in switch:
+            simulation.hold_breath(switch[step])
+        assert simulation.haptic_step()
+        rows.append(simulation.organ_state.motion[:, SIGNAL].copy())
+    return np.array(rows)
+
+
+def test_a_held_breath_ends_and_rests_and_the_heart_goes_on(anatomy):
+    """Held and let go in the middle of a breath, in its rest, and twice in one breath: the ground never jumps."""
+    simulation = patient(anatomy)
+    assert not simulation.holds_breath
+    drive = simulation.drive
+    # The breaths drawn first begin at 54 and 593 ms; that at 1700 ms is as long as the first.
+    switch = {200: True, 300: False, 700: True, 1700: False, 1850: True, 1900: False, 1930: True}
+    breath, heart = course(simulation, 2600, switch).T
+    assert simulation.holds_breath
+    # p' is at most 15 / 8.
+    for number, signal in enumerate((breath, heart)):
+        shortest = np.diff(drive.cycle_start[number]).min() * min(drive.rise[number], drive.fall[number])
+        fastest = 15.0 / 8.0 * drive.cycle_size[number].max() / shortest
+        assert np.abs(np.diff(signal, prepend=0.0)).max() <= fastest * simulation.haptic_dt
+    assert breath[[200, 300, 700, 1850, 1900, 1930]].min() > 0.1
+    # A breath moves in 0.8 of its time. Rates that are summed up leave rounding errors.
+    for rest in (slice(1000, 1700), slice(2200, 2600)):
+        assert np.abs(breath[rest]).max() < 1e-15
+        assert np.ptp(heart[rest]) > 0.5
+    assert simulation.drive.delay[0] == pytest.approx(1.7)
+
+
+def test_a_breath_stays_held_when_the_drawn_cycles_come_again(scene):
+    """After the last cycle comes the first: that one must not be breathed."""
+    quick = replace(BREATH, displacement=(1e-5, 0.0, 0.0), period=(0.02, 0.02), variation=0.0)
+    simulation = patient(load_anatomy(replace(scene, motions=(quick,))))
+    signal = course(simulation, round(1.1 * CYCLE_COUNT * 0.02 / simulation.haptic_dt), {25: True})[:, 0]
+    assert signal[20:40].max() > 0.01 and np.abs(signal[60:]).max() < 1e-15
+
+
+def test_a_restart_begins_the_drawn_course_again_with_the_breath_as_it_is(anatomy):
+    simulation = patient(anatomy)
+    parked = simulation.instrument.parked
+    drawn = course(simulation, 1000)
+    simulation.restart(parked)
+    course(simulation, 700, {200: True})
+    simulation.restart(parked)
+    held = course(simulation, 1000)
+    assert simulation.holds_breath and not held[:, 0].any()
+    assert held[:, 1].tobytes() == drawn[:, 1].tobytes()
+    simulation.hold_breath(False)
+    assert course(simulation, 300)[:, 0].any()
+    simulation.restart(parked)
+    assert course(simulation, 1000).tobytes() == drawn.tobytes()
+
+
+def test_a_state_saved_in_a_held_breath_goes_on_to_the_bit(anatomy):
+    """While the last breath ends, and while none is left; what was drawn is restored too."""
+    simulation, other = patient(anatomy), patient(anatomy, seed=5)
+    for count in (250, 700):
+        simulation.restart(simulation.instrument.parked)
+        simulation.hold_breath(False)
+        simulation.restart(simulation.instrument.parked)
+        course(simulation, count, {200: True})
+        state = simulation.get_state()
+        expected = course(simulation, 600, {400: False})
+        node_position = simulation.organ_state.node_position.copy()
+        other.set_state(simulation.organ_model, state)
+        assert other.holds_breath
+        assert course(other, 600, {400: False}).tobytes() == expected.tobytes()
+        assert other.organ_state.node_position.tobytes() == node_position.tobytes()
+        # Letting go began a cycle at once; a restart goes back to what was drawn.
+        for one in (simulation, other):
+            one.restart(one.instrument.parked)
+        assert course(other, 300).tobytes() == course(simulation, 300).tobytes()
+        assert other.organ_state.motion[0, SIGNAL] > 0.1
 
 
 def test_what_a_scene_says_of_motion_is_checked(scene):

@@ -10,6 +10,7 @@ import pytest
 
 from surgsim_env.cli.main import main
 from surgsim_env.haptics import udp_client
+from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.pacing import SPIN, Pacer
 from surgsim_env.haptics.trajectory import save_trajectory
 from surgsim_env.scene.load import scenes_folder
@@ -67,6 +68,11 @@ def test_bridge_feels_the_organ(monkeypatch, capsys):
     ("more", "words"),
     [
         (["--scene", "phantom_smal"], "did you mean 'phantom_small'"),
+        (["--motion", "fre"], "motion 'fre' is unknown; the motions are none, calm, free; did you mean 'free'?"),
+        (
+            ["--apnoea"],
+            "error: --apnoea: the patient of scene 'phantom_small' does not breathe; give --motion calm or free",
+        ),
         (["--seconds", "0"], "--seconds is 0; it must be finite and above 0"),
         (["--seconds", "inf"], "--seconds is inf; it must be finite and above 0"),
         (["--seconds", "nan"], "--seconds is nan; it must be finite and above 0"),
@@ -118,6 +124,25 @@ def test_ctrl_c_keeps_the_steps_until_then_whole(tmp_path, monkeypatch, capsys):
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     assert len(rows) == 26 and {len(row) for row in rows} == {len(rows[0])}
+
+
+@pytest.mark.parametrize("apnoea", [False, True])
+def test_apnoea_holds_the_breath_whatever_the_button_does(tmp_path, apnoea, monkeypatch):
+    """Without it the second button holds the breath while it is pressed: here in the first half."""
+    held = []
+
+    class Watched(HapticLoop):
+        def step(self):
+            told = super().step()
+            held.append(self.simulation.holds_breath)
+            return told
+
+    monkeypatch.setattr("surgsim_env.cli.haptics.HapticLoop", Watched)
+    save_trajectory(tmp_path / "still.csv", np.array([0.0, 0.01, 0.02]), np.zeros((3, 3)), [2, 0, 0])
+    arguments = ["haptics", "--scene", "phantom_small", "--trajectory", str(tmp_path / "still.csv"), "--motion", "calm"]
+    assert main([*arguments, *(["--apnoea"] if apnoea else [])]) == 0
+    # The first step only compiles.
+    assert held[1:] == [True] * (21 if apnoea else 10) + [False] * (0 if apnoea else 11)
 
 
 @pytest.mark.parametrize(

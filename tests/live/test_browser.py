@@ -20,6 +20,7 @@ from surgsim_env.live.session import HAND_SPEED, Session
 from surgsim_env.live.stage import page_camera
 from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.model import Scene
+from surgsim_env.scene.motions import with_motion
 from tests.live.served import Clock, wait_until
 
 WIDTH, HEIGHT = 900, 600
@@ -106,6 +107,8 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
     with chromium.page(WIDTH, HEIGHT) as browser:
         opened(browser, served)
         assert browser.run("document.cookie") == ""
+        # Who holds still has no breath to hold.
+        assert "Close the jaw" not in browser.text() and "Hold the breath" not in browser.text()
         # It draws in software, and has said so.
         assert served._plain and served._panel._plain.value
         assert not browser.run(SMOOTH_EDGES)
@@ -212,6 +215,30 @@ def test_both_arms_are_dragged_and_both_forces_shown(two_arms, chromium):
         browser.wait_until(lambda: min(curve_heights(browser, 0)) > 1)
         assert [one for one in browser.complaints() if "passive event listener" not in one] == []
     assert two_arms._message_filter.dropped == 0 and two_arms._message_filter.ignored == 0
+
+
+# The check box with some label, which is moved into view, and where it is.
+CHECK_BOX = """(() => { const label = [...document.querySelectorAll('label')].find(one => one.innerText.includes(%r));
+  if (!label) return null; const box = document.getElementById(label.htmlFor); box.scrollIntoView({block: 'nearest'});
+  const r = box.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2, box.checked]; })()"""
+
+
+def test_the_breath_is_held_by_a_switch(tmp_path, chromium):
+    scene = with_motion(make_scene("phantom_small"), "calm")
+    with serving(scene, tmp_path) as page, chromium.page(WIDTH, HEIGHT) as browser:
+        session = page.session
+        opened(browser, page)
+        for held in (True, False):
+            words = "held" if held else "goes on"
+            x, y, before = browser.wait_for(CHECK_BOX % "Hold the breath")
+            assert before != held
+            browser.mouse("mousePressed", x, y, 1)
+            browser.mouse("mouseReleased", x, y)
+            browser.wait_until(lambda held=held: bool(session.frame()["breath_held"]) == held)
+            browser.wait_for(f"{CHECK_BOX % 'Hold the breath'}[2] === {str(held).lower()}")
+            browser.wait_for(f"/breath\\s+{words}/.test(document.body.innerText)")
+        assert [one for one in browser.complaints() if "passive event listener" not in one] == []
+    assert page._message_filter.dropped == 0 and page._message_filter.ignored == 0
 
 
 # Of the plot with some number, in each arm's colour: the rows of pixels that its curve takes.

@@ -96,6 +96,12 @@ def test_a_session_that_fails_is_said_in_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "surgsim: error: the physics' process died: why\n"
 
 
+def test_a_motion_that_is_unknown_is_said_in_one_line(capsys):
+    assert cli.main(["view", "--scene", "phantom_small", "--motion", "clam"]) == 2
+    words = "motion 'clam' is unknown; the motions are none, calm, free; did you mean 'calm'?"
+    assert capsys.readouterr().err == f"surgsim: error: {words}\n"
+
+
 @pytest.mark.parametrize(
     ("kept", "updates", "force", "told"),
     [

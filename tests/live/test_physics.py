@@ -33,6 +33,7 @@ from surgsim_env.live.stage import COLOURS, FeltMap, colour_levels
 from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Scene
 
 ASIDE, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
@@ -40,8 +41,8 @@ ASIDE, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 class Bench:
     """A physics without a process: its hands are moved, and it is stepped, by the test."""
 
-    def __init__(self) -> None:
-        self.scene = live_scene(make_scene("phantom_small"))
+    def __init__(self, scene: Scene | None = None) -> None:
+        self.scene = live_scene(scene or make_scene("phantom_small"))
         self.anatomy = load_anatomy(self.scene)
         geoms = shown_geoms(Simulation(self.anatomy).instrument.model)
         self.exchange = new_exchange(1, self.anatomy.mesh.node_count, len(geoms))
@@ -52,16 +53,16 @@ class Bench:
         self.above = point + self.normal * (self.scene.instrument.tip_radius + 0.004)
         self.pressed = point + self.normal * (self.scene.instrument.tip_radius - 0.004)
 
-    def hold(self, place, *, beats: bool = True) -> None:
+    def hold(self, place, *, beats: bool = True, buttons: int = 0) -> None:
         with self.exchange.hand.writing() as hand:
-            hand["target"] = place
+            hand["target"], hand["buttons"] = place, buttons
             hand["beat"] += beats
 
-    def step(self, count: int, place=None) -> None:
+    def step(self, count: int, place=None, buttons: int = 0) -> None:
         """What `Physics.run` does in as many steps, without the clock."""
         for _ in range(count):
             if place is not None:
-                self.hold(place)
+                self.hold(place, buttons=buttons)
             if self.physics._phase == Phase.RUNNING:
                 self.physics._last = self.physics._loop.step()
                 self.physics._record_step(self.physics._last)

@@ -1,0 +1,131 @@
+"""The physics of a patient who breathes: the switch, recordings of it, what is drawn and felt of the ground."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from msdm_core.organ.motion import SIGNAL
+from msdm_core.organ.support import Support
+from surgsim_env.live.exchange_records import TRACE_STEPS, Record, Replay, Reset
+from surgsim_env.live.recording import read_recording, write_recording
+from surgsim_env.live.session import BREATH_BUTTON
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import CyclicMotion, Scene
+from tests.live.test_physics import ASIDE, Bench
+
+RISE = 0.003
+BREATH = CyclicMotion(
+    "breathing", (0.0, 0.001, RISE), period=(0.3, 0.4), rise=0.4, fall=0.4, variation=0.1, stops_in_apnoea=True
+)
+BEAT = CyclicMotion("heartbeat", (0.0, 0.0005, 0.0), period=(0.15, 0.2), rise=0.3, fall=0.3)
+
+
+def breathing_scene(**changes) -> Scene:
+    return replace(make_scene("phantom_small"), motions=(BREATH, BEAT), **changes)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench(breathing_scene())
+
+
+def signals(bench: Bench, count: int, place, buttons: int = 0) -> np.ndarray:
+    """Of both motions after each of some steps, (count, 2)."""
+    rows = []
+    for _ in range(count):
+        bench.step(1, place, buttons)
+        rows.append(bench.physics._simulation.organ_state.motion[:, SIGNAL].copy())
+    return np.array(rows)
+
+
+def test_the_switch_holds_the_breath_and_the_heart_goes_on(bench):
+    breath, _ = signals(bench, 600, bench.above).T
+    assert breath.max() > 0.5 and not bench.frame["breath_held"]
+    signals(bench, 600, bench.above, BREATH_BUTTON)
+    breath, heart = signals(bench, 400, bench.above, BREATH_BUTTON).T
+    assert np.abs(breath).max() < 1e-15 and np.ptp(heart) > 0.5
+    assert bench.frame["breath_held"]
+    # A reset leaves it held, and letting go begins a breath.
+    bench.ask(Reset())
+    assert bench.frame["breath_held"]
+    breath, _ = signals(bench, 300, bench.above, BREATH_BUTTON).T
+    assert not breath.any()
+    breath, _ = signals(bench, 200, bench.above).T
+    assert breath.max() > 0.5 and not bench.frame["breath_held"]
+
+
+@pytest.mark.parametrize("held_before", [0, BREATH_BUTTON])
+def test_a_replay_of_a_breathing_patient_repeats_every_bit(bench, held_before):
+    """The switch is recorded: turned before the recording, in its middle, with its first step."""
+    bench.step(700, bench.above, held_before)
+    bench.ask(Record(True))
+    for count, place, buttons in (
+        (150, bench.pressed, BREATH_BUTTON - held_before),
+        (50, None, 0),
+        (400, bench.pressed + 0.003 * ASIDE, held_before),
+    ):
+        bench.step(count, place, buttons)
+    bench.ask(Record(False))
+    steps = bench.exchange.recorded.steps.copy()
+    assert len(steps) == 600 and np.linalg.norm(steps["force"], axis=2).max() > 0.02
+    node, held = bench.frame["node"].copy(), bool(bench.frame["breath_held"])
+    # Meanwhile the patient does something else, and the page's switch stands as it does not in the recording's end.
+    bench.step(333, bench.above, BREATH_BUTTON - held_before)
+    bench.ask(Replay(True))
+    forces = []
+    for _ in range(600):
+        bench.step(1)
+        forces.append(bench.frame["force"][0].copy())
+    assert np.array_equal(np.array(forces), steps["force"][:, 0])
+    assert np.array_equal(bench.frame["node"], node)
+    # From here on the page's switch holds again.
+    assert bench.frame["breath_held"] == held == bool(held_before)
+    bench.step(2, bench.above, BREATH_BUTTON - held_before)
+    assert bench.frame["breath_held"] == (not held)
+
+
+def test_a_recorded_file_is_played_to_the_breaths_that_it_was_recorded_in(bench, tmp_path):
+    bench.step(200, bench.above)
+    bench.ask(Record(True))
+    recorded = np.concatenate(
+        [signals(bench, 300, bench.above), signals(bench, 300, bench.above, BREATH_BUTTON)], axis=0
+    )
+    bench.ask(Record(False))
+    assert "600 steps" in write_recording(bench.exchange.recorded.steps.copy(), tmp_path)
+    bench.exchange.recorded.fill(read_recording(tmp_path / "recording-1.csv", 1, bench.scene.timing.haptic_step))
+    bench.step(77, bench.above)
+    bench.ask(Replay(True, given=True))
+    np.testing.assert_allclose(signals(bench, 600, None), recorded, atol=1e-12)
+
+
+def test_supports_are_drawn_where_the_ground_carries_them_and_other_parts_are_not():
+    bed = Support("bed", "box", (0.02, 0.02, -0.02), size=(0.02, 0.02, 0.01))
+    bench = Bench(breathing_scene(supports=(bed,)))
+    geoms = bench.physics._geoms.tolist()
+    model = bench.physics._simulation.instrument.model
+    (place,) = [index for index, geom in enumerate(geoms) if model.geom(geom).name == "support_bed"]
+    rows = []
+    for _ in range(40):
+        bench.step(10, bench.above)
+        shift = bench.physics._simulation.organ_state.motion[:, SIGNAL] @ [BREATH.displacement, BEAT.displacement]
+        np.testing.assert_allclose(bench.frame["geom"][place], np.array(bed.position) + shift, atol=1e-8)
+        others = np.arange(len(geoms)) != place
+        there = bench.physics._simulation.instrument.data.geom_xpos[np.array(geoms)[others]]
+        np.testing.assert_allclose(bench.frame["geom"][others], there, atol=1e-8)
+        rows.append(shift)
+    assert np.ptp(rows, axis=0)[2] > 0.5 * RISE
+
+
+def test_the_map_is_told_where_on_the_organ_a_tip_touched(bench):
+    """A tip that is held still touches, as the organ goes to and fro below it, here and there."""
+    bench.step(800, bench.pressed)
+    rest = bench.exchange.trace.read()["row"][60 : 800 // TRACE_STEPS]
+    tip = rest["tip"][:, 0]
+    # The tip is where its hand holds it; of the organ it is that place less what the breath has moved.
+    assert 0.8 * RISE < np.ptp(tip[:, 2]) < 1.5 * 1.3 * RISE
+    surface = bench.anatomy.mesh.points[:, 2].max()
+    touches = rest["depth"][:, 0] > 0.0
+    assert touches.any()
+    depth = surface + bench.scene.instrument.tip_radius - tip[touches, 2]
+    np.testing.assert_allclose(rest["depth"][touches, 0], depth, atol=1e-12)

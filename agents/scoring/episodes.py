@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.scoring.site_agent import SiteAgent, site_facts
-from agents.site_search import OracleSites
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
 from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, with_intervals
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
@@ -188,7 +187,10 @@ def print_episodes(records: Sequence[TaskRecord], seeds: Sequence[int], soft_for
 
 
 class SiteActor:
-    """A baseline in each environment, its random generator seeded with the episode's seed."""
+    """A baseline in each environment, its random generator seeded with the episode's seed.
+
+    One with a method `see`, as `agents.site_search.OracleSites` has it, is given the task with the truth.
+    """
 
     def __init__(self, make: Callable[[], SiteAgent]) -> None:
         self.make = make
@@ -198,8 +200,9 @@ class SiteActor:
         """Make the agent of an episode in environment `index`."""
         agent = self.agents[index] = self.make()
         agent.reset(np.random.default_rng(seed), site_facts(env))
-        if isinstance(agent, OracleSites):
-            agent.see(env.unwrapped.task)
+        see = getattr(agent, "see", None)
+        if see is not None:
+            see(env.unwrapped.task)
         return agent
 
     def __call__(self, observations: NDArray[Any], begins: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -446,8 +446,8 @@ def _joint_rows(cycle: ThroughCycle) -> list[tuple[str, ...]]:
         for index, (speed, rush) in enumerate(zip(_greatest(arm.speed), _greatest(arm.acceleration), strict=True)):
             unit, limit = "rad" if arm.hinge[index] else "m", arm.speed_limit[index]
             rows.append(
-                (f"{side} arm: {arm.joint_names[index]}", f"{number_text(speed, 1.0, None)} {unit}/s",
-                 f"{limit:g} {unit}/s", _per_cent(speed / limit), f"{number_text(rush, 1.0, None)} {unit}/s²")
+                (f"{side} arm: {arm.joint_names[index]}", f"{number_text(speed, 1.0, 3)} {unit}/s",
+                 f"{limit:g} {unit}/s", _per_cent(speed / limit), f"{number_text(rush, 1.0, 3)} {unit}/s²")
             )  # fmt: skip
     return rows
 
@@ -510,7 +510,7 @@ def draw_cycle(evaluation: ArmsEvaluation, folder: AnyFolder) -> list[Picture]:
     return [
         Picture.of_file(
             folder / PICTURE_NAME,
-            "Through the cycle",
+            f"Over a cycle of {cycle.motions[0]}",
             f"Displacement by {cycle.motions[0]}; share of the surface's points that are reached; clearance from organ "
             "and wall over the points for which an arm has a path; largest speed of any joint over these points as a "
             f"share of its limit.{beside}",
@@ -531,4 +531,4 @@ def _per_cent(share: float) -> str:
 
 
 def _greatest_text(values: FloatArray) -> str:
-    return number_text(float(values.max()), 1.0, None)
+    return number_text(float(values.max()), 1.0, 2)

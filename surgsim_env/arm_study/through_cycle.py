@@ -504,9 +504,8 @@ def draw_cycle(evaluation: ArmsEvaluation, folder: AnyFolder) -> list[Picture]:
                 axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
     figure.suptitle(f"through a cycle of {_listed(cycle.motions)}", fontsize=12, color=INK)
     save_png(figure, folder / PICTURE_NAME)
-    beside = (
-        f" {_listed(cycle.motions[1:])} rests, but counts in the speeds with its quickest." if cycle.motions[1:] else ""
-    )
+    others = _listed(cycle.motions[1:])
+    beside = f" With {others} at rest, except that the speeds contain its largest." if others else ""
     return [
         Picture.of_file(
             folder / PICTURE_NAME,

@@ -112,7 +112,7 @@ def made_follower(generator, reachable, *, quickest=0.5):
     """An arm at three positions: it loses a tenth of its points at the top, and has a path for the others."""
     count = len(reachable)
     each = np.stack([reachable, reachable, reachable & (generator.random(count) > 0.1)])
-    path = each.all(axis=0)
+    path = np.asarray(each.all(axis=0))
     names, limit = ("yaw", "pitch", "insertion"), np.array([2.0, 1.0, 0.4])
     speed = np.where(path[:, None], generator.uniform(0.1, quickest, (count, 3)) * limit, np.nan)
     return ArmThroughCycle(

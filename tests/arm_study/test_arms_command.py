@@ -243,7 +243,7 @@ def test_a_urdf_whose_mesh_is_missing_is_refused(folder, made, capsys):
         (["--scene", "lever"], "scene 'lever' is unknown"),
         (["--scene", "nowhere.toml"], "nowhere.toml cannot be read"),
         (["--compare", "psm_grabber"], "--compare: arm 'psm_grabber' is unknown"),
-        (["--motion", "clam"], "motion 'clam' is unknown; the motions are none, calm, free; did you mean calm?"),
+        (["--motion", "clam"], "motion 'clam' is unknown; the motions are none, calm, free; did you mean 'calm'?"),
         (["--out", "ports.toml"], "--out ports.toml: cannot be written"),
         (["--out", "/proc/nothing"], "--out /proc/nothing: cannot be written"),
     ],

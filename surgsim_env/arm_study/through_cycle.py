@@ -272,8 +272,8 @@ def _arm_summary(arm: ArmThroughCycle, outer: NDArray[np.bool_]) -> dict[str, An
         "reachable": _reach_summary(arm.reachable[:, outer]),
         "has_path": float(arm.has_path[outer].mean()),
         "follows": float(arm.follows[outer].mean()),
-        "path_clearance": _worst_and_median(arm.clearance, np.min),
-        "path_trocar_load": _worst_and_median(arm.trocar_load, np.max),
+        "path_clearance": _worst_and_median(arm.clearance[:, outer], np.min),
+        "path_trocar_load": _worst_and_median(arm.trocar_load[:, outer], np.max),
         "path_turn": None if math.isnan(spread(arm.turn).greatest) else spread(arm.turn)._asdict(),
         "limiting_joint": joint,
         "speed_share": share,
@@ -498,10 +498,9 @@ def draw_cycle(evaluation: ArmsEvaluation, folder: AnyFolder) -> list[Picture]:
     for axes in (travel, reach, gap, speed):
         axes.grid(alpha=0.3)
         axes.set_ylim(bottom=0.0)
-        if axes is not travel:
-            axes.margins(y=0.1)
-            if axes.get_legend_handles_labels()[0]:
-                axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
+    reach.set_ylim(0.0, 104.0)
     figure.suptitle(f"through a cycle of {_listed(cycle.motions)}", fontsize=12, color=INK)
     save_png(figure, folder / PICTURE_NAME)
     others = _listed(cycle.motions[1:])

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,8 @@ def plain_presses(presses: Sequence[TrackedPress]) -> dict[str, Any]:
 def _pressed_by(anatomy: Anatomy, source: str, arm: Arm) -> Anatomy:
     """The anatomy with an arm at its port, each motion always in its largest and quickest cycle."""
     motions = tuple(_largest(one) for one in anatomy.scene.motions)
-    scene = with_instrument(anatomy.scene, source)
+    # A file is that of the command, not one of the same name beside the scene.
+    scene = with_instrument(anatomy.scene, str(Path(source).resolve()) if Path(source).suffix == ".toml" else source)
     return replace(anatomy, scene=replace(scene, port=arm.port, motions=motions))
 
 

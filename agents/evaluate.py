@@ -2,6 +2,7 @@
 
     python -m agents.evaluate --agent gp_ucb --scene phantom --level standard
     python -m agents.evaluate --all --scene phantom --level standard     # every baseline and every policy for it
+    python -m agents.evaluate --agent oracle_retract --motion calm       # a patient who breathes
     python -m agents.evaluate --policy agents/policies/NAME.safetensors --episodes 20 --video out.mp4
     python -m agents.evaluate --reach --scene phantom --level hard       # lesions below the sensor's reach
     python -m agents.evaluate --leaderboard
@@ -26,11 +27,21 @@ import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
 from agents.expert_palpate import PalpateExpert
 from agents.expert_retract import RetractExpert
-from agents.scoring.episodes import Actor, SiteActor, make_envs, play_sites, play_tasks, task_figures
+from agents.scoring.episodes import (
+    Actor,
+    SiteActor,
+    make_envs,
+    play_scripts,
+    play_sites,
+    play_tasks,
+    task_figures,
+)
 from agents.scoring.leaderboard import RESULTS, SITES, Result, write_leaderboard
 from agents.scoring.site_agent import SiteAgent
 from agents.site_search import AGENTS, RASTER_SIDES, REFERENCES
-from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score
+from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score, with_intervals
+from surgsim_env.scene.motions import list_motions
+from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR
 
 with one_line_errors(__name__, "agents"):
     from tqdm import tqdm
@@ -68,6 +79,14 @@ TASK_AGENTS = {
 }
 
 
+# Environments whose oracle plays its script, and whether they take `scene` and `level`.
+ORACLES = {
+    "oracle_palpate": ("SurgSim/Palpate-v0", True),
+    "oracle_retract": ("SurgSim/Retract-v0", False),
+    "oracle_bimanual_retract": ("SurgSim/BimanualRetract-v0", False),
+}
+
+
 def find_agent(name: str) -> Callable[[], SiteAgent]:
     """The factory of the site search with a name.
 
@@ -75,7 +94,7 @@ def find_agent(name: str) -> Callable[[], SiteAgent]:
         ValueError: an unknown name (lists the known).
     """
     if name not in AGENTS:
-        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS])}")
+        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
     return AGENTS[name]
 
 
@@ -84,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--all", action="store_true", help="every baseline, and every policy for this scene")
-    what.add_argument("--agent", help=f"one of {', '.join([*AGENTS, *TASK_AGENTS])}")
+    what.add_argument("--agent", help=f"one of {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
     what.add_argument("--policy", type=Path, help="NAME.safetensors, with NAME.json beside it")
     what.add_argument("--reach", action="store_true", help="count the lesions below the sensor's reach")
     what.add_argument("--leaderboard", action="store_true", help="write the leaderboard only")
@@ -93,6 +112,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--scene", default="phantom")
     parser.add_argument("--level", default="standard")
+    parser.add_argument("--motion", choices=list_motions(), help="how the patient moves; as the scene says by default")
+    parser.add_argument(
+        "--no-tracking", action="store_true", help="presses and oracles go where the surface is at rest, as it moves"
+    )
     parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
     parser.add_argument("--budget", type=int, help="presses of an episode, in place of the environment's own")
     parser.add_argument("--envs", type=int, default=16, help="organs side by side")
@@ -133,6 +156,8 @@ def evaluate_all(options: argparse.Namespace) -> None:
 
 def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
     """A baseline of SurgSim/PalpateSites-v0, or the script of another environment on its own scene."""
+    if name in ORACLES:
+        return evaluate_oracle(name, options)
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
         command, kwargs = f"python -m agents.evaluate --agent {name}", dict(script.kwargs)
@@ -141,11 +166,23 @@ def evaluate_agent(name: str, options: argparse.Namespace) -> Result:
             command += f" --scene {options.scene} --level {options.level}"
         return _evaluate(name, script.make(kwargs), script.env_id, kwargs, command, options)
     kwargs: dict[str, Any] = {"scene": options.scene, "level": options.level}
+    if options.no_tracking:
+        kwargs["track_motion"] = False
     if name in REFERENCES:
         # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
     command = f"python -m agents.evaluate --agent {name} --scene {options.scene} --level {options.level}"
     return _evaluate(name, SiteActor(find_agent(name)), SITES, kwargs, command, options)
+
+
+def evaluate_oracle(name: str, options: argparse.Namespace) -> Result:
+    """The oracle's script of an environment, played alone."""
+    env_id, has_places = ORACLES[name]
+    places = {"scene": options.scene, "level": options.level} if has_places else {}
+    command = f"python -m agents.evaluate --agent {name}" + "".join(
+        f" --{key} {value}" for key, value in places.items()
+    )
+    return _evaluate(name, None, env_id, places, command, options)
 
 
 def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
@@ -180,18 +217,22 @@ def evaluate_policy(path: Path, options: argparse.Namespace) -> Result:
 
 def _evaluate(
     name: str,
-    actor: Actor | SiteActor,
+    actor: Actor | SiteActor | None,
     env_id: str,
     kwargs: dict[str, Any],
     command: str,
     options: argparse.Namespace,
     check: Callable[[gym.Env], None] = lambda env: None,
 ) -> Result:
-    """Play the evaluation seeds; save and print the result."""
+    """Play the evaluation seeds, with the oracle's script where there is no actor; save and print the result."""
+    if options.motion is not None:
+        kwargs = {**kwargs, "motion": options.motion}
+    if options.no_tracking:
+        name += "_untracked"
     seeds, rng = EVALUATION_SEEDS[: options.episodes], np.random.default_rng(BOOTSTRAP_SEED)
     if env_id == SITES and options.budget is not None:
         kwargs = {**kwargs, "budget": options.budget}
-    count = min(options.envs, options.episodes)
+    count = 1 if actor is None else min(options.envs, options.episodes)
     try:
         envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
     except (gym.error.Error, TypeError) as error:
@@ -200,17 +241,23 @@ def _evaluate(
     check(first)
     start, bar = time.perf_counter(), tqdm(desc=name, unit=" steps", mininterval=PROGRESS_EVERY)
     scored: dict[str, Any]
-    if env_id == SITES:
+    if actor is not None and env_id == SITES:
         presses, budget = play_sites(actor, envs, seeds, bar.update), first.task.budget
+        line = SUCCESS_ERROR * first.task.tip_scale
+        succeeded = np.array([press_errors(record, budget)[-1] <= line for record in presses], dtype=np.float64)
         scored = {
             "budget": budget,
-            "figures": score(presses, budget, rng),
+            "figures": {**score(presses, budget, rng), **with_intervals({"success": succeeded}, rng)},
             "errors_mm": [np.round(1000.0 * press_errors(record, budget), 2).tolist() for record in presses],
             "lesion_counts": [len(record.truth) for record in presses],
         }
     else:
         control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
-        records = play_tasks(actor, envs, seeds, bar.update)
+        if actor is None:
+            single = gym.make(env_id, **kwargs)
+            records = play_scripts(single, seeds, tracks=not options.no_tracking, progress=bar.update)
+        else:
+            records = play_tasks(actor, envs, seeds, bar.update)
         scored = {
             "budget": gym.spec(env_id).max_episode_steps or 0,
             "figures": task_figures(records, control_step, soft_force, rng),
@@ -262,6 +309,8 @@ def write_reach(options: argparse.Namespace) -> None:
 def _with_options(command: str, options: argparse.Namespace) -> str:
     command += "" if options.episodes == len(EVALUATION_SEEDS) else f" --episodes {options.episodes}"
     command += "" if options.budget is None else f" --budget {options.budget}"
+    command += "" if options.motion is None else f" --motion {options.motion}"
+    command += " --no-tracking" * options.no_tracking
     return command + ("" if options.dtype == "float32" else f" --dtype {options.dtype}")
 
 

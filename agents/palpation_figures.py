@@ -17,7 +17,7 @@ from agents.command_line import one_line_errors
 from agents.scoring.leaderboard import SITES, Result, best_raster_alone, load_results
 from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
 from agents.scoring.site_agent import site_facts
-from agents.site_search import REFERENCES
+from agents.site_search import BOUNDS
 from surgsim_env.palpation.scores import ERROR_LINE
 
 matplotlib.use("Agg")
@@ -37,7 +37,7 @@ SHOWN_POLICY, AGENT_SEED, AGENT_PRESSES = "sites_ppo_seed0.safetensors", 4_000_0
 
 def draw_errors(results: list[Result], path: Path) -> None:
     """Median OSPA over organs with lesions after each press: one panel per scene and level, one line per method."""
-    rows = [row for row in results if row.env_id == SITES and row.method not in REFERENCES]
+    rows = [row for row in results if row.env_id == SITES and row.method not in BOUNDS and not row.motion]
     places = sorted({row.place for row in rows}, key=lambda place: ("standard" not in place, place))
     methods = sorted({family(row.method) for row in rows})
     figure = Figure(figsize=(10.4, 3.6 * math.ceil(len(places) / 2)), dpi=110, layout="constrained")

@@ -1,7 +1,7 @@
 """The methods for SurgSim/PalpateSites-v0 by name: site searches, and the reference scores, oracle and blind guess.
 
-They use observations and the size of the chart only (`SiteFacts`). A Gaussian process on log contrast is the belief of
-the searches `gp_*`.
+Searches use observations and the size of the chart only (`SiteFacts`). A Gaussian process on log contrast is the belief
+of the searches `gp_*`.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from scipy.stats import qmc
 from agents.scoring.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
 from surgsim_env.palpation.lesion_estimator import EXCESS_LEAST, EXCESS_LEAST_NOISE
 from surgsim_env.palpation.scores import MapScore
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 # Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
 UCB_BETA = 3.0
@@ -132,6 +133,27 @@ class GpLevelSet(GpVariance):
         return np.minimum(excess + margin - level, level - excess + margin)
 
 
+class OracleSites(GpVariance):
+    """Presses the true lesions, then where the process is least certain.
+
+    It bounds what presses and the common estimator allow an agent that knows where to press.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        super().reset(rng, facts)
+        self.places: list[NDArray[np.float32]] = []
+
+    def see(self, task: PalpateSitesTask) -> None:
+        """Take the truth of the episode that `reset` has begun."""
+        places = [task.charted.chart.place(point) for point in task.truth]
+        self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in places]
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        return self.places.pop(0) if self.places else super().act(observation)
+
+
 class TruthAgent:
     """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %.
 
@@ -177,9 +199,12 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "gp_variance": GpVariance,
     "gp_ucb": GpUcb,
     "gp_level_set": GpLevelSet,
+    "oracle": OracleSites,
     "truth": TruthAgent,
     "middle": Middle,
 }
 
 # Methods whose estimates do not depend on what their presses feel.
 REFERENCES = ("truth", "middle")
+# Methods that know the truth, or do not search.
+BOUNDS = (*REFERENCES, "oracle")

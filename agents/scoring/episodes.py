@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.scoring.site_agent import SiteAgent, site_facts
+from agents.site_search import OracleSites
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
 from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, with_intervals
+from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 # Actions (n, n_action) for observations (n, n_observation); where the second (n,) is true an episode begins.
@@ -111,6 +113,30 @@ def play_tasks(
     return play(actor, envs, seeds, lambda env, seed: TaskRecord(), progress)
 
 
+def play_scripts(
+    env: gym.Env, seeds: Sequence[int], *, tracks: bool, progress: Callable[[], object] = lambda: None
+) -> list[TaskRecord]:
+    """Episodes of the oracle's script, one after the other; a script that fails ends its episode without success.
+
+    Args:
+        env: one environment.
+        seeds: of the episodes.
+        tracks: the script follows a surface that moves.
+        progress: called after each episode.
+    """
+    records = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        try:
+            trace = run_script(env, oracle_script(env, tracks=tracks))
+        except ScriptError as failed:
+            trace = failed.trace
+        peaks = [float(info["force_peak"]) for info in trace.infos]
+        records.append(TaskRecord(len(trace.reward), float(trace.reward.sum()), peaks, trace.infos[-1]))
+        progress()
+    return records
+
+
 def task_figures(
     records: Sequence[TaskRecord], control_step: float, soft_force: float, rng: np.random.Generator
 ) -> dict[str, ScoreEstimate]:
@@ -172,6 +198,8 @@ class SiteActor:
         """Make the agent of an episode in environment `index`."""
         agent = self.agents[index] = self.make()
         agent.reset(np.random.default_rng(seed), site_facts(env))
+        if isinstance(agent, OracleSites):
+            agent.see(env.unwrapped.task)
         return agent
 
     def __call__(self, observations: NDArray[Any], begins: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scene.motions import STILL
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 LEADERBOARD = RESULTS.with_name("LEADERBOARD.md")
@@ -48,7 +49,14 @@ class Result:
     def place(self) -> str:
         """Environment, scene and level: the key that groups tables."""
         parts = [self.env_id.removeprefix("SurgSim/").removesuffix("-v0"), self.env_kwargs.get("scene", "")]
-        return "_".join(part for part in [*parts, self.env_kwargs.get("level") or ""] if part)
+        parts += [self.env_kwargs.get("level") or "", self.motion]
+        return "_".join(part for part in parts if part)
+
+    @property
+    def motion(self) -> str:
+        """How the patient moves; "" for one who holds still."""
+        motion = self.env_kwargs.get("motion") or STILL
+        return "" if motion == STILL else motion
 
     def save(self, folder: Path = RESULTS) -> Path:
         """Write it; replaces an older result of the same method and place."""
@@ -91,6 +99,7 @@ Column = tuple[str, str, int, float]
 PLACES: tuple[Column, ...] = (
     ("presses to 5 mm, median", "presses_to_median", 0, 1.0),
     ("90th percentile", "presses_to_p90", 0, 1.0),
+    ("success [%]", "success", 0, 100.0),
     ("error [mm]", "error_mm", 1, 1.0),
     ("over all presses [mm]", "error_of_presses_mm", 1, 1.0),
     ("centroid [mm]", "centroid_error_mm", 1, 1.0),
@@ -145,7 +154,9 @@ HEADER = """# Leaderboard
 Written by `python -m agents.evaluate --leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
 Each figure is a mean over the episodes of its seeds, in brackets the 95 % bootstrap interval over them; "never" is a
 line that was not reached within the presses of an episode. Baselines and policies play the same organs. The rasters
-shown are the best of those tried, by presses to 5 mm, then by the error over all presses.
+shown are the best of those tried, by presses to 5 mm, then by the error over all presses. An oracle knows the truth:
+its rows bound what an environment allows. Where the patient moves, presses and oracles go with the surface that markers
+show; a method whose name ends in `untracked` goes where places are at rest.
 """
 
 
@@ -178,7 +189,9 @@ def _tasks(place: str, rows: list[Result]) -> str:
 
 def _title(result: Result) -> str:
     scene, level = result.env_kwargs.get("scene", ""), result.env_kwargs.get("level")
-    return " ".join(part for part in (f"`{result.env_id}`", scene, f"({level})" if level else "") if part)
+    moves = f"motion {result.motion}" * bool(result.motion)
+    told = ", ".join(part for part in (level, moves) if part)
+    return " ".join(part for part in (f"`{result.env_id}`", scene, f"({told})" if told else "") if part)
 
 
 def best_raster_alone(rows: Sequence[Result]) -> list[Result]:

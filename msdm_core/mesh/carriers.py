@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import KDTree
 
+from msdm_core.errors import MeshError
 from msdm_core.mesh.geodesic import nearest_weights
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
@@ -48,6 +49,26 @@ def find_carriers(points: FloatArray, mesh: TetMesh) -> Carriers:
     tets = mesh.points[mesh.tets[mesh.boundary_tets[triangle]]]
     longest = np.linalg.norm(tets[:, :, None] - tets[:, None], axis=3).max(axis=(1, 2))
     return Carriers(triangle, weights, nearest, np.linalg.norm(points - nearest, axis=1), REACH * longest)
+
+
+def surface_carriers(vertices: FloatArray, mesh: TetMesh) -> Carriers:
+    """What carries the vertices [m] (n_vertex, 3) of a finer surface of a mesh.
+
+    Raises:
+        MeshError: a vertex farther from the mesh's boundary than REACH allows; names it.
+    """
+    found = find_carriers(vertices, mesh)
+    far = np.flatnonzero(found.beyond)
+    if far.size:
+        worst = far[np.argmax(found.distance[far] / found.reach[far])]
+        x, y, z = vertices[worst] * 1e3
+        raise MeshError(
+            f"vertex {worst} of the fine surface, at {x:.1f}, {y:.1f}, {z:.1f} mm, is "
+            f"{found.distance[worst] * 1e3:.3g} mm from the boundary of the tets; the rule is at most "
+            f"{found.reach[worst] * 1e3:.3g} mm there, {REACH:g} of a tet's longest edge ({len(far)} of "
+            f"{len(vertices)} vertices break it): is it the surface of this organ, in the same axes and unit?"
+        )
+    return found
 
 
 def node_gradients(mesh: TetMesh, nodes: IntArray) -> csr_array:

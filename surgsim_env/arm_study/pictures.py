@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -47,6 +48,7 @@ from surgsim_env.rendering.cameras import Camera
 from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
 from surgsim_env.reports.html_page import Picture
 from surgsim_env.reports.output_folder import AnyFolder
+from surgsim_env.reports.step_progress import StepProgress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,13 +120,16 @@ class ArmMaps:
         if self._tried[self._patches.normals @ back.towards > 0.0].mean() >= BEHIND_LEAST:
             self._views.append(("from behind", back))
 
-    def write_all(self, folder: AnyFolder) -> list[Picture]:
-        """Write all maps into a folder: reach, each quantity, and the arms' distances."""
-        written = [self._write_reach(folder)]
+    def write_all(self, folder: AnyFolder, progress: StepProgress | None = None) -> list[Picture]:
+        """Write all maps into a folder: reach, each quantity, and the arms' distances; a step of `progress`."""
         # The two errors are checks of the method and the same everywhere: the table suffices.
         shown = [quantity for quantity in QUANTITIES if quantity.field not in ("position_error", "trocar_error")]
-        written.extend(self._write_quantity(folder, quantity) for quantity in shown)
-        written.append(self._write_distances(folder))
+        quantities = [partial(self._write_quantity, quantity=quantity) for quantity in shown]
+        written = []
+        with (progress or StepProgress()).step("drawing the maps", len(quantities) + 2) as advance:
+            for write in (self._write_reach, *quantities, self._write_distances):
+                written.append(write(folder))
+                advance(1)
         return written
 
     def _write_reach(self, folder: AnyFolder) -> Picture:

@@ -78,6 +78,7 @@ from surgsim_env.palpation.job import package_version, plain_json
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.reports.html_page import Picture, render_page
 from surgsim_env.reports.output_folder import AnyFolder
+from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.arm_description import ArmDescription
 from surgsim_env.scene.load import make_scene
@@ -171,6 +172,7 @@ def evaluate_arms(
         "ports": json.loads(json.dumps(asdict(where))),
         "count": count,
     }
+    points, triangles = anatomy.outer_surface
     found = ArmsEvaluation(
         points=sites.points,
         normals=sites.normals,
@@ -182,8 +184,8 @@ def evaluate_arms(
         arm_distance_outside=both.outside,
         summary={},
         scene=anatomy.scene.name,
-        surface_points=mesh.points,
-        surface_triangles=mesh.boundary_triangles,
+        surface_points=points,
+        surface_triangles=triangles,
         pictures={},
         ports=where.frames,
         cycle=cycle,
@@ -393,12 +395,14 @@ def run_study(
         json.dumps(summary, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
     write_points(first, folder / POINTS_NAME)
-    pictures = write_pictures(first, (setups[0].left, setups[0].right), folder)
+    with StepProgress(console) as progress:
+        with progress.step("drawing the arms"):
+            pictures = write_pictures(first, (setups[0].left, setups[0].right), folder)
+        maps = ArmMaps(first).write_all(folder, progress)
     shown = "Drawn with OpenGL: the lobe and both arms in the overview and through the endoscope; "
     shown += "the target is green, arrows are the tissue's force on each tool."
     drawn = {} if episodes is None else episodes.pictures
     ends = write_given_pictures(drawn, folder, name="episode", description=shown)
-    maps = ArmMaps(first).write_all(folder)
     curves = draw_cycle(first, folder)
     write_report(
         first,

@@ -20,6 +20,7 @@ from surgsim_env.palpation.surface_drawing import (
     draw_patches,
     interpolated,
     nearness,
+    organ_patches,
     save_png,
     tube,
 )
@@ -55,8 +56,7 @@ def write_stiffness_map(palpation: PalpationResult, path: Path) -> None:
         fontsize=12,
     )
     view = OrthographicView.along(palpation.anatomy.face.approach)
-    mesh = palpation.anatomy.mesh
-    patches = curved_patches(mesh.points, mesh.boundary_triangles)
+    patches = organ_patches(palpation.anatomy)
     for axes, one in zip((left, middle), palpation.maps, strict=True):
         _draw_map(figure, axes, palpation, one, patches, view)
     _draw_curves(right, palpation)
@@ -70,7 +70,7 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
     figure = Figure(figsize=(10.0, 6.2), dpi=120, facecolor=NIGHT)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
-    mesh, scene = palpation.anatomy.mesh, palpation.anatomy.scene
+    scene = palpation.anatomy.scene
     one = next(item for item in palpation.maps if item.name == MODEL)
     place = one.estimates[0].point if one.estimates else palpation.sites[0]
     site, normal = palpation.anatomy.face.project(place)
@@ -78,7 +78,7 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
     right, up = tangent_axes(approach)
     # From beside the approach, so that the probe's shaft is visible.
     view = OrthographicView.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
-    organ = curved_patches(mesh.points, mesh.boundary_triangles)
+    organ = organ_patches(palpation.anatomy)
     colours = np.broadcast_to(LIVER, (len(organ.corners), 3)).copy()
     glow, weight = _map_over(palpation, one, organ, everywhere=True)
     painted = np.flatnonzero(weight > 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -10,8 +10,10 @@ import numpy as np
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import KDTree
 
+from msdm_core.mesh.carriers import surface_carriers
 from msdm_core.mesh.surface import triangle_lattice
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.palpable_surface import tangent_axes
 
 if TYPE_CHECKING:
@@ -19,8 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, PAPER = "#20242c", "white"
-# Each triangle is drawn as SPLITS^2, bent towards its corners' tangent planes by this share (Boubekeur & Alexa 2008).
+# Each triangle is drawn as SPLITS^2, or fewer where this would exceed a number of patches, bent towards its corners'
+# tangent planes by a share (Boubekeur & Alexa 2008).
 SPLITS = 4
+PATCHES_MOST = 100_000
 BEND = 0.6
 # Corners where a face turns from the mean normal by more than this stay sharp.
 CREASE_COSINE = 0.75
@@ -62,8 +66,25 @@ class Patches:
     origin: IntArray
 
 
-def curved_patches(points: FloatArray, triangles: IntArray, splits: int = SPLITS) -> Patches:
-    """Each triangle of a surface as splits^2 smaller triangles, bent towards the smooth normals."""
+def organ_patches(anatomy: Anatomy) -> Patches:
+    """An organ at rest; each patch came from the boundary triangle of the tets that it is a part of or lies over.
+
+    Raises:
+        MeshError: the scene's fine surface cannot be read, or is not of this organ.
+    """
+    points, triangles = anatomy.outer_surface
+    patches = curved_patches(points, triangles)
+    if anatomy.fine_surface is None:
+        return patches
+    first, second, third = surface_carriers(points, anatomy.mesh).triangle[triangles.T]
+    # That of two corners at least, where there is one: borders of colours are smoother than with one corner's.
+    below = np.where(second == third, second, first)
+    return replace(patches, origin=below[patches.origin])
+
+
+def curved_patches(points: FloatArray, triangles: IntArray, splits_most: int = SPLITS) -> Patches:
+    """Each triangle of a surface as up to splits_most^2 smaller triangles, bent towards the smooth normals."""
+    splits = max(k for k in range(1, splits_most + 1) if k == 1 or len(triangles) * k * k <= PATCHES_MOST)
     corners = points[triangles]
     area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face_normal = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]

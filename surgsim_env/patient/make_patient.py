@@ -266,17 +266,18 @@ def write_organ(
 
     scene_file = Path(name).with_suffix(".toml").name
     text = scene_text(found)
-    page = report_page(found, text, scene_file, command, retraction)
     write_mesh(files / name, found.patient.mesh)
     (files / scene_file).write_text(text, encoding="utf-8", newline="\n")
-    # What a page cannot show, such as bytes of a file's name that are not UTF-8, becomes a question mark.
-    (files / REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
-    load_scene(files / scene_file)
     written = [name, scene_file, REPORT_NAME]
     own = found.patient.surface
     if own is not None:
         written.append(surface_file(Path(name)).name)
         own.write(files / written[-1])
+    # The report's pictures show the surface that lies beside the scene.
+    placed = replace(found, anatomy=replace(found.anatomy, scene=load_scene(files / scene_file)))
+    page = report_page(placed, text, scene_file, command, retraction)
+    # What a page cannot show, such as bytes of a file's name that are not UTF-8, becomes a question mark.
+    (files / REPORT_NAME).write_text(page, encoding="utf-8", errors="replace", newline="\n")
     if isinstance(retraction, RetractScene):
         turned = _retract_file(Path(name)).name
         lifted = Path(turned).with_suffix(".toml").name
@@ -380,6 +381,7 @@ def scene_text(found: PatientScene) -> str:
     )
     comments = {
         "retract_scene": "used by the retraction environments",
+        "cranial": "where the head is, for motions" if patient.is_scan else "where the head is: chosen, for motions",
         **found.anchor_sources,
         "mesh.fine_surface": "what pictures and the live page draw; delete it to see the boundary of the tets",
         "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
@@ -422,6 +424,7 @@ def retract_text(found: PatientScene, made: RetractScene) -> str:
     )
     comments = {
         "gravity": "a scan shows the organ under its weight: that shape is its rest here",
+        "cranial": "where the head is, for motions",
         "anchors": "chosen: all but the flap is held",
         "supports": f"chosen: it ends {BED_INSIDE * 1e3:g} mm inside the edge, so that a jaw gets around the edge",
         "supports.position": f"[m] its top {BED_GAP * 1e3:g} mm below the lowest of the organ above it",

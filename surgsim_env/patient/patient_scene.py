@@ -42,6 +42,9 @@ SPACING_STEP = 5e-4
 # From the front and above in a scan's axes; against the third axis of files whose axes have no stated meaning.
 APPROACH_SCAN: Vector = (0.0, math.sqrt(0.5), -math.sqrt(0.5))
 APPROACH_FILE: Vector = (0.0, 0.0, -1.0)
+# Where the head is, likewise; in files across the usual approach.
+CRANIAL_SCAN: Vector = (0.0, 0.0, 1.0)
+CRANIAL_FILE: Vector = (1.0, 0.0, 0.0)
 # A raster of more sites takes minutes: its spacing is then enlarged.
 SITES_MOST = 60
 # Least thickness of organ below a site, in press depths; the first that leaves any site is taken.
@@ -159,6 +162,7 @@ def _first_scene(
         lesion=None,
         demonstration=(),
         regions=tuple(TissueRegion(one, what.material, one in patient.lesions) for one, what in regions.items()),
+        cranial=CRANIAL_SCAN if patient.is_scan else CRANIAL_FILE,
     )
     # Normalises the approach, and refuses values out of range.
     scene = with_options(scene, replace(options, approach=approach, tip_radius=tip, press_depth=depth))

@@ -12,7 +12,7 @@ from msdm_core.mesh.quality import dihedral_angles, mesh_quality, radius_ratios
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from msdm_core.organ.compile import compile_organ
 from msdm_core.organ.stability import stable_dt
-from surgsim_env.palpation.surface_drawing import INK, PAPER, OrthographicView, Patches, curved_patches, draw_patches
+from surgsim_env.palpation.surface_drawing import INK, PAPER, OrthographicView, Patches, draw_patches, organ_patches
 from surgsim_env.patient.meshers import DIHEDRAL_SMALLEST
 from surgsim_env.patient.patient_scene import PatientScene
 from surgsim_env.patient.retract_scene import RetractScene, told
@@ -188,7 +188,7 @@ def organ_picture(found: PatientScene) -> bytes:
     figure = Figure(figsize=(13.5, 8.6), dpi=100, facecolor=PAPER, layout="constrained")
     axes = figure.subplots(2, 3)
     mesh = found.anatomy.mesh
-    patches = curved_patches(mesh.points, mesh.boundary_triangles)
+    patches = organ_patches(found.anatomy)
     colours = _outer_colours(found)[patches.origin]
     through = _through(found)
     for column, (along, up, of_scan, of_file) in enumerate(SIDES):

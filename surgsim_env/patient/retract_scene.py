@@ -374,6 +374,7 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
         palpation=PalpationSettings(press_depth=0.003, face_angle_deg=60.0),
         retract=_retract(found, bed_end),
         regions=tuple(replace(region, lesion=False) for region in patient.regions),
+        cranial=_vector(*(np.array(patient.cranial) @ rim.frame)),
     )
 
 

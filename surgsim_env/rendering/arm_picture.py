@@ -1,20 +1,30 @@
 """A picture of one arm with its meshes, its shaft in a trocar."""
 
+from itertools import product
+
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm import Arm
-from surgsim_env.rendering.cameras import Camera
+from surgsim_env.rendering.cameras import Camera, filling
 from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
 from surgsim_env.rendering.scene_model import shown_geoms
 
-SIZE, FIELD_OF_VIEW = (960, 720), 35.0
+SIZE, FIELD_OF_VIEW = (1600, 1200), 30.0
+# Share of the picture that the arm fills.
+SHARE = 0.94
+# The view is from beside the arm, by these amounts from the trocar's side and from above.
+AHEAD, ABOVE = 0.5, 0.35
+# Places of the shaft that should be seen: from the tip this many times as far as the trocar.
+SHAFT, SHAFT_PLACES = 3.0, 30
 TROCAR_RADIUS, TROCAR_COLOUR = 0.008, (0.95, 0.75, 0.2, 1.0)
+CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 
 def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
-    """A picture (720, 960, 3) of an arm at joint values (n,) [rad or m], its trocar as a yellow ball.
+    """A picture (1200, 1600, 3) of an arm at joint values (n,) [rad or m], its trocar as a yellow ball.
 
     Raises:
         NoGLError: there is no OpenGL; names the packages that are missing.
@@ -22,21 +32,31 @@ def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
     data = mujoco.MjData(arm.model)
     arm.write(data, joints)
     mujoco.mj_kinematics(arm.model, data)
-    shown = shown_geoms(arm.model)
-    places, radii = data.geom_xpos[shown], arm.model.geom_rbound[shown][:, None]
-    # A plane has no bounding radius.
-    low, high = (places - radii).min(axis=0, initial=np.inf), (places + radii).max(axis=0, initial=-np.inf)
-    low, high = np.minimum(low, arm.trocar), np.maximum(high, arm.trocar)
-    tip = arm.tip_pose(joints).position
-    low, high = np.minimum(low, tip), np.maximum(high, tip)
-    centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    up = arm.port.rotation[:, 2]
-    # From the side on which the arm is seen in its whole width, a little from above.
-    aside = np.cross(up, arm.trocar - places.mean(axis=0))
-    aside = aside / np.linalg.norm(aside) if np.linalg.norm(aside) > 1e-6 else arm.port.rotation[:, 1]
-    direction = aside + 0.4 * up
-    direction /= np.linalg.norm(direction)
-    position = centre + 1.05 * radius / np.sin(np.radians(0.5 * FIELD_OF_VIEW)) * direction
-    camera = Camera.looking(position, centre, up, FIELD_OF_VIEW)
+    tip, up = arm.tip_pose(joints).position, arm.port.rotation[:, 2]
+    points = np.concatenate([_box_corners(arm.model, data), [arm.trocar, tip]])
+    aside = np.cross(up, arm.trocar - points.mean(axis=0))
+    # Of an arm whose middle is above the trocar every side shows as much.
+    aside = aside / length if (length := float(np.linalg.norm(aside))) > 1e-6 else arm.port.rotation[:, 1]
+    shaft = tip + np.linspace(0.0, SHAFT, SHAFT_PLACES)[:, None] * (arm.trocar - tip)
+    directions = np.outer((1.0, -1.0), aside) + AHEAD * np.cross(aside, up) + ABOVE * up
+    cameras = [filling(points, one, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE) for one in directions]
+    camera = min(cameras, key=lambda one: _hidden(arm, data, shaft, one))
     ball = DrawnCapsule(np.stack([arm.trocar, arm.trocar]), TROCAR_RADIUS, TROCAR_COLOUR)
     return draw_still(None, [(arm.model, data)], [ball], [camera], SIZE)[0]
+
+
+def _hidden(arm: Arm, data: mujoco.MjData, places: FloatArray, camera: Camera) -> int:
+    """Number of places [m] (n, 3) of the shaft that the arm's other parts hide from a camera."""
+    body, geom = arm.model.body(arm.description.trocar.shaft_body).id, np.zeros(1, dtype=np.int32)
+    rays = [mujoco.mj_ray(arm.model, data, place, camera.position - place, None, 1, body, geom) for place in places]
+    return sum(0.0 <= ray < 1.0 for ray in rays)
+
+
+def _box_corners(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
+    """Corners [m] (n, 3) of boxes around the geoms that are shown."""
+    # A plane has no bounds.
+    shown = [geom for geom in shown_geoms(model) if model.geom_rbound[geom] > 0.0]
+    boxes = model.geom_aabb[shown]
+    local = boxes[:, None, :3] + CORNERS * boxes[:, None, 3:]
+    rotation = data.geom_xmat[shown].reshape(-1, 3, 3)
+    return (data.geom_xpos[shown][:, None] + np.einsum("gij,gcj->gci", rotation, local)).reshape(-1, 3)

@@ -107,6 +107,23 @@ def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, aspect: 
     return Camera.looking(target + distance * camera.rotation[:, 2], target, up, OVERVIEW_FOV)
 
 
+def filling(
+    points: FloatArray, direction: FloatArray, up: FloatArray, fov: float, aspect: float, share: float
+) -> Camera:
+    """The nearest camera in a direction that has all points [m] (n, 3) in the middle share of a picture.
+
+    With x a point's place across the view, z towards the camera, c and d the camera's, and t the share times the
+    tangent of half the angle of view, |x - c| <= t (d - z) for all points where t d is at least max(x + t z) - c and
+    max(t z - x) + c.
+    """
+    rotation = Camera.looking(direction, np.zeros(3), up, fov).rotation
+    seen = points @ rotation
+    room = share * math.tan(math.radians(0.5 * fov)) * np.array([aspect, 1.0])
+    high, low = ((sign * seen[:, :2] + room * seen[:, 2:]).max(axis=0) for sign in (1.0, -1.0))
+    position = rotation @ np.append(0.5 * (high - low), (0.5 * (high + low) / room).max())
+    return Camera.looking(position, position - rotation[:, 2], up, fov)
+
+
 def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
     """A level unit direction raised towards up by an angle [degrees]."""
     return level * math.cos(math.radians(angle)) + up * math.sin(math.radians(angle))

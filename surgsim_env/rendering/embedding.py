@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, hstack
 
-from msdm_core.errors import MeshError
-from msdm_core.mesh.carriers import REACH, find_carriers, node_gradients
+from msdm_core.mesh.carriers import node_gradients, surface_carriers
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.rendering.surface import TRIANGLES_MOST, DrawnSurface, drawn_surface
 from surgsim_env.scene.anatomy import Anatomy
@@ -80,17 +79,7 @@ def embedded_surface(vertices: FloatArray, faces: IntArray, mesh: TetMesh) -> Em
     Raises:
         MeshError: a vertex farther from the mesh's boundary than `msdm_core.mesh.carriers.REACH` allows; names it.
     """
-    found, triangles, nodes = find_carriers(vertices, mesh), mesh.boundary_triangles, mesh.boundary_nodes
-    far = np.flatnonzero(found.beyond)
-    if far.size:
-        worst = far[np.argmax(found.distance[far] / found.reach[far])]
-        x, y, z = vertices[worst] * 1e3
-        raise MeshError(
-            f"vertex {worst} of the fine surface, at {x:.1f}, {y:.1f}, {z:.1f} mm, is "
-            f"{found.distance[worst] * 1e3:.3g} mm from the boundary of the tets; the rule is at most "
-            f"{found.reach[worst] * 1e3:.3g} mm there, {REACH:g} of a tet's longest edge ({len(far)} of "
-            f"{len(vertices)} vertices break it): is it the surface of this organ, in the same axes and unit?"
-        )
+    found, triangles, nodes = surface_carriers(vertices, mesh), mesh.boundary_triangles, mesh.boundary_nodes
     corners = triangles[found.triangle]
     onto = vertices - found.nearest
     lever = found.weights[:, :, None] * (onto[:, None] + 0.5 * (found.nearest[:, None] - mesh.points[corners]))

@@ -64,6 +64,15 @@ class Anatomy:
 
         return read_surface(self.scene.folder / source.file, length_unit=source.length_unit)
 
+    @property
+    def outer_surface(self) -> Surface:
+        """The surface of the organ at rest that pictures show: the fine surface, else the boundary of the tets.
+
+        Raises:
+            MeshError: the fine surface cannot be read.
+        """
+        return self.fine_surface or (self.mesh.points, self.mesh.boundary_triangles)
+
     @cached_property
     def ground_motions(self) -> tuple[Motion, ...]:
         """How a unit of each motion of the scene moves what holds the organ."""

@@ -105,6 +105,7 @@ class PalpateTask(Task):
     * `instrument`: "probe", the name of an arm (`surgsim_env.list_arms()`, such as "psm_palpator") or the path of an
       arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
       its tip points along the scene's approach as far as its joints allow.
+    * `motion`: "none", "calm" or "free": how the patient breathes (docs/motion.md); by default as the scene says.
     * `level`: "easy", "standard" or "hard" (`surgsim_env.scene.levels`); None, the default: the scene's own ranges.
     * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
 

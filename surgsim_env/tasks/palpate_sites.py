@@ -97,6 +97,8 @@ class PalpateSitesTask(Task):
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "phantom".
+    * `motion`: "none", "calm" or "free": how the patient breathes (docs/motion.md); by default as the scene says.
+    * `track_motion`: a press goes with the surface as a camera's markers show it (default), or to where it is at rest.
     * `level`: "easy", "standard" (default) or "hard".
     * `memory`: observe all presses (default), or the last one alone.
     * `budget`: presses of an episode; by default 25, or 60 where the chart is longer than ten tip radii.

@@ -111,6 +111,7 @@ class RetractTask(Task):
     * `scene`: a scene's name or the path of a scene file with a `[retract]` table, or that names such a file, as
       those of `surgsim organ` do; default "lobe".
     * `instrument`: the scene's own by default, or the name of an arm with a jaw, or the path of its TOML file.
+    * `motion`: "none", "calm" or "free": how the patient breathes (docs/motion.md); by default as the scene says.
 
     ## Version History
     * v0: first version.

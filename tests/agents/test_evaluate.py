@@ -97,6 +97,22 @@ def test_who_sees_the_truth_scores_all_of_it_on_the_environment(tmp_path: Path) 
     assert figures["middle"]["error_mm"].value > 5.0
 
 
+def test_oracles_play_a_patient_who_moves(tmp_path: Path) -> None:
+    """Tracked or not, a result of its own each, at a place that names the motion."""
+    common = ["--scene", "phantom_small", "--motion", "calm", "--results", str(tmp_path)]
+    evaluate.main(["--agent", "oracle_palpate", "--episodes", "1", *common])
+    evaluate.main(["--agent", "oracle", "--episodes", "2", "--budget", "7", "--envs", "2", "--no-tracking", *common])
+    sites, task = sorted(load_results(tmp_path), key=lambda made: made.method)
+    sites, task = (sites, task) if sites.env_id == leaderboard.SITES else (task, sites)
+    assert task.place == "Palpate_phantom_small_standard_calm" and task.method == "oracle_palpate"
+    assert task.figures["success"].value == 1.0 and task.figures["hard_limit_share"].value == 0.0
+    assert sites.method == "oracle_untracked" and sites.env_kwargs["track_motion"] is False
+    assert sites.command.endswith("--budget 7 --motion calm --no-tracking")
+    assert 0.0 <= sites.figures["success"].value <= 1.0
+    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    assert "(standard, motion calm)" in (tmp_path / "board.md").read_text()
+
+
 def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, message in (
         (["--agent", "gp_ucb", "--episodes", "101"], "there are 1 to 100 evaluation seeds"),

@@ -1,5 +1,7 @@
 """The baselines of SurgSim/PalpateSites-v0, on maps made of bell curves: what they press, and that they find."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -93,6 +95,20 @@ def test_variance_reduction_fills_the_chart() -> None:
     places = played("gp_variance", Chart([(0.027, 0.013)]))
     gaps = np.linalg.norm(FACTS.sites[:, None] - places, axis=2).min(axis=1)
     assert gaps.max() < 0.010
+
+
+def test_the_oracle_presses_lesions_first() -> None:
+    """The true places, then where it is least certain."""
+    agent = find_agent("oracle")()
+    agent.reset(np.random.default_rng(0), FACTS)
+    truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
+    chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)
+    agent.see(SimpleNamespace(truth=truth, charted=SimpleNamespace(chart=chart)))
+    pressed = Chart([])
+    for _ in range(3):
+        pressed.press(agent.act(pressed.observation()))
+    np.testing.assert_allclose(pressed.places[:2], truth[:, :2], atol=1e-8)
+    assert np.linalg.norm(pressed.places[2] - truth[:, :2], axis=1).min() > 0.01
 
 
 def test_unknown_agents_are_refused() -> None:

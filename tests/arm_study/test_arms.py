@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from msdm_core.mesh.tet_mesh import TetMesh
 from surgsim_env.arm_study.clearance import TIP_ZONE
@@ -22,9 +23,11 @@ from surgsim_env.arm_study.ports import (
 from surgsim_env.arm_study.results import ArmReach
 from surgsim_env.arm_study.study import evaluate_arms, facing_points
 from surgsim_env.instruments.arm.arm import load_arm
+from surgsim_env.patient.fine_surface import split_edges
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.arm_description import read_description
 from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import FineSurface
 from tests.arm_study.pivot_arm import SITE, TABLE, write_pivot
 
 PORTS_FILE = """
@@ -307,6 +310,18 @@ def test_ports_too_far_off_reach_nothing(phantom, found):
     far = evaluate_arms(phantom, "psm_palpator", "psm_grasper", ports_from_table(up, name="far"), count=5)
     assert far.summary["reachable"]["either"] == 0.0
     assert found.summary["reachable"]["either"] > 0.5
+
+
+def test_pictures_show_the_fine_surface(phantom, tmp_path):
+    mesh, scene = phantom.mesh, phantom.scene
+    vertices, faces = split_edges(mesh.points, mesh.boundary_triangles, 0.004)
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "own.ply")
+    fine = FineSurface(str(tmp_path / "own.ply"), "m")
+    anatomy = load_anatomy(replace(scene, mesh=replace(scene.mesh, fine_surface=fine)))
+    one = evaluate_arms(anatomy, "psm_grasper", "psm_grasper", count=2)
+    assert len(one.surface_triangles) == len(faces) > len(mesh.boundary_triangles)
+    other = evaluate_arms(phantom, "psm_grasper", "psm_grasper", count=2)
+    np.testing.assert_array_equal(one.points, other.points)
 
 
 def test_progress_is_told(phantom):

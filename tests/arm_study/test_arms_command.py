@@ -78,6 +78,9 @@ def test_the_files_and_the_summary(folder, made, capsys):
     assert summary["compared"] == [] and summary["episodes"] == [] and summary["inputs"]["episodes"] == 0
     said = " ".join(capsys.readouterr().out.split())
     assert summary["verdict"] in said and "written: out/{report.html" in said
+    # Each step that takes seconds is named when it begins.
+    steps = ("drawing the arms ...", "drawing the maps ...")
+    assert [said.index(step) for step in steps] == sorted(said.index(step) for step in steps)
     assert made[0][0].ports.endoscope.point == (0.03, -0.02, 0.15)
 
 

@@ -9,10 +9,15 @@ import pytest
 from surgsim_env.coupling.motion import CYCLE_COUNT, draw_drive
 from surgsim_env.coupling.motion_kernels import signal_at
 from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.coupling.tracking import FRAME_DELAY, SurfaceTracker
+from surgsim_env.palpation.press import SitePress, press_alone, press_phases
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import CyclicMotion
+from surgsim_env.scene.motions import list_motions, make_motion, with_motion
 from surgsim_env.scene.save import scene_toml
+from surgsim_env.scripting import Hold, oracle_script, run_script
+from surgsim_env.scripting.steps import Tracked
 
 BREATH = CyclicMotion("breathing", (0.004, 0.0, 0.001), period=(0.5, 0.7), rise=0.3, fall=0.5, variation=0.1)
 BEAT = CyclicMotion(
@@ -88,6 +93,18 @@ def test_a_saved_state_continues_as_the_episode_did(env_id, scene_file):
     assert other.unwrapped.save_state() == env.unwrapped.save_state()
 
 
+def test_a_saved_retraction_continues_as_the_episode_did():
+    """On a lobe whose bed moves, as above."""
+    env, other = (gym.make("SurgSim/Retract-v0", motion="calm") for _ in range(2))
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    state, action = env.unwrapped.save_state(), env.action_space.sample()
+    expected = env.step(action)[0]
+    other.reset(seed=2)
+    other.unwrapped.load_state(state)
+    assert other.step(action)[0].tobytes() == expected.tobytes()
+
+
 @pytest.mark.parametrize("env_id", IDS)
 def test_organs_side_by_side_breathe_as_alone(env_id, scene_file):
     """Each lane its own cycles, to the bit."""
@@ -116,3 +133,156 @@ def test_what_a_scene_says_of_motion_is_checked(scene):
     ):
         with pytest.raises(ValueError, match=words):
             replace(BREATH, **changes)
+
+
+# ---- presets ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in list_motions() if name != "none"])
+def test_a_preset_moves_towards_feet_and_front(name):
+    """On the shipped liver, x to the left, y to the back, z to the head; a probe along z takes the front away."""
+    breathing, heartbeat = make_motion(name).motions
+    liver = with_motion(make_scene("liver"), name)
+    for motion, preset in zip(liver.motions, (breathing, heartbeat), strict=True):
+        assert motion.displacement == pytest.approx((0.0, -preset.anterior, -preset.caudal))
+    assert liver.motions[0].stops_in_apnoea and not liver.motions[1].stops_in_apnoea
+    along = replace(liver, instrument=replace(liver.instrument, approach=(0.0, 0.0, -1.0)))
+    assert with_motion(along, name).motions[0].displacement == pytest.approx((0.0, 0.0, -breathing.caudal))
+    # The heart moves the half nearer to the head, most at its end.
+    points = load_anatomy(liver).mesh.points
+    share = np.linalg.norm(liver.motions[1].ground(points).shift(points), axis=1)
+    height = points[:, 2]
+    assert share[height < height.min() + 0.2 * np.ptp(height)].max() == 0.0
+    assert height[share.argmax()] > height.max() - 0.2 * np.ptp(height)
+
+
+def test_motion_none_and_unknown_ones():
+    """ "none" takes away what a scene says, None keeps it, another name is refused with those that there are."""
+    scene = replace(make_scene("phantom_small"), motions=(BREATH,))
+    assert with_motion(scene, "none").motions == () and with_motion(scene, None) is scene
+    for env_id in gym.registry:
+        if env_id.startswith("SurgSim/"):
+            with pytest.raises(ValueError, match="motion 'clam' is unknown; the motions are none, calm, free; did you"):
+                gym.make(env_id, motion="clam")
+
+
+# ---- a surface that moves --------------------------------------------------------------------------------------------
+
+LONG = CyclicMotion("breathing", (0.004, 0.0, 0.0015), period=(4.0, 4.0), rise=0.4, fall=0.4)
+
+
+@pytest.fixture(scope="module")
+def breathing():
+    return load_anatomy(replace(make_scene("phantom_small"), name="long_breath", motions=(LONG,)))
+
+
+@pytest.fixture(scope="module")
+def still():
+    return load_anatomy(make_scene("phantom_small"))
+
+
+def test_an_organ_rests_on_its_moving_ground(breathing):
+    """Put there or brought there: the same place within 1 % of the way, without a jump of what is held."""
+    brought, put = Simulation(breathing), Simulation(breathing)
+    for simulation in (brought, put):
+        simulation.draw_motion(np.random.default_rng(3))
+    delay = float(brought.drive.delay[0])
+    elapsed = round(delay + 0.8, 3)
+    for _ in range(round(elapsed / 1e-3)):
+        assert brought.haptic_step()
+    put.restart(put.instrument.parked, elapsed=elapsed)
+    for _ in range(2):
+        way = np.linalg.norm(brought.ground_shift(np.zeros(3)))
+        assert way > 1e-3
+        apart = brought.organ_state.node_position - put.organ_state.node_position
+        assert np.abs(apart).max() < 0.01 * way
+        for _ in range(100):
+            assert brought.haptic_step() and put.haptic_step()
+        assert put.motion_time == pytest.approx(brought.motion_time)
+
+
+def test_a_saved_simulation_goes_on_with_its_motion(breathing):
+    """Its clock began later than its motions, as in a press after others."""
+    first, second = Simulation(breathing), Simulation(breathing)
+    first.draw_motion(np.random.default_rng(3))
+    first.restart(first.instrument.parked, elapsed=float(first.drive.delay[0]) + 0.5)
+    second.set_state(first.organ_model, first.get_state())
+    for _ in range(50):
+        assert first.haptic_step() and second.haptic_step()
+    assert first.organ_state.node_position.tobytes() == second.organ_state.node_position.tobytes()
+
+
+def test_a_press_goes_with_the_surface(breathing, still):
+    """Force and depth of a tracked press as on an organ that holds still; one that does not track misses in depth."""
+    site, normal = still.face.project(np.array([0.020, 0.020, 0.020]))
+    scene = still.scene
+    forces, depths = [], []
+    for anatomy, elapsed, tracks in ((still, 0.0, True), (breathing, 0.8, True), (breathing, 0.8, False)):
+        simulation = Simulation(anatomy)
+        simulation.draw_motion(np.random.default_rng(3))
+        elapsed += float(simulation.drive.delay[0]) if anatomy is breathing else 0.0
+        result = press_alone(SitePress(simulation, site, normal, elapsed=elapsed, tracks=tracks), press_phases(scene))
+        assert not result.fault
+        forces.append(float(result.force @ normal))
+        depths.append(result.depth)
+    assert depths[1] == pytest.approx(depths[0], rel=0.05) and forces[1] == pytest.approx(forces[0], rel=0.08)
+    # The surface has risen by a good millimetre below the tip that does not go with it.
+    assert depths[2] > depths[0] + 0.0008 and forces[2] > 1.2 * forces[0]
+
+
+def test_markers_foretell_an_even_motion(breathing):
+    """The nodes are moved by hand: what is seen is late, what is foretold is not."""
+    simulation = Simulation(breathing)
+    nodes = np.unique(breathing.face.triangles)
+    velocity = np.array([0.003, 0.0, -0.001])
+    simulation.organ_state.node_velocity[:] = velocity
+    tracker, rest = SurfaceTracker(simulation, nodes), simulation.organ_state.node_position.copy()
+    for step in range(1, 6):
+        simulation._step = 50 * step
+        # A tool that presses a tenth of the markers does not change what is seen.
+        simulation.organ_state.node_position[:] = rest + simulation.time * velocity
+        simulation.organ_state.node_position[nodes[: len(nodes) // 10], 2] -= 0.005
+        tracker.look()
+        expected = (simulation.time + FRAME_DELAY) * velocity
+        np.testing.assert_allclose(tracker.displacement(FRAME_DELAY), expected, atol=1e-4 * np.linalg.norm(velocity))
+
+
+def test_a_tracked_step_goes_with_the_surface(scene_file):
+    """While it holds, the tip stays over the tissue; without tracking it stays where it is."""
+    ways = []
+    for tracks in (True, False):
+        env = gym.make("SurgSim/Palpate-v0", scene="phantom_small", motion="calm")
+        env.reset(seed=5)
+        inner = env.unwrapped
+        inner.simulation.drive = inner.simulation.drive._replace(delay=np.zeros(2))
+        tracker = SurfaceTracker(inner.simulation, np.unique(inner.simulation.anatomy.face.triangles))
+        run = run_script(env, [Tracked(Hold(1.5), tracker) if tracks else Hold(1.5)])
+        moved = run.tip_position[-1] - run.tip_position[0]
+        ways.append(np.linalg.norm(moved - inner.simulation.ground_shift(np.array([0.02, 0.02, 0.02]))))
+        assert np.linalg.norm(inner.simulation.ground_shift(np.zeros(3))) > 0.003
+    assert ways[0] < 0.0006 and ways[1] > 0.003
+
+
+def test_a_target_lies_on_its_bed_that_moves():
+    """What the endoscope looks for, and what pictures show, goes with the bed; observed is its place at rest."""
+    env = gym.make("SurgSim/Retract-v0", motion="free").unwrapped
+    env.reset(seed=2)
+    place = env.task.target.centre.copy()
+    env.simulation.drive = env.simulation.drive._replace(delay=np.zeros(2))
+    for _ in range(16):
+        observation, *_ = env.step(np.zeros(env.action_space.shape))
+    shift = env.simulation.ground_shift(place)
+    assert np.linalg.norm(shift) > 0.002
+    np.testing.assert_allclose(env._shown().target.centre, place + shift)
+    np.testing.assert_allclose(observation[env.observation_slices["target_place"]], place[:2], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_oracles_that_track_succeed_on_a_calm_patient():
+    """`agents.evaluate --motion calm` has 100 episodes of each."""
+    for env_id, scene in (("Palpate", "phantom"), ("Retract", None)):
+        env = gym.make(f"SurgSim/{env_id}-v0", scene=scene, motion="calm")
+        for seed in range(5):
+            env.reset(seed=seed)
+            last = run_script(env, oracle_script(env, tracks=True)).infos[-1]
+            assert last["success"] and not last["hard_limit"]

@@ -137,6 +137,9 @@ def test_the_picture_shows_the_meshes(scope):
         pytest.skip(str(error))
     drawn = [(np.abs(image - image[0, 0]).sum(axis=2) > 30).sum() for image in (whole, less)]
     assert drawn[0] > 1.2 * drawn[1] > 0
+    # The arm fills the picture in one direction.
+    rows, columns = np.nonzero(np.abs(whole - whole[0, 0]).sum(axis=2) > 30)
+    assert max(np.ptp(rows) / whole.shape[0], np.ptp(columns) / whole.shape[1]) > 0.8
 
 
 def vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray:

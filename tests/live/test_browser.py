@@ -89,6 +89,18 @@ def seen_at(browser, page, place) -> tuple[float, float]:
     return box[0] + float(at[0, 0]), box[1] + float(at[0, 1])
 
 
+def drag_into_the_organ(browser, page) -> None:
+    """Drag the handle of the only tip down until the organ presses back."""
+    session = page.session
+    start = session.targets[0]
+    grip = start + 0.02 * session.directions[2]
+    down = grip - 0.030 * session.directions[2]
+    there = seen_at(browser, page, grip), seen_at(browser, page, down)
+    browser.drag(*there, lambda: np.linalg.norm(session.targets[0] - start) > 0.015)
+    browser.wait_until(lambda: not page._held and not page._grabs)
+    browser.wait_until(lambda: np.linalg.norm(session.frame()["force"][0]) > 0.05)
+
+
 def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium):
     session = served.session
     with chromium.page(WIDTH, HEIGHT) as browser:
@@ -101,14 +113,7 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
         rest = session.frame()["node"].copy()
         plot_before = browser.run(PLOT)
 
-        start = session.targets[0]
-        grip = start + 0.02 * session.directions[2]
-        down = start - 0.030 * session.directions[2]
-        x, y = seen_at(browser, served, grip)
-        to_x, to_y = seen_at(browser, served, down + 0.02 * session.directions[2])
-        browser.drag((x, y), (to_x, to_y), lambda: np.linalg.norm(session.targets[0] - start) > 0.015)
-        browser.wait_until(lambda: not served._held and not served._grabs)
-        browser.wait_until(lambda: np.linalg.norm(session.frame()["force"][0]) > 0.05)
+        drag_into_the_organ(browser, served)
         assert np.linalg.norm(session.frame()["node"] - rest, axis=1).max() > 0.001
         browser.wait_until(lambda: browser.run(PLOT) != plot_before)
         box = browser.run(f"(() => {{ const r = {CANVAS}; return [r.x, r.y, r.width, r.height]; }})()")
@@ -121,7 +126,7 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
         browser.wait_until(lambda: changed() > 0.01)
         after = picture(browser)
         # The organ is there: reddish, and shaded, not one flat colour.
-        red = after[(after[:, :, 0] > 1.6 * after[:, :, 2]) & (after[:, :, 0] > 60)]
+        red = after[is_red(after)]
         assert len(red) > 2000 and len(np.unique(red, axis=0)) > 50
 
         browser.click_on("Pause")
@@ -130,6 +135,50 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
         # viser's camera complains of its own way to hear the wheel.
         assert [one for one in browser.complaints() if "passive event listener" not in one] == []
     assert served._message_filter.dropped == 0 and served._message_filter.ignored == 0
+
+
+# Lengths of the arrays that the page hands to OpenGL.
+UPLOADS = """window.uploads = new Set();
+for (const name of ["bufferData", "bufferSubData"]) {
+  const real = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...given) {
+    for (const one of given) if (ArrayBuffer.isView(one)) window.uploads.add(one.length);
+    return real.apply(this, given);
+  };
+}"""
+
+
+def test_the_page_draws_a_fine_surface_and_paints_it(fine_scene, tmp_path, chromium):
+    with serving(fine_scene, tmp_path) as served, chromium.page(WIDTH, HEIGHT) as browser:
+        vertices, faces = served.session.anatomy.fine_surface
+        shown = f"window.uploads.has({3 * len(vertices)}) && window.uploads.has({3 * len(faces)})"
+        browser.before_pages(UPLOADS)
+        opened(browser, served)
+        # It draws in software and has said so: the boundary of the tets, until it is told otherwise. The lights stay
+        # plain, which saves a minute.
+        assert served._plain
+        browser.run("window.uploads.clear()")
+        browser.next_frame()
+        assert not browser.run(shown)
+        served._organ.plain = False
+        browser.wait_for(shown)
+        before = picture(browser)
+        drag_into_the_organ(browser, served)
+        browser.wait_until(lambda: served.felt.felt.any())
+        served.session.park()
+
+        def painted() -> int:
+            """Number of pixels that were the organ's red and are the blue of the map's softest part."""
+            after = picture(browser)
+            return int((is_red(before) & (after[:, :, 2] > after[:, :, 0])).sum())
+
+        browser.wait_until(lambda: painted() > 200)
+        assert [one for one in browser.complaints() if "passive event listener" not in one] == []
+
+
+def is_red(shot: np.ndarray) -> np.ndarray:
+    """Which pixels of a picture are of the organ."""
+    return (shot[:, :, 0] > 1.6 * shot[:, :, 2]) & (shot[:, :, 0] > 60)
 
 
 def test_both_arms_are_dragged_and_both_forces_shown(two_arms, chromium):

@@ -1,18 +1,13 @@
 """The page's organ with a scan's own surface: what is sent to a browser, and the paint on it. No browser is needed."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import trimesh
 
 from surgsim_env.live.stage import SCALE, FeltMap, OrganView
-from surgsim_env.patient.fine_surface import split_edges
 from surgsim_env.rendering.embedding import EmbeddedSurface, organ_surface
 from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import FineSurface
 
 
 class Sent:
@@ -27,16 +22,8 @@ class Sent:
 
 
 @pytest.fixture(scope="module")
-def anatomy(tmp_path_factory):
-    """The small phantom with a finer surface of its own block."""
-    scene = make_scene("phantom_small")
-    points = load_anatomy(scene).mesh.points
-    low, high = points.min(axis=0), points.max(axis=0)
-    box = trimesh.creation.box(high - low)
-    vertices, faces = split_edges(np.array(box.vertices) + 0.5 * (low + high), np.array(box.faces), 0.0015)
-    file = tmp_path_factory.mktemp("own") / "own.ply"
-    trimesh.Trimesh(vertices, faces, process=False).export(file)
-    return load_anatomy(replace(scene, mesh=replace(scene.mesh, fine_surface=FineSurface(str(file), "m"))))
+def anatomy(fine_scene):
+    return load_anatomy(fine_scene)
 
 
 @pytest.fixture

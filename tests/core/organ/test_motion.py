@@ -14,7 +14,7 @@ from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.foundation import Foundation
 from msdm_core.organ.measure import kinetic_energy, potential_energy, support_forces
-from msdm_core.organ.motion import Motion, ground_work, steer
+from msdm_core.organ.motion import Motion, ground_work, place_on_ground, steer
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 from msdm_core.organ.support import Support
@@ -93,6 +93,18 @@ def test_a_heartbeat_is_as_with_small_steps():
     excursion = np.abs(paths[1] - MESH.points[MARKER]).max()
     assert excursion > 3e-4
     assert np.abs(paths[0] - paths[1]).max() < 0.05 * excursion
+
+
+def test_an_organ_placed_on_moving_ground_goes_with_it():
+    """All of the ground moves evenly: no tissue strains, whatever the signal."""
+    model = compile_organ(replace(HELD, motions=(BREATH,)))
+    state = rest_state(model)
+    place_on_ground(model, state, [0.4], [0.5])
+    shift = np.array(BREATH.displacement)
+    np.testing.assert_allclose(state.node_position, MESH.points + 0.4 * shift, atol=1e-15)
+    signals = [0.4 + 0.5 * HAPTIC_STEP * number for number in range(1, 301)]
+    follow(model, state, signals, HAPTIC_STEP, 1)
+    np.testing.assert_allclose(state.node_position, MESH.points + signals[-1] * shift, atol=1e-9)
 
 
 def energy(model: OrganModel, state: OrganState, dt: float) -> float:

@@ -116,17 +116,17 @@ def _residual(
     met = np.linalg.norm(errors[0], axis=1) < PLACE_MET
     if wanted.trocar and not kinematics.arm.remote_centre_fixed:
         errors.append(kinematics.trocar - chain.near)
-        jacobians.append(_across(kinematics.shaft_jacobian(chain), chain.along))
+        jacobians.append(across(kinematics.shaft_jacobian(chain), chain.along))
         met &= np.linalg.norm(errors[-1], axis=1) < PLACE_MET
     if wanted.direction is not None:
         turn = turns_between(chain.direction, wanted.direction)
         errors.append(DIRECTION_WEIGHT * turn)
-        jacobians.append(DIRECTION_WEIGHT * _across(angular, chain.direction))
+        jacobians.append(DIRECTION_WEIGHT * across(angular, chain.direction))
         met &= np.linalg.norm(turn, axis=1) < ANGLE_MET
     return np.concatenate(errors, axis=1), np.concatenate(jacobians, axis=1), met
 
 
-def _across(jacobian: FloatArray, axis: FloatArray) -> FloatArray:
+def across(jacobian: FloatArray, axis: FloatArray) -> FloatArray:
     """The part of (n, 3, n_joint) across unit vectors (n, 3)."""
     return jacobian - axis[:, :, None] * np.einsum("ni,nij->nj", axis, jacobian)[:, None]
 

@@ -40,6 +40,7 @@ class BatchKinematics:
     Fields:
         arm: the arm
         lower, upper: limits [rad or m]                     (n_joint,)
+        hinge: whether a joint turns or slides              (n_joint,)
         shaft_index: shapes that the shaft's body carries   (k,)
         distal: whether a shape is the shaft's or beyond    (n_shape,)
         effort: largest torque or force of each joint [N m or N], inf where the model states none  (n_joint,)
@@ -56,7 +57,7 @@ class BatchKinematics:
         self._tip_position = model.site_pos[arm.tip_site].copy()
         self._tip_axis = _rotation(model.site_quat[arm.tip_site]) @ arm.tip_axis
         self.trocar, self._into = arm.trocar, -arm.port.rotation[:, 2]
-        self._hinge = np.array([model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE for j in self._joint_of])
+        self.hinge = np.array([model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE for j in self._joint_of])
         bodies = [int(model.jnt_bodyid[joint]) for joint in self._joint_of]
         self._moves_tip = np.array([body in _ancestors(model, self._tip_body) for body in bodies])
         self._moves_shaft = np.array([body in _ancestors(model, arm.shaft) for body in bodies])
@@ -102,7 +103,7 @@ class BatchKinematics:
                     continue  # a finger of the jaw, which stays closed
                 axes[:, index], anchors[:, index] = axis, anchor
                 value = joints[:, index] - model.qpos0[model.jnt_qposadr[joint]]
-                if self._hinge[index]:
+                if self.hinge[index]:
                     turn = turn @ _turns(model.jnt_axis[joint], value)
                     place = anchor - turn @ model.jnt_pos[joint]
                 else:
@@ -120,8 +121,8 @@ class BatchKinematics:
         return self._jacobian(chain, chain.near, self._moves_shaft)[0]
 
     def _jacobian(self, chain: Chain, point: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        turning = chain.axes * (self._hinge & moves)[:, None]
-        linear = cross(turning, point[:, None] - chain.anchors) + chain.axes * (~self._hinge & moves)[:, None]
+        turning = chain.axes * (self.hinge & moves)[:, None]
+        linear = cross(turning, point[:, None] - chain.anchors) + chain.axes * (~self.hinge & moves)[:, None]
         return np.swapaxes(linear, 1, 2), np.swapaxes(turning, 1, 2)
 
     def trocar_error(self, chain: Chain) -> FloatArray:

@@ -232,34 +232,44 @@ def _report(
 
 @dataclass(frozen=True)
 class BothArms:
-    """Which points both reach at once (n,), and the pair's smallest distances inside and outside the body [m] (n,)."""
+    """Points that both arms reach at once.
+
+    Fields:
+        reachable: which they are                                                       (n,)
+        inside, outside: the pair's smallest distances inside and outside the body [m]  (n,)
+        joints: of the left and the right arm in that pair [rad or m]                   (n, n_joint) each
+    """
 
     reachable: NDArray[np.bool_]
     inside: FloatArray
     outside: FloatArray
+    joints: tuple[FloatArray, FloatArray]
 
 
 def evaluate_both(left: Reach, right: Reach, points: FloatArray) -> BothArms:
     """Points that both arms reach at once: with the reported joints, else with the best of 6 x 6 other pairs."""
     inside, outside = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    joints = left.report.joints.copy(), right.report.joints.copy()
     rows = np.flatnonzero(left.report.reachable & right.report.reachable)
     if rows.size:
-        inside[rows], outside[rows] = _distances(
-            left, right, left.report.joints[rows], right.report.joints[rows], points[rows]
-        )
+        kinematics = left.kinematics, right.kinematics
+        inside[rows], outside[rows] = pair_distances(kinematics, (joints[0][rows], joints[1][rows]), points[rows])
     close = rows[np.minimum(inside[rows], outside[rows]) < ARM_DISTANCE]
     if close.size:
         # The widest of the pairs of candidates there.
-        ways = [_ways(arm, close) for arm in (left, right)]
+        other = [ways(arm, close) for arm in (left, right)]
         for first, second in product(range(WAYS), repeat=2):
-            near, far = _distances(left, right, ways[0][:, first], ways[1][:, second], points[close])
+            pair = other[0][:, first], other[1][:, second]
+            near, far = pair_distances((left.kinematics, right.kinematics), pair, points[close])
             wider = np.minimum(near, far) > np.minimum(inside[close], outside[close])
             inside[close[wider]], outside[close[wider]] = near[wider], far[wider]
+            for chosen, tried in zip(joints, pair, strict=True):
+                chosen[close[wider]] = tried[wider]
     with np.errstate(invalid="ignore"):
-        return BothArms(np.minimum(inside, outside) >= ARM_DISTANCE, inside, outside)
+        return BothArms(np.minimum(inside, outside) >= ARM_DISTANCE, inside, outside, joints)
 
 
-def _ways(arm: Reach, rows: NDArray) -> FloatArray:
+def ways(arm: Reach, rows: NDArray) -> FloatArray:
     """Joint values of usable candidates, the furthest from limits to the nearest, (len(rows), WAYS, n_joint)."""
     usable = arm.usable[rows]
     margin = np.where(usable, limit_margin(arm.kinematics, arm.candidates.joints[rows]), -np.inf)
@@ -270,13 +280,12 @@ def _ways(arm: Reach, rows: NDArray) -> FloatArray:
     return arm.candidates.joints[rows[:, None], chosen]
 
 
-def _distances(
-    left: Reach, right: Reach, left_joints: FloatArray, right_joints: FloatArray, points: FloatArray
+def pair_distances(
+    kinematics: tuple[BatchKinematics, BatchKinematics], joints: tuple[FloatArray, FloatArray], points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    sides = [
-        (arm.kinematics, arm.kinematics.at(joints)) for arm, joints in ((left, left_joints), (right, right_joints))
-    ]
-    return arm_distances(sides[0], sides[1], points)
+    """`arm_distances` of the left and the right arm at joint values (n, n_joint) each."""
+    first, second = ((one, one.at(values)) for one, values in zip(kinematics, joints, strict=True))
+    return arm_distances(first, second, points)
 
 
 def scaled_singular_values(kinematics: BatchKinematics, chain: Chain) -> FloatArray:

@@ -79,6 +79,109 @@ class ArmReach:
 
 
 @dataclass(frozen=True)
+class ArmThroughCycle:
+    """One arm while the organ moves, at every point, at the positions of `ThroughCycle` and the instants of its `time`.
+
+    What is along a path is NaN where the arm has none: it begins at rest where the arm reaches the point, keeps joint
+    limits and trocar at every position, and touches neither organ nor wall.
+
+    Fields:
+        reachable: at each position by itself, whatever the joints before      (n_position, n_point)
+        joints: along the path [m, rad]                                        (n_position, n_point, n_joint)
+        clearance: smallest distance from organ and wall along the path [m]    (n_position, n_point)
+        trocar_load: sideways force on the trocar at 1 N at the tip, along the path [N]   (n_position, n_point)
+        turn: largest turn of the tip's direction on the path [rad]            (n_point,)
+        speed: largest of each joint [rad/s or m/s]                            (n_point, n_joint)
+        acceleration: largest of each joint [rad/s^2 or m/s^2]                 (n_point, n_joint)
+        speed_share: largest share of a speed limit over all points and joints (n_instant,)
+        joint_names: base to tip
+        hinge: whether a joint turns or slides                                 (n_joint,)
+        speed_limit: [rad/s or m/s]                                            (n_joint,)
+    """
+
+    reachable: NDArray[np.bool_]
+    joints: FloatArray
+    clearance: FloatArray
+    trocar_load: FloatArray
+    turn: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+    speed_share: FloatArray
+    joint_names: tuple[str, ...]
+    hinge: NDArray[np.bool_]
+    speed_limit: FloatArray
+
+    @property
+    def always(self) -> NDArray[np.bool_]:
+        """Which points the arm reaches at every position, (n_point,)."""
+        return np.asarray(self.reachable.all(axis=0))
+
+    @property
+    def has_path(self) -> NDArray[np.bool_]:
+        """Which points the arm has a path for, (n_point,)."""
+        return np.isfinite(self.turn)
+
+    @property
+    def joint_share(self) -> FloatArray:
+        """Each joint's largest speed as a share of its limit, (n_point, n_joint)."""
+        return self.speed / self.speed_limit
+
+    @property
+    def follows(self) -> NDArray[np.bool_]:
+        """Which points the arm can follow: it has a path, and no joint is too slow for it, (n_point,)."""
+        return self.has_path & (np.nan_to_num(self.joint_share, nan=np.inf) <= 1.0).all(axis=1)
+
+    @property
+    def limiting(self) -> tuple[str, float]:
+        """The joint with the largest share of its speed limit, and that share; "" and NaN without a path."""
+        if not self.has_path.any():
+            return "", math.nan
+        most = np.nanmax(self.joint_share, axis=0)
+        return self.joint_names[int(most.argmax())], float(most.max())
+
+
+@dataclass(frozen=True)
+class ThroughCycle:
+    """Both arms on an organ that moves with its ground, each motion in its largest and quickest cycle.
+
+    Fields:
+        motions: their names, the one that moves the organ most first
+        travel: largest displacement of any point by each motion [m]                  (n_motion,)
+        period: of each [s]                                                           (n_motion,)
+        level: share of each motion's top at each position, in the order of `motions` (n_position, n_motion)
+        time: instants of a cycle of the first motion [s]                             (n_instant,)
+        course: share of its top then                                                 (n_instant,)
+        left, right: each arm
+        both: reachable by both at once at each position                              (n_position, n_point)
+    """
+
+    motions: tuple[str, ...]
+    travel: FloatArray
+    period: FloatArray
+    level: FloatArray
+    time: FloatArray
+    course: FloatArray
+    left: ArmThroughCycle
+    right: ArmThroughCycle
+    both: NDArray[np.bool_]
+
+    @property
+    def arms(self) -> tuple[tuple[str, ArmThroughCycle], tuple[str, ArmThroughCycle]]:
+        """Both arms with the names of their sides."""
+        return (SIDES[0], self.left), (SIDES[1], self.right)
+
+    @property
+    def both_always(self) -> NDArray[np.bool_]:
+        """Which points both reach at once at every position, (n_point,)."""
+        return np.asarray(self.both.all(axis=0))
+
+    @property
+    def alone(self) -> NDArray[np.bool_]:
+        """Positions at which all motions but the first rest, from rest to its top, (n_position,)."""
+        return np.asarray((self.level[:, 1:] == 0.0).all(axis=1))
+
+
+@dataclass(frozen=True)
 class ArmsEvaluation:
     """Both arms on one scene.
 
@@ -94,6 +197,7 @@ class ArmsEvaluation:
         surface_points, surface_triangles: the organ's outer surface, for pictures            (n, 3), (m, 3)
         pictures: RGB images (height, width, 3) uint8 of the arms in the patient, by caption
         ports: where the arms ("left", "right") and the camera ("endoscope") enter, for pictures; may be empty
+        cycle: both arms while the patient breathes; None for one who holds still
     """
 
     points: FloatArray
@@ -110,6 +214,7 @@ class ArmsEvaluation:
     surface_triangles: IntArray
     pictures: Mapping[str, NDArray[np.uint8]]
     ports: Mapping[str, Port] = field(default_factory=dict)
+    cycle: ThroughCycle | None = None
 
 
 @dataclass(frozen=True)
@@ -387,7 +492,25 @@ def columns(evaluation: ArmsEvaluation) -> list[Column]:
             )
     listed.append(Column("both", "1 where both arms reach the point at once, else 0"))
     listed.extend(Column(f"{field}_m", title) for field, title, _ in DISTANCES)
+    if evaluation.cycle is not None:
+        for side in SIDES:
+            listed.extend(Column(f"{side}_{name}", f"{side} arm: {meaning}") for name, meaning in CYCLE_COLUMNS)
+        listed.append(Column("both_always", "1 where both arms reach the point at once at every position, else 0"))
     return listed
+
+
+# Columns of points.csv of each arm while the patient breathes.
+CYCLE_COLUMNS = (
+    ("always", "1 where it reaches the point at every position of the cycle, else 0"),
+    ("follows", "1 where it can follow the point through the cycle, else 0"),
+    ("path_clearance_worst_m", "smallest clearance from organ and wall on the path along which it follows"),
+    ("path_clearance_median_m", "median over the positions of that clearance"),
+    ("path_trocar_load_worst_N", "largest sideways load on the trocar on that path at 1 N on the tip"),
+    ("path_trocar_load_median_N", "median over the positions of that load"),
+    ("path_turn_rad", "largest turn of the tip's direction on that path"),
+    ("speed_share", "largest share of any joint's speed limit that following takes"),
+    ("speed_joint", "the joint of that share"),
+)
 
 
 def write_points(evaluation: ArmsEvaluation, path: Path) -> None:
@@ -406,7 +529,22 @@ def write_points(evaluation: ArmsEvaluation, path: Path) -> None:
                 row += map(_cell, arm.joints[index])
             row.append(str(int(evaluation.both[index])))
             row.extend(_cell(getattr(evaluation, field)[index]) for field, _, _ in DISTANCES)
+            if evaluation.cycle is not None:
+                row.extend(_cycle_cells(evaluation.cycle, index))
             writer.writerow(row)
+
+
+def _cycle_cells(cycle: ThroughCycle, index: int) -> list[str]:
+    """The cells of a point under CYCLE_COLUMNS for each arm, and whether both reach it at every position."""
+    cells = []
+    for _, arm in cycle.arms:
+        has, share = bool(arm.has_path[index]), arm.joint_share[index]
+        cells += [str(int(arm.always[index])), str(int(arm.follows[index]))]
+        for values in (arm.clearance, arm.trocar_load):
+            worst = values[:, index].min() if values is arm.clearance else values[:, index].max()
+            cells += [_cell(worst), _cell(np.median(values[:, index]))]
+        cells += [_cell(arm.turn[index]), _cell(share.max()), arm.joint_names[int(share.argmax())] if has else ""]
+    return [*cells, str(int(cycle.both[:, index].all()))]
 
 
 def rank(candidates: Sequence[tuple[str, str, ArmsEvaluation]]) -> list[Ranked]:

@@ -26,6 +26,7 @@ from surgsim_env.arm_study.episodes import (
     run_episodes,
     what_was_run,
 )
+from surgsim_env.arm_study.following import make_cycle
 from surgsim_env.arm_study.joint_search import APPROACH_ANGLE, DIRECTION_COUNT, REACHED
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.arm_study.pictures import ArmMaps, draw_arms, write_given_pictures, write_pictures
@@ -62,6 +63,16 @@ from surgsim_env.arm_study.results import (
     worst_clearance,
     write_points,
 )
+from surgsim_env.arm_study.through_cycle import (
+    PICTURE_NAME,
+    cycle_clause,
+    cycle_section,
+    cycle_summary,
+    draw_cycle,
+    evaluate_cycle,
+    rank_cycle,
+)
+from surgsim_env.arm_study.tracked_press import TrackedPress, plain_presses, tracked_presses
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.palpation.job import package_version, plain_json
 from surgsim_env.rendering.gl import NoGLError
@@ -79,6 +90,7 @@ REPORT_NAME, POINTS_NAME, SUMMARY_NAME = "report.html", "points.csv", "summary.j
 # Every file that a study can write; which pictures there are depends on the arms, the episodes and OpenGL.
 RESULT_NAMES = (
     *(REPORT_NAME, POINTS_NAME, SUMMARY_NAME, "arms.png", "map_reach.png", "map_arm_distance.png"),
+    PICTURE_NAME,
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
     *(f"{name}_{number}.png" for name in ("arms", "episode") for number in range(1, 100)),
 )
@@ -98,6 +110,8 @@ def evaluate_arms(
     pictures: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
+
+    A scene with motions is evaluated through their cycle too: `ArmsEvaluation.cycle`.
 
     Args:
         scene: a scene's name, its TOML file, or what is loaded from these.
@@ -129,13 +143,27 @@ def evaluate_arms(
         load_arm(source, place.port, tip_radius=radius) for source, place in ((left, where.left), (right, where.right))
     )
     sites = _sites(anatomy, where, inner, count, seed)
-    organ, reaches = ClusteredSurface(mesh.points, mesh.boundary_triangles), []
+    organ, reaches, around = ClusteredSurface(mesh.points, mesh.boundary_triangles), [], []
+    # A patient who breathes is evaluated at several positions, of which the first is at rest.
+    motions = anatomy.scene.motions
+    at_rest = 1.0 / len(make_cycle(motions).level) if motions else 1.0
     for index, arm in enumerate(arms):
-        tell(f"the {SIDES[index]} arm at {len(sites.points)} points", 0.05 + 0.4 * index)
+        tell(f"the {SIDES[index]} arm at {len(sites.points)} points", at_rest * (0.05 + 0.4 * index))
         kinematics = BatchKinematics(arm)
-        reaches.append(evaluate_reach(kinematics, sites, Obstacles(organ, where, tip_ball(kinematics))))
-    tell("both arms at once", 0.85)
+        around.append(Obstacles(organ, where, tip_ball(kinematics)))
+        reaches.append(evaluate_reach(kinematics, sites, around[-1]))
+    tell("both arms at once", at_rest * 0.85)
     both = evaluate_both(reaches[0], reaches[1], sites.points)
+    cycle = None
+    if motions:
+        cycle = evaluate_cycle(
+            (reaches[0], reaches[1]),
+            both,
+            sites,
+            (around[0], around[1]),
+            anatomy,
+            lambda what, share: tell(what, at_rest + (0.95 - at_rest) * share),
+        )
     reports = reaches[0].report, reaches[1].report
     inputs = {
         "scene": anatomy.scene.name,
@@ -160,8 +188,10 @@ def evaluate_arms(
         surface_triangles=triangles,
         pictures={},
         ports=where.frames,
+        cycle=cycle,
     )
-    found = replace(found, summary=summarise(found, inner, inputs, seed))
+    cycle_figures = plain_json(cycle_summary(found), digits=12)
+    found = replace(found, summary={**summarise(found, inner, inputs, seed), **cycle_figures})
     if pictures:
         tell("pictures", 0.95)
         try:
@@ -353,8 +383,13 @@ def run_study(
     first = found[0]
     ranking = rank([(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
     episodes = scripted_episodes(setups[0], plan, console) if plan.episodes else None
-    said = " ".join(filter(None, (verdict(first), clause(episodes, first.scene))))
-    summary = {**_summary(first, plan, ranking), **plain_json(plain_episodes(episodes), digits=12), "verdict": said}
+    named = [(setup.name, one) for setup, one in zip(setups, found, strict=True)]
+    cycle_ranking, presses = rank_cycle(named), presses_through_cycle(setups[0], first, anatomy, plan, console)
+    said = _said(first, episodes)
+    played = plain_json({**plain_episodes(episodes), **plain_presses(presses)}, digits=12)
+    if first.cycle is not None:
+        played["cycle_compared"] = plain_json([one._asdict() for one in cycle_ranking], digits=12)
+    summary = {**_summary(first, plan, ranking), **played, "verdict": said}
     first = replace(first, summary=summary)
     (folder / SUMMARY_NAME).write_text(
         json.dumps(summary, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
@@ -368,6 +403,7 @@ def run_study(
     shown += "the target is green, arrows are the tissue's force on each tool."
     drawn = {} if episodes is None else episodes.pictures
     ends = write_given_pictures(drawn, folder, name="episode", description=shown)
+    curves = draw_cycle(first, folder)
     write_report(
         first,
         folder / REPORT_NAME,
@@ -377,6 +413,7 @@ def run_study(
         ranking=ranking,
         episodes=episodes,
         episode_pictures=ends,
+        cycle=cycle_section(first, cycle_ranking, presses, curves),
     )
     console.print(said, highlight=False)
     for one in ranking:
@@ -385,7 +422,13 @@ def run_study(
             f"smallest tip force {number_text(one.force, 1.0, 2, 'N')}"
         )
         console.print(f"{one.place}. {one.name}: {figures}; {one.reasons}", highlight=False)
-    return [REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps, *ends))]
+    return [REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps, *ends, *curves))]
+
+
+def _said(evaluation: ArmsEvaluation, episodes: Episodes | None) -> str:
+    """The first paragraph of a report."""
+    parts = verdict(evaluation), cycle_clause(evaluation), clause(episodes, evaluation.scene)
+    return " ".join(filter(None, parts))
 
 
 def evaluate(setup: ArmSetup, anatomy: Anatomy, plan: StudyPlan, console: Console, *, pictures: bool) -> ArmsEvaluation:
@@ -409,6 +452,16 @@ def scripted_episodes(setup: ArmSetup, plan: StudyPlan, console: Console) -> Epi
     seeds = range(plan.seed, plan.seed + plan.episodes)
     with _progress("episodes", console) as tell:
         return run_episodes(plan.instruments, (setup.left, setup.right), seeds, tell)
+
+
+def presses_through_cycle(
+    setup: ArmSetup, evaluation: ArmsEvaluation, anatomy: Anatomy, plan: StudyPlan, console: Console
+) -> list[TrackedPress]:
+    """Presses of a setup's arms on the moving organ, with a progress bar; none where the patient holds still."""
+    if evaluation.cycle is None:
+        return []
+    with _progress("presses", console) as tell:
+        return tracked_presses(plan.instruments, (setup.left, setup.right), evaluation, anatomy, tell)
 
 
 @contextmanager
@@ -452,6 +505,7 @@ def write_report(
     ranking: Sequence[Ranked] = (),
     episodes: Episodes | None = None,
     episode_pictures: Sequence[Picture] = (),
+    cycle: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report.
 
@@ -464,12 +518,13 @@ def write_report(
         ranking: of several placements or robots; left out if there is none.
         episodes: run by a script; left out if there are none.
         episode_pictures: the ends of episodes.
+        cycle: what `cycle_section` says of a patient who breathes; left out if there is none.
     """
     summary = evaluation.summary
     page = render_page(
         "arms.html.j2",
         title=f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)",
-        verdict=" ".join(filter(None, (verdict(evaluation), clause(episodes, evaluation.scene)))),
+        verdict=_said(evaluation, episodes),
         ranking=ranking,
         ranking_rule=RANKING_RULE,
         number_text=number_text,
@@ -483,6 +538,7 @@ def write_report(
         reasons=_reasons(evaluation),
         touches=_touches(evaluation),
         episodes=episodes and _episodes(episodes, evaluation.scene, episode_pictures),
+        cycle=cycle,
         definitions=_definitions(),
         columns=columns(evaluation),
         inputs=[(name.capitalize(), list(_flat(summary.get(name, {})))) for name in ("inputs", "versions")],

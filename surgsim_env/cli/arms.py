@@ -15,6 +15,7 @@ from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.arm_description import ArmDescription, read_description
 from surgsim_env.scene.load import make_scene, read_toml
+from surgsim_env.scene.motions import with_motion
 
 FEWEST_POINTS = 10
 # A file of --compare with one of these tables is a ports file, any other an arm.
@@ -45,6 +46,9 @@ class Arms:
     """Number of scripted episodes in which the arms lift a lobe and touch the target under it; 0: none."""
     seed: int = 0
     """Seed of the points and of the starts of the searches for joints."""
+    motion: str | None = None
+    """How the patient breathes: none, calm or free; by default as the scene says. Adds reach, clearance and following
+    through the cycle to the report (cycle.png)."""
     out: Path = Path("runs/arms")
     """Folder for the results."""
 
@@ -58,6 +62,8 @@ class Arms:
         if self.compare:
             words += ["--compare", *map(_shown, self.compare)]
         counts = ["--points", self.points, "--episodes", self.episodes, "--seed", self.seed]
+        if self.motion is not None:
+            counts += ["--motion", self.motion]
         return shlex.join([*words, *map(str, counts)])
 
     def run(self, console: Console) -> int:
@@ -69,7 +75,7 @@ class Arms:
         for name, least in (("points", FEWEST_POINTS), ("episodes", 0), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
-        anatomy = load_anatomy(make_scene(self.scene))
+        anatomy = load_anatomy(with_motion(make_scene(self.scene), self.motion))
         setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
         plan = StudyPlan(
             self.points, self.seed, self.episodes, (self.left, self.right), _inputs(self), self.command_line
@@ -135,6 +141,8 @@ def _inputs(command: Arms) -> dict[str, Any]:
         "right": _arm_input(command.right),
         "compare": [_file_input(Path(one)) if _is_ports_file(one) else _arm_input(one) for one in command.compare],
     }
+    if command.motion is not None:
+        inputs["motion"] = command.motion
     if command.ports is not None:
         inputs["ports"] = {"file": _shown(command.ports), **read_toml(command.ports, "ports")}
     return inputs

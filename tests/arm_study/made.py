@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from surgsim_env.arm_study.episodes import ArmsEpisode, Episodes, StandIn
-from surgsim_env.arm_study.results import ArmReach, ArmsEvaluation
+from surgsim_env.arm_study.results import ArmReach, ArmsEvaluation, ArmThroughCycle, ThroughCycle
 from surgsim_env.palpation.surface_drawing import tube
 from surgsim_env.scene.model import Port
 
@@ -105,4 +105,46 @@ def made_evaluation(
         surface_triangles=triangles,
         pictures={"both arms at one point, from the camera": PICTURE} if pictures else {},
         ports=PORTS,
+    )
+
+
+def made_follower(generator, reachable, *, quickest=0.5):
+    """An arm at three positions: it loses a tenth of its points at the top, and has a path for the others."""
+    count = len(reachable)
+    each = np.stack([reachable, reachable, reachable & (generator.random(count) > 0.1)])
+    path = np.asarray(each.all(axis=0))
+    names, limit = ("yaw", "pitch", "insertion"), np.array([2.0, 1.0, 0.4])
+    speed = np.where(path[:, None], generator.uniform(0.1, quickest, (count, 3)) * limit, np.nan)
+    return ArmThroughCycle(
+        reachable=each,
+        joints=np.where(path[:, None], generator.uniform(-1.0, 1.0, (3, count, 3)), np.nan),
+        clearance=np.where(path, generator.uniform(0.001, 0.01, (3, count)), np.nan),
+        trocar_load=np.where(path, generator.uniform(0.5, 2.0, (3, count)), np.nan),
+        turn=np.where(path, 0.1, np.nan),
+        speed=speed,
+        acceleration=4.0 * speed,
+        speed_share=quickest * np.sin(np.linspace(0.0, math.pi, 11)),
+        joint_names=names,
+        hinge=np.array([True, True, False]),
+        speed_limit=limit,
+    )
+
+
+def made_cycle(evaluation, *, seed=0, quickest=0.5):
+    """A breath at rest, half way and at the top, for the points of an evaluation."""
+    generator = np.random.default_rng(seed)
+    left, right = (
+        made_follower(generator, arm.reachable, quickest=quickest) for arm in (evaluation.left, evaluation.right)
+    )
+    time = np.linspace(0.0, 4.0, 11)
+    return ThroughCycle(
+        motions=("breathing",),
+        travel=np.array([0.0096]),
+        period=np.array([4.0]),
+        level=np.array([[0.0], [0.5], [1.0]]),
+        time=time,
+        course=np.sin(0.25 * math.pi * time) ** 2,
+        left=left,
+        right=right,
+        both=evaluation.both & left.reachable & right.reachable,
     )

@@ -136,6 +136,14 @@ def test_the_command_in_the_report_makes_it_again(folder, made):
     assert (folder / "again" / "report.html").read_bytes() == (folder / "out" / "report.html").read_bytes()
 
 
+@pytest.mark.usefixtures("few_maps")
+def test_how_the_patient_moves_is_an_input(folder, made):
+    assert main(arguments("--motion", "calm")) == 0
+    summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["inputs"]["motion"] == "calm"
+    assert made[0][1].command.endswith("--seed 0 --motion calm")
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_maps")
 def test_compare_ranks_ports_and_robots(folder, made, capsys):
@@ -238,6 +246,7 @@ def test_a_urdf_whose_mesh_is_missing_is_refused(folder, made, capsys):
         (["--scene", "lever"], "scene 'lever' is unknown"),
         (["--scene", "nowhere.toml"], "nowhere.toml cannot be read"),
         (["--compare", "psm_grabber"], "--compare: arm 'psm_grabber' is unknown"),
+        (["--motion", "clam"], "motion 'clam' is unknown; the motions are none, calm, free; did you mean 'calm'?"),
         (["--out", "ports.toml"], "--out ports.toml: cannot be written"),
         (["--out", "/proc/nothing"], "--out /proc/nothing: cannot be written"),
     ],

@@ -24,7 +24,7 @@ from surgsim_env.coupling.motion import draw_drive, go_on, hold, signals
 from surgsim_env.coupling.mujoco_library import runs_compiled
 from surgsim_env.instruments.instrument import Grasp, Instrument, read_grasp
 from surgsim_env.instruments.make import make_instrument
-from surgsim_env.instruments.tool_bodies import check_tool_masses
+from surgsim_env.instruments.tool_bodies import check_tool_masses, place_supports
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import substeps_needed
 
@@ -229,6 +229,7 @@ class Simulation:
         self._step, self._motion_start = 0, round(elapsed / self.haptic_dt)
         self._begin_course()
         self._rest_on_ground()
+        self._place_supports()
         state.volume_ratio_smallest[:] = 1.0
         self.instrument.place(tip_position)
         self._wrench[:] = 0.0
@@ -327,6 +328,7 @@ class Simulation:
         if self._breath_ends:
             self._hold()
         self.drive.step_count[0] = self._motion_start + self._step
+        self._place_supports()
 
     def ground_shift(self, points: ArrayLike, elapsed: float | None = None) -> FloatArray:
         """How far the motions have moved the ground from where it was at rest [m], of the shape of the points.
@@ -340,6 +342,13 @@ class Simulation:
         for signal, motion in zip(now, self.anatomy.ground_motions, strict=True):
             shift += signal * motion.shift(points).reshape(shift.shape)
         return shift
+
+    def _place_supports(self) -> None:
+        """Move the supports that tools meet with the ground; they stay there until it is called again."""
+        supports = self.anatomy.scene.supports
+        if supports and self.anatomy.scene.motions:
+            shift = self.ground_shift(np.array([one.position for one in supports]))
+            place_supports(self.instrument.model, self.instrument.data, supports, shift)
 
     def _hold(self) -> None:
         """Let the breath end its present cycle; once that is over no cycle is left, as they all come again."""

@@ -159,7 +159,7 @@ def _compile_probe(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco
     tip.quat = _rotation_from_down(np.asarray(scene.instrument.approach))
     for axis, name in enumerate(SLIDES):
         spec.joint(f"slide_{name}").range = [lower[axis], upper[axis]]
-    add_supports(spec, scene.supports)
+    add_supports(spec, scene.supports, moving=bool(scene.motions))
     return spec.compile()
 
 
@@ -182,7 +182,7 @@ def _compile_grasper(scene: Scene, rotation: FloatArray) -> mujoco.MjModel:
     for name in SLIDES:
         # The box limits the tip; the slides' positions depend on the hinge too.
         spec.joint(f"slide_{name}").range = [-10.0, 10.0]
-    add_supports(spec, scene.supports)
+    add_supports(spec, scene.supports, moving=bool(scene.motions))
     return spec.compile()
 
 

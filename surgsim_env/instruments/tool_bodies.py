@@ -182,10 +182,11 @@ class ToolBodies:
         )
 
 
-def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support]) -> None:
+def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support], *, moving: bool = False) -> None:
     """Add supports to a model's world as geoms `support_NAME`, in the scene's frame; its tools then meet them.
 
-    Without supports nothing changes. Call it after every geom has its group and the world its final frame.
+    Supports that move are bodies of the same names, which `place_supports` moves. Without supports nothing changes.
+    Call it after every geom has its group and the world its final frame.
     """
     if not supports:
         return
@@ -195,10 +196,12 @@ def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support]) -> None:
         if geom.group == CONTACT_GROUP:
             geom.conaffinity |= SUPPORT_BIT
     for support in supports:
-        spec.worldbody.add_geom(
-            name=SUPPORT_PREFIX + support.name,
+        name = SUPPORT_PREFIX + support.name
+        body = spec.worldbody.add_body(name=name, mocap=True, pos=support.position) if moving else spec.worldbody
+        body.add_geom(
+            name=name,
             type=_GEOMS[support.kind],
-            pos=support.position,
+            pos=(0.0, 0.0, 0.0) if moving else support.position,
             quat=support.quaternion,
             # Half sizes of 0 draw an infinite plane.
             size=(*support.size, 0.0, 0.0, 0.0)[:3] if support.kind != "plane" else (0.0, 0.0, 0.05),
@@ -212,6 +215,13 @@ def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support]) -> None:
             solimp=SOLIMP,
             rgba=SUPPORT_COLOUR,
         )
+
+
+def place_supports(model: mujoco.MjModel, data: mujoco.MjData, supports: Sequence[Support], shift: FloatArray) -> None:
+    """Move supports that were added as ones that move from their places by shifts [m] (n_support, 3)."""
+    for support, way in zip(supports, shift, strict=True):
+        body = model.body(SUPPORT_PREFIX + support.name).mocapid[0]
+        data.mocap_pos[body] = np.asarray(support.position) + way
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from surgsim_env.live.exchange_records import (
     encoded,
 )
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
-from surgsim_env.rendering.scene_model import is_support, shown_geoms
+from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.model import Scene
 
@@ -168,8 +168,6 @@ class Physics:
         settings = HapticSettings(approach_speed=APPROACH_SPEED, speed_largest=SPEED_LARGEST, breath_button=BREATH_BIT)
         self._loop = HapticLoop(self._simulation, self._hands, settings)
         self._geoms = np.array(shown_geoms(instrument.model), dtype=np.int64)
-        # Which of them are supports; these go with the ground.
-        self._grounded = np.array([is_support(instrument.model, geom) for geom in self._geoms.tolist()], dtype=np.bool_)
         self._pacer = Pacer(pace, exchange.timing.peek)
         self._phase, self._said = Phase.RUNNING, ""
         self._recording = False
@@ -359,9 +357,7 @@ class Physics:
                 frame["pushed"][arm], frame["share"][arm] = tip.force, tip.share
                 frame["limited"][arm] = tip.clamped or tip.workspace_limited
             frame["node"] = simulation.organ_state.node_position[:, :3]
-            places = data.geom_xpos[self._geoms]
-            places[self._grounded] += simulation.ground_shift(places[self._grounded])
-            frame["geom"], frame["turn"] = places, data.geom_xmat[self._geoms]
+            frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
 
 
 # Unix niceness (scheduling priority); values below 0 need the right to set them.

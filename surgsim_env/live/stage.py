@@ -14,7 +14,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.palpation.touches import Indenter
 from surgsim_env.rendering.cameras import Camera, scene_cameras
 from surgsim_env.rendering.embedding import boundary_surface, organ_surface
-from surgsim_env.rendering.scene_model import geom_colour, mesh_rows
+from surgsim_env.rendering.scene_model import geom_colour, is_support, mesh_rows
 from surgsim_env.rendering.tissue import lesion_ball
 from surgsim_env.scene.anatomy import Anatomy
 
@@ -332,7 +332,7 @@ class InstrumentView:
             node = _add(scene, f"/instrument/{place}", model, geom)
             self.nodes.append(node)
             body = model.body(int(model.geom_bodyid[geom])).name
-            fixed = int(model.geom_bodyid[geom]) == 0
+            fixed = int(model.geom_bodyid[geom]) == 0 or is_support(model, geom)
             self.arms.append(None if fixed else int(arm_count > 1 and body.startswith("right_")))
 
     def follow(self, position: NDArray[np.float32], rotation: NDArray[np.float32]) -> None:

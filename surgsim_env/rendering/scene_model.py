@@ -322,8 +322,10 @@ def _is_drawn(model: mujoco.MjModel, geom: int) -> bool:
 
 
 def is_support(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether a geom is a support of the organ, which goes with its ground."""
-    return int(model.geom_bodyid[geom]) == 0 and model.geom(geom).name.startswith(SUPPORT_PREFIX)
+    """Whether a geom is a support of the organ."""
+    body = int(model.geom_bodyid[geom])
+    in_world = body == 0 or model.body_mocapid[body] >= 0
+    return in_world and model.geom(geom).name.startswith(SUPPORT_PREFIX)
 
 
 def _name(model: mujoco.MjModel, geom: int, prefix: str) -> str:

@@ -385,3 +385,23 @@ def test_oracles_that_track_succeed_on_a_calm_patient():
             env.reset(seed=seed)
             last = run_script(env, oracle_script(env, tracks=True)).infos[-1]
             assert last["success"] and not last["hard_limit"]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "instrument"), [("Retract", None), ("Retract", "psm_retractor"), ("BimanualRetract", None)]
+)
+def test_tools_meet_supports_where_these_have_moved(env_id, instrument):
+    """MuJoCo's bed, which tools touch and pictures show, is where the organ's is, to the way of a control step."""
+    env = gym.make(f"SurgSim/{env_id}-v0", motion="free", instrument=instrument).unwrapped
+    env.reset(seed=2)
+    simulation = env.simulation
+    bed = simulation.instrument.model.geom("support_bed").id
+    at_rest = np.array(simulation.anatomy.scene.supports[0].position)
+    simulation.instrument.refresh()
+    np.testing.assert_allclose(simulation.instrument.data.geom_xpos[bed], at_rest, atol=1e-12)
+    simulation.drive = simulation.drive._replace(delay=np.zeros(2))
+    for _ in range(16):
+        before = simulation.ground_shift(at_rest)
+        env.step(np.zeros(env.action_space.shape))
+    assert np.linalg.norm(before) > 0.002
+    np.testing.assert_allclose(simulation.instrument.data.geom_xpos[bed], at_rest + before, atol=1e-9)

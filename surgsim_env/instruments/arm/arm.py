@@ -156,6 +156,7 @@ def load_arm(
     tip_radius: float | None = None,
     timestep: float = 0.001,
     supports: Sequence[Support] = (),
+    supports_move: bool = False,
 ) -> Arm:
     """Load an arm with its trocar at a port, by default at the world's origin.
 
@@ -164,14 +165,15 @@ def load_arm(
         port: where the arm enters the body.
         tip_radius: of the tip's ball [m]; by default the model's.
         timestep: of MuJoCo [s].
-        supports: fixed bodies in the world that its tools touch.
+        supports: bodies in the world that its tools touch.
+        supports_move: whether these move with the organ's ground.
 
     Raises:
         ValueError: a wrong entry (names the arm, the entry and the remedy).
     """
     description = source if isinstance(source, ArmDescription) else read_description(source)
     port = port or Port()
-    arm = Arm(description, port, compile_arm(description, port, tip_radius, timestep, supports))
+    arm = Arm(description, port, compile_arm(description, port, tip_radius, timestep, supports, supports_move))
     _check_trocar(arm)
     return arm
 

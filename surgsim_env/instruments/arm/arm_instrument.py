@@ -172,6 +172,7 @@ def load_scene_arm(anatomy: Anatomy, name: str, port: Port) -> Arm:
         tip_radius=scene.instrument.tip_radius,
         timestep=scene.timing.haptic_step,
         supports=scene.supports,
+        supports_move=bool(scene.motions),
     )
 
 

@@ -28,7 +28,12 @@ SHAPE_COLOUR = (0.72, 0.74, 0.78, 1.0)
 
 
 def compile_arm(
-    description: ArmDescription, port: Port, tip_radius: float | None, timestep: float, supports: Sequence[Support] = ()
+    description: ArmDescription,
+    port: Port,
+    tip_radius: float | None,
+    timestep: float,
+    supports: Sequence[Support] = (),
+    supports_move: bool = False,
 ) -> mujoco.MjModel:
     """Compile the model of an arm alone with its trocar at a port; `tip_radius` [m] overrides that of the tip's ball.
 
@@ -41,7 +46,7 @@ def compile_arm(
     try:
         with warned(where):
             spec = arm_spec(description, port, tip_radius, timestep)
-            add_supports(spec, supports)
+            add_supports(spec, supports, moving=supports_move)
             model = spec.compile()
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None

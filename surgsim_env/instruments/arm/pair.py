@@ -182,7 +182,7 @@ def _compile(arms: dict[str, Arm], scene: Scene) -> mujoco.MjModel:
         spec.attach(child, prefix=f"{side}_", frame=spec.worldbody.add_frame())
         for name, value in rough.items():
             spec.add_numeric(name=f"{ROUGHNESS}{side}_{name.removeprefix(ROUGHNESS)}", data=value, size=1)
-    add_supports(spec, scene.supports)
+    add_supports(spec, scene.supports, moving=bool(scene.motions))
     for name, support in product(arms["right"].description.contact, scene.supports):
         friction = [support.friction, support.friction, 0.005, 1e-4, 1e-4]
         touch = {"solref": TOUCH_SOFTNESS, "solimp": SOLIMP, "friction": friction, "condim": 3}

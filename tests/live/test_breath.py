@@ -109,7 +109,8 @@ def test_supports_are_drawn_where_the_ground_carries_them_and_other_parts_are_no
     for _ in range(40):
         bench.step(10, bench.above)
         shift = bench.physics._simulation.organ_state.motion[:, SIGNAL] @ [BREATH.displacement, BEAT.displacement]
-        np.testing.assert_allclose(bench.frame["geom"][place], np.array(bed.position) + shift, atol=1e-8)
+        # As it was at the start of the last haptic step, in which the ground moves by less than this.
+        np.testing.assert_allclose(bench.frame["geom"][place], np.array(bed.position) + shift, atol=5e-5)
         others = np.arange(len(geoms)) != place
         there = bench.physics._simulation.instrument.data.geom_xpos[np.array(geoms)[others]]
         np.testing.assert_allclose(bench.frame["geom"][others], there, atol=1e-8)

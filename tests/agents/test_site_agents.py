@@ -8,12 +8,12 @@ import pytest
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents.evaluate import find_agent
 from agents.scoring.site_agent import SiteFacts
-from agents.site_search import AGENTS, REFERENCES
+from agents.site_search import AGENTS, BOUNDS
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
 pytestmark = pytest.mark.agents
 FACTS = SiteFacts(extent=(0.04, 0.04), site_count=13, tip_radius=0.008, noise=0.05, budget=25)
-NAMES = [name for name in AGENTS if name not in REFERENCES]
+NAMES = [name for name in AGENTS if name not in BOUNDS]
 
 
 class Chart:
@@ -97,18 +97,35 @@ def test_variance_reduction_fills_the_chart() -> None:
     assert gaps.max() < 0.010
 
 
-def test_the_oracle_presses_lesions_first() -> None:
-    """The true places, then where it is least certain."""
+def test_the_oracle_presses_lesions_then_where_the_estimate_is_wrong() -> None:
+    """A lesion that is missed is pressed beside; so is an estimate where there is none; else it searches."""
     agent = find_agent("oracle")()
     agent.reset(np.random.default_rng(0), FACTS)
     truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
     chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)
-    agent.see(SimpleNamespace(truth=truth, charted=SimpleNamespace(chart=chart)))
+    task = SimpleNamespace(
+        truth=truth,
+        estimated=truth,
+        tip_scale=1.0,
+        charted=SimpleNamespace(chart=chart),
+        estimator=SimpleNamespace(tip_radius=FACTS.tip_radius),
+    )
+    agent.see(task)
     pressed = Chart([])
-    for _ in range(3):
+
+    def press() -> np.ndarray:
         pressed.press(agent.act(pressed.observation()))
-    np.testing.assert_allclose(pressed.places[:2], truth[:, :2], atol=1e-8)
-    assert np.linalg.norm(pressed.places[2] - truth[:, :2], axis=1).min() > 0.01
+        return pressed.places[-1]
+
+    for lesion in truth:
+        np.testing.assert_allclose(press(), lesion[:2], atol=1e-8)
+    assert np.linalg.norm(press() - truth[:, :2], axis=1).min() > 0.01
+    # The second one is missed, and one is found that is not there.
+    false = np.array([0.030, 0.008, 0.0])
+    task.estimated = np.array([truth[0] + [0.002, 0.0, 0.0], false])
+    assert np.linalg.norm(press() - truth[1, :2]) == pytest.approx(0.75 * FACTS.tip_radius)
+    task.estimated = np.array([*truth, false])
+    np.testing.assert_allclose(press(), false[:2], atol=1e-8)
 
 
 def test_unknown_agents_are_refused() -> None:

@@ -15,13 +15,11 @@ from scipy.stats import qmc
 from agents.scoring.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
 from surgsim_env.palpation.lesion_estimator import EXCESS_LEAST, EXCESS_LEAST_NOISE
 from surgsim_env.palpation.scores import MapScore
-from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR, PalpateSitesTask
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 # Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
 UCB_BETA = 3.0
 LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
-# Where the oracle presses, one after the other, on and beside a place where the estimate is wrong [tip radii].
-AROUND = 0.75 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
 class RandomSites:
@@ -136,34 +134,22 @@ class GpLevelSet(GpVariance):
 
 
 class OracleSites(GpVariance):
-    """Presses the true lesions, then where the estimate is wrong, else where the process is least certain.
+    """Presses where the process is least certain, and the true lesions last.
 
-    It bounds what presses and the common estimator allow an agent that knows the truth.
+    It bounds what presses and the common estimator allow. Pressing around the lesions is worse: it leaves too few
+    presses elsewhere to tell the healthy tissue's background.
     """
 
     def see(self, task: PalpateSitesTask) -> None:
-        """Take the task, with the truth of the episode that `reset` has begun."""
-        self.task, self.tries = task, dict[bytes, int]()
-        self.waiting = list(task.truth)
+        """Take the truth of the episode that `reset` has begun."""
+        places = [task.charted.chart.place(point) for point in task.truth]
+        self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in places]
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
         """Where to press next."""
-        wrong = self.waiting or self._wrong()
-        if not wrong:
-            return super().act(observation)
-        point = wrong[0]
-        self.waiting = self.waiting[1:]
-        chart, key = self.task.charted.chart, np.round(point, 3).tobytes()
-        aside = AROUND[self.tries.get(key, 0) % len(AROUND)]
-        self.tries[key] = self.tries.get(key, 0) + 1
-        step = self.task.estimator.tip_radius / (0.5 * chart.extent) * aside
-        return np.clip(chart.place(point) + step, -1.0, 1.0).astype(np.float32)
-
-    def _wrong(self) -> list[NDArray[np.float64]]:
-        """Lesions [m] (3,) that the estimate misses, and estimates where there is none."""
-        truth, estimated = self.task.truth, self.task.estimated
-        near = np.linalg.norm(truth[:, None] - estimated, axis=2) <= SUCCESS_ERROR * self.task.tip_scale
-        return [*truth[~near.any(axis=1)], *estimated[~near.any(axis=0)]]
+        left = self.process.facts.budget - self.count
+        action = super().act(observation)
+        return self.places[left - 1] if left <= len(self.places) else action
 
 
 class TruthAgent:

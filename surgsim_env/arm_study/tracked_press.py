@@ -113,7 +113,8 @@ def _played(simulation: Simulation, planned: TrackedPress, evaluation: ArmsEvalu
     scene, cycle = simulation.anatomy.scene, evaluation.cycle
     assert cycle is not None
     timing, cycle_time = scene.timing, float(cycle.period[0])
-    hold = PressPhase(timing.haptic_steps_per_control, False, scene.limits.hard_force, read=True)
+    count = timing.haptic_steps_per_control
+    hold = PressPhase(count, False, scene.limits.hard_force, read=True, command=count)
     phases = [one for one in press_phases(scene) if one.inward]
     phases += [hold] * math.ceil(cycle_time / timing.control_step)
     # Before its first cycle a motion rests for up to one period.

@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 
-# A picture is evaluated this long after it was taken, and its markers' speed is read over as long [s].
-FRAME_DELAY = 0.05
+# A picture is evaluated this long after it was taken, and its markers' speed is read over as long [s]; chosen: two
+# pictures of an endoscope with 60 a second.
+FRAME_DELAY = 1.0 / 30.0
 
 
 class SurfaceTracker:

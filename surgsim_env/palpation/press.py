@@ -4,7 +4,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from surgsim_env.scene.model import Limits, Scene
 PRESS_SPEED = 0.04
 HOLD_TIME = 0.10
 AVERAGE_TIME = 0.04
+# A tip that follows a surface is commanded this often [s].
+FOLLOWING_TIME = 0.010
 # Interval of the readings that `press_phases` averages [s]; `recorded_phases` reads every haptic step.
 READING_TIME = 0.010
 
@@ -34,14 +36,15 @@ class PressPhase:
         inward: the tip moves inward; else it rests.
         force_limit: contact force [N] that ends the phase with the haptic step that exceeds it.
         read: force and depth are read at its end.
-        command: the instrument's velocity is commanded at its start; False continues the previous command.
+        command: haptic steps until the instrument's velocity is commanded again, from the phase's start; 0 continues
+            the previous command.
     """
 
     count: int
     inward: bool
     force_limit: float
     read: bool = False
-    command: bool = True
+    command: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,26 +113,28 @@ def press_phases(scene: Scene) -> tuple[PressPhase, ...]:
     inward, hold, longest = _step_counts(scene)
     apart, readings = max(1, round(READING_TIME / scene.timing.haptic_step)), round(AVERAGE_TIME / READING_TIME)
     hard, stop = scene.limits.hard_force, stop_force(scene.limits)
-    phases = [PressPhase(count, True, stop) for count in _parts(inward, longest)]
-    phases += [PressPhase(count, False, hard) for count in _parts(hold - (readings - 1) * apart, longest)]
-    phases[-1] = PressPhase(phases[-1].count, False, hard, read=True)
-    return (*phases, *[PressPhase(apart, False, hard, read=True)] * (readings - 1))
+    phases = [PressPhase(count, True, stop, command=count) for count in _parts(inward, longest)]
+    before = _parts(hold - (readings - 1) * apart, longest)
+    phases += [PressPhase(count, False, hard, command=count) for count in before]
+    phases[-1] = replace(phases[-1], read=True)
+    return (*phases, *[PressPhase(apart, False, hard, read=True, command=apart)] * (readings - 1))
 
 
 def recorded_phases(scene: Scene) -> tuple[PressPhase, ...]:
     """A press that is read at every haptic step and that only the hard limit ends."""
     inward, hold, longest = _step_counts(scene)
     return tuple(
-        PressPhase(1, step < inward, scene.limits.hard_force, True, step == inward or step % longest == 0)
+        PressPhase(1, step < inward, scene.limits.hard_force, True, longest * (step == inward or step % longest == 0))
         for step in range(inward + hold)
     )
 
 
 def _step_counts(scene: Scene) -> tuple[int, int, int]:
-    """Haptic steps of the way in, of the hold, and at most of one control step."""
+    """Haptic steps of the way in, of the hold, and at most of one command."""
     dt = scene.timing.haptic_step
     inward = round((scene.palpation.clearance + scene.palpation.press_depth) / (PRESS_SPEED * dt))
-    return inward, round(HOLD_TIME / dt), scene.timing.haptic_steps_per_control
+    longest = max(1, round(FOLLOWING_TIME / dt)) if scene.motions else scene.timing.haptic_steps_per_control
+    return inward, round(HOLD_TIME / dt), longest
 
 
 def _parts(count: int, most: int) -> list[int]:
@@ -169,7 +174,6 @@ class SitePress:
         self._radius = scene.instrument.tip_radius
         self._hard_force = scene.limits.hard_force
         self._stopped = self._over = self._limited = False
-        self._control_step = scene.timing.control_step
         moves = tracks and bool(scene.motions)
         start = point + simulation.ground_shift(point, elapsed) if moves else point
         simulation.restart(start + normal * (self._radius + scene.palpation.clearance), elapsed=elapsed)
@@ -184,11 +188,12 @@ class SitePress:
         # A velocity holds for one control step: an arm's joint speeds are solved anew.
         if phase.command:
             velocity = -PRESS_SPEED * self.normal if phase.inward else np.zeros(3)
-            self.simulation.instrument.command_velocity(velocity + self._surface_velocity())
+            duration = phase.command * self.simulation.haptic_dt
+            self.simulation.instrument.command_velocity(velocity + self._surface_velocity(duration))
         return True
 
-    def _surface_velocity(self) -> FloatArray:
-        """The velocity with which the tip goes with the surface for the next control step [m/s], (3,)."""
+    def _surface_velocity(self, duration: float) -> FloatArray:
+        """The velocity with which the tip goes with the surface for a duration [s] [m/s], (3,)."""
         if self._tracker is None:
             return self._velocity
         now = self.simulation.time
@@ -196,7 +201,7 @@ class SitePress:
         self._carried_until = now
         if now > 0.0:
             self._tracker.look()
-        self._velocity = (self._tracker.displacement(self._control_step) - self._carried) / self._control_step
+        self._velocity = (self._tracker.displacement(duration) - self._carried) / duration
         return self._velocity
 
     def end(self, phase: PressPhase, force_peak: float) -> None:

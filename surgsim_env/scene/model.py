@@ -16,8 +16,8 @@ from msdm_core.organ.support import Support, SupportLaw
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
 
-# A motion of an end is centred at nodes within END_SHARE of the organ's length there; it reaches MOVING_SHARE of it.
-END_SHARE, MOVING_SHARE = 0.05, 0.5
+# A motion of an organ's end is centred at the nodes within this share of its length from there.
+END_SHARE = 0.05
 # Instruments and places in an organ are smaller and nearer than this [m]: MuJoCo's numbers stay far from overflow.
 LENGTH_LARGEST = 100.0
 
@@ -605,7 +605,7 @@ class CyclicMotion:
         variation: standard deviation of the durations and sizes of cycles, as a share of their mean.
         centre: of the part of the ground that moves [m]; None: all of it moves alike.
         reach: distance from the centre beyond which nothing moves [m].
-        side: in place of `centre` and `reach`: the direction of the organ's end around which half its length moves.
+        side: in place of `centre`: the direction of the organ's end which is the centre.
         stops_in_apnoea: whether it rests while the breath is held.
     """
 
@@ -636,18 +636,17 @@ class CyclicMotion:
         if self.side is not None:
             require_direction(f"motion {self.name!r}: side", self.side)
             if self.centre is not None:
-                raise ValueError(f"motion {self.name!r}: give a side, or centre and reach, not both")
-        # What is wrong with displacement and centre is said there.
-        Motion(self.name, self.displacement, self.centre, self.reach)
+                raise ValueError(f"motion {self.name!r}: give a side or a centre, not both")
+        # What is wrong with displacement, centre and reach is said there.
+        Motion(self.name, self.displacement, self.side or self.centre, self.reach)
 
     def ground(self, points: FloatArray) -> Motion:
         """How a unit of the signal moves the ground of an organ whose nodes rest at some points [m] (n_node, 3)."""
         if self.side is None:
             return Motion(self.name, self.displacement, self.centre, self.reach)
         along = points @ (np.array(self.side) / np.linalg.norm(self.side))
-        length = float(np.ptp(along))
-        x, y, z = points[along >= along.max() - END_SHARE * length].mean(axis=0).tolist()
-        return Motion(self.name, self.displacement, (x, y, z), MOVING_SHARE * length)
+        x, y, z = points[along >= along.max() - END_SHARE * np.ptp(along)].mean(axis=0).tolist()
+        return Motion(self.name, self.displacement, (x, y, z), self.reach)
 
 
 @dataclass(frozen=True)

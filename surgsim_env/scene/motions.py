@@ -1,5 +1,6 @@
 """Presets of how a patient moves, from the library in `scenes/motions`: each becomes motions of a scene."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ class PatientMotion:
     Args:
         name: as "breathing".
         caudal, anterior: displacement towards the feet and towards the front, of a cycle of size 1 [m].
-        side: "cranial": only the half of the organ nearer to the head moves; "": all of it.
+        cranial_reach: distance [m] from the organ's end nearest to the head up to which it moves; infinite: all of it.
         period, rise, fall, size, variation, stops_in_apnoea: as of a `CyclicMotion`.
     """
 
@@ -32,12 +33,8 @@ class PatientMotion:
     fall: float
     size: Range = (1.0, 1.0)
     variation: float = 0.0
-    side: str = ""
+    cranial_reach: float = math.inf
     stops_in_apnoea: bool = False
-
-    def __post_init__(self) -> None:
-        if self.side not in ("", "cranial"):
-            raise ValueError(f'motion {self.name!r}: side is {self.side!r}; it must be "cranial" or left out')
 
     def within(self, scene: Scene) -> CyclicMotion:
         """The motion in the axes of a scene: the head is where `cranial` points, the front where the probe comes from.
@@ -59,7 +56,8 @@ class PatientMotion:
             self.fall,
             self.size,
             self.variation,
-            side=_vector(cranial) if self.side else None,
+            reach=self.cranial_reach,
+            side=_vector(cranial) if math.isfinite(self.cranial_reach) else None,
             stops_in_apnoea=self.stops_in_apnoea,
         )
 

@@ -55,7 +55,9 @@ def clone_dataset(
     curve = clone(model, seen, taken, sample_weight=weight, normalisation=normalisation, options=options)
     spec = dataset.spec.env_spec
     assert spec is not None
-    description = describe(model, normalisation, env_id=spec.id, env_kwargs=dict(spec.kwargs))
+    description = describe(
+        model, normalisation, dataset.recover_environment(), env_id=spec.id, env_kwargs=dict(spec.kwargs)
+    )
     return TrainedPolicy(model.policy, description), curve
 
 

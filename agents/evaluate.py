@@ -69,7 +69,7 @@ class TaskAgent:
 
 
 TASK_AGENTS = {
-    "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all),
+    "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all, {"scaled": False}),
     "expert_palpate": TaskAgent(
         "SurgSim/Palpate-v0",
         lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,

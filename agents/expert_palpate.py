@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.scoring.episodes import make_envs, play_tasks, print_episodes
+from surgsim_env.palpation.chart import MAP_SIDE
 
 ROWS_FEWEST = 5
 NEAR = 0.003  # [m] below this distance speed is proportional to it; also the zone at the end of a row
@@ -51,23 +52,24 @@ class PalpateExpert:
             raise ValueError(f"this expert slides on a block's flat top; {scene.name!r} is not a block: use phantom")
         if task.memory is None:
             raise ValueError("this expert reads the memory of the observation: make the environment with memory=True")
-        self.slices = task.observation_slices
-        self.chart, side = task.memory.chart, task.memory.chart.side_count
+        self.env, self.slices = env.unwrapped, task.observation_slices
+        self.chart = task.memory.chart
         self.surface = scene.mesh.block.size[2] + scene.instrument.tip_radius
         self.force_most = force_share * scene.limits.soft_force
         self.depth = depth
-        # Rows lie on rows of sites, which have visited marks.
+        # Rows lie on rows of the map's sites, which have visited marks.
         row_count = max(int(np.ceil(self.chart.extent[1] / row_spacing - 1e-6)) + 1, ROWS_FEWEST)
-        rows = np.unique(np.round(np.linspace(0, side - 1, row_count)).astype(int))
-        self.rows = self.chart.lower[1] + rows * self.chart.extent[1] / (side - 1)
+        along, across = task.memory.map.rows_and_columns
+        rows = np.unique(np.round(np.linspace(along[0], along[-1], row_count)).astype(int))
+        self.rows = self.chart.lower[1] + task.memory.map.axes[1][rows]
         marks = self.slices["visited"].start
-        self.first = marks + rows[0] * side
-        self.last = marks + rows[-1] * side + (side - 1 if len(rows) % 2 else 0)
+        self.first = marks + rows[0] * MAP_SIDE + across[0]
+        self.last = marks + rows[-1] * MAP_SIDE + across[-1 if len(rows) % 2 else 0]
         self.start = np.array([self.chart.lower[0], self.rows[0]])
 
     def act(self, observations: NDArray, begins: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """The next actions; `begins` is not used."""
-        seen = np.asarray(observations, dtype=np.float64)
+        seen = self.env.si_values(observations)
         position, force, stiffest = (
             seen[:, self.slices[name]] for name in ("tip_position", "contact_force", "stiffest")
         )
@@ -87,8 +89,8 @@ class PalpateExpert:
 
     def _along_rows(self, tip: NDArray[np.float64]) -> NDArray[np.float64]:
         """Directions (n, 2) at places (n, 2) [m]: along the current row, at its end to the next."""
-        spacing = self.rows[1] - self.rows[0]
-        row = np.clip(np.floor((tip[:, 1] - self.rows[0] + CLOSE_ENOUGH) / spacing), 0, len(self.rows) - 1).astype(int)
+        row = np.searchsorted(self.rows, tip[:, 1] + CLOSE_ENOUGH, side="right") - 1
+        row = np.clip(row, 0, len(self.rows) - 1)
         way = np.where(row % 2 == 0, 1.0, -1.0)
         end = np.where(way > 0.0, self.chart.upper[0], self.chart.lower[0])
         short = way * (end - tip[:, 0])

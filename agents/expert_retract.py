@@ -44,10 +44,13 @@ CARRYING_SPEED, APPROACH_SPEED = 0.015, 0.015
 
 
 class RetractExpert:
-    """Waits before the edge above the target, encloses and grips it, lifts, folds, and holds once enough is visible."""
+    """Waits before the edge above the target, encloses and grips it, lifts, folds, and holds once enough is visible.
+
+    It reads SI units: the environment is made with `scaled=False`.
+    """
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """The action (5,) for an observation (56,)."""
+        """The action (5,) for an observation (56,) in SI units."""
         now = np.asarray(observation, dtype=np.float64)
         velocity, turning, jaw = self._carry(now) if self._grasped(now) else self._approach(now)
         return np.concatenate([velocity / SPEED, [turning / TURNING, jaw]]).clip(-1.0, 1.0).astype(np.float32)
@@ -113,7 +116,10 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    envs, seeds = make_envs("SurgSim/Retract-v0", 1, dtype="float64"), range(given.seed, given.seed + given.episodes)
+    envs, seeds = (
+        make_envs("SurgSim/Retract-v0", 1, dtype="float64", scaled=False),
+        range(given.seed, given.seed + given.episodes),
+    )
     soft_force = envs.unwrapped.envs[0].unwrapped.scene.limits.soft_force  # type: ignore[attr-defined]
     records = play_tasks(RetractExpert().act_all, envs, seeds)
     names = ("success", "torn", "hard_limit", "sim_fault", "pull_force_peak", "slips", "visible")

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from agents.command_line import one_line_errors
 from agents.expert_palpate import PalpateExpert
 from agents.training.palpate_surrogate import PalpateSurrogate
+from surgsim_env.palpation.chart import MAP_SIDE
 
 with one_line_errors(__name__, "agents"):
     import torch
     from stable_baselines3 import PPO
-    from stable_baselines3.common.vec_env import VecNormalize
 
     from agents.training.environments import blinded
     from agents.training.extractors import MemorySummary
-    from agents.training.imitation import CloningOptions, clone, normalise_by
+    from agents.training.imitation import CloningOptions, clone
     from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
@@ -66,7 +66,7 @@ def imagined(
     observations: NDArray[np.float32], envs: PalpateSurrogate, expert: PalpateExpert, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """The same observations with the tip anywhere over the face, and the search not begun, in progress or over."""
-    made, count = observations.copy(), len(observations)
+    made, count = envs.envs[0].si_values(observations), len(observations)
     # Views of the channels.
     tip, force, visited, stiffest = (
         made[:, envs.task.observation_slices[name]] for name in ("tip_position", "contact_force", "visited", "stiffest")
@@ -80,10 +80,10 @@ def imagined(
     force[:, 2] = stiffness * np.maximum(depth, 0.0) ** envs.touch.exponent + rng.normal(0.0, 0.015, count)
     # Not begun, in progress, over.
     stage = rng.choice(3, count, p=[0.1, 0.5, 0.4])
-    corners = np.array([0, envs.chart.side_count - 1])
-    for row in corners * envs.chart.side_count:
-        for column in corners:
-            visited[:, row + column] = np.where(stage == 2, 1.0, (stage == 1) & (rng.random(count) < 0.5))
+    rows, columns = envs.map.rows_and_columns
+    for row in rows[[0, -1]]:
+        for column in columns[[0, -1]]:
+            visited[:, row * MAP_SIDE + column] = np.where(stage == 2, 1.0, (stage == 1) & (rng.random(count) < 0.5))
     made[:, expert.first] = stage >= 1
     made[:, expert.last] = stage == 2
     stiffest[:, :2] = rng.uniform(-1.0, 1.0, (count, 2))
@@ -91,7 +91,7 @@ def imagined(
     close = (stage == 2) & (rng.random(count) < 0.4)
     spot = envs.chart.plane_point(stiffest[:, :2]) + rng.normal(0.0, 0.003, (count, 2))
     tip[close, :2] = spot[close]
-    return made
+    return envs.envs[0].as_observed(made)
 
 
 def main() -> None:
@@ -114,8 +114,7 @@ def main() -> None:
     envs = PalpateSurrogate(arguments.envs, arguments.scene)
     expert = PalpateExpert(envs.envs[0])
     entries = list(envs.task.force_entries) if arguments.without_force else []
-    scaled = VecNormalize(VectorEnvForStableBaselines(envs), norm_reward=False)
-    model = PPO("MlpPolicy", scaled, policy_kwargs=NETWORK, device="cpu", seed=0)
+    model = PPO("MlpPolicy", VectorEnvForStableBaselines(envs), policy_kwargs=NETWORK, device="cpu", seed=0)
     begun = (envs.reset(seed=arguments.seed)[0], np.ones(envs.num_envs, dtype=np.bool_))
     seen: list[NDArray] = []
     labels: list[NDArray] = []
@@ -126,15 +125,12 @@ def main() -> None:
         seen += new_seen
         labels += new_labels
         real = np.concatenate(seen)
-        if index < EXPERT_ROUNDS:
-            normalise_by(scaled, blinded(real, entries))
         made = imagined(real[rng.integers(len(real), size=arguments.imagined)], envs, expert, rng)
         options = CloningOptions(epochs=arguments.epochs, patience=4, batch_size=512, std=0.05, seed=index)
         curve = clone(
             model,
             blinded(np.concatenate([real, made]), entries),
             np.concatenate([*labels, expert.act(made)]),
-            normalisation=scaled,
             options=options,
         )
         success = np.mean(won) if won else float("nan")
@@ -145,7 +141,8 @@ def main() -> None:
         )
         description = describe(
             model,
-            scaled,
+            None,
+            envs.envs[0],
             env_id="SurgSim/Palpate-v0",
             env_kwargs={"scene": arguments.scene, "level": "standard", "memory": True},
             force_entries=entries,

@@ -136,6 +136,7 @@ def main() -> None:
         description = describe(
             model,
             scaled,
+            blind.envs[0],
             env_id="SurgSim/Palpate-v0",
             env_kwargs={"scene": arguments.scene, "level": "standard", "memory": False},
             action_repeat=arguments.repeat,

@@ -101,6 +101,7 @@ def learn(arguments: argparse.Namespace) -> None:
         description = describe(
             model,
             normalisation,
+            envs.unwrapped.envs[0],  # type: ignore[attr-defined]
             env_id=ID,
             force_entries=entries,
             trained_steps=done.sample_count,

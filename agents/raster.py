@@ -25,7 +25,7 @@ class RasterAgent:
     """Presses a grid of sites on a flat top, remembers each force, then declares at the stiffest."""
 
     def __init__(self, env: gym.Env, *, sites_per_side: int = 5) -> None:
-        scene = env.unwrapped.scene
+        self.env, scene = env.unwrapped, env.unwrapped.scene
         if scene.mesh.block is None:
             raise ValueError(f"this agent presses the flat top of a block; {scene.name!r} is not a block: use phantom")
         width, depth, self.top = scene.mesh.block.size
@@ -39,8 +39,9 @@ class RasterAgent:
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The next action, from an observation."""
-        self.tip = observation[self.slices["tip_position"]]
-        self.force = float(observation[self.slices["contact_force"]][2])
+        seen = self.env.si_values(observation)
+        self.tip = seen[self.slices["tip_position"]]
+        self.force = float(seen[self.slices["contact_force"]][2])
         return next(self._plan)
 
     def reset(self) -> None:

@@ -1,12 +1,12 @@
 """Agents for SurgSim/PalpateSites-v0: their interface, what they may know, and the belief that presses give them."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import contrast_process
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
@@ -22,49 +22,60 @@ FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75), (0.75, 0.25), (0.25, 0.75))
 FIRST_LENGTHS = 6.0
 
 
-@dataclass(frozen=True)
+SITE_COUNT = MAP_SIDE**2
+# Entries of the observation with memory, by channel.
+SLICES = PalpateSitesTask.channel_slices(
+    **dict.fromkeys(("contrast_map", "pressed_map", "face_map"), SITE_COUNT),
+    map_cell=1,
+    chart_share=2,
+    contrast_noise=1,
+)
+FACTS = ("map_cell", "chart_share", "contrast_noise")
+OBSERVATION_SIZE = max(part.stop for part in SLICES.values())
+
+
+@dataclass(frozen=True, eq=False)
 class SiteFacts:
-    """Constants of an environment.
+    """What an episode does not change: the palpable face, the tip and the sensor. All of it is in the observation.
 
     Fields:
-        extent: of the chart [m]
-        site_count: sites of its grid along each axis
+        map: the sites of the touch map; lengths in metres, or in tip radii with a tip_radius of 1
         tip_radius: of the ball that presses [m]
         noise: standard deviation of one log contrast by the force sensor
         budget: presses of an episode
     """
 
-    extent: tuple[float, float]
-    site_count: int
+    map: TouchMap
     tip_radius: float
     noise: float
     budget: int = 25
 
-    @cached_property
-    def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Coordinates of the grid's columns and rows on the chart [m], (n,) each."""
-        first, second = (np.linspace(0.0, extent, self.site_count) for extent in self.extent)
-        return first, second
+    @property
+    def extent(self) -> NDArray[np.float64]:
+        """Lengths of the chart's sides [m] (2,)."""
+        return self.map.extent
 
-    @cached_property
-    def slices(self) -> dict[str, slice]:
-        """Entries of the observation with memory, by channel."""
-        count = self.site_count**2
-        return PalpateSitesTask.channel_slices(contrast_map=count, pressed_map=count)
-
-    @cached_property
+    @property
     def sites(self) -> NDArray[np.float64]:
-        """Places of the grid's sites on the chart [m], row by row along the first axis, shape (n n, 2)."""
-        return np.stack(np.meshgrid(*self.axes), axis=-1).reshape(-1, 2)
+        """The map's sites, lengths along the chart's sides [m], row by row along the first axis, shape (n n, 2)."""
+        return self.map.sites
 
     def action(self, place: NDArray[np.float64]) -> NDArray[np.float32]:
         """The action that presses at a place of the chart [m], shape (2,)."""
-        return (2.0 * np.asarray(place) / self.extent - 1.0).astype(np.float32)
+        return np.clip(2.0 * np.asarray(place) / self.extent - 1.0, -1.0, 1.0).astype(np.float32)
 
-    def remembered(self, observation: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """Numbers of the pressed sites, and the log contrast at each."""
-        pressed = np.flatnonzero(observation[self.slices["pressed_map"]] > 0.5)
-        return pressed, np.asarray(observation[self.slices["contrast_map"]], dtype=np.float64)[pressed]
+
+def remembered(observation: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Numbers of the pressed sites of an observation with memory, and the log contrast at each."""
+    pressed = np.flatnonzero(observation[SLICES["pressed_map"]] > 0.5)
+    return pressed, np.asarray(observation[SLICES["contrast_map"]], dtype=np.float64)[pressed]
+
+
+def observed_facts(observation: NDArray[np.floating]) -> SiteFacts:
+    """The facts that an observation with memory holds, lengths in tip radii."""
+    cell, share, noise = (np.asarray(observation[SLICES[name]], dtype=np.float64) for name in FACTS)
+    face = np.asarray(observation[SLICES["face_map"]]) > 0.5
+    return SiteFacts(TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face), 1.0, float(noise[0]))
 
 
 class SiteAgent(Protocol):
@@ -82,53 +93,51 @@ class SiteAgent(Protocol):
 def site_facts(env: Any) -> SiteFacts:
     """The facts of an environment (its wrappers do not matter)."""
     task = env.unwrapped.task
-    return SiteFacts(
-        extent=tuple(task.estimator.extent.tolist()),
-        site_count=task.site_count,
-        tip_radius=task.estimator.tip_radius,
-        noise=task.estimator.noise,
-        budget=task.budget,
-    )
+    return SiteFacts(task.charted.touch_map, task.estimator.tip_radius, task.estimator.noise, task.budget)
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Expected excess of the log contrast at the sites of a chart's grid, and its standard deviation, (n n,) each."""
+    """Expected excess of the log contrast at the sites of a map, and its standard deviation, (n n,) each."""
 
     excess: NDArray[np.float64]
     spread: NDArray[np.float64]
 
 
 class SiteProcess:
-    """The estimator's Gaussian process on the sites of a chart's grid, with LENGTH_SHARE of its correlation length.
+    """The estimator's Gaussian process on the sites of a map, with LENGTH_SHARE of its correlation length.
 
-    `candidates` says which sites an agent chooses among: those off the border, shape (n n,).
+    `candidates` says which sites an agent chooses among: those that may be pressed, off the border, shape (n n,).
     """
 
     def __init__(self, facts: SiteFacts) -> None:
         self.facts = facts
         self.process = contrast_process(
-            facts.axes, tip_radius=facts.tip_radius, noise=facts.noise, length_share=LENGTH_SHARE
+            facts.map.axes, tip_radius=facts.tip_radius, noise=facts.noise, length_share=LENGTH_SHARE
         )
         from_border = np.minimum(facts.sites, facts.extent - facts.sites) / facts.extent
-        self.candidates = from_border.min(axis=1) >= BORDER
+        self.candidates = facts.map.pressable & (from_border.min(axis=1) >= BORDER)
 
     def belief(self, observation: NDArray[np.floating]) -> Belief:
         """The belief given all presses that an observation remembers.
 
         It is about the excess alone: uncertainty of the background, the same at all sites, should attract no press.
         """
-        pressed, values = self.facts.remembered(observation)
+        pressed, values = remembered(observation)
         places = self.facts.sites[pressed]
         return Belief(self.process.mean(places, values)[1].ravel(), self.process.spread(places).ravel())
 
     def best(
         self, worth: NDArray[np.float64], observation: NDArray[np.floating], rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """The action for the candidate of most worth (n n,) that was not pressed yet; ties are broken at random."""
-        pressed, _ = self.facts.remembered(observation)
-        worth = np.where(self.candidates, worth, -np.inf)
-        worth[pressed] = -np.inf
+        """The action for the candidate of most worth (n n,) that was not pressed yet; ties are broken at random.
+
+        Where all were pressed, one of them again.
+        """
+        pressed, _ = remembered(observation)
+        fresh = self.candidates.copy()
+        fresh[pressed] = False
+        worth = np.where(fresh if fresh.any() else self.candidates, worth, -np.inf)
         return self.facts.action(self.facts.sites[rng.choice(np.flatnonzero(worth >= worth.max() - 1e-9))])
 
     def first(self, number: int) -> NDArray[np.float32] | None:

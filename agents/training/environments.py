@@ -8,9 +8,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper,
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.scoring.site_agent import SiteFacts, site_facts
 from agents.training.config import EnvironmentSettings
-from agents.training.site_policy import SiteBelief
+from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, belief_features, site_actions
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 
@@ -22,7 +21,7 @@ def make_environments(settings: EnvironmentSettings, count: int | None = None) -
     if settings.without_force:
         envs = WithoutForce(envs, force_entries(envs))
     if settings.belief:
-        envs = BelievingEnvs(envs, SiteBelief(belief_facts(envs)))
+        envs = BelievingEnvs(envs)
     return EpisodeMonitor(envs)
 
 
@@ -39,11 +38,6 @@ def force_entries(envs: VecEnv) -> list[int]:
             "`force_entries`, or train with without_force: false"
         )
     return list(task.force_entries)
-
-
-def belief_facts(envs: VecEnv) -> SiteFacts:
-    """The constants of environments of SurgSim/PalpateSites-v0 that belief is computed with."""
-    return site_facts(envs.get_attr("unwrapped", indices=[0])[0])
 
 
 def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
@@ -118,10 +112,13 @@ class Observed(VecEnvWrapper):
     def __init__(self, envs: VecEnv, see: Callable[[np.ndarray], np.ndarray], **spaces: gym.Space) -> None:
         super().__init__(envs, **spaces)
         self.see = see
+        # The observations as they are, of the last reset or step.
+        self.unseen = np.zeros(0)
 
     def reset(self) -> VecEnvObs:
         """Start an episode everywhere."""
-        return self.see(np.asarray(self.venv.reset()))
+        self.unseen = np.asarray(self.venv.reset())
+        return self.see(self.unseen)
 
     def step_wait(self) -> VecEnvStepReturn:
         """One step of all."""
@@ -129,7 +126,8 @@ class Observed(VecEnvWrapper):
         for info in infos:
             if "terminal_observation" in info:
                 info["terminal_observation"] = self.see(info["terminal_observation"][None])[0]
-        return self.see(np.asarray(observation)), reward, done, infos
+        self.unseen = np.asarray(observation)
+        return self.see(self.unseen), reward, done, infos
 
 
 class WithoutForce(Observed):
@@ -142,14 +140,12 @@ class WithoutForce(Observed):
 class BelievingEnvs(Observed):
     """Environments of SurgSim/PalpateSites-v0 whose observation is the belief and whose action is a site's number."""
 
-    def __init__(self, envs: VecEnv, belief: SiteBelief) -> None:
-        choice = gym.spaces.Discrete(belief.site_count**2)
-        super().__init__(envs, belief.features, observation_space=belief.space, action_space=choice)
-        self.belief = belief
+    def __init__(self, envs: VecEnv) -> None:
+        super().__init__(envs, belief_features, observation_space=FEATURE_SPACE, action_space=CHOICE_SPACE)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Press the sites (n_env,)."""
-        self.venv.step_async(self.belief.action(actions))
+        self.venv.step_async(site_actions(self.unseen, actions))
 
 
 class EpisodeMonitor(VecMonitor):

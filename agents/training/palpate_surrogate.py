@@ -21,6 +21,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.palpation.chart import MAP_SIDE
 from surgsim_env.tasks.palpate import (
     DECLARE_STEPS,
     DECLARE_VALUE,
@@ -81,7 +82,8 @@ class PalpateSurrogate(VectorEnv):
         env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level="standard", memory=memory).unwrapped
         self.touch, self.scene, self.task = TOUCH_MODELS[scene], env.scene, env.task
         remembered = touch_memory(env.simulation.anatomy)
-        self.chart, self.indenter, self.least_depth = remembered.chart, remembered.indenter, remembered.least_depth
+        self.chart, self.map = remembered.chart, remembered.map
+        self.indenter, self.least_depth = remembered.indenter, remembered.least_depth
         self.memory = memory
         timing = env.scene.timing
         self.control_step = timing.haptic_step * timing.haptic_steps_per_control
@@ -96,7 +98,7 @@ class PalpateSurrogate(VectorEnv):
         # Scene and task are those of the original environment.
         self.envs = [env] * count
         self.rng = np.random.default_rng(0)
-        sites = self.chart.side_count**2
+        sites = MAP_SIDE**2
         self.tip, self.velocity, self.bias = np.zeros((3, count, 3))
         self.lesion = np.zeros((count, 2))
         self.excess, self.width, self.background = np.zeros((3, count))
@@ -175,23 +177,22 @@ class PalpateSurrogate(VectorEnv):
         if self.memory:
             self._remember(which, reading[:, 2])
             seen |= zip(("contrast", "visited", "stiffest"), self._recalled(), strict=True)
+            seen["face"] = np.broadcast_to(self.map.pressable, seen["visited"].shape)
         channels = self.task.observation_slices
-        return np.concatenate([seen[name] for name in channels], axis=1).astype(np.float32)
+        return self.envs[0].as_observed(np.concatenate([seen[name] for name in channels], axis=1))
 
     def _remember(self, which: NDArray[np.bool_], force: NDArray[np.float64]) -> None:
         """`TouchMemory.feel` of all at once."""
-        side, depth = self.chart.side_count, self.surface - self.tip[:, 2]
-        cell = np.floor(0.5 * (self.chart.place(self.tip) + 1.0) * (side - 1) + 0.5).astype(np.int64)
-        felt = which & (depth >= self.least_depth) & ((cell >= 0) & (cell < side)).all(axis=1)
-        rows, sites = np.flatnonzero(felt), cell[felt, 1] * side + cell[felt, 0]
+        depth, site = self.surface - self.tip[:, 2], self.map.nearest(self.chart.place(self.tip))
+        felt = which & (depth >= self.least_depth) & (site >= 0) & self.map.pressable[site]
+        rows, sites = np.flatnonzero(felt), site[felt]
         healthy = self.indenter.force(1.0) * depth[felt] ** 1.5
         self.product[rows, sites] += force[felt] * healthy
         self.square[rows, sites] += healthy**2
 
     def _recalled(self) -> tuple[NDArray[np.float64], ...]:
         """Contrasts, visited marks and the stiffest place, as `TouchMemory` gives them."""
-        side = self.chart.side_count
-        visited = self.square > 0.0
+        side, visited = MAP_SIDE, self.square > 0.0
         contrast = np.divide(self.product, self.square, out=np.zeros_like(self.product), where=visited)
         sums = []
         for values in (self.product, self.square):
@@ -200,7 +201,7 @@ class PalpateSurrogate(VectorEnv):
             sums.append((rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]).reshape(len(values), -1))
         around = np.divide(sums[0], sums[1], out=np.zeros_like(sums[0]), where=sums[1] > 0.0)
         best = np.argmax(np.where(visited, around, -np.inf), axis=1)
-        stiffest = np.column_stack([self.chart.sites[best], around[np.arange(len(best)), best]])
+        stiffest = np.column_stack([self.map.places[best], around[np.arange(len(best)), best]])
         stiffest[~visited.any(axis=1)] = 0.0
         return contrast, visited.astype(np.float64), stiffest
 

@@ -23,7 +23,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.scoring.site_agent import SiteFacts
+from agents.scoring.site_agent import OBSERVATION_SIZE
 from agents.training.environments import blinded
 from agents.training.networks import (
     NetworkDescription,
@@ -33,16 +33,17 @@ from agents.training.networks import (
     load_weights,
     shortened,
 )
-from agents.training.site_policy import SiteBelief
+from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, PLACE_SPACE, belief_features, site_actions
 from surgsim_env.scene.load import fill
+from surgsim_env.tasks.task import Task
 
 # Defaults of VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8
 CUT = 10.0
 # Most control steps of a decision; the longest episode has fewer.
 REPEAT_MOST = 10_000
-# Of a normalisation; and the range of a chart's lengths [m].
-LARGEST, LENGTHS = 1e30, (1e-6, 1e3)
+# Of a normalisation.
+LARGEST = 1e30
 # Sizes beyond which a file is not read [bytes].
 MOST_WEIGHT_BYTES, MOST_TEXT_BYTES = 400_000_000, 20_000_000
 
@@ -56,7 +57,8 @@ class PolicyDescription:
         env_id, env_kwargs: environment of the policy
         action_repeat: control steps per decision
         force_entries: entries of the observation that are set to 0; empty for a policy with force
-        belief: for a policy on belief maps whose action is a site's number; else None
+        observation: declaration of what it reads (`observation_declaration`); None for environments without one
+        belief: whether it reads belief maps and its action is a site's number
         observation_mean, observation_variance: of the normalisation; None without one
         trained_steps, seed, score: of its training
         network: its networks; None only beside a zip of an earlier version
@@ -68,7 +70,8 @@ class PolicyDescription:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     action_repeat: int = 1
     force_entries: list[int] = field(default_factory=list)
-    belief: SiteFacts | None = None
+    observation: dict[str, Any] | None = None
+    belief: bool = False
     observation_mean: list[float] | None = None
     observation_variance: list[float] | None = None
     trained_steps: int = 0
@@ -78,12 +81,26 @@ class PolicyDescription:
     sha256: str | None = None
 
 
-def describe(model: BaseAlgorithm, normalisation: VecNormalize | None, **fields: Any) -> PolicyDescription:
-    """The description of a model with its normalisation; `fields` are the other entries.
+def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
+    """Size and scale of each channel that an environment observes, by name; None for one without a task of ours."""
+    inner = getattr(env, "unwrapped", env)
+    task = getattr(inner, "task", None)
+    if not isinstance(task, Task):
+        return None
+    return {
+        name: [size, scale if getattr(inner, "scaled", True) else "SI"] for name, (size, scale) in task.declared.items()
+    }
+
+
+def describe(
+    model: BaseAlgorithm, normalisation: VecNormalize | None, env: Any = None, **fields: Any
+) -> PolicyDescription:
+    """The description of a model with its normalisation and the observation of `env`; `fields` are the other entries.
 
     Raises:
         ValueError: networks that a policy's file has no names for.
     """
+    fields["observation"] = None if env is None else observation_declaration(env)
     if normalisation is not None and normalisation.norm_obs:
         statistics: Any = normalisation.obs_rms
         fields |= {"observation_mean": statistics.mean.tolist(), "observation_variance": statistics.var.tolist()}
@@ -101,26 +118,36 @@ class TrainedPolicy:
     def __init__(self, networks: BasePolicy, description: PolicyDescription) -> None:
         self.networks = networks
         self.description = description
-        self.belief = None if description.belief is None else SiteBelief(description.belief)
         self.reset(1)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
         """Shape of the raw observation."""
-        if self.description.belief is not None:
-            return (max(part.stop for part in self.description.belief.slices.values()),)
-        return self.networks.observation_space.shape or ()
+        return (OBSERVATION_SIZE,) if self.description.belief else self.networks.observation_space.shape or ()
+
+    @property
+    def action_space(self) -> gym.spaces.Box:
+        """The environment's: of the networks, or places where the networks choose a site."""
+        space: Any = self.networks.action_space
+        return PLACE_SPACE if self.description.belief else space
 
     def check_environment(self, env: gym.Env, name: str = "the policy") -> None:
         """Check that this is an environment for the policy, which messages call `name`.
 
         Raises:
-            ValueError: it has observations or actions of another shape.
+            ValueError: it observes other channels, or in other scales, or has actions of another shape.
         """
-        actions: Any = self.networks.action_space if self.belief is None else self.belief.action_space
+        reads, given = self.description.observation, observation_declaration(env)
+        if given is not None and reads != given:
+            wrong = [one for one in {**(reads or {}), **given} if (reads or {}).get(one) != given.get(one)]
+            raise ValueError(
+                f"{name} reads {shortened({one: (reads or {}).get(one) for one in wrong})} where the observation of "
+                f"{self.description.env_id} with {shortened(self.description.env_kwargs)} has "
+                f"{shortened({one: given.get(one) for one in wrong})}: make the environment as the policy's file says"
+            )
         for what, space, shape in (
             ("observations", env.observation_space, self.observation_shape),
-            ("actions", env.action_space, actions.shape),
+            ("actions", env.action_space, self.action_space.shape),
         ):
             if space.shape != shape:
                 raise ValueError(
@@ -132,9 +159,7 @@ class TrainedPolicy:
         """Begin episodes in `count` environments."""
         self._state: Any = None
         self._since = np.zeros(count, dtype=np.int64)
-        # Of the networks, or places where the networks return a site's number.
-        space: Any = self.networks.action_space if self.belief is None else self.belief.action_space
-        self._actions = np.zeros((count, *space.shape), dtype=space.dtype)
+        self._actions = np.zeros((count, *self.action_space.shape), dtype=self.action_space.dtype)
 
     def act(self, observations: NDArray[Any], begins: NDArray[np.bool_] | None = None) -> NDArray:
         """Deterministic actions (n, n_action) for raw observations (n, n_observation).
@@ -148,8 +173,8 @@ class TrainedPolicy:
         if deciding.any():
             seen = self.seen(observations)
             actions, state = self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=True)
-            if self.belief is not None:
-                actions = self.belief.action(actions)
+            if self.description.belief:
+                actions = site_actions(observations, actions)
             self._actions[deciding] = actions[deciding]
             if self._state is not None and state is not None and not deciding.all():
                 # The recurrent state (layers, n, size) is new where a decision was made.
@@ -162,8 +187,8 @@ class TrainedPolicy:
         """Observations as the network reads them: force removed, then belief maps, then normalised."""
         one = self.description
         values = blinded(observations, one.force_entries) if one.force_entries else observations
-        if self.belief is not None:
-            values = self.belief.features(values)
+        if one.belief:
+            values = belief_features(values)
         if one.observation_mean is None or one.observation_variance is None:
             return values
         scale = np.sqrt(np.asarray(one.observation_variance) + VARIANCE_SLACK)
@@ -321,21 +346,13 @@ def _check_preprocessing(description: PolicyDescription, networks: BasePolicy, d
     shape, actions = networks.observation_space.shape or (), networks.action_space
     where = f"policy {document}"
     raw = shape[0] if len(shape) == 1 else 0
-    facts = description.belief
-    if facts is not None:
-        lengths, (least, most) = (*facts.extent, facts.tip_radius), LENGTHS
-        if len(lengths) != 3 or not all(least <= one <= most for one in lengths) or not 0.0 <= facts.noise <= most:
+    if description.belief:
+        if shape != FEATURE_SPACE.shape or getattr(actions, "n", 0) != CHOICE_SPACE.n:
             raise ValueError(
-                f"{where}: belief is {facts}; the rule is two extents and a tip_radius from {least} to {most}, and a "
-                f"noise from 0 to {most}"
+                f"{where}: belief is true, for which networks read {FEATURE_SPACE.shape} numbers and choose among "
+                f"{CHOICE_SPACE.n} sites; these read {shape} and choose from {actions}"
             )
-        count = facts.site_count**2
-        if facts.site_count < 2 or shape != (3 * count + 1,) or getattr(actions, "n", 0) != count:
-            raise ValueError(
-                f"{where}: belief.site_count is {facts.site_count}, for n of which networks read 3 n^2 + 1 numbers and "
-                f"choose among n^2 sites; these read {shape} and choose from {actions}"
-            )
-        raw = max(part.stop for part in facts.slices.values())
+        raw = OBSERVATION_SIZE
     for index, entry in enumerate(description.force_entries):
         if not 0 <= entry < raw:
             raise ValueError(f"{where}: force_entries[{index}] is {entry}; the observation has entries 0 to {raw - 1}")

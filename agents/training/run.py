@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.training.config import TrainingConfig, config_text
-from agents.training.environments import belief_facts, force_entries, make_environments
+from agents.training.environments import force_entries, make_environments
 from agents.training.networks import POLICIES, algorithm_class, describe_networks, with_classes
 from agents.training.policy_files import PolicyDescription, TrainedPolicy, describe, load_policy, save_policy
 
@@ -87,11 +87,12 @@ class Run:
         return describe(
             self.model,
             self.normalization,
+            self.bare.get_attr("unwrapped", indices=[0])[0],
             env_id=settings.id,
             env_kwargs=settings.kwargs,
             action_repeat=settings.action_repeat,
             force_entries=self.blind_entries,
-            belief=belief_facts(self.bare) if settings.belief else None,
+            belief=settings.belief,
             trained_steps=self.model.num_timesteps,
             seed=self.config.seed,
             score=score,
@@ -139,7 +140,7 @@ class Run:
             count = min(self.config.environment.count, settings.episodes)
             self._evaluated = make_environments(self.config.environment, count)
         # These environments repeat actions, remove force and compute beliefs themselves.
-        seen = replace(self.description(), action_repeat=1, force_entries=[], belief=None)
+        seen = replace(self.description(), action_repeat=1, force_entries=[], belief=False)
         figures = mean_figures(
             play_episodes(TrainedPolicy(self.model.policy, seen), self._evaluated, settings.episodes)
         )

@@ -11,8 +11,10 @@ from msdm_core.errors import MeshError
 from msdm_core.mesh.geodesic import nearest_weights
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
-# A point is carried to this share of the longest edge of the tet behind its nearest boundary triangle.
+# A point is carried to this share of the tets' longest edges at its nearest point of the boundary.
 REACH = 0.75
+# A vertex that was within its reach still is when a file has rounded its coordinates to single precision.
+ROUNDING = 1e-3
 # Triangles of a size that are tried first near a point, and points that are tried at once.
 NEAR_FIRST, POINTS_AT_ONCE = 8, 4096
 
@@ -46,9 +48,20 @@ def find_carriers(points: FloatArray, mesh: TetMesh) -> Carriers:
     corners = mesh.points[mesh.boundary_triangles]
     triangle, weights = _nearest_triangles(points, corners)
     nearest = np.einsum("pi,pij->pj", weights, corners[triangle])
-    tets = mesh.points[mesh.tets[mesh.boundary_tets[triangle]]]
+    # Interpolated between nodes: where triangles share the nearest point, rounding decides which of them is found, and
+    # the reach must not depend on it.
+    longest = _longest_edges(mesh)[mesh.boundary_triangles[triangle]]
+    reach = REACH * np.einsum("pi,pi->p", weights, longest)
+    return Carriers(triangle, weights, nearest, np.linalg.norm(points - nearest, axis=1), reach)
+
+
+def _longest_edges(mesh: TetMesh) -> FloatArray:
+    """Mean over the tets around each node of their longest edges [m], (n_node,)."""
+    tets = mesh.points[mesh.tets]
     longest = np.linalg.norm(tets[:, :, None] - tets[:, None], axis=3).max(axis=(1, 2))
-    return Carriers(triangle, weights, nearest, np.linalg.norm(points - nearest, axis=1), REACH * longest)
+    corners = mesh.tets.ravel()
+    total = np.bincount(corners, np.repeat(longest, 4), mesh.node_count)
+    return total / np.bincount(corners, minlength=mesh.node_count)
 
 
 def surface_carriers(vertices: FloatArray, mesh: TetMesh) -> Carriers:
@@ -58,14 +71,14 @@ def surface_carriers(vertices: FloatArray, mesh: TetMesh) -> Carriers:
         MeshError: a vertex farther from the mesh's boundary than REACH allows; names it.
     """
     found = find_carriers(vertices, mesh)
-    far = np.flatnonzero(found.beyond)
+    far = np.flatnonzero(found.distance > (1.0 + ROUNDING) * found.reach)
     if far.size:
         worst = far[np.argmax(found.distance[far] / found.reach[far])]
         x, y, z = vertices[worst] * 1e3
         raise MeshError(
             f"vertex {worst} of the fine surface, at {x:.1f}, {y:.1f}, {z:.1f} mm, is "
             f"{found.distance[worst] * 1e3:.3g} mm from the boundary of the tets; the rule is at most "
-            f"{found.reach[worst] * 1e3:.3g} mm there, {REACH:g} of a tet's longest edge ({len(far)} of "
+            f"{found.reach[worst] * 1e3:.3g} mm there, {REACH:g} of the tets' longest edges ({len(far)} of "
             f"{len(vertices)} vertices break it): is it the surface of this organ, in the same axes and unit?"
         )
     return found

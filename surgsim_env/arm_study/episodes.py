@@ -232,7 +232,7 @@ def run_episodes(sources: tuple[str, str], arms: tuple[Arm, Arm], seeds: range, 
         able[1], right = RIGHT, RIGHT
     ran = Episodes(SCENE, left, right, make_scene(SCENE).ports, tuple(stand_ins))
     try:
-        env = gym.make(ENV_ID, scene=SCENE, instrument="+".join(able))
+        env = gym.make(ENV_ID, scene=SCENE, instrument="+".join(able), scaled=False)
     except ValueError as error:
         return replace(ran, left_out=" ".join(str(error).split()))
     runs, pictures = [], {}

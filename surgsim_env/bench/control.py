@@ -27,7 +27,7 @@ organs per group in float64, 16 in float32, one thread per group; {{cores}} core
 def make_env() -> gym.Env:
     """One environment of the benchmark."""
     # The import of this package has registered the id, also in a process of its own.
-    return gym.make(ENV_ID, scene=SCENE)
+    return gym.make(ENV_ID, scene=SCENE, scaled=False)
 
 
 def contact_force() -> slice:
@@ -50,7 +50,7 @@ def stroke(observation: NDArray[Any], force: slice, step: int) -> NDArray[np.flo
 
 def abreast(count: int, dtype: Literal["float64", "float32"]) -> Any:
     """Environments side by side in vector registers, one process, a thread for each group of organs."""
-    return gym.make_vec(ENV_ID, count, vectorization_mode="vector_entry_point", scene=SCENE, dtype=dtype)
+    return gym.make_vec(ENV_ID, count, vectorization_mode="vector_entry_point", scene=SCENE, scaled=False, dtype=dtype)
 
 
 # One row each.

@@ -67,6 +67,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         instrument: str | None = None,
         *,
         obs_mode: str = "state",
+        scaled: bool = True,
         observe_force: bool = True,
         render_mode: str | None = None,
         **settings: Any,
@@ -88,13 +89,18 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self.metadata = self._view.metadata()  # type: ignore[misc]
         self.task = task
         self._low, self._high = (side.astype(np.float32) for side in task.bounds(self.simulation.instrument))
+        # An observation is (task observation - origin) / scale.
+        origin, scale = task.scales(self.simulation.instrument)
+        self.scaled = scaled
+        self._origin, self._scale = (origin, scale) if scaled else (np.zeros_like(origin), np.ones_like(scale))
         self._eye: EpisodeView | None = None
         if obs_mode == "rgb":
             sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_force": False}
             self._eye = EpisodeView(self.simulation, "rgb_array", sight)
             self.observation_space = gym.spaces.Box(0, 255, (PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
         else:
-            self.observation_space = gym.spaces.Box(self._low, self._high, dtype=np.float32)
+            low, high = self.as_observed(self._low), self.as_observed(self._high)
+            self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (task.action_size,), dtype=np.float32)
         self._observation = np.zeros(self._low.shape, dtype=np.float32)
         self._unobserved = [] if observe_force else task.force_entries
@@ -196,8 +202,16 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     @property
     def task_observation(self) -> NDArray[np.float32]:
-        """The task's own numbers of that moment, whatever `obs_mode` and `observe_force` leave of them."""
+        """The task's own numbers of that moment in SI units, whatever the arguments leave of them."""
         return self._observation.copy()
+
+    def si_values(self, observations: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Observations (..., n_observation) of this environment in SI units, whether it is `scaled` or not."""
+        return np.asarray(observations, dtype=np.float64) * self._scale + self._origin
+
+    def as_observed(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The task's numbers (..., n_observation) in SI units as this environment observes them, `si_values` undone."""
+        return ((values - self._origin) / self._scale).astype(np.float32)
 
     @property
     def window(self) -> Window | None:
@@ -284,7 +298,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _observed(self) -> Observation:
         """The last observation, as obs_mode has it."""
         if self._eye is None:
-            observed = self._observation.copy()
+            observed = self.as_observed(self._observation)
             observed[self._unobserved] = 0.0
             return observed
         if self._picture is None:

@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 
 import msdm_core
@@ -30,6 +30,9 @@ from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
 
 # Fewest and most sites on a side of the grid; an odd number has one in the middle.
 SITES_FEWEST, SITES_MOST = 13, 25
+# Sites on a side of the touch map, the same for every organ, and their distance in tip radii; larger where that many
+# do not span the face.
+MAP_SIDE, MAP_CELL = 33, 0.5
 # Subdivisions of a cell of the grid in the table of surface points.
 POINTS_BETWEEN = 2
 # Rounding puts the chart's border slightly inside the margin: sites up to this [m] within it are accepted.
@@ -73,14 +76,6 @@ class Chart:
         """The point of the plane [m] (..., 2) at a place (..., 2) of the chart, the inverse of `place`."""
         return self.lower + 0.5 * (np.asarray(place, dtype=np.float64) + 1.0) * self.extent
 
-    def site(self, place: ArrayLike) -> int | None:
-        """Number of the grid's site nearest to a place (2,), row by row along the first axis; None beyond the grid."""
-        steps = 0.5 * (np.asarray(place, dtype=np.float64) + 1.0) * (self.side_count - 1)
-        column, row = np.floor(steps + 0.5).astype(int).tolist()
-        if not (0 <= column < self.side_count and 0 <= row < self.side_count):
-            return None
-        return row * self.side_count + column
-
     @property
     def sites(self) -> FloatArray:
         """Places of all sites, shape (side_count**2, 2), in the order of their numbers."""
@@ -110,6 +105,60 @@ def make_chart(face: PalpableFace, tip_radius: float) -> Chart:
 
 
 @dataclass(frozen=True, eq=False)
+class TouchMap:
+    """A square of MAP_SIDE x MAP_SIDE sites over the middle of a chart: the same size for every organ.
+
+    Fields:
+        extent: of the chart [m]                                                        (2,)
+        cell: distance between neighbouring sites [m], MAP_CELL tip radii where they span the chart
+        pressable: whether a site may be pressed, row by row along the chart's second axis  (MAP_SIDE**2,)
+    """
+
+    extent: FloatArray
+    cell: float
+    pressable: NDArray[np.bool_]
+
+    @property
+    def axes(self) -> tuple[FloatArray, FloatArray]:
+        """Coordinates of its columns and rows, lengths along the chart's sides [m], (MAP_SIDE,) each.
+
+        A column or row up to half a cell beyond the chart lies on its border.
+        """
+        steps = (np.arange(MAP_SIDE) - MAP_SIDE // 2) * self.cell
+        first, second = (_onto(0.5 * side + steps, side, 0.5 * self.cell) for side in self.extent)
+        return first, second
+
+    @cached_property
+    def sites(self) -> FloatArray:
+        """Lengths of all sites along the chart's sides [m], row by row, shape (MAP_SIDE**2, 2)."""
+        return np.stack(np.meshgrid(*self.axes), axis=-1).reshape(-1, 2)
+
+    @cached_property
+    def places(self) -> FloatArray:
+        """Places of all sites on the chart (MAP_SIDE**2, 2), -1 to 1 inside it."""
+        return 2.0 * self.sites / self.extent - 1.0
+
+    @cached_property
+    def rows_and_columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Numbers of the rows and of the columns that have a pressable site, ascending."""
+        face = self.pressable.reshape(MAP_SIDE, MAP_SIDE)
+        return np.flatnonzero(face.any(axis=1)), np.flatnonzero(face.any(axis=0))
+
+    def nearest(self, places: ArrayLike) -> NDArray[np.intp]:
+        """Number of the site nearest to each place (..., 2) of the chart; -1 beyond the square."""
+        steps = 0.5 * np.asarray(places, dtype=np.float64) * self.extent / self.cell + MAP_SIDE // 2
+        cell = np.floor(steps + 0.5).astype(np.intp)
+        inside = ((cell >= 0) & (cell < MAP_SIDE)).all(axis=-1)
+        return np.where(inside, cell[..., 1] * MAP_SIDE + cell[..., 0], -1)
+
+
+def _onto(values: FloatArray, length: float, reach: float) -> FloatArray:
+    """Values with those at most `reach` outside [0, length] moved onto its ends."""
+    inside = np.clip(values, 0.0, length)
+    return np.where(np.abs(values - inside) <= reach + ROUNDING, inside, values)
+
+
+@dataclass(frozen=True, eq=False)
 class Site:
     """A place that may be pressed.
 
@@ -127,10 +176,11 @@ class Site:
 
 @dataclass(frozen=True, eq=False)
 class ChartedFace:
-    """A palpable face and its chart."""
+    """A palpable face, its chart, and the radius of the tip that presses it [m]."""
 
     face: PalpableFace
     chart: Chart
+    tip_radius: float
 
     def site(self, place: ArrayLike) -> Site:
         """The site at a place of the chart (2,); the grid's nearest one if that may not be pressed.
@@ -166,6 +216,20 @@ class ChartedFace:
             )
         places, points, normals = (np.array(values) for values in zip(*allowed, strict=True))
         return places, points, normals
+
+    @cached_property
+    def touch_map(self) -> TouchMap:
+        """The sites of observations."""
+        extent = self.chart.extent
+        plain = TouchMap(extent, self.cell, np.ones(MAP_SIDE**2, dtype=np.bool_))
+        points = self.chart.plane_point(plain.places).tolist()
+        pressable = [self.face.site(u, v, slack=ROUNDING) is not None for u, v in points]
+        return TouchMap(extent, plain.cell, np.array(pressable))
+
+    @property
+    def cell(self) -> float:
+        """Distance between neighbouring sites of the touch map [m]."""
+        return max(MAP_CELL * self.tip_radius, float(self.chart.extent.max()) / (MAP_SIDE - 1))
 
     def surface(self, places: ArrayLike) -> FloatArray:
         """Surface points [m] (..., 3) at places of the chart (..., 2), interpolated in a table of projected points.
@@ -217,7 +281,8 @@ class HealthyMap:
 @lru_cache(maxsize=8)
 def charted_face(anatomy: Anatomy) -> ChartedFace:
     """The palpable face of an anatomy with its chart; the same anatomy gives the same object."""
-    return ChartedFace(anatomy.face, make_chart(anatomy.face, anatomy.scene.instrument.tip_radius))
+    tip_radius = anatomy.scene.instrument.tip_radius
+    return ChartedFace(anatomy.face, make_chart(anatomy.face, tip_radius), tip_radius)
 
 
 def healthy_map(scene: Scene) -> HealthyMap:

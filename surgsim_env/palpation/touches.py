@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.chart import Chart, ChartedFace, HealthyMap, Site
+from surgsim_env.palpation.chart import MAP_SIDE, ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.scene.model import PalpationSettings, Vector
 
@@ -86,7 +86,7 @@ class SiteTouches:
         self.touches: list[Touch] = []
         self.seconds = self.path_length = 0.0
         self._last_start: FloatArray | None = None
-        self._maps = np.zeros((2, self.charted.chart.side_count**2))
+        self._maps = np.zeros((2, len(self.charted.touch_map.pressable)))
 
     @property
     def last(self) -> Touch:
@@ -123,14 +123,14 @@ class SiteTouches:
         return np.array([touch.log_contrast for touch in self.touches])
 
     def maps(self) -> FloatArray:
-        """Log contrast, and 1 where pressed, for each site of the chart's grid, shape (2 n_site,).
+        """Log contrast, and 1 where pressed, for each site of the touch map, shape (2, n_site).
 
         A site that was pressed again has its latest contrast.
         """
-        return self._maps.ravel()
+        return self._maps
 
     def _mark(self, touch: Touch) -> None:
-        site = self.charted.chart.site(np.array(touch.place))
+        site = self.charted.touch_map.nearest(touch.place)
         self._maps[:, site] = touch.log_contrast, 1.0
 
     def get_state(self) -> dict[str, Any]:
@@ -172,30 +172,31 @@ class Indenter:
 
 
 class TouchMemory:
-    """Contrast at each site of a chart: force over Hertz's for nominal tissue, fitted to all readings there.
+    """Contrast at each site of a touch map: force over Hertz's for nominal tissue, fitted to all readings there.
 
     Readings f_i at depths with Hertz's forces h_i give the least-squares contrast sum(f_i h_i) / sum(h_i^2), so that
-    deep presses, which have the least relative noise, weigh most. Readings beyond the chart, and at less than half the
-    scene's press depth, are left out: |contrast| is at most the sensor's range over Hertz's force there (`bound`).
+    deep presses, which have the least relative noise, weigh most. Readings where no site may be pressed, and at less
+    than half the scene's press depth, are left out: |contrast| is at most the sensor's range over Hertz's force there
+    (`bound`).
     """
 
-    def __init__(self, chart: Chart, indenter: Indenter, *, press_depth: float, force_range: float) -> None:
+    def __init__(self, charted: ChartedFace, indenter: Indenter, *, press_depth: float, force_range: float) -> None:
         """Start with an empty record.
 
         Args:
-            chart: its sites are recorded.
+            charted: the face, whose touch map is recorded.
             indenter: model of the healthy press.
             press_depth: of the scene [m].
             force_range: of the sensor, each axis [N].
         """
-        self.chart, self.indenter = chart, indenter
+        self.chart, self.map, self.indenter = charted.chart, charted.touch_map, indenter
         self.least_depth = 0.5 * press_depth
         self.bound = math.sqrt(3.0) * force_range / indenter.force(self.least_depth)
         self.forget()
 
     def forget(self) -> None:
         """Begin an episode."""
-        self.product, self.square = np.zeros((2, self.chart.side_count**2))
+        self.product, self.square = np.zeros((2, len(self.map.pressable)))
 
     def restored(self, product: ArrayLike, square: ArrayLike) -> Self:
         """A copy with other sums of the readings, (n_site,) each; this one stays as it is.
@@ -205,7 +206,7 @@ class TouchMemory:
         """
         other = copy.copy(self)
         other.product, other.square = np.array(product, dtype=np.float64), np.array(square, dtype=np.float64)
-        sites = (self.chart.side_count**2,)
+        sites = self.map.pressable.shape
         if other.product.shape != sites or other.square.shape != sites or (other.square < 0.0).any():
             shapes = f"{other.product.shape} and {other.square.shape}"
             raise ValueError(f"memory: sums of shapes {shapes}; they must be {sites}, and squares at least 0")
@@ -213,8 +214,8 @@ class TouchMemory:
 
     def feel(self, place: FloatArray, depth: float, force: float) -> None:
         """Add a reading of the force along the normal [N], at a place of the chart (2,) and a depth [m]."""
-        site = self.chart.site(place)
-        if site is None or depth < self.least_depth:
+        site = self.map.nearest(place)
+        if site < 0 or not self.map.pressable[site] or depth < self.least_depth:
             return
         healthy = self.indenter.force(depth)
         self.product[site] += force * healthy
@@ -236,12 +237,11 @@ class TouchMemory:
             return np.zeros(3)
         around = _ratio(self._with_neighbours(self.product), self._with_neighbours(self.square))
         best = int(np.argmax(np.where(self.square > 0.0, around, -np.inf)))
-        return np.append(self.chart.sites[best], around[best])
+        return np.append(self.map.places[best], around[best])
 
     def _with_neighbours(self, values: FloatArray) -> FloatArray:
         """Sums over three by three sites."""
-        side = self.chart.side_count
-        padded = np.pad(values.reshape(side, side), 1)
+        padded = np.pad(values.reshape(MAP_SIDE, MAP_SIDE), 1)
         rows = padded[:-2] + padded[1:-1] + padded[2:]
         return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]).ravel()
 

@@ -18,12 +18,14 @@ from surgsim_env.scene.model import Vector, require_number
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.retract import AXIS_BOUND, FORCE_BOUND, SUCCESS_SHARE, TURNING_FULL_SCALE, RetractTask
 from surgsim_env.tasks.task import (
+    LENGTH_SCALE,
     SPEED_BOUND,
     SPEED_FULL_SCALE,
     TIP_POSITION,
     InfoValue,
     Start,
     check_share,
+    force_scale,
     soft_force_share,
 )
 
@@ -107,6 +109,7 @@ class BimanualRetractTask(RetractTask):
         Channel(
             "right_velocity", 3, "m/s", -SPEED_BOUND, SPEED_BOUND,
             read=lambda task, simulation: _right(simulation).tip_velocity, meaning="right tip's velocity",
+            scale=SPEED_FULL_SCALE,
         ),
         Channel(
             "right_axes", 6, "", -AXIS_BOUND, AXIS_BOUND,
@@ -117,10 +120,11 @@ class BimanualRetractTask(RetractTask):
             "right_force", 3, "N", sensor=1.0,
             read=lambda task, simulation: _pair(simulation).contact_force("right", simulation.contact_wrench),
             meaning="the tissue's force on the right arm, through the sensor model",
+            scale=force_scale, scale_text="soft limit",
         ),
         Channel(
             "touch_force", 1, "N", 0.0, FORCE_BOUND, felt=True, read=lambda task, simulation: task.touch_force,
-            meaning="force between the right arm and the bed",
+            meaning="force between the right arm and the bed", scale=force_scale, scale_text="soft limit",
         ),
         Channel(
             "uncovered", 1, "", 0.0, 1.0, read=lambda task, simulation: task.uncovered_share,
@@ -129,6 +133,7 @@ class BimanualRetractTask(RetractTask):
         Channel(
             "arm_distance", 1, "m", -DISTANCE_BOUND, DISTANCE_BOUND,
             read=lambda task, simulation: _pair(simulation).distance, meaning="distance of the arms, at most 0.05 m",
+            scale=LENGTH_SCALE,
         ),
     )  # fmt: skip
     # By the inequality of RetractTask; `near` may begin as high as 1, so that the margin is

@@ -74,7 +74,9 @@ class Channel:
         sensor: 0, or the factor on noise, bias and range of the scene's force sensor, whose model the value (3 numbers)
             passes through
         felt: whether it depends on force sensing, so that `observe_force=False` observes it as 0; true with a `sensor`
-        size_text, bounds_text: what the table shows for a size and for bounds that are functions
+        size_text, bounds_text, scale_text: what the table shows for a size, bounds and a scale that are functions
+        scale: value that an environment observes as 1, as a bound is given; required of a channel with a unit
+        origin: value that it observes as 0, likewise
     """
 
     name: str
@@ -88,9 +90,26 @@ class Channel:
     felt: bool = False
     size_text: str = "by the scene"
     bounds_text: str = "by the scene"
+    scale: Bound | None = None
+    origin: Bound = 0.0
+    scale_text: str = "by the scene"
 
     def __post_init__(self) -> None:
         _check_part("channel", self, self.size)
+        if self.scale is None:
+            if self.unit:
+                raise ValueError(
+                    f"channel {self.name!r} in {self.unit} has no scale: give the value that is observed as 1, so that "
+                    "a network reads numbers of order 1"
+                )
+            object.__setattr__(self, "scale", 1.0)
+        if not callable(self.scale):
+            scale = np.asarray(self.scale, dtype=np.float64)
+            if not (np.isfinite(scale).all() and (scale > 0.0).all()):
+                raise ValueError(
+                    f"channel {self.name!r}: scale is {self.scale!r}; it is the value that is observed as 1: give "
+                    "finite numbers above 0"
+                )
         if not callable(self.read):
             raise ValueError(
                 f"channel {self.name!r}: read is {self.read!r}; it must be a function (task, simulation) that returns "
@@ -112,6 +131,13 @@ class Channel:
                     f"channel {self.name!r}: bounds are {self.low!r} and {self.high!r}; low must be below high and "
                     "both finite: widen them"
                 )
+
+    @property
+    def scale_shown(self) -> str:
+        """Its scale as the table of observations shows it."""
+        if isinstance(self.scale, int | float):
+            return f"{self.scale:g} {self.unit}".strip()
+        return self.scale_text
 
     @property
     def bounds_shown(self) -> str:
@@ -221,14 +247,14 @@ def action_table(task_class: Any) -> str:
 
 
 def observation_table(task_class: Any) -> str:
-    """Channels of a task: size, meaning with unit, bounds; then those that `observe_force=False` observes as 0."""
+    """Channels of a task: size, meaning with unit, bounds, scale; then those that `observe_force=False` hides."""
     rows = []
     for one in task_class.channels:
         unit = f" [{one.unit}]" if one.unit else ""
-        rows.append((f"`{one.name}`", _size_shown(one), one.meaning + unit, one.bounds_shown))
+        rows.append((f"`{one.name}`", _size_shown(one), one.meaning + unit, one.bounds_shown, one.scale_shown))
     felt = ", ".join(f"`{one.name}`" for one in task_class.channels if one.felt)
     note = f"\n\nWith `observe_force=False` these are observed as 0: {felt}." if felt else ""
-    return table("channel, size, meaning, bounds", rows) + note
+    return table("channel, size, meaning, bounds, scale", rows) + SCALED + note
 
 
 def reward_table(task_class: Any) -> str:
@@ -268,7 +294,13 @@ def _size_shown(part: Command | Channel) -> str:
     return part.size_text if callable(part.size) else str(part.size)
 
 
-COMMON_ARGUMENTS = """* `observe_force`: False observes all channels that depend on force sensing as 0.
+SCALED = """
+
+Meanings and bounds are in SI units. The environment observes each value over its channel's scale, positions from the
+middle of their bounds; with `scaled=False` SI units. Numbers and places of entries are the same."""
+
+COMMON_ARGUMENTS = """* `scaled`: each value over its channel's scale, of order 1 (default); False: SI units.
+* `observe_force`: False observes all channels that depend on force sensing as 0.
 * `obs_mode`: "state" (default), or "rgb" for the endoscope's picture, `Box(0, 255, (84, 84, 3), uint8)` (needs OpenGL).
 * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
 * `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of

@@ -10,7 +10,7 @@ from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.palpation.chart import make_chart
+from surgsim_env.palpation.chart import MAP_SIDE, charted_face
 from surgsim_env.palpation.touches import Indenter, TouchMemory
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import DrawnOrgan
@@ -42,7 +42,7 @@ def touch_memory(anatomy: Anatomy) -> TouchMemory:
     """An empty memory for an anatomy's palpable face and its scene's sensor."""
     scene = anatomy.scene
     return TouchMemory(
-        make_chart(anatomy.face, scene.instrument.tip_radius),
+        charted_face(anatomy),
         Indenter(scene.instrument.tip_radius, scene.material),
         press_depth=scene.palpation.press_depth,
         force_range=scene.sensor.range,
@@ -50,7 +50,7 @@ def touch_memory(anatomy: Anatomy) -> TouchMemory:
 
 
 def _site_count(task: "PalpateTask") -> int:
-    return 0 if task.memory is None else task.memory.chart.side_count**2
+    return 0 if task.memory is None else MAP_SIDE**2
 
 
 def _stiffest_bound(task: "PalpateTask", instrument: Instrument) -> FloatArray:
@@ -70,10 +70,10 @@ class PalpateTask(Task):
     `Box(-1, 1, (4,), float32)`
 
     ## Observation Space
-    `Box((10,), float32)`, all bounds finite. With `memory=True` `Box((13 + 2 n,), float32)`: what the sensor felt so
-    far (`surgsim_env.palpation.touches`) on a grid of n sites over the palpable face
-    (`surgsim_env.palpation.chart`); n is 169 on `phantom`. `env.unwrapped.observation_slices` has the entries of each
-    channel by its name.
+    `Box((10,), float32)`, all bounds finite. With `memory=True` `Box((3280,), float32)`: what the sensor felt so far
+    (`surgsim_env.palpation.touches`) on a map of n = 33 x 33 sites, half a tip's radius apart, over the middle of the
+    palpable face (`surgsim_env.palpation.chart`), row by row, the same size for every organ; farther apart where 16 tip
+    radii do not span the face. `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
     ## Rewards
     `info["reward_<term>"]` shows what each term paid. A failure (a wrong declaration, the hard limit, a fault) also
@@ -134,6 +134,11 @@ class PalpateTask(Task):
             "visited", _site_count, "", 0.0, 1.0,
             read=lambda task, simulation: task.memory.visited,
             meaning="with `memory`: 1 for each site where something was felt", size_text="n or 0",
+        ),
+        Channel(
+            "face", _site_count, "", 0.0, 1.0,
+            read=lambda task, simulation: task.memory.map.pressable,
+            meaning="with `memory`: 1 for each site that lies on the palpable face", size_text="n or 0",
         ),
         Channel(
             "stiffest", lambda task: 0 if task.memory is None else 3,

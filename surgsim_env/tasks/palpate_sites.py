@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -12,7 +13,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.palpation.chart import HealthyMap, Site, charted_face, healthy_map
+from surgsim_env.palpation.chart import MAP_SIDE, HealthyMap, Site, charted_face, healthy_map
 from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
@@ -35,8 +36,16 @@ SUCCESS_ERROR = 0.005
 DEPTH_BOUND = 2.0
 
 
+# Bounds of a map's cell over the tip's radius, and of the deviation of a log contrast.
+CELL_BOUND, NOISE_BOUND = 100.0, 100.0
+
+
 def _map_size(task: "PalpateSitesTask") -> int:
-    return task.site_count**2 if task.memory else 0
+    return MAP_SIDE**2 if task.memory else 0
+
+
+def _with_memory(size: int) -> Callable[["PalpateSitesTask"], int]:
+    return lambda task: size if task.memory else 0
 
 
 def _force_bound(task: "PalpateSitesTask") -> float:
@@ -62,9 +71,10 @@ class PalpateSitesTask(Task):
     the chart's grid that may.
 
     ## Observation Space
-    With `memory=True` `Box((2 n n + 6,), float32)`, n x n sites of a fixed grid over the chart, row by row along its
-    second axis (n is odd, 13 to 25, sites about half a tip's radius apart; phantom 13, so 344 numbers); with
-    `memory=False` the last six alone: a true POMDP, for agents with a memory of their own. All bounds finite.
+    With `memory=True` `Box((3277,), float32)`: maps of n x n sites, n = 33, half a tip's radius apart, over the middle
+    of the chart, row by row along its second axis, the same size for every organ; sites are farther apart where 16 tip
+    radii do not span the chart, as `map_cell` shows. With `memory=False` the last six numbers alone: a true POMDP, for
+    agents with a memory of their own. All bounds finite.
     `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
     Contrast is stiffness (force over depth) over that of the scene's healthy organ of nominal modulus at this place, a
@@ -112,12 +122,31 @@ class PalpateSitesTask(Task):
     channels = (
         Channel(
             "contrast_map", _map_size, "", -LOG_CONTRAST_BOUND, LOG_CONTRAST_BOUND, felt=True,
-            read=lambda task, simulation: task.felt.maps()[: _map_size(task)],
+            read=lambda task, simulation: task.felt.maps()[0],
             meaning="log contrast of the latest press nearest to each site, 0 without one", size_text="n n or 0",
         ),
         Channel(
-            "pressed_map", _map_size, "", 0.0, 1.0, read=lambda task, simulation: task.felt.maps()[_map_size(task) :],
+            "pressed_map", _map_size, "", 0.0, 1.0, read=lambda task, simulation: task.felt.maps()[1],
             meaning="1 for each site where there was one", size_text="n n or 0",
+        ),
+        Channel(
+            "face_map", _map_size, "", 0.0, 1.0, read=lambda task, simulation: task.charted.touch_map.pressable,
+            meaning="1 for each site that may be pressed", size_text="n n or 0",
+        ),
+        Channel(
+            "map_cell", _with_memory(1), "", 0.0, CELL_BOUND,
+            read=lambda task, simulation: task.charted.cell / task.charted.tip_radius,
+            meaning="distance between neighbouring sites over the tip's radius", size_text="1 or 0",
+        ),
+        Channel(
+            "chart_share", _with_memory(2), "", 0.0, 1.0,
+            read=lambda task, simulation: task.charted.chart.extent / (task.charted.cell * (MAP_SIDE - 1)),
+            meaning="lengths of the chart's sides over the map's", size_text="2 or 0",
+        ),
+        Channel(
+            "contrast_noise", _with_memory(1), "", 0.0, NOISE_BOUND,
+            read=lambda task, simulation: task.estimator.noise,
+            meaning="standard deviation of one log contrast by the force sensor", size_text="1 or 0",
         ),
         Channel(
             "last_place", 2, "", -1.0, 1.0, read=lambda task, simulation: task.felt.last.place,
@@ -193,10 +222,9 @@ class PalpateSitesTask(Task):
         `take` with the result of the press, `observe`, `judge`.
 
         Attributes that agents and scores may read: `estimator` (the benchmark's common estimator, on the lengths of
-        `charted.chart`), `site_count` (sites on a side of the observation's grid), `budget`, `step_count`, `felt`
-        (record of the presses), `estimate`, `estimated` (where it is on the face [m] (k, 3)), `truth` (the face's
-        points nearest to the lesions' centres [m] (n_lesion, 3)), `error` (OSPA [m]), `found` (share of the lesions
-        with an estimate near them).
+        `charted.chart`), `budget`, `step_count`, `felt` (record of the presses), `estimate`, `estimated` (where it is
+        on the face [m] (k, 3)), `truth` (the face's points nearest to the lesions' centres [m] (n_lesion, 3)), `error`
+        (OSPA [m]), `found` (share of the lesions with an estimate near them).
 
         Args:
             anatomy: of a scene that `level.scene` gave.
@@ -218,7 +246,7 @@ class PalpateSitesTask(Task):
             budget = BUDGET_WIDE if chart.extent.max() > WIDE * tip else BUDGET
         if isinstance(budget, bool) or not isinstance(budget, int) or budget < 1:
             raise ValueError(f"budget is {budget!r}; it must be a whole number of presses, at least 1")
-        self.budget, self.site_count = budget, chart.side_count
+        self.budget = budget
         self.reading = ForceReading(scene.sensor)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
         healthy_force = float(healthy.grid.mean()) * scene.palpation.press_depth

@@ -22,6 +22,7 @@ from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera, Vec
 from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import (
+    LENGTH_SCALE,
     SPEED_FULL_SCALE,
     TIME_LEFT,
     TIP_POSITION,
@@ -32,6 +33,7 @@ from surgsim_env.tasks.task import (
     check_count,
     check_names,
     check_share,
+    force_scale,
     soft_force_share,
 )
 from surgsim_env.tasks.visibility import Disc, hiding_geoms, visible
@@ -60,6 +62,10 @@ TRACKED = tuple((along, depth, 1.0) for depth in (1.0, 0.5) for along in ALONG)
 
 def _lobe_lower(task: "RetractTask", instrument: Instrument) -> FloatArray:
     return np.tile(task.anatomy.mesh.points.min(axis=0) - LOBE_SLACK, len(ALONG))
+
+
+def _lobe_middle(task: "RetractTask", instrument: Instrument) -> FloatArray:
+    return 0.5 * (_lobe_lower(task, instrument) + _lobe_upper(task, instrument))
 
 
 def _lobe_upper(task: "RetractTask", instrument: Instrument) -> FloatArray:
@@ -135,23 +141,26 @@ class RetractTask(Task):
         ),
         Channel(
             "opening", 1, "m", -OPENING_BOUND, OPENING_BOUND,
-            read=lambda task, simulation: task.grasp.opening, meaning="gap between the pads",
+            read=lambda task, simulation: task.grasp.opening, meaning="gap between the pads", scale=LENGTH_SCALE,
         ),
         Channel(
             "contact_force", 3, "N", sensor=1.0, read=lambda task, simulation: jaw_wrench(simulation)[0],
             meaning="contact force on the jaw, mean of the last haptic step, through the sensor model",
+            scale=force_scale, scale_text="soft limit",
         ),
         Channel(
             "contact_torque", 3, "N m", sensor=TORQUE_LEVER, read=lambda task, simulation: jaw_wrench(simulation)[1],
             meaning="its torque about the tip, likewise; its range is the force sensor's times 10 mm",
+            scale=lambda task, instrument: TORQUE_LEVER * force_scale(task, instrument),
+            scale_text="soft limit x 10 mm",
         ),
         Channel(
             "grip_force", 1, "N", 0.0, FORCE_BOUND, felt=True, read=lambda task, simulation: task.grasp.grip_force,
-            meaning="the smaller of the two pads' normal forces",
+            meaning="the smaller of the two pads' normal forces", scale=force_scale, scale_text="soft limit",
         ),
         Channel(
             "pull_force", 1, "N", 0.0, FORCE_BOUND, felt=True, read=lambda task, simulation: task.grasp.pull_force,
-            meaning="size of the sum of both fingers' forces",
+            meaning="size of the sum of both fingers' forces", scale=force_scale, scale_text="soft limit",
         ),
         Channel(
             "holds", 1, "", 0.0, 1.0, read=lambda task, simulation: float(task.grasp.holds),
@@ -161,11 +170,13 @@ class RetractTask(Task):
             "edge_points", 3 * len(ALONG), "m", _lobe_lower, _lobe_upper,
             read=lambda task, simulation: simulation.organ_state.node_position[task.tracked_nodes[: len(ALONG)]],
             meaning="five points of the free edge, on top, along x", bounds_text="the lobe's box and 0.1 m",
+            scale=LENGTH_SCALE, origin=_lobe_middle,
         ),
         Channel(
             "middle_points", 3 * len(ALONG), "m", _lobe_lower, _lobe_upper,
             read=lambda task, simulation: simulation.organ_state.node_position[task.tracked_nodes[len(ALONG) :]],
             meaning="five points half way to the held edge, likewise", bounds_text="the lobe's box and 0.1 m",
+            scale=LENGTH_SCALE, origin=_lobe_middle,
         ),
         Channel(
             "visible", 1, "", 0.0, 1.0, read=lambda task, simulation: task.visible_share,
@@ -176,7 +187,8 @@ class RetractTask(Task):
             low=lambda task, instrument: [task.table.target_along[0], task.table.target_distance[0]],
             high=lambda task, instrument: [task.table.target_along[1], task.table.target_distance[1]],
             read=lambda task, simulation: task.drawn.target[:2],
-            meaning="x and y of the target", bounds_text="the scene's ranges",
+            meaning="x and y of the target", bounds_text="the scene's ranges", scale=LENGTH_SCALE,
+            origin=lambda task, instrument: [np.mean(task.table.target_along), np.mean(task.table.target_distance)],
         ),
         TIME_LEFT,
     )  # fmt: skip

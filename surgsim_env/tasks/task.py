@@ -31,6 +31,8 @@ InfoValue = bool | float | str
 
 # Full scale of a velocity command [m/s].
 SPEED_FULL_SCALE = 0.02
+# Length that is observed as 1 [m], near the radius of a tip.
+LENGTH_SCALE = 0.01
 # Bounds of the tip beyond its workspace [m] and on its speed [m/s].
 POSITION_SLACK = 0.005
 SPEED_BOUND = 0.5
@@ -234,6 +236,11 @@ class Task:
         """The entries of an observation that each channel has, by its name."""
         return _slices((channel.name, size) for channel, size in self._observed)
 
+    @property
+    def declared(self) -> dict[str, tuple[int, str]]:
+        """Size and scale, as the documentation shows it, of each channel that is observed, by its name."""
+        return {channel.name: (size, channel.scale_shown) for channel, size in self._observed}
+
     @classmethod
     def channel_slices(cls, **sizes: int) -> dict[str, slice]:
         """`observation_slices` without an episode, from the sizes of the channels whose size is a function."""
@@ -260,22 +267,39 @@ class Task:
         pairs = [self._channel_bounds(channel, size, instrument) for channel, size in self._observed]
         return np.concatenate([low for low, _ in pairs]), np.concatenate([high for _, high in pairs])
 
+    def scales(self, instrument: Instrument | None) -> tuple[FloatArray, FloatArray]:
+        """Origin and scale of each entry of the observation with an instrument, shape (n_observation,) each.
+
+        An environment observes (value - origin) / scale.
+
+        Raises:
+            ValueError: a channel whose origin or scale is not finite, does not fit its size, or a scale not above 0.
+        """
+        origins = [self._entries(one, size, "origin", one.origin, instrument) for one, size in self._observed]
+        scales = [self._entries(one, size, "scale", one.scale, instrument) for one, size in self._observed]
+        for (channel, _), scale in zip(self._observed, scales, strict=True):
+            if not (scale > 0.0).all():
+                raise ValueError(f"channel {channel.name!r}: scale is {scale.tolist()}; it must be above 0")
+        return np.concatenate(origins), np.concatenate(scales)
+
+    def _entries(self, channel: Channel, size: int, what: str, given: Any, instrument: Instrument | None) -> FloatArray:
+        """A bound, an origin or a scale of a channel as an array (size,)."""
+        value = np.asarray(given(self, instrument) if callable(given) else given, dtype=np.float64)
+        if value.size not in (1, size) or not np.isfinite(value).all():
+            raise ValueError(
+                f"channel {channel.name!r}: {what} is {value.tolist()}; it must be one finite number or {size}, "
+                f"in {channel.unit or 'its own unit'}"
+            )
+        return np.broadcast_to(value.ravel(), size).copy()
+
     def _channel_bounds(
         self, channel: Channel, size: int, instrument: Instrument | None
     ) -> tuple[FloatArray, FloatArray]:
         if channel.low is None or channel.high is None:
             reach = np.full(size, self.sensors[channel.name].sensor.range)
             return -reach, reach
-        sides = []
-        for side in (channel.low, channel.high):
-            value = np.asarray(side(self, instrument) if callable(side) else side, dtype=np.float64)
-            if value.size not in (1, size) or not np.isfinite(value).all():
-                raise ValueError(
-                    f"channel {channel.name!r}: a bound is {value.tolist()}; it must be one finite number or {size}, "
-                    f"in {channel.unit or 'its own unit'}"
-                )
-            sides.append(np.broadcast_to(value.ravel(), size).copy())
-        low, high = sides
+        low = self._entries(channel, size, "a bound", channel.low, instrument)
+        high = self._entries(channel, size, "a bound", channel.high, instrument)
         if not (low <= high).all():
             raise ValueError(f"channel {channel.name!r}: low is {low.tolist()}, above high {high.tolist()}: swap them")
         return low, high
@@ -550,22 +574,30 @@ class Task:
 
 # ---- channels and values that many tasks share ------------------------------------------------------------------
 
+
+def force_scale(task: Task, instrument: Instrument | None) -> float:
+    """Force that is observed as 1 [N]: the scene's soft limit."""
+    return task.limits.soft_force
+
+
 TIP_POSITION = Channel(
     "tip_position", 3, "m",
     low=lambda task, instrument: instrument.lower - POSITION_SLACK,
     high=lambda task, instrument: instrument.upper + POSITION_SLACK,
     read=lambda task, simulation: simulation.instrument.tip_position,
     meaning="tip position", bounds_text="the organ's bounding box with a margin",
+    scale=LENGTH_SCALE, origin=lambda task, instrument: 0.5 * (instrument.lower + instrument.upper),
 )  # fmt: skip
 TIP_VELOCITY = Channel(
     "tip_velocity", 3, "m/s", -SPEED_BOUND, SPEED_BOUND,
     read=lambda task, simulation: simulation.instrument.tip_velocity,
-    meaning="tip velocity",
+    meaning="tip velocity", scale=SPEED_FULL_SCALE,
 )  # fmt: skip
 CONTACT_FORCE = Channel(
     "contact_force", 3, "N", sensor=1.0,
     read=lambda task, simulation: simulation.contact_force,
     meaning="contact force on the tip, mean of the last haptic step, through the sensor model",
+    scale=force_scale, scale_text="soft limit",
 )  # fmt: skip
 TIME_LEFT = Channel(
     "time_left", 1, "", 0.0, 1.0,

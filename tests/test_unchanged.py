@@ -158,7 +158,7 @@ def make(env_id: str, scene: str, **settings: object) -> gym.Env | gym.vector.Ve
     # Others take from half a minute on, so that they may come from the user's cache.
     fresh = scene == "phantom_small" and "Sites" in env_id
     with variable("SURGSIM_CACHE", fresh_folder()) if fresh else contextlib.nullcontext():
-        return maker(f"SurgSim/{env_id}", scene=scene, **settings)  # type: ignore[arg-type, operator, return-value]
+        return maker(f"SurgSim/{env_id}", scene=scene, scaled=False, **settings)  # type: ignore[arg-type, operator, return-value]
 
 
 def random_actions(env_id: str, space: gym.spaces.Box, scene: str, count: int) -> np.ndarray:
@@ -242,11 +242,11 @@ def play_greedy(scene: str, presses: int, seed: int = 3, **settings: object) -> 
     observation, info = env.reset(seed=seed)
     keep(parts, observation, None, None, None, info)
     actions = random_actions("PalpateSites-v0", env.action_space, scene, presses)
-    side = int(np.sqrt((len(observation) - 6) // 2))
+    sites = env.unwrapped.task.charted.touch_map.places  # type: ignore[union-attr]
     for number, action in enumerate(actions):
         if number % 2:
-            place = np.array(np.unravel_index(int(np.argmax(observation[: side**2])), (side, side)))
-            action = np.clip(2.0 * place / (side - 1) - 1.0 + 0.1 * action, -1.0, 1.0).astype(np.float32)
+            place = sites[int(np.argmax(observation[: len(sites)]))]
+            action = np.clip(place + 0.1 * action, -1.0, 1.0).astype(np.float32)
         observation, *rest = env.step(action)
         keep(parts, observation, *rest)
     keep_state(parts, env)

@@ -16,8 +16,9 @@ class EnvironmentSettings:
     Fields:
         id: of the environment, such as "SurgSim/Palpate-v0"
         kwargs: its arguments (scene, level, memory, ...)
-        kind: "lanes" (side by side in vector registers), "library" (presses looked up, PalpateSites only), "surrogate"
-            (forces by formula, Palpate on blocks only) or "dummy" (one after the other, any Gymnasium id)
+        kind: "lanes" (side by side in vector registers), "library" (presses looked up, PalpateSites only), "bells"
+            (contrast from bell curves on drawn faces, PalpateSites only), "surrogate" (forces by formula, Palpate on
+            blocks only) or "dummy" (one after the other, any Gymnasium id)
         count: number of environments
         dtype, threads: of lanes
         library: file of presses for kind "library"
@@ -29,7 +30,7 @@ class EnvironmentSettings:
 
     id: str
     kwargs: dict[str, Any] = field(default_factory=dict)
-    kind: Literal["lanes", "library", "surrogate", "dummy"] = "lanes"
+    kind: Literal["lanes", "library", "bells", "surrogate", "dummy"] = "lanes"
     count: int = 16
     dtype: Literal["float64", "float32"] = "float32"
     threads: int = 1

@@ -56,6 +56,10 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
         from agents.press_library import PressLibraryEnv
 
         return DummyVecEnv([lambda: PressLibraryEnv(settings.library, **settings.kwargs)] * count)
+    if settings.kind == "bells":
+        from agents.training.bell_sites import BellSites
+
+        return DummyVecEnv([BellSites] * count)
     if settings.kind == "surrogate":
         from agents.training.palpate_surrogate import PalpateSurrogate
 

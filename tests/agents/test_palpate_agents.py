@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
+from surgsim_env.palpation.chart import MAP_SIDE
 
 pytestmark = pytest.mark.agents
 pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
@@ -59,11 +60,13 @@ def test_its_memory_is_the_environments():
         tip = envs.tip[0]
         surface, normal = env.task.anatomy.face.project(tip)
         depth = memory.indenter.radius - (tip - surface) @ normal
-        memory.feel(memory.chart.place(surface), depth, float(observation[0, 8]))
+        seen = env.si_values(observation[0])
+        memory.feel(memory.chart.place(surface), depth, float(seen[8]))
     assert memory.visited.sum() > 30
-    np.testing.assert_allclose(observation[0, 10:179], memory.contrast, rtol=1e-5)
-    np.testing.assert_array_equal(observation[0, 179:348], memory.visited)
-    np.testing.assert_allclose(observation[0, 348:], memory.stiffest(), rtol=1e-5)
+    slices = env.observation_slices
+    np.testing.assert_allclose(seen[slices["contrast"]], memory.contrast, rtol=1e-4)
+    np.testing.assert_array_equal(seen[slices["visited"]], memory.visited)
+    np.testing.assert_allclose(seen[slices["stiffest"]], memory.stiffest(), rtol=1e-4)
 
 
 def test_its_spaces_rewards_and_ends_are_the_environments():
@@ -139,15 +142,25 @@ def test_the_expert_refuses_what_it_cannot_do():
 def test_extractors_choose_what_they_say():
     import torch
 
-    from agents.training.extractors import MemorySummary, PlaceAndForce
+    from agents.training.extractors import WITH_MEMORY, MemorySummary, PlaceAndForce
 
     space = gym.make(ID, memory=True).observation_space
-    row = torch.arange(351.0)[None]
-    marks = [10 + 169 + corner for corner in (0, 12, 156, 168)]
-    assert MemorySummary(space)(row)[0].tolist() == [0, 1, 2, 8, *marks, 348, 349, 350]
+    assert space.shape is not None
+    row = torch.arange(float(space.shape[0]))[None]
+    # A face of 11 x 9 sites with a corner cut off, in the middle of the map.
+    face = torch.zeros(MAP_SIDE, MAP_SIDE)
+    middle = MAP_SIDE // 2
+    face[middle - 4 : middle + 5, middle - 5 : middle + 6] = 1.0
+    face[middle + 4, middle + 5] = 0.0
+    face[middle + 4, middle + 4] = 0.0
+    row[0, WITH_MEMORY["face"]] = face.flatten()
+    corners = [(-4, -5), (-4, 5), (4, -5), (3, 5)]
+    marks = [WITH_MEMORY["visited"].start + (middle + y) * MAP_SIDE + middle + x for y, x in corners]
+    stiffest = WITH_MEMORY["stiffest"]
+    assert MemorySummary(space)(row)[0].tolist() == [0, 1, 2, 8, *range(stiffest.start, stiffest.stop), *marks]
     short = gym.make(ID).observation_space
     assert PlaceAndForce(short)(row[:, :10])[0].tolist() == [0, 1, 2, 8]
-    with pytest.raises(ValueError, match="an observation of 10 numbers is not that of Palpate-v0 with memory=True"):
+    with pytest.raises(ValueError, match="is not that of Palpate-v0 with memory=True"):
         MemorySummary(short)
     with pytest.raises(ValueError, match="is not that of Palpate-v0 with memory=False"):
         PlaceAndForce(space)

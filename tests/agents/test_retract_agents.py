@@ -65,7 +65,7 @@ def test_the_expert_follows_from_the_observation_alone():
 
 def test_forces_are_those_entries_of_the_observation():
     """Where the jaw presses tissue, they alone tell the wrench, grip and pull."""
-    env = gym.make(ID)
+    env = gym.make(ID, scaled=False)
     observation, _ = env.reset(seed=3)
     task = env.unwrapped.task  # type: ignore[attr-defined]
     assert task.force_entries == list(range(13, 21))

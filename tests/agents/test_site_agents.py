@@ -7,12 +7,15 @@ import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents.evaluate import find_agent
-from agents.scoring.site_agent import SiteFacts
+from agents.scoring.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts
 from agents.site_search import AGENTS, BOUNDS
+from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
 pytestmark = pytest.mark.agents
-FACTS = SiteFacts(extent=(0.04, 0.04), site_count=13, tip_radius=0.008, noise=0.05, budget=25)
+# Under a tip of 8 mm: 11 x 11 sites of the map, 4 mm apart.
+FACE = np.pad(np.ones((11, 11), dtype=bool), (MAP_SIDE - 11) // 2)
+FACTS = SiteFacts(TouchMap(np.array([0.04, 0.04]), 0.004, FACE.ravel()), tip_radius=0.008, noise=0.05, budget=25)
 NAMES = [name for name in AGENTS if name not in BOUNDS]
 
 
@@ -25,13 +28,12 @@ class Chart:
         self.values: list[float] = []
 
     def observation(self) -> np.ndarray:
-        count = FACTS.site_count
-        memory = np.zeros((2, count**2))
+        seen = np.zeros(OBSERVATION_SIZE, dtype=np.float32)
         for place, value in zip(self.places, self.values, strict=True):
-            column, row = np.round(place / FACTS.extent * (count - 1)).astype(int)
-            memory[:, row * count + column] = value, 1.0
-        left = 1.0 - len(self.places) / FACTS.budget
-        return np.concatenate([memory.ravel(), np.zeros(5), [left]]).astype(np.float32)
+            site = FACTS.map.nearest(2.0 * place / FACTS.extent - 1.0)
+            seen[SLICES["contrast_map"]][site], seen[SLICES["pressed_map"]][site] = value, 1.0
+        seen[SLICES["presses_left"]] = 1.0 - len(self.places) / FACTS.budget
+        return seen
 
     def press(self, action: np.ndarray) -> None:
         assert action.shape == (2,) and action.dtype == np.float32 and (np.abs(action) <= 1.0).all()
@@ -93,7 +95,7 @@ def test_what_is_felt_draws_presses(name: str, inner: float, outer: float) -> No
 def test_variance_reduction_fills_the_chart() -> None:
     """No candidate is farther from a press than one correlation length after 25 presses."""
     places = played("gp_variance", Chart([(0.027, 0.013)]))
-    gaps = np.linalg.norm(FACTS.sites[:, None] - places, axis=2).min(axis=1)
+    gaps = np.linalg.norm(FACTS.sites[FACTS.map.pressable][:, None] - places, axis=2).min(axis=1)
     assert gaps.max() < 0.010
 
 

@@ -9,9 +9,26 @@ import torch
 from stable_baselines3 import PPO
 
 from agents.evaluate import POLICIES
-from agents.scoring.site_agent import LENGTH_SHARE, SiteFacts, SiteProcess
+from agents.scoring.site_agent import (
+    LENGTH_SHARE,
+    OBSERVATION_SIZE,
+    SITE_COUNT,
+    SLICES,
+    SiteFacts,
+    SiteProcess,
+    observed_facts,
+)
 from agents.training.policy_files import describe, load_policy, save_policy
-from agents.training.site_policy import CURIOSITY, SHARPNESS, SiteBelief, SitePolicy
+from agents.training.site_policy import (
+    CHOICE_SPACE,
+    CURIOSITY,
+    FEATURE_SPACE,
+    SHARPNESS,
+    SitePolicy,
+    belief_features,
+    site_actions,
+)
+from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import (
     BACKGROUND_SPREAD,
     EXCESS_LENGTH,
@@ -21,26 +38,44 @@ from surgsim_env.palpation.lesion_estimator import (
 )
 
 pytestmark = pytest.mark.agents
-SETTINGS = SiteFacts(extent=(0.04, 0.03), site_count=7, tip_radius=0.008, noise=0.04)
-SITES = SETTINGS.site_count**2
-OUTERMOST = np.pad(np.zeros((5, 5), dtype=bool), 1, constant_values=True).ravel()
+# A chart of 40 x 32 mm under a tip of 8 mm: 11 x 9 sites of the map, 4 mm apart, around its middle.
+EXTENT, TIP, CELL, NOISE = np.array([0.04, 0.032]), 0.008, 0.004, 0.04
+MIDDLE = MAP_SIDE // 2
+FACE = np.zeros((MAP_SIDE, MAP_SIDE), dtype=bool)
+FACE[MIDDLE - 4 : MIDDLE + 5, MIDDLE - 5 : MIDDLE + 6] = True
+SETTINGS = SiteFacts(TouchMap(EXTENT, CELL, FACE.ravel()), TIP, NOISE)
+# Those off the chart's border, and not in a corner that was cut off.
+INSIDE = np.zeros((MAP_SIDE, MAP_SIDE), dtype=bool)
+INSIDE[MIDDLE - 3 : MIDDLE + 4, MIDDLE - 4 : MIDDLE + 5] = True
+
+
+def at(row: int, column: int) -> int:
+    """The number of the site so many rows and columns from the middle."""
+    return (MIDDLE + row) * MAP_SIDE + MIDDLE + column
 
 
 def observed(contrast: dict[int, float], left: float = 0.6) -> np.ndarray:
     """An observation that remembers the log contrast of some sites."""
-    values = np.zeros(2 * SITES + 6, dtype=np.float32)
+    values = np.zeros(OBSERVATION_SIZE, dtype=np.float32)
     for site, value in contrast.items():
-        values[site], values[SITES + site] = value, 1.0
-    values[-1] = left
+        values[SLICES["contrast_map"]][site], values[SLICES["pressed_map"]][site] = value, 1.0
+    values[SLICES["face_map"]] = FACE.ravel()
+    values[SLICES["map_cell"]] = CELL / TIP
+    values[SLICES["chart_share"]] = EXTENT / (CELL * (MAP_SIDE - 1))
+    values[SLICES["contrast_noise"]] = NOISE
+    values[SLICES["presses_left"]] = left
     return values
 
 
-def place(site: int) -> tuple[float, float]:
-    row, column = divmod(site, SETTINGS.site_count)
-    return column / 6 * SETTINGS.extent[0], row / 6 * SETTINGS.extent[1]
+def place(site: int) -> np.ndarray:
+    row, column = divmod(site, MAP_SIDE)
+    return 0.5 * EXTENT + CELL * np.array([column - MIDDLE, row - MIDDLE])
 
 
-@pytest.mark.parametrize("pressed", [{3: 0.1, 17: 0.5, 24: -0.2, 40: 0.05}, {24: 0.3}])
+PRESSES = [{at(-3, -3): 0.1, at(0, 2): 0.5, at(0, 0): -0.2, at(3, 1): 0.05}, {at(0, 0): 0.3}]
+
+
+@pytest.mark.parametrize("pressed", PRESSES)
 def test_belief_is_that_of_scikit_learn(pressed):
     """Its process predicts background plus excess; mean and variance of the excess follow from its fitted weights."""
     from scipy.linalg import solve_triangular
@@ -54,54 +89,67 @@ def test_belief_is_that_of_scikit_learn(pressed):
         alpha=SETTINGS.noise**2 + MODEL_SPREAD**2,
         optimizer=None,  # pyright: ignore[reportArgumentType]  (None is documented)
     )
-    sites = np.array([place(site) for site in range(SITES)])
+    sites = np.array([place(site) for site in range(SITE_COUNT)])
+    inside = FACE.ravel()
     peer.fit(sites[list(pressed)], observation[list(pressed)])
     covariance = excess(sites, peer.X_train_)
     explained = solve_triangular(peer.L_, covariance.T, lower=True)
     belief = SiteProcess(SETTINGS).belief(observation)
-    np.testing.assert_allclose(belief.excess, covariance @ peer.alpha_, atol=1e-12)
-    np.testing.assert_allclose(belief.spread, np.sqrt(EXCESS_SPREAD**2 - (explained**2).sum(axis=0)), atol=1e-10)
-    features = SiteBelief(SETTINGS).features(observation[None])[0]
-    np.testing.assert_allclose(features[:SITES] * EXCESS_SPREAD, belief.excess, atol=1e-7)
-    np.testing.assert_allclose(features[SITES : 2 * SITES] * EXCESS_SPREAD, belief.spread, atol=1e-7)
+    expected = np.sqrt(EXCESS_SPREAD**2 - (explained**2).sum(axis=0))
+    np.testing.assert_allclose(belief.excess[inside], (covariance @ peer.alpha_)[inside], atol=1e-12)
+    np.testing.assert_allclose(belief.spread[inside], expected[inside], atol=1e-10)
+    # What a policy reads of the observation, in tip radii, is the same in single precision.
+    excess_read, spread_read, touched, face = belief_features(observation[None])[0][:-2].reshape(4, -1)
+    np.testing.assert_allclose(excess_read * EXCESS_SPREAD, belief.excess, atol=1e-6)
+    np.testing.assert_allclose(spread_read * EXCESS_SPREAD, belief.spread, atol=1e-6)
+    assert np.flatnonzero(touched).tolist() == sorted(pressed) and (face > 0.5).tolist() == INSIDE.ravel().tolist()
     # A belief of the estimator's own length is another one.
-    longer = contrast_process(SETTINGS.axes, tip_radius=SETTINGS.tip_radius, noise=SETTINGS.noise)
+    longer = contrast_process(SETTINGS.map.axes, tip_radius=SETTINGS.tip_radius, noise=SETTINGS.noise)
     _, other = longer.mean(sites[list(pressed)], observation[list(pressed)])
     assert np.abs(belief.excess - other.ravel()).max() > 0.01
 
 
 def test_doubt_is_that_of_the_joint_normal_distribution():
-    belief, visited = SiteBelief(SETTINGS), [3, 17, 24]
-    assert belief.features(observed({})[None])[0][SITES : 2 * SITES].tolist() == [1.0] * SITES
-    doubt = belief.features(observed(dict.fromkeys(visited, 0.1))[None])[0][SITES : 2 * SITES] * EXCESS_SPREAD
-    # Bayes' rule in terms of precisions: excess at every site and the background, then the presses.
-    places = np.array([place(site) for site in range(SITES)])
+    visited = [at(-4, 0), at(0, 2), at(0, 0)]
+    spread = slice(SITE_COUNT, 2 * SITE_COUNT)
+    assert belief_features(observed({})[None])[0][spread].tolist() == [1.0] * SITE_COUNT
+    doubt = belief_features(observed(dict.fromkeys(visited, 0.1))[None])[0][spread] * EXCESS_SPREAD
+    # Bayes' rule in terms of precisions: excess at the face's sites and the background, then the presses.
+    sites = np.flatnonzero(FACE.ravel())
+    places, count = np.array([place(site) for site in sites]), len(sites)
     squared = ((places[:, None] - places) ** 2).sum(axis=2)
-    prior = np.zeros((SITES + 1, SITES + 1))
-    prior[:-1, :-1] = EXCESS_SPREAD**2 * np.exp(-0.5 * squared / (LENGTH_SHARE * EXCESS_LENGTH) ** 2) + 1e-8 * np.eye(
-        SITES
-    )
+    prior = np.zeros((count + 1, count + 1))
+    prior[:-1, :-1] = EXCESS_SPREAD**2 * np.exp(-0.5 * squared / (LENGTH_SHARE * EXCESS_LENGTH) ** 2)
+    prior[:-1, :-1] += 1e-8 * np.eye(count)
     prior[-1, -1] = BACKGROUND_SPREAD**2
-    seen = np.eye(SITES + 1)[visited]
+    seen = np.eye(count + 1)[np.searchsorted(sites, visited)]
     seen[:, -1] = 1.0
-    posterior = np.linalg.inv(np.linalg.inv(prior) + seen.T @ seen / belief.process.process.noise_variance)
-    np.testing.assert_allclose(doubt, np.sqrt(np.diag(posterior)[:-1]), atol=1e-4)
+    posterior = np.linalg.inv(np.linalg.inv(prior) + seen.T @ seen / SiteProcess(SETTINGS).process.noise_variance)
+    np.testing.assert_allclose(doubt[sites], np.sqrt(np.diag(posterior)[:-1]), atol=1e-4)
 
 
-def test_sites_and_actions_are_the_grids():
-    belief = SiteBelief(SETTINGS)
-    np.testing.assert_allclose(belief.action(np.array([0, 6, 42, 24])), [[-1, -1], [1, -1], [-1, 1], [0, 0]], atol=1e-7)
+def test_sites_and_actions_are_the_maps():
+    sites = np.array([at(-4, -5), at(-4, 5), at(4, -5), at(0, 0), at(2, 1)])
+    expected = [[-1, -1], [1, -1], [-1, 1], [0, 0], [0.2, 0.5]]
+    np.testing.assert_allclose(site_actions(np.stack([observed({})] * 5), sites), expected, atol=1e-6)
+
+
+def test_facts_are_those_of_the_observation():
+    facts = observed_facts(observed({}))
+    np.testing.assert_allclose(facts.extent * TIP, EXTENT, rtol=1e-6)
+    np.testing.assert_allclose(facts.sites[FACE.ravel()] * TIP, SETTINGS.sites[FACE.ravel()], rtol=1e-6, atol=1e-9)
+    assert facts.noise == pytest.approx(NOISE) and facts.map.pressable.tolist() == FACE.ravel().tolist()
 
 
 def test_an_untrained_policy_is_an_upper_confidence_bound():
-    belief = SiteBelief(SETTINGS)
-    policy = SitePolicy(belief.space, gym.spaces.Discrete(SITES), lambda _: 1e-3)
-    features = belief.features(np.stack([observed({3: 0.1, 17: 0.5}), observed({40: 0.3})]))
+    policy = SitePolicy(FEATURE_SPACE, CHOICE_SPACE, lambda _: 1e-3)
+    # A site of the border, which is no candidate, and others.
+    features = belief_features(np.stack([observed({at(-4, 0): 0.1, at(0, 2): 0.5}), observed({at(3, 3): 0.3})]))
     logits = policy.get_distribution(torch.as_tensor(features)).distribution.logits
-    bound = SHARPNESS * (features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES])
-    touched = (features[:, 2 * SITES : 3 * SITES] > 0.5) | OUTERMOST
-    # Site 3 lies in the outermost row.
-    assert touched.sum(axis=1).tolist() == [24 + 1, 24 + 1]
+    excess, spread, pressed, face = np.moveaxis(features[:, :-2].reshape(2, 4, -1), 1, 0)
+    bound = SHARPNESS * (excess + CURIOSITY * spread)
+    touched = (pressed > 0.5) | (face < 0.5)
+    assert (~touched).sum(axis=1).tolist() == [63 - 1, 63 - 1]
     assert (logits.exp().detach().numpy()[touched] == 0.0).all()
     difference = logits.detach().numpy() - bound
     for one, hidden in zip(difference, touched, strict=True):
@@ -113,29 +161,34 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
 @pytest.mark.parametrize("path", sorted(POLICIES.glob("sites_*.safetensors")), ids=lambda path: path.stem)
 def test_shipped_policies_load(path):
     policy = load_policy(path)
-    assert isinstance(policy.networks, SitePolicy) and policy.belief is not None
-    count = policy.belief.site_count**2
-    actions = policy.act(np.zeros((1, 2 * count + 6), dtype=np.float32), np.ones(1, dtype=bool))
+    assert isinstance(policy.networks, SitePolicy) and policy.description.belief
+    assert policy.description.observation is not None
+    actions = policy.act(observed({})[None], np.ones(1, dtype=bool))
     assert (np.abs(actions) < 1.0).all()
+
+
+def test_a_face_that_is_pressed_everywhere_is_pressed_again():
+    everything = observed(dict.fromkeys(np.flatnonzero(INSIDE).tolist(), 0.1))
+    policy = SitePolicy(FEATURE_SPACE, CHOICE_SPACE, lambda _: 1e-3)
+    chosen, _ = policy.predict(belief_features(everything[None]), deterministic=True)
+    assert INSIDE.ravel()[chosen[0]]
 
 
 def test_a_saved_policy_presses_what_its_scores_say(tmp_path):
     class Sites(gym.Env):
         """Just spaces: the policy is never asked to step."""
 
-        observation_space = SiteBelief(SETTINGS).space
-        action_space = gym.spaces.Discrete(SITES)
+        observation_space = FEATURE_SPACE
+        action_space = CHOICE_SPACE
 
     model = PPO(SitePolicy, Sites(), n_steps=8, batch_size=8)
     file = tmp_path / "p.safetensors"
-    save_policy(model.policy, describe(model, None, env_id="SurgSim/PalpateSites-v0", belief=SETTINGS), file)
+    save_policy(model.policy, describe(model, None, env_id="SurgSim/PalpateSites-v0", belief=True), file)
     policy = load_policy(file)
     policy.reset(2)
-    observations = np.stack([observed({3: 0.1, 17: 0.5}), observed({40: 0.3})])
+    observations = np.stack([observed({at(-4, 0): 0.1, at(0, 2): 0.5}), observed({at(3, 3): 0.3})])
     actions = policy.act(observations, np.ones(2, dtype=bool))
-    belief = SiteBelief(SETTINGS)
-    features = belief.features(observations)
-    bound = features[:, :SITES] + CURIOSITY * features[:, SITES : 2 * SITES]
-    bound[(features[:, 2 * SITES : 3 * SITES] > 0.5) | OUTERMOST] = -np.inf
-    np.testing.assert_array_equal(actions, belief.action(bound.argmax(axis=1)))
+    excess, spread, pressed, face = np.moveaxis(belief_features(observations)[:, :-2].reshape(2, 4, -1), 1, 0)
+    bound = np.where((pressed > 0.5) | (face < 0.5), -np.inf, excess + CURIOSITY * spread)
+    np.testing.assert_array_equal(actions, site_actions(observations, bound.argmax(axis=1)))
     assert actions.dtype == np.float32

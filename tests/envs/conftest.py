@@ -8,7 +8,7 @@ from surgsim_env.envs.ids import RetractEnv
 @pytest.fixture(scope="module")
 def shared_retract():
     """One environment for tests that leave nothing behind but an episode."""
-    return RetractEnv()
+    return RetractEnv(scaled=False)
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ EMPTY = Grasp(opening=0.02, grip_force=0.0, pull_force=0.0, friction_left=0.0, h
 
 @pytest.fixture(scope="module")
 def shared():
-    return BimanualRetractEnv()
+    return BimanualRetractEnv(scaled=False)
 
 
 @pytest.fixture

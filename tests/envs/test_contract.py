@@ -12,6 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.palpation.chart import MAP_SIDE
 from surgsim_env.scene.load import scenes_folder
 from tests.envs.own_task import load_own_task
 from tests.envs.walks import rollout
@@ -42,7 +43,10 @@ CELLS = {
 HINGE = {f"tip_axes[{entry}]" for entry in range(4)}
 UNSEEN = {"grip_force[0]", "holds[0]", "visible[0]"}
 STILL = {
-    "SurgSim/PalpateSites-v0": {f"{name}[{site}]" for name in ("contrast_map", "pressed_map") for site in range(13**2)},
+    "SurgSim/PalpateSites-v0": {
+        *(f"{name}[{site}]" for name in ("contrast_map", "pressed_map", "face_map") for site in range(MAP_SIDE**2)),
+        *("map_cell[0]", "chart_share[0]", "chart_share[1]", "contrast_noise[0]"),
+    },
     "SurgSim/Retract-v0": HINGE | UNSEEN,
     "SurgSim/BimanualRetract-v0": UNSEEN | {"touch_force[0]", "uncovered[0]"},
 }
@@ -184,8 +188,23 @@ def test_channels_make_up_the_observation_in_their_order(made):
     observation, info = env.reset(seed=1)
     if "tip_position" in slices:
         tip = env.simulation.instrument.tip_position.astype(np.float32)
-        np.testing.assert_array_equal(observation[slices["tip_position"]], tip)
+        np.testing.assert_array_equal(env.task_observation[slices["tip_position"]], tip)
+        np.testing.assert_allclose(env.si_values(observation)[slices["tip_position"]], tip, atol=1e-7)
     assert [key for key in info if key.startswith("reward_")] == [f"reward_{one.name}" for one in task.rewards]
+
+
+def test_scaled_observations_are_of_order_one_and_hold_what_si_units_do(made):
+    scaled, plain = made(), made(scaled=False)
+    steps = 12 // SHORTER.get(scaled.spec.id, 1)
+    first, second = rollout(scaled, seed=3, steps=steps), rollout(plain, seed=3, steps=steps)
+    inner = scaled.unwrapped
+    for one, other in zip(first, second, strict=True):
+        # To the rounding of single precision, of the value or of what it was less.
+        back, rounding = inner.si_values(one[0]), 3e-7 * (np.abs(inner._origin) + inner._scale)
+        assert (np.abs(back - other[0]) <= rounding + 3e-7 * np.abs(other[0])).all()
+        assert one[1:] == other[1:]
+        assert np.abs(one[0]).max() < 40.0
+    assert inner.save_state() == plain.unwrapped.save_state()
 
 
 def test_documentation_names_every_command_channel_and_reward(made):

@@ -367,7 +367,7 @@ def test_a_tracked_step_goes_with_the_surface(scene_file):
 
 def test_a_target_lies_on_its_bed_that_moves():
     """What the endoscope looks for, and what pictures show, goes with the bed; observed is its place at rest."""
-    env = gym.make("SurgSim/Retract-v0", motion="free").unwrapped
+    env = gym.make("SurgSim/Retract-v0", motion="free", scaled=False).unwrapped
     env.reset(seed=2)
     place = env.task.target.centre.copy()
     env.simulation.drive = env.simulation.drive._replace(delay=np.zeros(2))

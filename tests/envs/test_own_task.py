@@ -12,7 +12,7 @@ from tests.envs.own_task import load_own_task
 HEIGHT = Channel(
     "height", 2, "m", -0.1, 0.1,
     read=lambda task, simulation: [simulation.instrument.tip_position[2], 0.01],
-    meaning="height of the tip, and a hundredth",
+    meaning="height of the tip, and a hundredth", scale=0.01,
 )  # fmt: skip
 SLOW = Reward("slow", -0.5, "step", "speed of the tip", lambda task, step: task.speed(step.simulation))
 
@@ -66,8 +66,8 @@ def test_one_more_channel_and_reward_in_a_shipped_task_are_one_place(registered)
     slices = inner.observation_slices
     assert slices == {**plain.unwrapped.observation_slices, "height": slice(10, 12)}
     space = env.observation_space
-    assert space.shape == (12,) and (space.high[10:] == np.float32(0.1)).all() and (space.low[10:] < 0.0).all()
-    assert "| `height` | 2 | height of the tip, and a hundredth [m] | +-0.1 |" in inner.__doc__
+    assert space.shape == (12,) and (space.high[10:] == np.float32(10.0)).all() and (space.low[10:] < 0.0).all()
+    assert "| `height` | 2 | height of the tip, and a hundredth [m] | +-0.1 | 0.01 m |" in inner.__doc__
     assert "| `slow` | -0.5 | control step | speed of the tip |" in inner.__doc__
     assert "## Starting State" in inner.__doc__ or inner.__doc__.startswith("Palpate slowly.")
     observation, info = env.reset(seed=3)

@@ -15,7 +15,7 @@ STEP = 0.05
 
 @pytest.fixture
 def env():
-    return gym.make("SurgSim/Palpate-v0").unwrapped
+    return gym.make("SurgSim/Palpate-v0", scaled=False).unwrapped
 
 
 def place(env, x, y, gap=0.001):

@@ -6,8 +6,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401
+from surgsim_env.palpation.chart import MAP_SIDE
 
 ID = "SurgSim/Palpate-v0"
+SITES = MAP_SIDE**2
+CONTRAST, VISITED, FACE = (slice(10 + k * SITES, 10 + (k + 1) * SITES) for k in range(3))
 DOWN, ACROSS, UP = [0.0, 0.0, -0.5, 0.0], [0.6, 0.3, 0.0, 0.0], [0.0, 0.0, 0.8, 0.0]
 WALK = np.array([DOWN] * 16 + [ACROSS] * 10 + [UP] * 4, dtype=np.float32)
 
@@ -22,70 +25,72 @@ def walked(env, seed=3):
 
 
 def test_without_memory_nothing_has_changed_and_with_it_more_is_appended():
-    plain, long = walked(gym.make(ID)), walked(gym.make(ID, memory=True))
-    assert plain.shape[1] == 10 and long.shape[1] == 10 + 2 * 13 * 13 + 3
+    plain, long = walked(gym.make(ID, scaled=False)), walked(gym.make(ID, memory=True, scaled=False))
+    assert plain.shape[1] == 10 and long.shape[1] == 10 + 3 * SITES + 3
     np.testing.assert_array_equal(long[:, :10], plain)
 
 
 def test_contrasts_are_the_fit_of_the_readings_to_hertz():
     """Recomputed from the first ten entries alone: place, reading; the top of the phantom is at z = 30 mm."""
-    env = gym.make(ID, memory=True)
+    env = gym.make(ID, memory=True, scaled=False)
     seen = walked(env)
-    felt, healthy = np.zeros((2, 169))
+    felt, healthy = np.zeros((2, SITES))
     for row in seen.astype(np.float64):
         depth = 0.008 + 0.030 - row[2]
         if depth < 0.002:
             continue
-        # 13 sites over the 40 mm between margins of 10 mm.
-        column, line = np.round((row[:2] - 0.010) / (0.040 / 12)).astype(int)
+        # Sites of 4 mm around the middle of the top, at 30 mm.
+        column, line = np.round((row[:2] - 0.030) / 0.004).astype(int) + MAP_SIDE // 2
         hertz = 4 / 3 * 5000 / (1 - 0.45**2) * np.sqrt(0.008) * depth**1.5
-        felt[13 * line + column] += row[8] * hertz
-        healthy[13 * line + column] += hertz**2
+        felt[MAP_SIDE * line + column] += row[8] * hertz
+        healthy[MAP_SIDE * line + column] += hertz**2
     visited = healthy > 0.0
     assert 3 <= visited.sum() <= 20
-    np.testing.assert_array_equal(seen[-1, 179:348], visited)
+    np.testing.assert_array_equal(seen[-1, VISITED], visited)
     # The observation is rounded to float32: 1 nm of 38 mm, so a part in 1e5 of a depth of 2 mm.
-    np.testing.assert_allclose(seen[-1, 10:179][visited], felt[visited] / healthy[visited], rtol=1e-4)
-    assert not seen[-1, 10:179][~visited].any()
-    assert 0.5 < seen[-1, 10:179][visited].mean() < 3.0, "a tray stiffens Hertz's half space"
+    np.testing.assert_allclose(seen[-1, CONTRAST][visited], felt[visited] / healthy[visited], rtol=1e-4)
+    assert not seen[-1, CONTRAST][~visited].any()
+    assert 0.5 < seen[-1, CONTRAST][visited].mean() < 3.0, "a tray stiffens Hertz's half space"
 
 
 def test_the_stiffest_place_is_where_most_was_felt():
-    env = gym.make(ID, memory=True)
+    env = gym.make(ID, memory=True, scaled=False)
     seen = walked(env)
     u, v, contrast = seen[-1, -3:]
-    chart = env.unwrapped.task.memory.chart
-    site = chart.site([u, v])
-    assert seen[-1, 179:348][site] == 1.0
-    np.testing.assert_allclose(chart.sites[site], [u, v], atol=1e-6)
-    felt = seen[-1, 10:179][seen[-1, 179:348] > 0.0]
+    touch_map = env.unwrapped.task.memory.map
+    site = touch_map.nearest([u, v])
+    assert seen[-1, VISITED][site] == 1.0
+    np.testing.assert_allclose(touch_map.places[site], [u, v], atol=1e-6)
+    felt = seen[-1, CONTRAST][seen[-1, VISITED] > 0.0]
     assert felt.mean() <= contrast <= felt.max()
 
 
 def test_an_episode_begins_with_nothing_remembered():
-    env = gym.make(ID, memory=True)
-    assert walked(env)[-1, 179:348].any()
-    assert not env.reset()[0][10:].any()
+    env = gym.make(ID, memory=True, scaled=False)
+    assert walked(env)[-1, VISITED].any()
+    begun = env.reset()[0]
+    assert not begun[10 : FACE.start].any() and not begun[FACE.stop :].any()
+    assert begun[FACE].sum() == 11 * 11
 
 
 def test_passes_gymnasiums_checker_and_bounds_are_finite():
-    env = gym.make(ID, memory=True).unwrapped
+    env = gym.make(ID, memory=True, scaled=False).unwrapped
     assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
     check_env(env)
 
 
 def test_a_saved_state_holds_the_memory():
-    env = gym.make(ID, memory=True).unwrapped
+    env = gym.make(ID, memory=True, scaled=False).unwrapped
     walked(env)
     saved = env.save_state()
     expected = env.step(WALK[0])
-    other = gym.make(ID, memory=True).unwrapped
+    other = gym.make(ID, memory=True, scaled=False).unwrapped
     other.reset(seed=50)
     other.load_state(saved)
     assert other.save_state() == saved
     assert other.step(WALK[0])[0].tobytes() == expected[0].tobytes()
     with pytest.raises(ValueError, match="observation has shape"):
-        gym.make(ID).unwrapped.load_state(saved)
+        gym.make(ID, scaled=False).unwrapped.load_state(saved)
 
 
 @pytest.mark.slow
@@ -93,11 +98,11 @@ def test_side_by_side_is_as_alone():
     envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", memory=True)
     rows = [envs.reset(seed=[8, 3])[0]]
     rows += [envs.step(np.tile(action, (2, 1)))[0] for action in WALK]
-    np.testing.assert_array_equal(np.array(rows)[:, 1], walked(gym.make(ID, memory=True)))
+    np.testing.assert_array_equal(np.array(rows)[:, 1], walked(gym.make(ID, memory=True, scaled=False)))
 
 
 def test_entries_of_the_force_sensor_are_named():
-    env = gym.make(ID, memory=True)
+    env = gym.make(ID, memory=True, scaled=False)
     numbers = env.unwrapped.task.force_entries
-    assert numbers == [6, 7, 8, *range(10, 179), 348, 349, 350]
+    assert numbers == [6, 7, 8, *range(CONTRAST.start, CONTRAST.stop), *range(FACE.stop, FACE.stop + 3)]
     assert gym.make(ID).unwrapped.task.force_entries == [6, 7, 8]

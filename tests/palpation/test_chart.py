@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.chart import make_chart
+from surgsim_env.palpation.chart import MAP_SIDE, charted_face, make_chart
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
@@ -29,13 +29,40 @@ def test_places_points_and_sites_are_each_others_inverse(scene: str):
     plane = chart.plane_point(chart.sites)
     points = plane[:, :1] * chart.across + plane[:, 1:] * chart.along
     np.testing.assert_allclose(chart.place(points), chart.sites, atol=1e-9)
-    assert [chart.site(place) for place in chart.sites] == list(range(chart.side_count**2))
-    step = 2.0 / (chart.side_count - 1)
-    assert chart.site([-1.0 - 0.49 * step, 1.0]) == chart.side_count**2 - chart.side_count
-    assert chart.site([-1.0 - 0.51 * step, 1.0]) is None
     # Every place that a raster of the face allows is on the chart.
     allowed = chart.place(anatomy.face.raster(0.01)[0])
     assert np.abs(allowed).max() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize(("scene", "count"), [("phantom_small", 9 * 9), ("phantom", 11 * 11), ("liver", None)])
+def test_the_touch_map_holds_the_sites_that_may_be_pressed(scene: str, count: int | None):
+    charted = charted_face(load_anatomy(make_scene(scene)))
+    chart, touch_map, face = charted.chart, charted.touch_map, charted.face
+    assert charted.cell == pytest.approx(0.5 * charted.tip_radius)
+    assert touch_map.pressable.shape == (MAP_SIDE**2,) and touch_map.pressable.sum() == (
+        count or touch_map.pressable.sum()
+    )
+    assert touch_map.nearest(touch_map.places).tolist() == list(range(MAP_SIDE**2))
+    middle = MAP_SIDE**2 // 2
+    np.testing.assert_allclose(touch_map.places[middle], [0.0, 0.0], atol=1e-12)
+    # What may be pressed is on the chart, is pressed where it lies, and is what the face says.
+    allowed = touch_map.places[touch_map.pressable]
+    assert np.abs(allowed).max() <= 1.0 + 1e-12
+    assert max(charted.site(place).moved for place in allowed) == 0.0
+    beyond = touch_map.places[~touch_map.pressable]
+    assert all(face.site(*chart.plane_point(place).tolist(), slack=1e-9) is None for place in beyond)
+    # A place is nearest to the site of its cell, and those beyond the square have none.
+    cell = 2.0 * charted.cell / chart.extent
+    assert touch_map.nearest(0.49 * cell) == middle
+    assert touch_map.nearest(0.51 * cell) == middle + MAP_SIDE + 1
+    assert touch_map.nearest([17.0 * cell[0], 0.0]) == -1
+
+
+def test_a_face_too_long_for_the_map_has_larger_cells():
+    charted = charted_face(load_anatomy(make_scene("phantom")))
+    small = replace(charted, tip_radius=0.001)
+    assert small.cell == pytest.approx(0.040 / (MAP_SIDE - 1))
+    assert small.touch_map.pressable.all()
 
 
 def test_a_margin_that_leaves_nothing_is_refused():

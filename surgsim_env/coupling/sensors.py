@@ -8,24 +8,54 @@ from surgsim_env.scene.model import ForceSensor
 
 
 class ForceReading:
-    """A three-axis force sensor: reading = force + bias + noise, clipped to +-range on each axis.
+    """A three-axis force sensor: reading = held force + bias + drift x time + noise, clipped to +-range on each axis.
 
-    The bias is drawn once per episode, the noise for each reading. The clip is the only one between simulation and
-    observation, and it is reported.
+    Bias and drift are drawn once per episode, the noise for each reading; the held force follows the force with a play
+    of +-hysteresis. The clip is the only one between simulation and observation, and it is reported.
+
+    Fields:
+        bias: [N] (3,)
+        drift: rate of the bias [N/s] (3,)
+        held: force that the sensor holds [N] (3,)
     """
 
-    def __init__(self, sensor: ForceSensor, bias: ArrayLike = (0.0, 0.0, 0.0)) -> None:
-        """Take the description of a sensor, and its present bias [N] (3,)."""
+    def __init__(self, sensor: ForceSensor, state: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+        """Take the description of a sensor, and its present state (`get_state`).
+
+        Raises:
+            ValueError: another number of entries than the sensor's.
+        """
         self.sensor = sensor
-        self.bias = np.array(bias, dtype=np.float64)
+        values = np.array(state, dtype=np.float64)
+        # One that neither drifts nor holds has a bias alone.
+        self._plain = not (sensor.drift or sensor.hysteresis)
+        size = 3 if self._plain else 9
+        if values.shape == (3,):
+            values = np.concatenate([values, np.zeros(size - 3)])
+        if values.shape != (size,):
+            raise ValueError(f"bias has {values.size} entries; the rule is {size} for this sensor")
+        self.bias = values[:3]
+        self.drift, self.held = (np.zeros(3), np.zeros(3)) if self._plain else (values[3:6], values[6:])
+
+    def get_state(self) -> list[float]:
+        """Bias; of a sensor with drift or hysteresis also the drift and the held force."""
+        return self.bias.tolist() if self._plain else np.concatenate([self.bias, self.drift, self.held]).tolist()
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Draw the episode's bias [N], uniform in +-sensor.bias on each axis."""
+        """Draw the episode's bias [N] and drift [N/s], each uniform on each axis; no force is held."""
         self.bias = rng.uniform(-self.sensor.bias, self.sensor.bias, size=3)
+        if not self._plain:
+            self.drift, self.held = rng.uniform(-self.sensor.drift, self.sensor.drift, size=3), np.zeros(3)
 
-    def read(self, force: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """One reading of a force (3,) [N], and whether an axis exceeded the sensor's range."""
-        reading = force + self.bias + rng.normal(0.0, self.sensor.noise, size=3)
+    def follow(self, force: FloatArray) -> None:
+        """Let the held force follow a force (3,) [N]."""
+        play = self.sensor.hysteresis
+        self.held = np.clip(self.held, force - play, force + play)
+
+    def read(self, force: FloatArray, rng: np.random.Generator, time: float) -> tuple[FloatArray, bool]:
+        """One reading of a force (3,) [N] at a time of the episode [s], and whether an axis exceeded the range."""
+        self.follow(force)
+        reading = self.held + self.bias + self.drift * time + rng.normal(0.0, self.sensor.noise, size=3)
         saturated = bool((np.abs(reading) > self.sensor.range).any())
         return self._clipped(reading), saturated
 

@@ -222,9 +222,10 @@ class ChartedFace:
         """The sites of observations."""
         extent = self.chart.extent
         plain = TouchMap(extent, self.cell, np.ones(MAP_SIDE**2, dtype=np.bool_))
+        on_chart = (np.abs(plain.places) <= 1.0 + ROUNDING).all(axis=1)
         points = self.chart.plane_point(plain.places).tolist()
-        pressable = [self.face.site(u, v, slack=ROUNDING) is not None for u, v in points]
-        return TouchMap(extent, plain.cell, np.array(pressable))
+        allowed = [self.face.site(u, v, slack=ROUNDING) is not None for u, v in points]
+        return TouchMap(extent, plain.cell, np.array(allowed) & on_chart)
 
     @property
     def cell(self) -> float:

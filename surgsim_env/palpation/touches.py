@@ -75,10 +75,12 @@ class SiteTouches:
     Fields:
         touches: one a press, in their order
         seconds, path_length: of the tip so far [s], [m], with the travel between sites, which is not simulated
+        map_shift: where the healthy map lies off the organ, along the chart's sides [m] (2,)
     """
 
     def __init__(self, charted: ChartedFace, healthy: HealthyMap, palpation: PalpationSettings) -> None:
         self.charted, self.healthy, self.palpation = charted, healthy, palpation
+        self.map_shift = np.zeros(2)
         self.clear()
 
     def clear(self) -> None:
@@ -95,7 +97,7 @@ class SiteTouches:
 
     def add(self, site: Site, result: PressResult, force: float) -> None:
         """Record a press at a site, with the sensor's reading of the force along the normal [N]."""
-        healthy = float(self.healthy.stiffness(site.place))
+        healthy = float(self.healthy.stiffness(site.place + 2.0 * self.map_shift / self.charted.chart.extent))
         # Bias and noise may reverse a small force, and an arm may not reach below the surface: the least contrast.
         contrast = force / (result.depth * healthy) if result.depth > 0.0 else 0.0
         log_contrast = math.log(contrast) if contrast > 0.0 else -math.inf

@@ -11,7 +11,7 @@ from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Capsule, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.load import fill_json, nearest
+from surgsim_env.scene.load import fill_json, make_material, nearest
 from surgsim_env.scene.model import LesionDraw, Range, Scene, require_number
 
 # Least distance between lesions' balls under a tip of radius REFERENCE_TIP [m], in proportion for other tips: nearer
@@ -42,6 +42,13 @@ class Level:
         background: range of the factor on the healthy tissue's modulus; lesions keep their ratio to it.
         capsule_share: probability that an organ without a capsule gets one, drawn from CAPSULE_STIFFNESS.
         sensor_noise, sensor_bias: factors on the scene's force sensor.
+        sensor_drift: largest drift of the force sensor, as a share of its range in a second.
+        sensor_hysteresis: half the width of its loop, as a share of its range.
+        tissue: material of the library whose law healthy tissue has, with the scene's own modulus and density; None:
+            the scene's law.
+        motion: how the patient moves, where the environment's arguments do not say; None: as the scene says.
+        map_error: deviation along each of the chart's sides at which the healthy map lies off the organ [m]; each
+            episode draws one.
     """
 
     name: str
@@ -53,18 +60,35 @@ class Level:
     capsule_share: float
     sensor_noise: float
     sensor_bias: float
+    sensor_drift: float = 0.0
+    sensor_hysteresis: float = 0.0
+    tissue: str | None = None
+    motion: str | None = None
+    map_error: float = 0.0
 
     def scene(self, scene: Scene) -> Scene:
-        """A scene at this level: with its sensor, and mass scaling where stiffer tissue needs shorter substeps.
+        """A scene at this level: with its sensor and tissue, and mass scaling where stiffer tissue needs it.
 
         Raises:
             ValueError: the scene has no [lesion] table, or the level's share of one of its ranges is invalid.
         """
         self.lesion_draw(scene)
+        own = scene.sensor
         sensor = replace(
-            scene.sensor, noise=scene.sensor.noise * self.sensor_noise, bias=scene.sensor.bias * self.sensor_bias
+            own,
+            noise=own.noise * self.sensor_noise,
+            bias=own.bias * self.sensor_bias,
+            drift=own.drift + self.sensor_drift * own.range,
+            hysteresis=own.hysteresis + self.sensor_hysteresis * own.range,
         )
-        return replace(scene, sensor=sensor, timing=replace(scene.timing, mass_scaling=True))
+        return replace(self.healthy(scene), sensor=sensor, timing=replace(scene.timing, mass_scaling=True))
+
+    def healthy(self, scene: Scene) -> Scene:
+        """A scene with this level's healthy tissue, before an operation."""
+        if self.tissue is None:
+            return scene
+        law = make_material(self.tissue).material
+        return replace(scene, material=replace(scene.material, stiffening=law.stiffening, relaxation=law.relaxation))
 
     def lesion_draw(self, scene: Scene) -> LesionDraw:
         """The lesion ranges of a scene at this level."""
@@ -216,12 +240,31 @@ def _apart(lesion: Lesion, others: Sequence[Lesion], gap: float) -> bool:
 # Ranges: normal liver by elastography 6.63 +- 1.65 kPa, +-25 % from one person to the next, HCC and metastases 8 times
 # that, malignant lesions at large 3 times (doi 10.1177/8756479317733713, 10.1186/s43055-020-00186-2), adenomas twice
 # (PMID 26299323); sensors of minimally invasive tools 5 to 50 mN.
+# "clinical": stiffening and relaxation as identified on pig liver (scenes/materials), a ventilated patient
+# (scenes/motions); drift, hysteresis and the map's error are chosen, of the order of data sheets of miniature strain
+# gauge sensors and of surface registrations in liver surgery, without a source for the numbers.
 LEVELS: Mapping[str, Level] = {
     level.name: level
     for level in (
         Level("easy", (0.0, 1.0), (0.5, 1.0), (0.0, 0.5), (0.5, 1.0), (0.9, 1.1), 0.0, 1.0, 1.0),
         Level("standard", (0.1, 0.5, 0.25, 0.15), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (0.7, 1.3), 0.5, 2.0, 1.0),
-        Level("hard", (0.15, 0.3, 0.3, 0.25), (-0.25, 0.5), (0.0, 2.0), (-1.0 / 3.0, 0.5), (0.7, 1.3), 0.5, 4.0, 2.0),
+        Level("hard", (0.15, 0.3, 0.3, 0.25), (0.0, 0.75), (0.25, 1.25), (0.0, 0.75), (0.7, 1.3), 0.5, 3.0, 2.0),
+        Level(
+            "clinical",
+            (0.1, 0.5, 0.25, 0.15),
+            (0.0, 1.0),
+            (0.0, 1.0),
+            (0.0, 1.0),
+            (0.7, 1.3),
+            0.5,
+            2.0,
+            1.0,
+            sensor_drift=2e-4,
+            sensor_hysteresis=0.005,
+            tissue="pig_liver_ex_vivo_relaxing",
+            motion="calm",
+            map_error=0.004,
+        ),
     )
 }
 

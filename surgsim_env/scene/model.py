@@ -401,19 +401,26 @@ class Limits:
 
 @dataclass(frozen=True)
 class ForceSensor:
-    """A force sensor per axis: reading = force + bias + noise, clipped at +-range and flagged.
+    """A force sensor per axis: reading = held force + bias + drift x time + noise, clipped at +-range and flagged.
 
     Args:
         noise: standard deviation of each reading [N].
         bias: largest bias [N]; each episode draws one uniformly from [-bias, bias].
         range: largest reading [N].
+        drift: largest rate at which the bias changes [N/s]; each episode draws one uniformly from [-drift, drift].
+        hysteresis: half the width of the loop of a slow cycle [N]: the held force follows the force with a play of
+            +-hysteresis (the play operator, Visintin 1994, Differential Models of Hysteresis, III.2).
     """
 
     noise: float
     bias: float
     range: float
+    drift: float = 0.0
+    hysteresis: float = 0.0
 
     def __post_init__(self) -> None:
+        require_number("sensor.drift", self.drift, 0.0, "N/s")
+        require_number("sensor.hysteresis", self.hysteresis, 0.0, "N")
         require_number("sensor.noise", self.noise, 0.0, "N")
         require_number("sensor.bias", self.bias, 0.0, "N")
         require_number("sensor.range", self.range, 0.0, "N", above=True)

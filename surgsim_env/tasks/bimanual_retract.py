@@ -14,7 +14,7 @@ from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import fill_json
-from surgsim_env.scene.model import Vector, require_number
+from surgsim_env.scene.model import require_number
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.retract import AXIS_BOUND, FORCE_BOUND, SUCCESS_SHARE, TURNING_FULL_SCALE, RetractTask
 from surgsim_env.tasks.task import (
@@ -264,7 +264,7 @@ class BimanualRetractTask(RetractTask):
     def get_state(self) -> str:
         """Draw, biases, counters and measures as JSON, exact."""
         right = {
-            "bias": self.sensors["right_force"].bias.tolist(),
+            "bias": self.sensors["right_force"].get_state(),
             "felt": [self.uncovered_share, self.touch_force],
         }
         return json.dumps({"left": super().get_state(), **right})
@@ -286,7 +286,7 @@ class _SavedBimanual:
     """What `BimanualRetractTask.get_state` writes: RetractTask's text, and of the right arm bias and measures."""
 
     left: str
-    bias: Vector
+    bias: list[float]
     felt: tuple[float, float]
 
 

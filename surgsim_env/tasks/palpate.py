@@ -15,7 +15,6 @@ from surgsim_env.palpation.touches import Indenter, TouchMemory
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import DrawnOrgan
 from surgsim_env.scene.load import fill_json
-from surgsim_env.scene.model import Vector
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import (
     CONTACT_FORCE,
@@ -106,7 +105,8 @@ class PalpateTask(Task):
       arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
       its tip points along the scene's approach as far as its joints allow.
     * `motion`: "none", "calm" or "free": how the patient breathes (docs/motion.md); by default as the scene says.
-    * `level`: "easy", "standard" or "hard" (`surgsim_env.scene.levels`); None, the default: the scene's own ranges.
+    * `level`: "easy", "standard", "hard" or "clinical" (`surgsim_env.scene.levels`); None, the default: the scene's own
+      ranges.
     * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
 
     ## Version History
@@ -254,7 +254,7 @@ class PalpateTask(Task):
         return json.dumps(
             {
                 "drawn": self.drawn.to_json(),
-                "bias": self.sensors["contact_force"].bias.tolist(),
+                "bias": self.sensors["contact_force"].get_state(),
                 "counts": [self.step_count, self.declare_count],
                 "declare_value": self._declare_value,
                 "memory": None if self.memory is None else [self.memory.product.tolist(), self.memory.square.tolist()],
@@ -287,7 +287,7 @@ class _SavedPalpation:
     """What `PalpateTask.get_state` writes."""
 
     drawn: str
-    bias: Vector
+    bias: list[float]
     counts: tuple[int, int]
     declare_value: float
     memory: tuple[list[float], list[float]] | None

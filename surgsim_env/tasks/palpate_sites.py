@@ -21,7 +21,6 @@ from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, Site
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
 from surgsim_env.scene.load import fill_json, make_scene, with_instrument
-from surgsim_env.scene.model import Vector
 from surgsim_env.scene.motions import STILL, with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import InfoValue, Start, Task, check_count, check_share, soft_force_share
@@ -109,7 +108,7 @@ class PalpateSitesTask(Task):
     * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "phantom".
     * `motion`: "none", "calm" or "free": how the patient breathes (docs/motion.md); by default as the scene says.
     * `track_motion`: a press goes with the surface as a camera's markers show it (default), or to where it is at rest.
-    * `level`: "easy", "standard" (default) or "hard".
+    * `level`: "easy", "standard" (default), "hard" or "clinical".
     * `memory`: observe all presses (default), or the last one alone.
     * `budget`: presses of an episode; by default 25, or 60 where the chart is longer than ten tip radii.
     * `instrument`: "probe", the name of an arm or the path of an arm's TOML file; by default the scene's own.
@@ -278,8 +277,10 @@ class PalpateSitesTask(Task):
     ) -> tuple[Simulation, Self]:
         """As `Task.make`, with the map of the scene's healthy organ."""
         chosen, plain = find_level(level or "standard"), make_scene(scene)
-        anatomy = load_anatomy(chosen.scene(with_motion(with_instrument(plain, instrument), motion)))
-        task = cls(anatomy, chosen, healthy_map(with_motion(plain, STILL)), memory=memory, budget=budget, **settings)
+        moving = with_motion(with_instrument(plain, instrument), motion or chosen.motion)
+        anatomy = load_anatomy(chosen.scene(moving))
+        healthy = healthy_map(chosen.healthy(with_motion(plain, STILL)))
+        task = cls(anatomy, chosen, healthy, memory=memory, budget=budget, **settings)
         return Simulation(anatomy), task
 
     def reset(self, rng: np.random.Generator) -> Start:
@@ -296,6 +297,8 @@ class PalpateSitesTask(Task):
         self.drawn = drawn
         self.truth = drawn.places(self.anatomy) if truth is None else truth
         self.reading.reset(rng)
+        if self.level.map_error:
+            self.felt.map_shift = rng.normal(0.0, self.level.map_error, 2)
         self._clear()
 
     def command(self, action: FloatArray, instrument: Instrument) -> None:
@@ -314,7 +317,9 @@ class PalpateSitesTask(Task):
         saturated = False
         if self._pending is not None:
             (site, result), self._pending = self._pending, None
-            reading, saturated = self.reading.read(result.force, rng)
+            # Between presses the sensor bears nothing.
+            self.reading.follow(np.zeros(3))
+            reading, saturated = self.reading.read(result.force, rng, self.felt.seconds)
             self.felt.add(site, result, float(reading @ site.normal))
             self._believe()
         # A press that was looked up has no simulation, and no channel reads it.
@@ -370,7 +375,8 @@ class PalpateSitesTask(Task):
         return json.dumps(
             {
                 "drawn": self.drawn.to_json(),
-                "bias": self.reading.bias.tolist(),
+                "bias": self.reading.get_state(),
+                "map_shift": self.felt.map_shift.tolist(),
                 "felt": self.felt.get_state(),
                 "step_count": self.step_count,
                 "budget": self.budget,
@@ -393,9 +399,12 @@ class PalpateSitesTask(Task):
         check_count("step_count", state.step_count, self.budget)
         check_count("the number of felt.touches", len(state.felt.touches), state.step_count)
         check_share("found_before", state.found_before)
+        if any(state.map_shift) and not self.level.map_error:
+            raise ValueError(f"map_shift is {list(state.map_shift)} m; at level {self.level.name!r} it must be 0")
         drawn = DrawnOrgan.from_json(state.drawn, self.anatomy)
         organ, truth, felt = drawn.compiled(self.anatomy), drawn.places(self.anatomy), self.felt.restored(state.felt)
         self.drawn, self.truth, self.felt = drawn, truth, felt
+        self.felt.map_shift = np.array(state.map_shift)
         self.reading = ForceReading(self.reading.sensor, state.bias)
         self.step_count = state.step_count
         self._pending = None
@@ -409,7 +418,8 @@ class _SavedSites:
     """What `PalpateSitesTask.get_state` writes."""
 
     drawn: str
-    bias: Vector
+    bias: list[float]
+    map_shift: tuple[float, float]
     felt: SavedTouches
     step_count: int
     budget: int

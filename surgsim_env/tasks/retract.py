@@ -388,7 +388,7 @@ class RetractTask(Task):
             {
                 "drawn": asdict(self.drawn),
                 "record": asdict(self.record),
-                "bias": [self.sensors[name].bias.tolist() for name in ("contact_force", "contact_torque")],
+                "bias": [self.sensors[name].get_state() for name in ("contact_force", "contact_torque")],
                 "counts": [self.step_count, self.goal_count],
                 "jaw_target": self.jaw_target,
                 "visible": self.visible_share,
@@ -642,7 +642,7 @@ class _SavedRetraction:
 
     drawn: RetractionDraw
     record: RetractionRecord
-    bias: tuple[Vector, Vector]
+    bias: tuple[list[float], list[float]]
     counts: tuple[int, int]
     jaw_target: float
     visible: float

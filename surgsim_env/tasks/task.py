@@ -155,11 +155,11 @@ class Task:
             instrument: name of an arm, or its TOML file; the scene's own by default.
             motion: "none", "calm" or "free": how the patient breathes (`surgsim_env.scene.motions`); as the scene says
                 by default.
-            level: "easy", "standard" or "hard": what the organ hides (`surgsim_env.scene.levels`).
+            level: "easy", "standard", "hard" or "clinical": what the organ hides (`surgsim_env.scene.levels`).
             settings: the keyword-only parameters of `__init__`.
         """
         chosen = None if level is None else find_level(level)
-        described = with_motion(with_instrument(make_scene(scene), instrument), motion)
+        described = with_motion(with_instrument(make_scene(scene), instrument), motion or (chosen and chosen.motion))
         anatomy = load_anatomy(described if chosen is None else chosen.scene(described))
         simulation = Simulation(anatomy)
         task = cls(anatomy, simulation.instrument, **settings)
@@ -314,7 +314,7 @@ class Task:
         for channel, _ in self._observed:
             if channel.sensor and channel.read is not None:
                 value = np.asarray(channel.read(self, simulation), dtype=np.float64)
-                self.sensed[channel.name], cut = self.sensors[channel.name].read(value, rng)
+                self.sensed[channel.name], cut = self.sensors[channel.name].read(value, rng, simulation.time)
                 saturated = saturated or cut
         self.look(simulation)
         return np.concatenate([self._value(channel, size, simulation) for channel, size in self._observed]), saturated
@@ -496,7 +496,7 @@ class Task:
             {
                 "drawn": self.drawn.to_json(),
                 "step_count": self.step_count,
-                "bias": {name: sensor.bias.tolist() for name, sensor in self.sensors.items()},
+                "bias": {name: sensor.get_state() for name, sensor in self.sensors.items()},
                 "sensed": {name: value.tolist() for name, value in self.sensed.items()},
                 "reached": self._reached,
                 "kept": {name: _encoded(name, getattr(self, name)) for name in self.kept},
@@ -565,7 +565,7 @@ class Task:
         vars(self).update(vars(other))
 
     def biased(self, bias: Mapping[str, ArrayLike]) -> dict[str, ForceReading]:
-        """The sensor models, with another bias [N, N m] (3,) for some of them, by name."""
+        """The sensor models, with another state (`ForceReading.get_state`) for some of them, by name."""
         return {
             name: ForceReading(reading.sensor, bias[name]) if name in bias else reading
             for name, reading in self.sensors.items()
@@ -612,7 +612,8 @@ def soft_force_share(task: Task, step: ControlStep) -> float:
 
 
 def _scaled(sensor: ForceSensor, factor: float) -> ForceSensor:
-    return ForceSensor(sensor.noise * factor, sensor.bias * factor, sensor.range * factor)
+    numbers = (sensor.noise, sensor.bias, sensor.range, sensor.drift, sensor.hysteresis)
+    return ForceSensor(*(factor * number for number in numbers))
 
 
 def _size(part: Command | Channel, task: Task) -> int:
@@ -662,7 +663,7 @@ class _SavedTask:
 
     drawn: str
     step_count: int
-    bias: dict[str, Vector]
+    bias: dict[str, list[float]]
     sensed: dict[str, Vector]
     reached: dict[str, float]
     kept: dict[str, Any]

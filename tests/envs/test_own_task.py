@@ -61,7 +61,7 @@ def registered():
 def test_one_more_channel_and_reward_in_a_shipped_task_are_one_place(registered):
     """Bounds, slices, documentation, info and lanes follow, and what was there stays where it was."""
     id = registered(PalpateSlowly)
-    env, plain = gym.make(id, scene="phantom_small"), gym.make("SurgSim/Palpate-v0", scene="phantom_small")
+    env, plain = (gym.make(one, scene="phantom_small") for one in (id, "SurgSim/Palpate-v0"))
     inner = env.unwrapped
     slices = inner.observation_slices
     assert slices == {**plain.unwrapped.observation_slices, "height": slice(10, 12)}
@@ -77,7 +77,9 @@ def test_one_more_channel_and_reward_in_a_shipped_task_are_one_place(registered)
     for _ in range(3):
         (observation, reward, *_, info), (expected, paid, *_) = env.step(down), plain.step(down)
     np.testing.assert_array_equal(observation[:10], expected)
-    np.testing.assert_allclose(observation[slices["height"]], [observation[2], 0.01], atol=1e-7)
+    seen = inner.si_values(observation)
+    np.testing.assert_allclose(seen[slices["height"]], [seen[2], 0.01], atol=1e-7)
+    np.testing.assert_allclose(observation[slices["height"]], [100.0 * seen[2], 1.0], rtol=1e-5)
     assert info["reward_slow"] == pytest.approx(-0.5 * 0.01, rel=0.1)
     assert reward == pytest.approx(paid + info["reward_slow"])
     envs = gym.make_vec(id, num_envs=2, vectorization_mode="vector_entry_point", scene="phantom_small")

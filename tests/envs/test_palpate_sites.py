@@ -325,7 +325,7 @@ def test_a_saved_state_says_what_was_drawn():
     env.reset(seed=9)
     env.step(MIDDLE)
     table = json.loads(env.task.get_state())
-    assert set(table) == {"drawn", "bias", "felt", "step_count", "budget", "found_before"}
+    assert set(table) == {"drawn", "bias", "map_shift", "felt", "step_count", "budget", "found_before"}
     assert len(table["felt"]["touches"]) == table["step_count"] == 1
 
 

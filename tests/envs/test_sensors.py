@@ -1,0 +1,94 @@
+"""The force sensor's errors: drift and hysteresis, what levels make of them, and that saved states hold them."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_env.coupling.sensors import ForceReading
+from surgsim_env.scene.levels import LEVELS
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import ForceSensor
+
+QUIET = ForceSensor(noise=0.0, bias=0.0, range=2.0)
+RNG = np.random.default_rng(0)
+
+
+def readings(sensor: ForceSensor, forces: list[float]) -> list[float]:
+    one = ForceReading(sensor)
+    one.reset(RNG)
+    return [float(one.read(np.array([0.0, 0.0, force]), RNG, 0.0)[0][2]) for force in forces]
+
+
+def test_hysteresis_is_a_loop_of_twice_its_value():
+    """The play operator: behind by its value on the way up, ahead by it on the way down, still where the way turns."""
+    sensor = replace(QUIET, hysteresis=0.01)
+    up, down = readings(sensor, [0.0, 0.1, 0.5, 0.495, 0.48, 0.1, 0.0])[1:3], readings(sensor, [0.5, 0.495, 0.48, 0.1])
+    np.testing.assert_allclose(up, [0.09, 0.49])
+    np.testing.assert_allclose(down, [0.49, 0.49, 0.49, 0.11])
+    assert readings(QUIET, [0.1, 0.5, 0.495]) == [0.1, 0.5, 0.495]
+
+
+def test_drift_is_drawn_once_and_grows_with_time():
+    one = ForceReading(replace(QUIET, drift=0.001))
+    one.reset(np.random.default_rng(1))
+    assert (np.abs(one.drift) <= 0.001).all() and np.ptp(one.drift) > 0.0
+    for time in (0.0, 10.0, 40.0):
+        np.testing.assert_allclose(one.read(np.zeros(3), RNG, time)[0], one.drift * time)
+
+
+def test_a_plain_sensor_draws_what_it_did():
+    """A sensor without drift takes no further random numbers, so that episodes of seeds stay what they were."""
+    first, second = np.random.default_rng(3), np.random.default_rng(3)
+    one = ForceReading(replace(QUIET, bias=0.02))
+    one.reset(first)
+    np.testing.assert_array_equal(one.bias, second.uniform(-0.02, 0.02, 3))
+    assert first.random() == second.random()
+
+
+@pytest.mark.parametrize("entry", ["drift", "hysteresis"])
+@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
+def test_what_no_sensor_has_is_refused(entry: str, value: float):
+    with pytest.raises(ValueError, match=f"sensor.{entry}"):
+        replace(QUIET, **{entry: value})
+
+
+def test_the_state_of_another_sensor_is_refused():
+    with pytest.raises(ValueError, match="bias has 9 entries; the rule is 3 for this sensor"):
+        ForceReading(QUIET, np.zeros(9))
+    with pytest.raises(ValueError, match="bias has 4 entries; the rule is 9 for this sensor"):
+        ForceReading(replace(QUIET, drift=0.1), np.zeros(4))
+
+
+def test_clinical_has_all_that_a_patient_brings():
+    scene, level = make_scene("phantom_small"), LEVELS["clinical"]
+    made = level.scene(scene)
+    assert made.sensor.drift == pytest.approx(2e-4 * scene.sensor.range)
+    assert made.sensor.hysteresis == pytest.approx(0.005 * scene.sensor.range)
+    law, own = made.material, scene.material
+    assert law.stiffening is not None and law.relaxation is not None
+    assert (law.youngs_modulus, law.density) == (own.youngs_modulus, own.density)
+    env = gym.make("SurgSim/Palpate-v0", scene="phantom_small", level="clinical").unwrapped
+    assert env.scene.motions and not gym.make("SurgSim/Palpate-v0", scene="phantom_small").unwrapped.scene.motions
+    still = gym.make("SurgSim/Palpate-v0", scene="phantom_small", level="clinical", motion="none").unwrapped
+    assert not still.scene.motions
+
+
+@pytest.mark.slow
+def test_a_clinical_episode_goes_on_from_its_saved_state():
+    """Drift, held force and the shift of the map are part of it; the shift changes the contrast."""
+    settings = {"scene": "phantom_small", "level": "clinical", "budget": 6}
+    envs = [gym.make("SurgSim/PalpateSites-v0", **settings).unwrapped for _ in range(2)]
+    place = np.array([0.4, -0.3], dtype=np.float32)
+    for seed, env in enumerate(envs):
+        env.reset(seed=seed)
+        env.step(place)
+    shift = envs[0].task.felt.map_shift
+    assert 0.0 < np.abs(shift).max() < 0.03
+    envs[1].load_state(envs[0].save_state())
+    np.testing.assert_array_equal(envs[1].task.felt.map_shift, shift)
+    for _ in range(2):
+        one, other = (env.step(-place) for env in envs)
+        assert one[0].tobytes() == other[0].tobytes() and one[4] == other[4]

@@ -115,6 +115,17 @@ def test_parts_without_tets_are_drawn_on_the_boundary_and_counted():
     assert fitted_surface(np.array(ball.vertices), np.array(ball.faces), mesh, 0.006).moved == 0
 
 
+def test_the_reach_does_not_depend_on_which_of_equally_near_triangles_is_found():
+    """Above a node all triangles around it are equally near, and tets of different sizes lie behind them."""
+    ball = trimesh.creation.icosphere(4, RADIUS)
+    mesh = mesh_surface(ball.vertices, ball.faces, cell_size=0.006)
+    above = 1.1 * mesh.points[np.unique(mesh.boundary_triangles)]
+    rng = np.random.default_rng(0)
+    reaches = [find_carriers(above + rng.normal(0.0, 1e-9, above.shape), mesh).reach for _ in range(4)]
+    np.testing.assert_allclose(np.ptp(reaches, axis=0) / reaches[0], 0.0, atol=1e-5)
+    assert np.ptp(reaches[0]) > 0.15 * reaches[0].mean()
+
+
 def test_a_scan_s_surface_is_written_named_and_drawn(written):
     """Its vertices lie on the ellipsoid of the scan, in the patient's axes."""
     anatomy = load_anatomy(load_scene(written / "patient.toml"))

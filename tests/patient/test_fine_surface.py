@@ -116,14 +116,16 @@ def test_parts_without_tets_are_drawn_on_the_boundary_and_counted():
 
 
 def test_the_reach_does_not_depend_on_which_of_equally_near_triangles_is_found():
-    """Above a node all triangles around it are equally near, and tets of different sizes lie behind them."""
+    """Above an edge two triangles are equally near, and tets of different sizes lie behind them."""
     ball = trimesh.creation.icosphere(4, RADIUS)
     mesh = mesh_surface(ball.vertices, ball.faces, cell_size=0.006)
-    above = 1.1 * mesh.points[np.unique(mesh.boundary_triangles)]
+    above = 1.1 * mesh.points[mesh.boundary_triangles[:, :2]].mean(axis=1)
     rng = np.random.default_rng(0)
-    reaches = [find_carriers(above + rng.normal(0.0, 1e-9, above.shape), mesh).reach for _ in range(4)]
-    np.testing.assert_allclose(np.ptp(reaches, axis=0) / reaches[0], 0.0, atol=1e-5)
-    assert np.ptp(reaches[0]) > 0.15 * reaches[0].mean()
+    found = [find_carriers(above + rng.normal(0.0, 1e-9, above.shape), mesh) for _ in range(4)]
+    assert (np.ptp([one.triangle for one in found], axis=0) > 0).any()
+    reaches = np.array([one.reach for one in found])
+    assert np.ptp(reaches, axis=0).max() < 1e-5 * reaches.min()
+    assert np.ptp(reaches[0]) > 0.1 * reaches[0].mean()
 
 
 def test_a_scan_s_surface_is_written_named_and_drawn(written):

@@ -121,7 +121,7 @@ def test_an_environment_whose_episode_is_over_can_be_paused():
     assert not envs.step(still)[3].any() and envs.step(still)[3].all()
     envs.pause(np.ones(COUNT, dtype=np.bool_))
     times = [env.unwrapped.simulation.time for env in envs.envs]
-    observations, rewards, terminated, truncated, infos = envs.step(still)
+    _, rewards, terminated, truncated, infos = envs.step(still)
     assert not (rewards.any() or terminated.any() or truncated.any() or infos)
     assert [env.unwrapped.simulation.time for env in envs.envs] == times
 

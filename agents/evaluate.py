@@ -446,12 +446,12 @@ def print_comparison(one: str, other: str, options: argparse.Namespace) -> None:
     """Print the differences of two methods, each a file, a method's name, or a name that training seeds share."""
     groups = [_group(name, options) for name in (one, other)]
     names = [Path(name).stem if name.endswith(".json") else name for name in (one, other)]
-    first = groups[0][0]
+    first, differences = groups[0][0], compare(*groups, np.random.default_rng(BOOTSTRAP_SEED))
     print(f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap")
     for name, group in zip(names, groups, strict=True):
         if len(group) > 1:
             print(f"{name}: mean over {len(group)} training seeds")
-    for difference in compare(*groups, np.random.default_rng(BOOTSTRAP_SEED)):
+    for difference in differences:
         print(describe(difference, *names))
 
 

@@ -104,13 +104,13 @@ SHOWN = {
 def _check(results: Sequence[Result]) -> None:
     first = results[0]
     for result in results:
+        if not result.successes:
+            raise ValueError(f"the result of {result.method} does not list its episodes: evaluate it again")
         for fault in _faults(first, result):
             raise ValueError(f"{first.method} and {result.method} cannot be compared: {fault}: evaluate both again")
 
 
 def _faults(one: Result, other: Result) -> Iterator[str]:
-    if not other.successes:
-        yield f"the result of {other.method} does not list its episodes"
     if one.seeds != other.seeds:
         yield f"their seeds are {seeds_text(one.seeds)} and {seeds_text(other.seeds)}"
     if (one.env_id, one.place) != (other.env_id, other.place) or one.budget != other.budget:

@@ -235,8 +235,8 @@ def test_a_strangers_result_is_submitted_and_checked(module: Path, capsys: pytes
         ({"origin": {**made.origin, "environment": {**environment, "scene": "0" * 24}}}, "environment: scene is 000"),
         ({"origin": {**made.origin, "versions": {**versions, "mujoco": "1.0"}}}, "versions: mujoco is 1.0, here"),
         ({"origin": {}}, "it names no versions and digests"),
-        ({"successes": [True, True]}, "figure success is 0.0; its episodes give 1"),
-        ({"errors_mm": [[1.0, 1.0]] * 2}, "figure presses_to_median is inf; its episodes give 1"),
+        ({"successes": [True, True]}, r"figure success is [\d.]+; its episodes give 1"),
+        ({"errors_mm": [[1.0, 1.0]] * 2}, r"figure presses_to_median is \w+; its episodes give 1"),
         ({"errors_mm": made.errors_mm[:1]}, "it lists 2 seeds, 2 successes, 1 errors_mm, 2 lesion_counts"),
         ({"env_kwargs": {**made.env_kwargs, "level": "hard"}}, "environment: scene is"),
     ):

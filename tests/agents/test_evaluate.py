@@ -267,13 +267,9 @@ def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
         evaluate.main(["--compare", "one", "ppo", "--results", str(tmp_path)])
 
 
-POLICY = evaluate.POLICIES / "sites_ppo_seed0.safetensors"
-
-
 @pytest.mark.parametrize(
     ("policy", "options", "message"),
     [
-        ("sites_ppo_seed0", ["--scene", "phantom_small"], r"policy .* the scene 'phantom_small' has"),
         ("palpate_phantom_cloned", ["--scene", "phantom_small"], r"was trained on the scene 'phantom', .* cannot play"),
         ("palpate_phantom_small_cloned", ["--scene", "phantom"], r"was trained on the scene 'phantom_small'"),
         ("retract_ppo", ["--level", "hard"], "argument 'level' is unknown"),
@@ -290,14 +286,15 @@ def test_a_policy_does_not_play_what_it_was_not_made_for(policy: str, options: l
 
 def test_level_and_motion_beside_a_policy_are_honoured(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
-    common = ["--policy", str(POLICY), "--seeds", "3", "--budget", "1", "--submit", str(tmp_path / "mine.json")]
-    evaluate.main([*common, "--level", "easy", "--motion", "calm", "--scene", "phantom"])
+    path = evaluate.POLICIES / "palpate_phantom_small_cloned.safetensors"
+    common = ["--policy", str(path), "--seeds", "3", "--submit", str(tmp_path / "mine.json")]
+    evaluate.main([*common, "--level", "easy", "--motion", "calm", "--scene", "phantom_small"])
     made = load_result(tmp_path / "mine.json")
-    assert made.env_kwargs == {"scene": "phantom", "level": "easy", "motion": "calm", "budget": 1}
-    assert set(made.origin["agent"]) == {"sites_ppo_seed0.safetensors", "sites_ppo_seed0.json"}
+    assert (made.scene, made.env_kwargs["level"], made.motion) == ("phantom_small", "easy", "calm")
+    assert set(made.origin["agent"]) == {path.name, "palpate_phantom_small_cloned.json"}
     assert made.command == (
-        "python -m agents.evaluate --policy agents/policies/sites_ppo_seed0.safetensors --level easy --seeds 3 "
-        "--budget 1 --motion calm"
+        "python -m agents.evaluate --policy agents/policies/palpate_phantom_small_cloned.safetensors --level easy "
+        "--seeds 3 --motion calm"
     )
 
 

@@ -296,7 +296,8 @@ def _places(options: argparse.Namespace, defaults: dict[str, str]) -> dict[str, 
 
 
 def _place_options(kwargs: dict[str, Any]) -> str:
-    return "".join(f" --{name} {kwargs[name]}" for name in PLACES if name in kwargs)
+    told = _without_folders(kwargs)
+    return "".join(f" --{name} {told[name]}" for name in PLACES if name in told)
 
 
 def policy_player(path: Path, options: argparse.Namespace) -> Player:

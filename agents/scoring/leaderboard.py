@@ -141,7 +141,8 @@ def _averaged(name: str, members: Sequence[Result]) -> Result:
     figures = {}
     for figure in members[0].figures:
         values = [member.figures[figure].value for member in members]
-        figures[figure] = ScoreEstimate(None, None, None) if None in values else student_interval(values)
+        known = [value for value in values if value is not None]
+        figures[figure] = student_interval(known) if len(known) == len(values) else ScoreEstimate(None, None, None)
     return replace(members[0], method=f"{name} ({len(members)} training seeds)", figures=figures)
 
 

@@ -129,12 +129,13 @@ class LaneVectorEnv(SyncVectorEnv):
             if not (resets or self._paused[index]):
                 self._command(index, action)
                 active[index] = True
-        moving = [
-            (group, members)
-            for group, members in zip(self._groups, self._members, strict=True)
-            if active[members.start : members.stop].any()
-        ]
-        list(self._pool.map(lambda one: self._advance(*one, active[one[1].start : one[1].stop]), moving))
+
+        def advance(group: LaneGroup, members: range) -> None:
+            moves = active[members.start : members.stop]
+            if moves.any():
+                self._advance(group, members, moves)
+
+        list(self._pool.map(advance, self._groups, self._members))
         if not self._paused.any():
             return super().step(actions)
         return self._step_others(actions)
@@ -144,10 +145,11 @@ class LaneVectorEnv(SyncVectorEnv):
         envs = self.envs
         self._autoreset_envs[self._paused] = False
         try:
-            self.envs = [
+            stand_ins: list[Any] = [
                 _Standstill(seen) if paused else env
                 for env, seen, paused in zip(envs, self._env_obs, self._paused, strict=True)
-            ]  # type: ignore[assignment]
+            ]
+            self.envs = stand_ins
             return super().step(actions)
         finally:
             self.envs = envs

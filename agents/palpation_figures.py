@@ -4,7 +4,6 @@ python -m agents.palpation_figures
 """
 
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,10 @@ import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from agents.scoring.leaderboard import SITES, Result, best_raster_alone, load_results
+from agents.scoring.episodes import agent_generator
+from agents.scoring.leaderboard import best_raster_alone
 from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
+from agents.scoring.results import SITES, Result, family, load_results
 from agents.scoring.site_agent import site_facts
 from agents.site_search import BOUNDS
 from surgsim_env.palpation.scores import ERROR_LINE
@@ -39,18 +40,18 @@ def draw_errors(results: list[Result], path: Path) -> None:
     """Median OSPA over organs with lesions after each press: one panel per scene and level, one line per method."""
     rows = [row for row in results if row.env_id == SITES and row.method not in BOUNDS and not row.motion]
     places = sorted({row.place for row in rows}, key=lambda place: ("standard" not in place, place))
-    methods = sorted({family(row.method) for row in rows})
+    methods = sorted({label(row.method) for row in rows})
     figure = Figure(figsize=(10.4, 3.6 * math.ceil(len(places) / 2)), dpi=110, layout="constrained")
     panels = np.atleast_1d(figure.subplots(math.ceil(len(places) / 2), 2, squeeze=False)).ravel()
     for axes, place in zip(panels, places, strict=False):
         shown = best_raster_alone([row for row in rows if row.place == place])
-        for method in {family(row.method) for row in shown}:
+        for method in {label(row.method) for row in shown}:
             # Over the organs with lesions after each press, one row for each seed; their mean as a line, all as a band.
             medians = np.array(
                 [
                     np.median(np.array(row.errors_mm)[np.array(row.lesion_counts) > 0], axis=0)
                     for row in shown
-                    if family(row.method) == method
+                    if label(row.method) == method
                 ]
             )
             presses = np.arange(1, medians.shape[1] + 1)
@@ -74,11 +75,9 @@ def draw_errors(results: list[Result], path: Path) -> None:
     figure.savefig(path)
 
 
-def family(method: str) -> str:
+def label(method: str) -> str:
     """Label of a line: seeds of one policy, and rasters of all sides, share one."""
-    if method.startswith("raster_"):
-        return "best raster"
-    return re.sub(r"_seed\d+$", "", method)
+    return "best raster" if method.startswith("raster_") else family(method)
 
 
 def draw_search(path: Path) -> None:
@@ -89,7 +88,7 @@ def draw_search(path: Path) -> None:
     for row, name in zip(grid, ("gp_ucb", "raster_3"), strict=True):
         agent = find_agent(name)()
         observation, _ = env.reset(seed=SHOWN_SEED)
-        agent.reset(np.random.default_rng(SHOWN_SEED), site_facts(env))
+        agent.reset(agent_generator(SHOWN_SEED), site_facts(env))
         for press in range(1, max(SHOWN_PRESSES) + 1):
             observation, _, _, _, info = env.step(agent.act(observation))
             if press in SHOWN_PRESSES:

@@ -15,7 +15,6 @@ bit. A person plays with `agents/keyboard.py`. `Recorder` records any other code
 
 import argparse
 import copy
-import importlib
 import json
 import warnings
 from collections.abc import Callable, Sequence
@@ -29,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.command_line import one_line_errors
+from agents.command_line import named_class, one_line_errors
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
@@ -137,12 +136,12 @@ def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
         from agents.training.policy_files import load_policy
 
         policy = load_policy(Path(by), trust_pickle=trust_pickle)
+        policy.check_environment(env, f"policy {by}")
         alone = SimpleNamespace(reset=lambda: policy.reset(1), act=lambda seen: policy.act(seen[None])[0])
         return lambda env, seed: play_agent(env, seed, alone)
-    module, _, name = by.partition(":")
-    if not name:
+    if ":" not in by:
         raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.safetensors or MODULE:CLASS")
-    agent = getattr(importlib.import_module(module), name)(env)
+    agent = named_class(by, "--by")(env)
     return lambda env, seed: play_agent(env, seed, agent)
 
 

@@ -1,12 +1,13 @@
 """The methods for SurgSim/PalpateSites-v0 by name: site searches, and the reference scores, oracle and blind guess.
 
-Searches use observations and the size of the chart only (`SiteFacts`). A Gaussian process on log contrast is the belief
+Searches use observations and the size of the chart only (`SiteFacts`). Methods that see the truth declare it in
+`sees_truth`. A Gaussian process on log contrast is the belief
 of the searches `gp_*`.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 # Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
 UCB_BETA = 3.0
 LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
+# The points of the face [m] (k, 3) at places of the chart (k, 2), each in [-1, 1].
+Surface = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class RandomSites:
@@ -140,6 +143,8 @@ class OracleSites(GpVariance):
     presses elsewhere to tell the healthy tissue's background.
     """
 
+    sees_truth: ClassVar[bool] = True
+
     def see(self, task: PalpateSitesTask) -> None:
         """Take the truth of the episode that `reset` has begun."""
         places = [task.charted.chart.place(point) for point in task.truth]
@@ -152,11 +157,11 @@ class OracleSites(GpVariance):
         return self.places[left - 1] if left <= len(self.places) else action
 
 
-class TruthAgent:
-    """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %.
+class Middle:
+    """The blind guess: one lesion in the middle of the chart, regardless of the presses.
 
-    It presses the middle of the chart, as the environment asks for presses; `estimate` and `estimate_map` are scored
-    in place of the estimator's output.
+    It presses the middle too, as the environment asks for presses; `estimate` and `estimate_map` are scored in place of
+    the estimator's output.
     """
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
@@ -166,25 +171,31 @@ class TruthAgent:
         """The middle of the chart."""
         return np.zeros(2, dtype=np.float32)
 
-    def estimate(self, task: Any) -> NDArray[np.float64]:
-        """Places of the lesions on the surface [m], shape (k, 3)."""
-        return task.truth
-
-    def estimate_map(self, made: MapScore) -> MapScore:
-        """The true map: 1 over lesions, else 0, and the true outline."""
-        return replace(made, excess=made.lesion.astype(np.float64), outline=made.outline_true)
-
-
-class Middle(TruthAgent):
-    """The blind guess: one lesion in the middle of the chart, regardless of the presses."""
-
-    def estimate(self, task: Any) -> NDArray[np.float64]:
+    def estimate(self, surface: Surface) -> NDArray[np.float64]:
         """The middle of the chart on the surface [m], shape (1, 3)."""
-        return task.charted.surface(np.zeros((1, 2)))
+        return surface(np.zeros((1, 2)))
 
     def estimate_map(self, made: MapScore) -> MapScore:
         """A uniform map without an outline."""
         return replace(made, excess=np.zeros_like(made.excess), outline=np.zeros_like(made.outline))
+
+
+class TruthAgent(Middle):
+    """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %."""
+
+    sees_truth: ClassVar[bool] = True
+
+    def see(self, task: PalpateSitesTask) -> None:
+        """Take the truth of the episode that `reset` has begun."""
+        self.truth = task.truth
+
+    def estimate(self, surface: Surface) -> NDArray[np.float64]:
+        """Places of the lesions on the surface [m], shape (k, 3)."""
+        return self.truth
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        """The true map: 1 over lesions, else 0, and the true outline."""
+        return replace(made, excess=made.lesion.astype(np.float64), outline=made.outline_true)
 
 
 # Sides of the rasters tried on each scene; the leaderboard shows the best raster.

@@ -1,8 +1,12 @@
-"""Play episodes of given seeds side by side, record them, and the figures of a policy."""
+"""Play episodes of given seeds side by side, record them, and the figures of a policy.
+
+An agent draws from `agent_generator(seed)`, which no environment uses. One that declares `sees_truth = True` is given
+the task with the truth by its method `see`; no other is given it.
+"""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 import gymnasium as gym
@@ -11,12 +15,14 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.scoring.site_agent import SiteAgent, site_facts
+from agents.scoring.site_agent import site_facts
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
 from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, with_intervals
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
+# Of the seeds that belong to agents, among those that follow from an episode's (`SeedSequence.spawn_key`).
+AGENT_STREAM = 0x41_67_65_6E_74
 # Actions (n, n_action) for observations (n, n_observation); where the second (n,) is true an episode begins.
 Actor = Callable[[NDArray[Any], NDArray[np.bool_]], NDArray[Any]]
 
@@ -40,14 +46,27 @@ def make_envs(
     return gym.make_vec(env_id, num_envs=count, threads=threads, **lanes, **kwargs)
 
 
+def agent_generator(seed: int) -> np.random.Generator:
+    """The random numbers of the agent that plays the episode of a seed.
+
+    An environment draws its episode from `default_rng(seed)`: an agent with that generator could redraw the lesions.
+    This one begins with words that a child of the seed's `SeedSequence` gives, so that it holds neither the seed nor
+    the environment's numbers.
+    """
+    child = np.random.SeedSequence(seed, spawn_key=(AGENT_STREAM,))
+    return np.random.default_rng(child.generate_state(8).tolist())
+
+
 def play(
-    actor: Actor,
+    actor: "Actor | AgentActor",
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
     begin: Callable[[int, int], R],
     progress: Callable[[], object] = lambda: None,
 ) -> list[R]:
     """Play an episode of each seed and return its record; where one ends the next seed begins.
+
+    Environments for which no seed is left are paused (`LaneVectorEnv.pause`).
 
     Args:
         actor: what plays.
@@ -57,32 +76,153 @@ def play(
         progress: called after each step.
 
     Raises:
-        ValueError: another autoreset mode.
+        ValueError: another autoreset mode, or several environments that cannot be paused.
     """
-    mode = AutoresetMode(envs.metadata["autoreset_mode"])
+    mode, lanes = AutoresetMode(envs.metadata["autoreset_mode"]), envs.unwrapped
     if mode is not AutoresetMode.DISABLED:
         raise ValueError(f'autoreset_mode is {mode.value!r}; episodes of given seeds need "Disabled"')
+    if envs.num_envs > 1 and not hasattr(lanes, "pause"):
+        raise ValueError(
+            f"{envs.num_envs} environments of {type(lanes).__name__} cannot be paused where no seed is left: make them "
+            'with vectorization_mode="vector_entry_point"'
+        )
     waiting, records = list(range(len(seeds))), dict[int, R]()
     playing: list[int | None] = [None] * envs.num_envs
     observations, begins = np.zeros(0), np.ones(envs.num_envs, dtype=np.bool_)
     while True:
         for env in np.flatnonzero(begins):
             playing[env] = waiting.pop(0) if waiting else None
-        if all(index is None for index in playing):
+        idle = np.array([index is None for index in playing])
+        if idle.all():
             return [records[index] for index in range(len(seeds))]
-        if begins.any():
-            # A surplus environment plays the first seed again, unrecorded.
+        # All environments are reset once, with the first seed where there is no other: an observation is of all.
+        resets = begins & ~idle if records else np.ones_like(begins)
+        if resets.any():
             starts = [int(seeds[index or 0]) for index in playing]
-            observations, _ = envs.reset(seed=starts, options={"reset_mask": begins.copy()})  # type: ignore[arg-type]
-            made = {playing[env]: begin(int(env), starts[env]) for env in np.flatnonzero(begins)}
-            records |= {index: record for index, record in made.items() if index is not None}
+            observations, _ = envs.reset(seed=starts, options={"reset_mask": resets})  # type: ignore[arg-type]
+        for env in np.flatnonzero(begins):
+            index = playing[env]
+            if isinstance(actor, AgentActor):
+                actor.end(int(env))
+            if index is not None:
+                if isinstance(actor, AgentActor):
+                    actor.begin(int(env), lanes.envs[env], int(seeds[index]))  # type: ignore[attr-defined]
+                records[index] = begin(int(env), int(seeds[index]))
+        if begins.any() and idle.any():
+            lanes.pause(idle)  # type: ignore[attr-defined]
         observations, rewards, terminated, truncated, infos = envs.step(actor(observations, begins))
-        begins = terminated | truncated
+        begins = (terminated | truncated) & ~idle
         for env, index in enumerate(playing):
             if index is not None:
                 info = {name: values[env] for name, values in infos.items() if not name.startswith("_")}
                 records[index].note(float(rewards[env]), info, bool(begins[env]))
         progress()
+
+
+# ---- agents, one for each episode ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EpisodeFacts:
+    """Constants of an environment whose steps are control steps.
+
+    Fields:
+        env_id, env_kwargs: of the environment; an agent may make one of its own from them
+        observation_slices: entries of an observation, by channel
+        action_size: entries of an action, each in [-1, 1]
+        control_step: duration of a step [s]
+        step_count: most steps of an episode
+        soft_force, hard_force: limits of the contact force [N]
+    """
+
+    env_id: str
+    env_kwargs: dict[str, Any]
+    observation_slices: dict[str, slice]
+    action_size: int
+    control_step: float
+    step_count: int
+    soft_force: float
+    hard_force: float
+
+
+class EpisodeAgent(Protocol):
+    """Plays one episode of an environment whose steps are control steps; each episode has an agent of its own.
+
+    For SurgSim/PalpateSites-v0, whose step is a press: `agents.scoring.site_agent.SiteAgent`.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
+        """Begin the episode."""
+        ...
+
+    def act(self, observation: NDArray[Any]) -> NDArray[np.float32]:
+        """The next action, shape (action_size,), for an observation as the environment gives it."""
+        ...
+
+
+def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeFacts:
+    """The facts of an environment (its wrappers do not matter)."""
+    single = env.unwrapped
+    return EpisodeFacts(
+        env_id=env_id,
+        env_kwargs=dict(env_kwargs),
+        observation_slices=single.observation_slices,
+        action_size=single.action_space.shape[0],
+        control_step=single.scene.timing.control_step,
+        step_count=gym.spec(env_id).max_episode_steps or 0,
+        soft_force=single.scene.limits.soft_force,
+        hard_force=single.scene.limits.hard_force,
+    )
+
+
+def sees_truth(agent: object) -> bool:
+    """Whether an agent, or its class, declares that it may see the truth."""
+    return bool(getattr(agent, "sees_truth", False))
+
+
+class AgentActor:
+    """An agent for each episode, with random numbers that no environment uses."""
+
+    def __init__(self, make: Callable[[], Any], facts: Callable[[Any], Any] = site_facts) -> None:
+        """Play agents that `make` gives.
+
+        Args:
+            make: a `SiteAgent` or an `EpisodeAgent`.
+            facts: what it is told of its environment.
+        """
+        self.make, self.facts = make, facts
+        self.agents: dict[int, Any] = {}
+        self._idle = np.zeros(0, dtype=np.float32)
+
+    def begin(self, index: int, env: Any, seed: int) -> Any:
+        """Make the agent of an episode in environment `index`.
+
+        Raises:
+            ValueError: it has a method `see` and does not declare that it sees the truth.
+        """
+        agent = self.agents[index] = self.make()
+        self._idle = np.zeros(env.action_space.shape, dtype=np.float32)
+        agent.reset(agent_generator(seed), self.facts(env))
+        if sees_truth(agent):
+            agent.see(env.unwrapped.task)
+        elif hasattr(agent, "see"):
+            raise ValueError(
+                f"agent {type(agent).__name__} has a method see, which takes the task with the truth, and does not "
+                "declare sees_truth = True: declare it, or call the method otherwise"
+            )
+        return agent
+
+    def end(self, index: int) -> None:
+        """Forget the agent of environment `index`, if there is one."""
+        self.agents.pop(index, None)
+
+    def __call__(self, observations: NDArray[Any], begins: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """The next action of each agent (n, n_action); 0 where an environment has none."""
+        chosen = [
+            self.agents[index].act(one) if index in self.agents else self._idle
+            for index, one in enumerate(observations)
+        ]
+        return np.stack(chosen)
 
 
 # ---- SurgSim/Palpate-v0 and Retract-v0 ------------------------------------------------------------------------------
@@ -106,7 +246,10 @@ class TaskRecord:
 
 
 def play_tasks(
-    actor: Actor, envs: gym.vector.VectorEnv, seeds: Sequence[int], progress: Callable[[], object] = lambda: None
+    actor: Actor | AgentActor,
+    envs: gym.vector.VectorEnv,
+    seeds: Sequence[int],
+    progress: Callable[[], object] = lambda: None,
 ) -> list[TaskRecord]:
     """`play` for the records of these environments."""
     return play(actor, envs, seeds, lambda env, seed: TaskRecord(), progress)
@@ -186,51 +329,33 @@ def print_episodes(records: Sequence[TaskRecord], seeds: Sequence[int], soft_for
 # ---- SurgSim/PalpateSites-v0 ----------------------------------------------------------------------------------------
 
 
-class SiteActor:
-    """A baseline in each environment, its random generator seeded with the episode's seed.
-
-    One with a method `see`, as `agents.site_search.OracleSites` has it, is given the task with the truth.
-    """
-
-    def __init__(self, make: Callable[[], SiteAgent]) -> None:
-        self.make = make
-        self.agents: dict[int, SiteAgent] = {}
-
-    def begin(self, index: int, env: Any, seed: int) -> SiteAgent:
-        """Make the agent of an episode in environment `index`."""
-        agent = self.agents[index] = self.make()
-        agent.reset(np.random.default_rng(seed), site_facts(env))
-        see = getattr(agent, "see", None)
-        if see is not None:
-            see(env.unwrapped.task)
-        return agent
-
-    def __call__(self, observations: NDArray[Any], begins: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """The next site of each agent, as actions (n, 2)."""
-        return np.stack([self.agents[index].act(one) for index, one in enumerate(observations)])
-
-
 def play_sites(
-    actor: Actor | SiteActor,
+    actor: Actor | AgentActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
     progress: Callable[[], object] = lambda: None,
 ) -> list[PalpationRecord]:
-    """`play` for baselines, or for one policy in all environments.
+    """`play` for agents, or for one policy in all environments.
 
-    An agent with a method `estimate`, as `agents.site_search.TruthAgent` has it, replaces the estimator.
+    An agent with methods `estimate` and `estimate_map`, as `agents.site_search.TruthAgent` has them, replaces the
+    estimator.
     """
     singles = envs.unwrapped.envs  # type: ignore[attr-defined]
 
     def begin(index: int, seed: int) -> SiteRecord:
-        agent = actor.begin(index, singles[index], seed) if isinstance(actor, SiteActor) else None
-        return SiteRecord(singles[index].unwrapped.task, agent if hasattr(agent, "estimate") else None)
+        agent = actor.agents[index] if isinstance(actor, AgentActor) else None
+        return SiteRecord(singles[index].unwrapped.task, agent if estimates_itself(agent) else None)
 
     return [one.record for one in play(actor, envs, seeds, begin, progress)]
 
 
+def estimates_itself(agent: object) -> bool:
+    """Whether an agent's own estimate is scored in place of the common estimator's."""
+    return hasattr(agent, "estimate")
+
+
 class SiteRecord:
-    """A record of presses; `reference` replaces the estimator."""
+    """A record of presses; the estimates of `reference`, an agent, replace the estimator's."""
 
     def __init__(self, task: PalpateSitesTask, reference: Any) -> None:
         self.task, self.reference = task, reference
@@ -239,9 +364,9 @@ class SiteRecord:
 
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
         """Add a press; the last one completes the record."""
-        self.estimates.append(
-            np.array(self.task.estimated if self.reference is None else self.reference.estimate(self.task))
-        )
+        reference = self.reference
+        said = self.task.estimated if reference is None else reference.estimate(self.task.charted.surface)
+        self.estimates.append(np.array(said))
         self.forces.append((float(info["force"]), float(info["force_peak"]), float(info["depth"])))
         if over:
             self._complete(info)
@@ -262,8 +387,14 @@ class SiteRecord:
             soft_force=self.task.limits.soft_force,
             hard_limit=bool(info["hard_limit"]),
             fault=str(info["sim_fault"]),
-            map=made if self.reference is None else self.reference.estimate_map(made),
+            map=made if self.reference is None else self._own_map(made),
         )
+
+    def _own_map(self, made: MapScore) -> MapScore:
+        """The agent's own map beside the truth, which only one that declares it sees."""
+        hidden = {"lesion": np.zeros_like(made.lesion), "outline_true": np.zeros_like(made.outline_true)}
+        said = self.reference.estimate_map(made if sees_truth(self.reference) else replace(made, **hidden))
+        return replace(made, excess=said.excess, outline=said.outline)
 
 
 def map_score(task: PalpateSitesTask) -> MapScore:

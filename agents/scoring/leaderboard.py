@@ -1,98 +1,20 @@
-"""Result files agents/results/*.json, and agents/LEADERBOARD.md from them."""
+"""agents/LEADERBOARD.md from the result files agents/results/*.json."""
 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import astuple, replace
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+from scipy.stats import t as student
+
+from agents.scoring.results import RESULTS, SITES, Result, family, load_results, seeds_text
 from surgsim_env.palpation.scores import ScoreEstimate
-from surgsim_env.scene.motions import STILL
 
-RESULTS = Path(__file__).resolve().parents[1] / "results"
 LEADERBOARD = RESULTS.with_name("LEADERBOARD.md")
-# JSON has no infinity.
-NEVER = "never"
-
-
-@dataclass(frozen=True)
-class Result:
-    """One method on one environment, with the command that reproduces its figures.
-
-    Fields:
-        method: name of an agent or of a policy's file
-        env_id, env_kwargs: the environment
-        seeds: first and last of the range
-        budget: largest number of steps of an episode
-        figures: by name, each a value with its interval
-        errors_mm: OSPA after each press of each episode (PalpateSites only)
-        lesion_counts: lesions of each episode (PalpateSites only)
-        command: that produced it
-        wall_time: of all episodes [s], on a machine with other load
-        date: of its end
-    """
-
-    method: str
-    env_id: str
-    env_kwargs: dict[str, Any]
-    seeds: tuple[int, int]
-    budget: int
-    figures: dict[str, ScoreEstimate]
-    command: str
-    wall_time: float
-    date: str
-    errors_mm: list[list[float]] = field(default_factory=list)
-    lesion_counts: list[int] = field(default_factory=list)
-
-    @property
-    def place(self) -> str:
-        """Environment, scene and level: the key that groups tables."""
-        parts = [self.env_id.removeprefix("SurgSim/").removesuffix("-v0"), self.env_kwargs.get("scene", "")]
-        parts += [self.env_kwargs.get("level") or "", self.motion]
-        return "_".join(part for part in parts if part)
-
-    @property
-    def motion(self) -> str:
-        """How the patient moves; "" for one who holds still."""
-        motion = self.env_kwargs.get("motion") or STILL
-        return "" if motion == STILL else motion
-
-    def save(self, folder: Path = RESULTS) -> Path:
-        """Write it; replaces an older result of the same method and place."""
-        table = asdict(self)
-        table["figures"] = {
-            name: [_written(value) for value in astuple(figure)] for name, figure in self.figures.items()
-        }
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{self.place}_{self.method}.json"
-        lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
-        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-        return path
-
-
-def load_result(path: Path) -> Result:
-    """Read a file of `Result.save`."""
-    table = json.loads(path.read_text(encoding="utf-8"))
-    table["figures"] = {
-        name: ScoreEstimate(*(math.inf if value == NEVER else value for value in values))
-        for name, values in table["figures"].items()
-    }
-    return Result(**{**table, "seeds": tuple(table["seeds"])})
-
-
-def load_results(folder: Path = RESULTS) -> list[Result]:
-    """All results of a folder, by file name, without `reach_*.json`."""
-    return [load_result(path) for path in sorted(folder.glob("*.json")) if not path.name.startswith("reach_")]
-
-
-def _written(value: float | None) -> float | str | None:
-    if value is None:
-        return None
-    return NEVER if math.isinf(value) else float(f"{value:.5g}")
-
-
-# ---- the leaderboard ------------------------------------------------------------------------------------------------
+# Coverage of the intervals over training seeds.
+COVERAGE = 0.95
 
 # Columns: heading, figure, decimals, factor.
 Column = tuple[str, str, int, float]
@@ -134,7 +56,6 @@ TASKS: tuple[Column, ...] = (
     ("hard limit, faults [%]", "violations", 0, 100.0),
     ("return", "return", 2, 1.0),
 )
-SITES = "SurgSim/PalpateSites-v0"
 
 
 def write_leaderboard(folder: Path = RESULTS, path: Path = LEADERBOARD) -> None:
@@ -154,9 +75,14 @@ HEADER = """# Leaderboard
 Written by `python -m agents.evaluate --leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
 Each figure is a mean over the episodes of its seeds, in brackets the 95 % bootstrap interval over them; "never" is a
 line that was not reached within the presses of an episode. Baselines and policies play the same organs. The rasters
-shown are the best of those tried, by presses to 5 mm, then by the error over all presses. An oracle knows the truth:
-its rows bound what an environment allows. Where the patient moves, presses and oracles go with the surface that markers
-show; a method whose name ends in `untracked` goes where places are at rest.
+shown are the best of those tried, by presses to 5 mm, then by the error over all presses. Where policies of one
+configuration were trained with several seeds, their row is the mean over them, in brackets the 95 % interval of
+Student's t over training seeds (which may pass 100 %); "never" where one of them never does. Methods marked
+**sees truth** are told what is hidden: their rows bound what an environment allows. Where the patient moves, presses
+and oracles go with the surface that markers show; a method whose name ends in `untracked` goes where places are at
+rest.
+How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
+`python -m agents.evaluate --compare A B`.
 """
 
 
@@ -167,20 +93,20 @@ def _order(place: str) -> tuple[int, str]:
 
 
 def _sites(place: str, rows: list[Result], folder: Path) -> str:
-    rows = sorted(best_raster_alone(rows), key=_merit)
+    rows = sorted(over_training_seeds(best_raster_alone(rows)), key=_merit)
     first = max(rows, key=lambda row: row.budget)
     lesions = first.lesion_counts
     organs = (
-        f"{len(lesions)} organs (seeds {first.seeds[0]} to {first.seeds[1]}), {sum(lesions)} lesions, "
+        f"{len(lesions)} organs (seeds {seeds_text(first.seeds)}), {sum(lesions)} lesions, "
         f"{lesions.count(0)} organs without one; {first.budget} presses.{_reach(place, folder)}\n"
     )
     return "\n".join([f"\n## {_title(first)}\n", organs, _table(rows, PLACES), "", _table(rows, MAPS)])
 
 
 def _tasks(place: str, rows: list[Result]) -> str:
-    rows = sorted(rows, key=lambda result: -(result.figures["success"].value or 0.0))
+    rows = sorted(over_training_seeds(rows), key=lambda result: -(result.figures["success"].value or 0.0))
     used = [column for column in TASKS if any(column[1] in _figures(row) for row in rows)]
-    counts = {row.method: row.seeds[1] - row.seeds[0] + 1 for row in rows}
+    counts = {row.method: len(row.seeds) for row in rows}
     most = max(counts.values())
     fewer = "".join(f", {count} of {method}" for method, count in counts.items() if count < most)
     seeds = f"{most} episodes{fewer} (seeds from {rows[0].seeds[0]}), at most {rows[0].budget} control steps.\n"
@@ -188,7 +114,7 @@ def _tasks(place: str, rows: list[Result]) -> str:
 
 
 def _title(result: Result) -> str:
-    scene, level = result.env_kwargs.get("scene", ""), result.env_kwargs.get("level")
+    scene, level = result.scene, result.env_kwargs.get("level")
     moves = f"motion {result.motion}" * bool(result.motion)
     told = ", ".join(part for part in (level, moves) if part)
     return " ".join(part for part in (f"`{result.env_id}`", scene, f"({told})" if told else "") if part)
@@ -201,6 +127,32 @@ def best_raster_alone(rows: Sequence[Result]) -> list[Result]:
         return list(rows)
     best = min(rasters, key=_merit)
     return [row for row in rows if row not in rasters or row is best]
+
+
+def over_training_seeds(rows: Sequence[Result]) -> list[Result]:
+    """The rows, with policies that differ in their training's seed alone as one: means, intervals over those seeds."""
+    families: dict[str, list[Result]] = {}
+    for row in rows:
+        families.setdefault(family(row.method), []).append(row)
+    return [members[0] if len(members) == 1 else _averaged(name, members) for name, members in families.items()]
+
+
+def _averaged(name: str, members: Sequence[Result]) -> Result:
+    figures = {}
+    for figure in members[0].figures:
+        values = [member.figures[figure].value for member in members]
+        known = [value for value in values if value is not None]
+        figures[figure] = student_interval(known) if len(known) == len(values) else ScoreEstimate(None, None, None)
+    return replace(members[0], method=f"{name} ({len(members)} training seeds)", figures=figures)
+
+
+def student_interval(values: Sequence[float]) -> ScoreEstimate:
+    """Mean of two or more values m, and m -+ t s / sqrt(n) (Student 1908); infinite where a value is."""
+    mean = float(np.mean(values))
+    if math.isinf(mean):
+        return ScoreEstimate(mean, mean, mean)
+    half = float(student.ppf(0.5 + 0.5 * COVERAGE, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values)))
+    return ScoreEstimate(mean, mean - half, mean + half)
 
 
 def _merit(result: Result) -> tuple[float, float]:
@@ -238,10 +190,11 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _name(result: Result) -> str:
-    if result.method.startswith("raster_"):
-        side = result.method.removeprefix("raster_")
-        return f"raster {side} x {side}"
-    return result.method
+    name = result.method
+    if name.startswith("raster_"):
+        side = name.removeprefix("raster_")
+        name = f"raster {side} x {side}"
+    return name + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate
 
 
 def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:

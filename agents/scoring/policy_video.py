@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.scoring.leaderboard import SITES
+from agents.scoring.results import SITES
 
 matplotlib.use("Agg")
 from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -34,6 +34,7 @@ from agents.training.networks import (
     shortened,
 )
 from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, PLACE_SPACE, belief_features, site_actions
+from surgsim_env.envs.ids import TASKS
 from surgsim_env.scene.load import fill
 from surgsim_env.tasks.task import Task
 
@@ -135,7 +136,8 @@ class TrainedPolicy:
         """Check that this is an environment for the policy, which messages call `name`.
 
         Raises:
-            ValueError: it observes other channels, or in other scales, or has actions of another shape.
+            ValueError: it observes other channels, or in other scales, has actions of another shape, or is another
+                scene than that of its training, which a policy on belief maps alone can play.
         """
         reads, given = self.description.observation, observation_declaration(env)
         if given is not None and reads != given:
@@ -154,6 +156,15 @@ class TrainedPolicy:
                     f"{name} has {what} of shape {shape}, {self.description.env_id} with "
                     f"{shortened(self.description.env_kwargs)} those of {space.shape}: env_id or env_kwargs are wrong"
                 )
+        if self.description.belief or given is None:
+            # Belief maps are relative to the tip and the face; of an environment that is not ours nothing is known.
+            return
+        home, scene = home_scene(self.description.env_id, self.description.env_kwargs), env.unwrapped.scene.name  # type: ignore[attr-defined]
+        if scene != home:
+            raise ValueError(
+                f"{name} was trained on the scene {home!r}, whose size and place its observations have, and cannot "
+                f"play {scene!r}: leave out the scene, or train a policy on that one"
+            )
 
     def reset(self, count: int) -> None:
         """Begin episodes in `count` environments."""
@@ -193,6 +204,12 @@ class TrainedPolicy:
             return values
         scale = np.sqrt(np.asarray(one.observation_variance) + VARIANCE_SLACK)
         return np.clip((values - np.asarray(one.observation_mean)) / scale, -CUT, CUT).astype(np.float32)
+
+
+def home_scene(env_id: str, env_kwargs: dict[str, Any]) -> str:
+    """Name of the scene that a policy was trained on."""
+    task = TASKS.get(env_id.rpartition(":")[2])
+    return Path(env_kwargs.get("scene") or (task.default_scene if task else "")).stem
 
 
 # ---- files ----------------------------------------------------------------------------------------------------------

@@ -1,10 +1,9 @@
 """The Gymnasium environment: it puts a simulation and a task together and computes no physics and no reward itself."""
 
+import inspect
 import io
 import json
 import zipfile
-import zlib
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +15,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import check_entries
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.renderer import OrganRenderer
+from surgsim_env.scene.digest import content_digest, instrument_files, scene_digest, source_files
 from surgsim_env.tasks.declaration import documentation
 from surgsim_env.tasks.task import Task
 
@@ -31,6 +31,8 @@ DRAWS_MOST = 20
 # Kinds of observation, and the size of an observed picture [pixels].
 OBSERVATION_MODES = ("state", "rgb")
 PICTURE_SIZE = 84
+# Rooms of surgsim_env whose code decides an episode.
+EPISODE_ROOMS = ("scene", "instruments", "coupling", "palpation", "tasks", "envs")
 # Characters of a refused state's text that a message shows.
 LINE_MOST = 400
 
@@ -224,6 +226,19 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if self._eye is not None:
             self._eye.close()
 
+    def digests(self) -> dict[str, str]:
+        """Hashes of what decides an episode beside the seed and the environment's arguments.
+
+        "scene" is of the scene, its mesh and the instrument's files, "source" of the code of organ, instruments, tasks
+        and environments, with the task's own file. Equal ones on two machines mean the same episodes.
+        """
+        scene, rooms = self.scene, EPISODE_ROOMS if self._eye is None else (*EPISODE_ROOMS, "rendering")
+        own = Path(inspect.getsourcefile(type(self.task)) or __file__)
+        return {
+            "scene": content_digest(scene_digest(scene, self.simulation.anatomy.mesh), *instrument_files(scene)),
+            "source": content_digest(*source_files(*rooms), own),
+        }
+
     def save_state(self) -> bytes:
         """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed.
 
@@ -319,11 +334,10 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _maker(self) -> str:
         """What a saved state must agree with: the kind of environment, its scene and mesh, the rates."""
         scene, mesh = self.scene, self.simulation.anatomy.mesh
-        digest = zlib.crc32(mesh.tets.tobytes(), zlib.crc32(mesh.points.tobytes()))
-        digest = zlib.crc32(repr(replace(scene, folder=Path())).encode(), digest)
+        digest = scene_digest(scene, mesh, size=4)
         return (
             f"{type(self).__name__} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
-            f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest:08x})"
+            f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest})"
         )
 
     def _random_state(self, text: str) -> dict[str, Any]:

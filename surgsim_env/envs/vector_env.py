@@ -4,7 +4,7 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -70,6 +70,7 @@ class LaneVectorEnv(SyncVectorEnv):
             for members in self._members
         ]
         self._pool = ThreadPoolExecutor(max_workers=min(len(self._groups), threads))
+        self._paused = np.zeros(num_envs, dtype=np.bool_)
         # The threads live in this process alone: a forked child has none of them, and would wait for them for ever.
         self._process = os.getpid()
 
@@ -83,11 +84,37 @@ class LaneVectorEnv(SyncVectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in all environments, or in those that `options={"reset_mask": ...}` names.
 
+        One that is reset is paused no more.
+
         Raises:
             RuntimeError: a forked child calls it; see `step`.
         """
         self._check_process()
-        return super().reset(seed=seed, options=options)
+        begins = (options or {}).get("reset_mask")
+        given = super().reset(seed=seed, options=options)
+        self._paused[slice(None) if begins is None else begins] = False
+        return given
+
+    def pause(self, mask: NDArray[np.bool_]) -> None:
+        """Leave the environments that a mask (n,) names as they are in each `step`, until they are reset.
+
+        A step gives of them the last observation, a reward of 0, False for both ends, and no info; their actions are
+        not read. So nothing is computed for lanes whose last episode is over.
+
+        Raises:
+            ValueError: another autoreset mode than "Disabled", in which an episode's end does not begin the next one; a
+                mask that is not one bool per environment.
+        """
+        if self.autoreset_mode is not AutoresetMode.DISABLED:
+            raise ValueError(
+                f'autoreset_mode is {self.autoreset_mode.value!r}: only with "Disabled" can environments be paused'
+            )
+        if np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != np.bool_:
+            raise ValueError(
+                f"the mask has shape {np.shape(mask)} of {np.asarray(mask).dtype}; it must be one bool for each of "
+                f"{self.num_envs} environments"
+            )
+        self._paused = np.array(mask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One control step of all environments whose episode runs; the others are reset as their mode says.
@@ -98,17 +125,34 @@ class LaneVectorEnv(SyncVectorEnv):
         self._check_process()
         active = np.zeros(self.num_envs, dtype=np.bool_)
         for index, action in enumerate(iterate(self.action_space, actions)):
-            if not (self._autoreset_envs[index] and self.autoreset_mode is AutoresetMode.NEXT_STEP):
+            resets = self._autoreset_envs[index] and self.autoreset_mode is AutoresetMode.NEXT_STEP
+            if not (resets or self._paused[index]):
                 self._command(index, action)
                 active[index] = True
-        list(
-            self._pool.map(
-                lambda group, members: self._advance(group, members, active[members.start : members.stop]),
-                self._groups,
-                self._members,
-            )
-        )
-        return super().step(actions)
+
+        def advance(group: LaneGroup, members: range) -> None:
+            moves = active[members.start : members.stop]
+            if moves.any():
+                self._advance(group, members, moves)
+
+        list(self._pool.map(advance, self._groups, self._members))
+        if not self._paused.any():
+            return super().step(actions)
+        return self._step_others(actions)
+
+    def _step_others(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """`SyncVectorEnv.step`, with stand-ins for the environments that are paused."""
+        envs = self.envs
+        self._autoreset_envs[self._paused] = False
+        try:
+            stand_ins: list[Any] = [
+                _Standstill(seen) if paused else env
+                for env, seen, paused in zip(envs, self._env_obs, self._paused, strict=True)
+            ]
+            self.envs = stand_ins
+            return super().step(actions)
+        finally:
+            self.envs = envs
 
     def _check_process(self) -> None:
         if (child := os.getpid()) != self._process:
@@ -132,6 +176,15 @@ class LaneVectorEnv(SyncVectorEnv):
         """Stop the threads and close the environments."""
         self._pool.shutdown()
         super().close_extras(**kwargs)
+
+
+class _Standstill(NamedTuple):
+    """In place of an environment that is paused: its step gives the last observation, and nothing happens."""
+
+    observation: Any
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.observation, 0.0, False, False, {}
 
 
 @cache

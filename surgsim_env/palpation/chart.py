@@ -1,7 +1,6 @@
 """The chart of a palpable face, a grid of sites across the approach, and the healthy organ's stiffness at each."""
 
 import contextlib
-import hashlib
 import os
 import threading
 import zipfile
@@ -15,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 
-import msdm_core
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
@@ -24,6 +22,7 @@ from surgsim_env.palpation.surface_scene import with_substeps
 from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
+from surgsim_env.scene.digest import content_digest, source_files
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
@@ -415,24 +414,17 @@ def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
 def _digest(anatomy: Anatomy) -> str:
     """Hash of everything that determines the map, including the source of the organ and of the press."""
     scene = anatomy.scene
-    digest = hashlib.blake2b(digest_size=12)
-    for array in (anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors):
-        digest.update(np.ascontiguousarray(array).data)
     parts = (
         *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing, scene.limits),
         *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports, scene.support_law),
         tuple(region for region in scene.regions if not region.lesion),
         tuple(one for one in scene.anchors if one.is_elastic),
     )
-    digest.update(repr(parts).encode())
-    core, here = Path(msdm_core.__file__).parent, Path(__file__)
-    package = here.parents[1]
-    sources = [package / "scene" / "palpable_surface.py", here.with_name("press.py"), here]
-    for folder in (core, package / "instruments", package / "coupling"):
-        sources += sorted(folder.rglob("*.py"))
-    for path in (*sources, scenes_folder() / "instruments" / scene.instrument.model):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
+    here = Path(__file__)
+    sources = (here.parents[1] / "scene" / "palpable_surface.py", here.with_name("press.py"), here)
+    instrument = scenes_folder() / "instruments" / scene.instrument.model
+    arrays = (anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors)
+    return content_digest(*arrays, parts, *sources, *source_files("instruments", "coupling"), instrument)
 
 
 def _folder() -> Path | None:

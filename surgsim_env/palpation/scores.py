@@ -152,7 +152,9 @@ def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Genera
 
     whole = figures(np.arange(len(records)))
     draws = [figures(rng.integers(len(records), size=len(records))) for _ in range(RESAMPLES)]
-    return {name: _figure(value, np.array([draw[name] for draw in draws])) for name, value in whole.items()}
+    return {
+        name: figure_with_interval(value, np.array([draw[name] for draw in draws])) for name, value in whole.items()
+    }
 
 
 def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) -> dict[str, ScoreEstimate]:
@@ -161,7 +163,7 @@ def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) 
     count = table.shape[1]
     draws = np.array([_means(table[:, rng.integers(count, size=count)]) for _ in range(RESAMPLES)])
     means = _means(table).tolist()
-    return {name: _figure(mean, draw) for name, mean, draw in zip(columns, means, draws.T, strict=True)}
+    return {name: figure_with_interval(mean, draw) for name, mean, draw in zip(columns, means, draws.T, strict=True)}
 
 
 def press_errors(record: PalpationRecord, budget: int) -> FloatArray:
@@ -198,8 +200,8 @@ def _means(values: FloatArray) -> FloatArray:
     return np.divide(total, count, out=np.full(count.shape, math.nan), where=count > 0)
 
 
-def _figure(value: float, draws: FloatArray) -> ScoreEstimate:
-    """A figure with its interval; undefined draws are left out."""
+def figure_with_interval(value: float, draws: FloatArray) -> ScoreEstimate:
+    """A figure with its interval from draws of it (n,); undefined draws, NaN, are left out."""
     defined = np.sort(draws[~np.isnan(draws)])
     if math.isnan(value) or len(defined) == 0:
         return ScoreEstimate(None, None, None)

@@ -2,6 +2,9 @@
 
 import json
 import math
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +13,8 @@ import pytest
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents import evaluate
 from agents.scoring import leaderboard
-from agents.scoring.leaderboard import Result, load_results
+from agents.scoring.origin import file_digest
+from agents.scoring.results import SITES, Result, load_result, load_results, read_seeds, seeds_text
 from surgsim_env.palpation.scores import ScoreEstimate
 
 pytestmark = pytest.mark.agents
@@ -27,7 +31,7 @@ def result(method: str, presses: float = 5.0, **changes: object) -> Result:
     }
     settings = {
         "method": method,
-        "env_id": leaderboard.SITES,
+        "env_id": SITES,
         "env_kwargs": {"scene": "phantom", "level": "hard"},
         "seeds": (1_000_000, 1_000_001),
         "budget": 25,
@@ -37,6 +41,9 @@ def result(method: str, presses: float = 5.0, **changes: object) -> Result:
         "date": "2026-11-22",
         "errors_mm": [[20.0, 1.0]],
         "lesion_counts": [1, 0],
+        "successes": [True, False],
+        "sees_truth": method == "truth",
+        "origin": {"versions": {"numpy": "2"}},
     }
     return Result(**{**settings, **changes})  # type: ignore[arg-type]
 
@@ -82,7 +89,11 @@ def test_a_baseline_is_played_and_scored(tmp_path: Path) -> None:
     assert 0.1 < made.figures["force_mean"].value < 0.6
     assert made.figures["fault_share"].value == made.figures["hard_limit_share"].value == 0.0
     assert made.figures["seconds"].value > 3 * 0.25
-    assert made.command.endswith("--scene phantom --level standard --episodes 2 --budget 3")
+    assert made.command.endswith("--scene phantom --level standard --seeds 1000000:1000001 --budget 3")
+    assert made.successes == [row[-1] <= 5.0 for row in made.errors_mm] and not made.sees_truth
+    assert set(made.origin) == {"versions", "environment", "agent", "dtype"} and set(made.origin["agent"]) == {
+        "site_search.py"
+    }
 
 
 def test_who_sees_the_truth_scores_all_of_it_on_the_environment(tmp_path: Path) -> None:
@@ -95,6 +106,10 @@ def test_who_sees_the_truth_scores_all_of_it_on_the_environment(tmp_path: Path) 
     assert figures["truth"]["presses_to_median"].value == 1.0
     assert figures["middle"]["auroc"].value == 0.5 and figures["middle"]["outline_iou"].value == 0.0
     assert figures["middle"]["error_mm"].value > 5.0
+    marks = {made.method: (made.sees_truth, made.own_estimate) for made in load_results(tmp_path)}
+    assert marks == {"truth": (True, True), "middle": (False, True)}
+    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    assert "| truth **sees truth** (own estimate) |" in (tmp_path / "board.md").read_text()
 
 
 def test_oracles_play_a_patient_who_moves(tmp_path: Path) -> None:
@@ -103,11 +118,12 @@ def test_oracles_play_a_patient_who_moves(tmp_path: Path) -> None:
     evaluate.main(["--agent", "oracle_palpate", "--episodes", "1", *common])
     evaluate.main(["--agent", "oracle", "--episodes", "2", "--budget", "7", "--envs", "2", "--no-tracking", *common])
     sites, task = sorted(load_results(tmp_path), key=lambda made: made.method)
-    sites, task = (sites, task) if sites.env_id == leaderboard.SITES else (task, sites)
+    sites, task = (sites, task) if sites.env_id == SITES else (task, sites)
     assert task.place == "Palpate_phantom_small_standard_calm" and task.method == "oracle_palpate"
     assert task.figures["success"].value == 1.0 and task.figures["hard_limit_share"].value == 0.0
     assert sites.method == "oracle_untracked" and sites.env_kwargs["track_motion"] is False
     assert sites.command.endswith("--budget 7 --motion calm --no-tracking")
+    assert sites.sees_truth and task.sees_truth and task.successes == [True]
     assert 0.0 <= sites.figures["success"].value <= 1.0
     leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
     assert "(standard, motion calm)" in (tmp_path / "board.md").read_text()
@@ -115,19 +131,178 @@ def test_oracles_play_a_patient_who_moves(tmp_path: Path) -> None:
 
 def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, message in (
-        (["--agent", "gp_ucb", "--episodes", "101"], "there are 1 to 100 evaluation seeds"),
+        (["--agent", "gp_ucb", "--episodes", "101"], "there are 1 to 100 seeds"),
+        (["--agent", "gp_ucb", "--seeds", "5:9", "--episodes", "6"], "there are 1 to 5 seeds"),
+        (["--agent", "gp_ucb", "--seeds", "9:5"], "FIRST is at most LAST"),
+        (["--agent", "gp_ucb", "--seeds", "1,x"], "the rule is FIRST:LAST, both included, or a list"),
+        (["--agent", "gp_ucb", "--envs", "0"], "at least 1 organ"),
         (["--agent", "gp_ucb", "--video", "out.mp4"], "--video films a policy"),
+        (["--all", "--submit", "all.json"], "--submit writes one result"),
+        (
+            ["--agent", "gp_ucb", "--env", "SurgSim/Palpate-v0"],
+            "--env and --env-arguments are for --agent MODULE:CLASS",
+        ),
     ):
         with pytest.raises(SystemExit):
             evaluate.main(arguments)
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--agent", "gp_ubc"], "agent 'gp_ubc' is unknown"),
+        (["--agent", "nowhere_at_all:Agent"], "there is no module 'nowhere_at_all' on Python's path"),
+        (["--agent", "agents.site_search:Nobody"], "has no class 'Nobody'"),
+        (["--agent", "agents.evaluate:Player"], "missing"),
+        (["--agent", "agents.site_search:SiteFacts"], "missing"),
+        (["--agent", "expert_retract", "--level", "hard"], "argument 'level' is unknown"),
+        (["--agent", "expert_retract", "--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
+        (["--agent", "expert_retract", "--budget", "3"], "--budget is the number of presses"),
+        (["--agent", "expert_retract", "--no-tracking"], "--no-tracking is for the presses"),
+        (["--compare", "gp_ucb", "nobody"], "'nobody' names 0 results"),
+        (["--check", "nowhere.json"], "nowhere.json"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(arguments: list[str], message: str) -> None:
+    with pytest.raises((ValueError, TypeError, OSError), match=message):
+        evaluate.main([*arguments, *(["--episodes", "1"] if "--agent" in arguments else [])])
+
+
+def test_seeds_are_read_as_they_are_written() -> None:
+    for text, seeds in (("5:8", (5, 6, 7, 8)), ("5", (5,)), ("5,8", (5, 8)), ("8,5,6", (8, 5, 6))):
+        assert read_seeds(text) == seeds and seeds_text(seeds) == text
+    assert read_seeds("7:7") == (7,) and seeds_text((5, 6)) == "5:6"
+    for wrong in ("", "a", "5:", "5:8:9", "-3:2", "5,,6", "8:5", "0:100000", "5,6,5", "5:8,9"):
+        with pytest.raises(ValueError, match="the rule is FIRST:LAST"):
+            read_seeds(wrong)
+
+
+def test_results_of_other_seeds_are_not_written_by_themselves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nor those of some evaluation seeds, or of an agent from elsewhere."""
+    monkeypatch.setattr(evaluate, "RESULTS", tmp_path / "ours")
+    monkeypatch.setattr(evaluate, "write_leaderboard", lambda: pytest.fail("the leaderboard is written"))
+    common = ["--scene", "phantom_small", "--budget", "1", "--envs", "1"]
+    for arguments in (
+        ["--agent", "random", "--seeds", "3"],
+        ["--agent", "random", "--episodes", "1"],
+        ["--agent", "agents.site_search:RandomSites", "--episodes", "1"],
+    ):
+        evaluate.main([*arguments, *common])
+        assert "not written (--results FOLDER or --submit FILE does)" in capsys.readouterr().out
+    assert not (tmp_path / "ours").exists()
+    evaluate.main(["--agent", "random", "--seeds", "3,9", "--results", str(tmp_path / "mine"), *common])
+    (made,) = load_results(tmp_path / "mine")
+    assert made.seeds == (3, 9) and "--seeds 3,9" in made.command
+
+
+AGENT = """
+import numpy as np
+
+class Middle:
+    def reset(self, rng, facts):
+        self.facts = facts
+    def act(self, observation):
+        return np.zeros(2, dtype=np.float32)
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A stranger's file in the working folder, from which modules are imported."""
+    (tmp_path / "strangers_agent.py").write_text(AGENT, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path / "strangers_agent.py"
+    sys.modules.pop("strangers_agent", None)
+
+
+def test_a_strangers_result_is_submitted_and_checked(module: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = ["--agent", "strangers_agent:Middle", "--scene", "phantom_small", "--seeds", "3:4", "--budget", "2"]
+    evaluate.main([*name, "--submit", "mine.json"])
+    made = load_result(Path("mine.json"))
+    assert made.method == "strangers_agent.Middle" and made.place == "PalpateSites_phantom_small_standard"
+    assert made.origin["agent"] == {"strangers_agent.py": file_digest(module)}
+    assert {"surgsim", "numpy", "mujoco", "gymnasium", "python"} <= set(made.origin["versions"])
+    assert str(module.parent) not in Path("mine.json").read_text()
+    evaluate.main(["--check", "mine.json"])
+    assert "the environment is the same" in capsys.readouterr().out
+    # Each entry that says something else is named.
+    environment, versions = made.origin["environment"], made.origin["versions"]
+    for changed, fault in (
+        ({"origin": {**made.origin, "environment": {**environment, "scene": "0" * 24}}}, "environment: scene is 000"),
+        ({"origin": {**made.origin, "versions": {**versions, "mujoco": "1.0"}}}, "versions: mujoco is 1.0, here"),
+        ({"origin": {}}, "it names no versions and digests"),
+        ({"successes": [True, True]}, r"figure success is [\d.]+; its episodes give 1"),
+        ({"errors_mm": [[1.0, 1.0]] * 2}, r"figure presses_to_median is \w+; its episodes give 1"),
+        ({"errors_mm": made.errors_mm[:1]}, "it lists 2 seeds, 2 successes, 1 errors_mm, 2 lesion_counts"),
+        ({"env_kwargs": {**made.env_kwargs, "level": "hard"}}, "environment: scene is"),
+    ):
+        replace(made, **changed).write(Path("changed.json"))  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=f"changed.json cannot be compared .*{fault}"):
+            evaluate.main(["--check", "changed.json"])
+    module.write_text(AGENT + "# better\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"agent: strangers_agent.py is"):
+        evaluate.main(["--check", "mine.json"])
+    Path("broken.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"broken.json is no result of agents.evaluate"):
+        evaluate.main(["--check", "broken.json"])
+
+
+def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By names among the results at a place, with a training's seeds under the name they share; or by files."""
+    errors = [[20.0, 1.0], [9.0, 9.0]]
+    for method, rows in (("one", errors), ("ppo_seed0", errors), ("ppo_seed1", [[1.0, 1.0], [1.0, 1.0]])):
+        wins = [row[-1] <= 5.0 for row in rows]
+        result(method, errors_mm=rows, successes=wins, lesion_counts=[1, 1], budget=2).save(tmp_path)
+    evaluate.main(["--compare", "one", "ppo", "--level", "hard", "--results", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "ppo: mean over 2 training seeds" in printed and "success: one 50, ppo 75 %; difference -25" in printed
+    files = [str(tmp_path / f"PalpateSites_phantom_hard_{name}.json") for name in ("one", "ppo_seed1")]
+    evaluate.main(["--compare", *files])
+    assert "success: PalpateSites_phantom_hard_one 50" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"'one' names 0 results in .* at phantom, standard; it has some at .*_hard"):
+        evaluate.main(["--compare", "one", "ppo", "--results", str(tmp_path)])
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "message"),
+    [
+        ("palpate_phantom_cloned", ["--scene", "phantom_small"], r"was trained on the scene 'phantom', .* cannot play"),
+        ("palpate_phantom_small_cloned", ["--scene", "phantom"], r"was trained on the scene 'phantom_small'"),
+        ("retract_ppo", ["--level", "hard"], "argument 'level' is unknown"),
+        ("retract_ppo", ["--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
+    ],
+)
+def test_a_policy_does_not_play_what_it_was_not_made_for(policy: str, options: list[str], message: str) -> None:
+    """Among them scenes whose observations have the same shape, which it would answer wrong without a word."""
+    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+    path = evaluate.POLICIES / f"{policy}.safetensors"
+    with pytest.raises(ValueError, match=message):
+        evaluate.main(["--policy", str(path), "--seeds", "3", *options])
+
+
+def test_level_and_motion_beside_a_policy_are_honoured(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+    path = evaluate.POLICIES / "palpate_phantom_small_cloned.safetensors"
+    common = ["--policy", str(path), "--seeds", "3", "--submit", str(tmp_path / "mine.json")]
+    evaluate.main([*common, "--level", "easy", "--motion", "calm", "--scene", "phantom_small"])
+    made = load_result(tmp_path / "mine.json")
+    assert (made.scene, made.env_kwargs["level"], made.motion) == ("phantom_small", "easy", "calm")
+    assert set(made.origin["agent"]) == {path.name, "palpate_phantom_small_cloned.json"}
+    assert made.command == (
+        "python -m agents.evaluate --policy agents/policies/palpate_phantom_small_cloned.safetensors --level easy "
+        "--seeds 3 --motion calm"
+    )
+
+
 class MiddleOfAll:
     """A policy that presses the middle, in place of a trained one."""
 
     class description:
-        env_id = leaderboard.SITES
+        env_id = SITES
 
     def reset(self, count: int) -> None:
         """Nothing to forget."""

@@ -87,6 +87,58 @@ def test_disabled_resets_those_that_the_mask_names():
         assert_equal(together.step(actions(step)), apart.step(actions(step)))
 
 
+def test_a_paused_environment_stays_as_it_is_until_it_is_reset():
+    """The others go on as without it, to the bit; its own actions are not read."""
+    paused, whole = side_by_side(autoreset_mode="Disabled"), side_by_side(autoreset_mode="Disabled")
+    for envs in (paused, whole):
+        envs.reset(seed=4)
+        envs.step(actions(0))
+    seen = paused.step(actions(1))[0][1]
+    whole.step(actions(1))
+    state = paused.envs[1].unwrapped.save_state()
+    paused.pause(np.array([False, True, False]))
+    for step in range(2, 5):
+        given = actions(step)
+        expected = whole.step(given)
+        given[1] = np.nan
+        found = paused.step(given)
+        for lane in (0, 2):
+            assert_equal(tuple(part[lane] for part in found[:4]), tuple(part[lane] for part in expected[:4]))
+        np.testing.assert_array_equal(found[0][1], seen)
+        assert (found[1][1], found[2][1], found[3][1]) == (0.0, False, False)
+        assert not found[4]["_force_peak"][1] and found[4]["_force_peak"][0]
+    assert paused.envs[1].unwrapped.save_state() == state
+    paused.reset(seed=[0, 7, 0], options={"reset_mask": np.array([False, True, False])})
+    paused.step(actions(5))
+    assert paused.envs[1].unwrapped.simulation.time > 0.0
+
+
+def test_an_environment_whose_episode_is_over_can_be_paused():
+    """Where Gymnasium asks for a reset; if all are paused, nothing at all is computed."""
+    envs = side_by_side(autoreset_mode="Disabled", max_episode_steps=2)
+    envs.reset(seed=0)
+    still = np.zeros((COUNT, 4), dtype=np.float32)
+    assert not envs.step(still)[3].any() and envs.step(still)[3].all()
+    envs.pause(np.ones(COUNT, dtype=np.bool_))
+    times = [env.unwrapped.simulation.time for env in envs.envs]
+    _, rewards, terminated, truncated, infos = envs.step(still)
+    assert not (rewards.any() or terminated.any() or truncated.any() or infos)
+    assert [env.unwrapped.simulation.time for env in envs.envs] == times
+
+
+@pytest.mark.parametrize(
+    ("mode", "mask", "message"),
+    [
+        ("SameStep", np.zeros(COUNT, dtype=np.bool_), 'only with "Disabled" can environments be paused'),
+        ("Disabled", np.zeros(COUNT + 1, dtype=np.bool_), r"the mask has shape \(4,\) of bool; it must be one bool"),
+        ("Disabled", np.zeros(COUNT), r"the mask has shape \(3,\) of float64"),
+    ],
+)
+def test_a_wrong_pause_is_refused(mode: str, mask: np.ndarray, message: str):
+    with pytest.raises(ValueError, match=message):
+        side_by_side(autoreset_mode=mode).pause(mask)
+
+
 def test_a_fault_leaves_the_neighbours_untouched():
     """A node of the middle organ is not a number any more: its episode ends, the others' bits are as without it."""
     spoilt, whole = side_by_side(autoreset_mode="SameStep"), side_by_side(autoreset_mode="SameStep")

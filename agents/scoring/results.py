@@ -1,0 +1,156 @@
+"""Result files agents/results/*.json: one method on one environment, with what it takes to compare it with others."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, astuple, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scene.motions import STILL
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+# JSON has no infinity.
+NEVER = "never"
+SITES = "SurgSim/PalpateSites-v0"
+# Most seeds of a range that a user writes.
+SEEDS_MOST = 100_000
+
+
+@dataclass(frozen=True)
+class Result:
+    """One method on one environment, with the command that reproduces its figures.
+
+    Fields:
+        method: name of an agent or of a policy's file
+        env_id, env_kwargs: the environment
+        seeds: of the episodes; in a file as text, "FIRST:LAST" or "A,B,C"
+        budget: largest number of steps of an episode
+        figures: by name, each a value with its interval
+        successes: whether each episode succeeded
+        command: that produced it
+        wall_time: of all episodes [s], on a machine with other load
+        date: of its end
+        errors_mm: OSPA after each press of each episode (PalpateSites only)
+        lesion_counts: lesions of each episode (PalpateSites only)
+        sees_truth: whether the method is declared to see what is hidden
+        own_estimate: whether its own estimate is scored in place of the common estimator's
+        origin: versions and digests (`agents.scoring.origin`); empty in files of earlier versions
+    """
+
+    method: str
+    env_id: str
+    env_kwargs: dict[str, Any]
+    seeds: tuple[int, ...]
+    budget: int
+    figures: dict[str, ScoreEstimate]
+    command: str
+    wall_time: float
+    date: str
+    errors_mm: list[list[float]] = field(default_factory=list)
+    lesion_counts: list[int] = field(default_factory=list)
+    successes: list[bool] = field(default_factory=list)
+    sees_truth: bool = False
+    own_estimate: bool = False
+    origin: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def place(self) -> str:
+        """Environment, scene and level: the key that groups tables."""
+        parts = [self.env_id.removeprefix("SurgSim/").removesuffix("-v0"), self.scene]
+        parts += [self.env_kwargs.get("level") or "", self.motion]
+        return "_".join(part for part in parts if part)
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene, also where it was given as a file; "" for the environment's own."""
+        return Path(self.env_kwargs.get("scene") or "").stem
+
+    @property
+    def motion(self) -> str:
+        """How the patient moves; "" for one who holds still."""
+        motion = self.env_kwargs.get("motion") or STILL
+        return "" if motion == STILL else motion
+
+    def save(self, folder: Path = RESULTS) -> Path:
+        """Write it into a folder; replaces an older result of the same method and place."""
+        path = folder / f"{self.place}_{self.method}.json"
+        self.write(path)
+        return path
+
+    def write(self, path: Path) -> None:
+        """Write it as a file."""
+        table = asdict(self)
+        table["seeds"] = seeds_text(self.seeds)
+        table["figures"] = {
+            name: [_written(value) for value in astuple(figure)] for name, figure in self.figures.items()
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
+        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+
+
+def load_result(path: Path) -> Result:
+    """Read a file of `Result.write`.
+
+    Raises:
+        ValueError: another content (names the file and what is wrong).
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        table["figures"] = {
+            name: ScoreEstimate(*(math.inf if value == NEVER else value for value in values))
+            for name, values in table["figures"].items()
+        }
+        return Result(**{**table, "seeds": read_seeds(table["seeds"])})
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} is no result of agents.evaluate: {type(error).__name__}: {said}") from None
+
+
+def load_results(folder: Path = RESULTS) -> list[Result]:
+    """All results of a folder, by file name, without `reach_*.json`."""
+    return [load_result(path) for path in sorted(folder.glob("*.json")) if not path.name.startswith("reach_")]
+
+
+def family(method: str) -> str:
+    """The name that policies of one configuration and several training seeds share: sites_ppo of sites_ppo_seed3."""
+    return re.sub(r"_seed\d+(?=_untracked$|$)", "", method)
+
+
+def read_seeds(text: str) -> tuple[int, ...]:
+    """The seeds of "FIRST:LAST", both included, or of a list "A,B,C".
+
+    Raises:
+        ValueError: another text, a negative seed, one twice, or more than SEEDS_MOST.
+    """
+    rule = (
+        f"seeds are {text!r:.60}; the rule is FIRST:LAST, both included, or a list A,B,C of whole numbers, at least 0"
+    )
+    if not isinstance(text, str) or not re.fullmatch(r"\d+(:\d+|(,\d+)*)", text):
+        raise ValueError(rule)
+    if ":" in text:
+        first, last = map(int, text.split(":"))
+        if not 0 <= last - first < SEEDS_MOST:
+            raise ValueError(f"{rule}; FIRST is at most LAST, with at most {SEEDS_MOST} seeds")
+        return tuple(range(first, last + 1))
+    seeds = tuple(map(int, text.split(",")))
+    twice = next((seed for place, seed in enumerate(seeds) if seed in seeds[:place]), None)
+    if twice is not None:
+        raise ValueError(f"{rule}; {twice} is there twice")
+    return seeds
+
+
+def seeds_text(seeds: Sequence[int]) -> str:
+    """Seeds as `read_seeds` takes them."""
+    if len(seeds) > 1 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]}:{seeds[-1]}"
+    return ",".join(map(str, seeds))
+
+
+def _written(value: float | None) -> float | str | None:
+    if value is None:
+        return None
+    return NEVER if math.isinf(value) else float(f"{value:.5g}")

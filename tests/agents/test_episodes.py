@@ -1,0 +1,171 @@
+"""How episodes are played for scores: agents' random numbers, lanes without a seed, and who sees the truth."""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn", reason="needs the `agents` extra")
+from agents.scoring.episodes import (
+    AgentActor,
+    EpisodeFacts,
+    agent_generator,
+    episode_facts,
+    make_envs,
+    play_sites,
+    play_tasks,
+)
+from agents.site_search import Middle, OracleSites, RandomSites, TruthAgent
+from surgsim_env.palpation.scores import MapScore, press_errors
+
+pytestmark = pytest.mark.agents
+SITES = "SurgSim/PalpateSites-v0"
+SMALL: dict[str, Any] = {"scene": "phantom_small", "budget": 2}
+
+
+# ---- random numbers --------------------------------------------------------------------------------------------------
+
+
+def test_an_agent_cannot_redraw_the_hidden_lesions():
+    """Its generator does not give the level's draw, which the environment's own seed does give."""
+    env = gym.make(SITES, **SMALL).unwrapped
+    for seed in (1_000_000, 1_000_001, 1_000_002):
+        env.reset(seed=seed)
+        draw, drawn = env.task.level.draw, env.task.drawn  # type: ignore[attr-defined]
+        assert draw(env.task.anatomy, np.random.default_rng(seed)) == drawn  # type: ignore[attr-defined]
+        rng = agent_generator(seed)
+        again = [draw(env.task.anatomy, rng) for _ in range(20)]  # type: ignore[attr-defined]
+        assert drawn not in again and all(one.background != drawn.background for one in again)
+
+
+def test_its_stream_is_none_of_the_environments_or_their_children():
+    seed, count = 1_000_000, 1000
+    own = set(agent_generator(seed).integers(2**63, size=count).tolist())
+    sequence = np.random.SeedSequence(seed)
+    for other in (
+        np.random.default_rng(seed),
+        *map(np.random.default_rng, sequence.spawn(4)),
+        agent_generator(seed + 1),
+    ):
+        assert not own & set(other.integers(2**63, size=count).tolist())
+    np.testing.assert_array_equal(agent_generator(seed).random(5), agent_generator(seed).random(5))
+
+
+def test_it_does_not_hold_the_seed():
+    sequence: Any = agent_generator(1_000_000).bit_generator.seed_seq
+    assert 1_000_000 not in np.atleast_1d(sequence.entropy) and sequence.spawn_key == ()
+
+
+# ---- lanes -----------------------------------------------------------------------------------------------------------
+
+
+class Counting(RandomSites):
+    """Counts the actions of all its kind."""
+
+    acted: ClassVar[list[int]] = []
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        self.acted.append(1)
+        return super().act(observation)
+
+
+def test_lanes_without_a_seed_are_not_stepped(monkeypatch: pytest.MonkeyPatch):
+    """Three seeds on two lanes, as on one: equal records, each press chosen and simulated once."""
+    Counting.acted.clear()
+    seeds, envs = [5, 6, 7], make_envs(SITES, 2, dtype="float64", **SMALL)
+    stepped = []
+    singles = envs.unwrapped.envs  # type: ignore[attr-defined]
+    for number, single in enumerate(singles):
+        inner = single.unwrapped.begin_press
+        monkeypatch.setattr(
+            single.unwrapped, "begin_press", lambda action, n=number, inner=inner: stepped.append(n) or inner(action)
+        )
+    records = play_sites(AgentActor(Counting), envs, seeds)
+    assert len(Counting.acted) == 3 * 2 and sorted(stepped) == [0, 0, 0, 0, 1, 1]
+    alone = play_sites(AgentActor(RandomSites), make_envs(SITES, 1, dtype="float64", **SMALL), seeds)
+    for one, other in zip(records, alone, strict=True):
+        np.testing.assert_array_equal(one.truth, other.truth)
+        np.testing.assert_array_equal(one.force, other.force)
+        np.testing.assert_array_equal(press_errors(one, 2), press_errors(other, 2))
+
+
+def test_more_lanes_than_seeds():
+    (record,) = play_sites(AgentActor(RandomSites), make_envs(SITES, 3, **SMALL), [5])
+    assert len(record.force) == 2
+
+
+def test_environments_that_cannot_be_paused_are_refused():
+    envs = gym.make_vec(
+        SITES, num_envs=2, vectorization_mode="sync", vector_kwargs={"autoreset_mode": "Disabled"}, **SMALL
+    )
+    with pytest.raises(ValueError, match="2 environments of SyncVectorEnv cannot be paused"):
+        play_sites(AgentActor(RandomSites), envs, [1])
+
+
+# ---- the truth -------------------------------------------------------------------------------------------------------
+
+
+class Peeking(RandomSites):
+    """Takes the task without declaring it."""
+
+    def see(self, task: object) -> None:
+        raise AssertionError("it was given the task")
+
+
+def test_the_truth_is_for_those_that_declare_it():
+    env = gym.make(SITES, **SMALL)
+    env.reset(seed=5)
+    with pytest.raises(ValueError, match=r"agent Peeking has a method see, .* does not declare sees_truth = True"):
+        AgentActor(Peeking).begin(0, env, 5)
+    oracle = AgentActor(OracleSites).begin(0, env, 5)
+    assert len(oracle.places) == len(env.unwrapped.task.truth)  # type: ignore[attr-defined]
+    truth = AgentActor(TruthAgent).begin(0, env, 5)
+    np.testing.assert_array_equal(truth.truth, env.unwrapped.task.truth)  # type: ignore[attr-defined]
+
+
+class Prying(Middle):
+    """Makes its map of what it finds in the estimator's."""
+
+    seen: ClassVar[list[MapScore]] = []
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        self.seen.append(made)
+        return made
+
+
+def test_an_estimate_of_ones_own_is_made_without_the_truth():
+    envs = make_envs(SITES, 1, **SMALL)
+    (record,) = play_sites(AgentActor(Prying), envs, [1_000_000])
+    (shown,) = Prying.seen
+    assert record.map is not None and record.map.lesion.any() and record.map.outline_true.any()
+    assert not shown.lesion.any() and not shown.outline_true.any()
+    charted = envs.unwrapped.envs[0].unwrapped.task.charted  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(record.estimates[-1], charted.surface(np.zeros((1, 2))))
+
+
+# ---- other environments ----------------------------------------------------------------------------------------------
+
+
+class Still:
+    """Does nothing, and keeps what it was told."""
+
+    told: ClassVar[list[tuple[np.random.Generator, EpisodeFacts]]] = []
+
+    def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
+        self.told.append((rng, facts))
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        return np.zeros(self.told[-1][1].action_size, dtype=np.float32)
+
+
+def test_an_agent_plays_an_environment_of_control_steps():
+    env_id, kwargs = "SurgSim/Palpate-v0", {"scene": "phantom_small"}
+    envs = make_envs(env_id, 1, max_episode_steps=3, **kwargs)
+    records = play_tasks(AgentActor(Still, lambda env: episode_facts(env, env_id, kwargs)), envs, [8, 9])
+    assert [record.steps for record in records] == [3, 3]
+    (first, facts), (second, _) = Still.told
+    assert facts.env_kwargs == kwargs and facts.step_count == gym.spec(env_id).max_episode_steps
+    assert facts.observation_slices["contact_force"].stop <= envs.single_observation_space.shape[0]  # type: ignore[index]
+    assert 0.0 < facts.soft_force < facts.hard_force and facts.control_step == 0.05
+    assert first.random() == agent_generator(8).random() and second.random() == agent_generator(9).random()

@@ -25,7 +25,7 @@ TRIES_MOST = 200
 # is 20 N/m, which adds some 7 % to an indentation, as a human one does (Roan 2010, doi 10.1115/1.4002369).
 CAPSULE_THICKNESS = 2e-5
 CAPSULE_STIFFNESS = (5.0, 20.0)
-# Factor on the substeps of a scene whose tissue is given another law: fast parts of its relaxation, and strained tissue,
+# Factor on the substeps of a scene whose tissue is given another law: strained tissue and the fast part of a relaxation
 # are stiffer than tissue at rest.
 TISSUE_SUBSTEPS = 2
 # Most lesions of a saved draw: each takes time to compile.

@@ -27,7 +27,6 @@ from surgsim_env.tasks.palpate import (
     DECLARE_VALUE,
     EPISODE_STEPS,
     START_GAP,
-    SUCCESS_DISTANCE,
     PalpateTask,
     touch_memory,
 )
@@ -213,7 +212,7 @@ class PalpateSurrogate(VectorEnv):
         hard = force > limits.hard_force
         declared = ~hard & (self.declared >= DECLARE_STEPS)
         error = np.linalg.norm(self.tip[:, :2] - self.lesion, axis=1)
-        found = declared & (error <= SUCCESS_DISTANCE)
+        found = declared & (error <= self.task.success_distance)
         terminated, left = hard | declared, EPISODE_STEPS - self.steps
         share = np.clip((force - limits.soft_force) / (limits.hard_force - limits.soft_force), 0.0, 1.0)
         rewards = (

@@ -31,7 +31,6 @@ from surgsim_env.tasks.task import (
 EPISODE_STEPS = 600
 DECLARE_VALUE = 0.8
 DECLARE_STEPS = 3
-SUCCESS_DISTANCE = 0.010
 
 # Height of the tip ball above the surface at the start [m].
 START_GAP = (0.002, 0.006)
@@ -86,7 +85,8 @@ class PalpateTask(Task):
     (`surgsim_env.scene.levels`).
 
     ## Episode End
-    Terminated: the lesion was declared (success within 10 mm of its centre, measured along the surface); the contact
+    Terminated: the lesion was declared (success within the radius of the smallest lesion that the scene hides, measured
+    along the surface from the point nearest to its centre: 6 mm on `phantom`, 18 mm on `liver`); the contact
     force exceeded the hard limit in a haptic step; the simulation faulted (`info["sim_fault"]` says how, the
     observation is the last finite one). Truncated: 600 control steps (30 s).
 
@@ -181,6 +181,12 @@ class PalpateTask(Task):
         self._error: float | None = None
 
     @property
+    def success_distance(self) -> float:
+        """Largest distance of a right declaration from the lesion [m]: a blind one succeeds in at most 20 %."""
+        assert self.anatomy.scene.lesion is not None
+        return self.anatomy.scene.lesion.radius[0]
+
+    @property
     def lesion(self) -> Lesion | None:
         """The lesion of the episode; None before the first."""
         return self.lesions[0] if self.lesions else None
@@ -224,7 +230,7 @@ class PalpateTask(Task):
         self._error = self.declared_error(step.simulation) if declared else None
         if self._error is None:
             return end
-        return "found" if self._error <= SUCCESS_DISTANCE else "wrong"
+        return "found" if self._error <= self.success_distance else "wrong"
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
         """As `Task.info`, and what was declared."""

@@ -222,6 +222,6 @@ def test_committed_policies_search_as_they_were_taught(path: Path):
             break
     found = np.nan_to_num(first).mean()
     if policy.description.force_entries:
-        assert found < 0.35  # what a fixed declaration finds on phantom
+        assert found < 0.2  # more than a fixed declaration finds on phantom
     else:
         assert found >= (0.6 if policy.description.algorithm == "RecurrentPPO" else 0.8)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.tasks.palpate import EPISODE_STEPS, SUCCESS_DISTANCE, PalpateTask
+from surgsim_env.tasks.palpate import EPISODE_STEPS, PalpateTask
 
 SPEED = 0.02
 STEP = 0.05
@@ -56,8 +56,8 @@ def test_declaring_on_the_lesion_wins(env):
     assert total > 9.5
 
 
-def test_success_is_judged_at_ten_millimetres_along_the_surface(env):
-    for offset, success in ((0.0085, True), (0.0115, False)):
+def test_success_is_judged_at_the_smallest_lesions_radius_along_the_surface(env):
+    for offset, success in ((0.0045, True), (0.0075, False)):
         env.reset(seed=1)
         x, y = lesion_place(env)
         inwards = np.sign(0.03 - x)
@@ -66,7 +66,7 @@ def test_success_is_judged_at_ten_millimetres_along_the_surface(env):
         assert info["success"] is success
         # The tissue between tip and lesion is squeezed aside: the touched patch comes from up to 1 mm further out.
         assert info["error_mm"] == pytest.approx(offset * 1000, abs=1.0)
-    assert SUCCESS_DISTANCE == 0.010
+    assert env.task.success_distance == 0.006
 
 
 def test_declare_needs_contact_three_steps_and_a_value_above_0p8(env):

@@ -108,6 +108,8 @@ class PalpateTask(Task):
     * `level`: "easy", "standard", "hard" or "clinical" (`surgsim_env.scene.levels`); None, the default: the scene's own
       ranges.
     * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
+    * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family", of
+      which each episode draws one; `info["member"]` names it.
 
     ## Version History
     * v0: first version.
@@ -179,6 +181,12 @@ class PalpateTask(Task):
         self.declare_count = 0
         self._declare_value = 0.0
         self._error: float | None = None
+
+    def take_anatomy(self, anatomy: Anatomy) -> None:
+        """As `Task.take_anatomy`, with an empty memory on the chart of its face."""
+        super().take_anatomy(anatomy)
+        if self.memory is not None:
+            self.memory = touch_memory(anatomy)
 
     @property
     def lesion(self) -> Lesion | None:

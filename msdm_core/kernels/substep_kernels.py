@@ -276,7 +276,10 @@ def _begin(lanes, model, state, shapes, response, duration):
             ground = ground_of(lanes, model, lane)
             carry_anchors(ground, motion, touched_of(lanes, state, lane).node_velocity)
             place_ground(
-                ground, motion, part_of(lanes, state.ground_foundation, lane), part_of(lanes, state.ground_support, lane)
+                ground,
+                motion,
+                part_of(lanes, state.ground_foundation, lane),
+                part_of(lanes, state.ground_support, lane),
             )
         answer = response_of(lanes, response, lane)
         answer.tool_wrench[:, :] = 0.0

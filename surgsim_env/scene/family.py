@@ -32,7 +32,7 @@ TRIES_MOST = 200
 # Waves of the outline around the organ.
 WAVES = (2, 3, 4)
 # Members whose anatomy is kept, the most recently used: a liver with its surface distances takes some 20 MB.
-KEPT_MOST = 64
+KEPT_MOST = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +209,9 @@ def family_of(template: Anatomy, split: str | None) -> OrganFamily | None:
         ValueError: a split for a scene without a family, or an unknown one.
     """
     if split is not None and split not in SPLITS:
-        raise ValueError(f"split {split!r} is unknown{nearest(str(split), list(SPLITS))}; it is one of {', '.join(SPLITS)}")
+        raise ValueError(
+            f"split {split!r} is unknown{nearest(str(split), list(SPLITS))}; it is one of {', '.join(SPLITS)}"
+        )
     if template.scene.family is not None:
         return OrganFamily(template, split or DEFAULT_SPLIT)
     if split is not None:

@@ -69,6 +69,11 @@ class PalpableFace:
         normal = weights @ self.normals[nodes]
         return weights @ self.points[nodes], normal / np.linalg.norm(normal)
 
+    def carried(self, point: ArrayLike, other: "PalpableFace") -> FloatArray:
+        """Where a point [m] (3,) of this face is on that of another member of its family, of the same triangles."""
+        face, weights = self._nearest(np.asarray(point, dtype=np.float64))
+        return weights @ other.points[other.triangles[face]]
+
     def rim_distance(self, point: FloatArray) -> float:
         """Distance from a point to the face's border [m]."""
         start, span, squared = self._rim_segments

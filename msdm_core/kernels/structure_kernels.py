@@ -263,7 +263,7 @@ class LaneModel(NamedTuple):
         foundation_nodes: nodes that elastic foundations hold                    (n_held,)
         foundation_position: where those nodes are without force [m]             (n_held, 3) or own
         foundation_stiffness: as in OrganModel [N/m]                             (n_held, 3, 3) or own
-        motion_node_shift: as in OrganModel [m]                     (n_motion, n_node, 4) or (n_motion, n_node, 4, n_lane)
+        motion_node_shift: as in OrganModel [m]                                  (n_motion, n_node, 4) or own, lane last
         motion_anchored_nodes: as in OrganModel                                  (n_anchored,) or own
         anchor_count: how many of them each lane has                             (n_lane,)
         motion_foundation_shift: as in OrganModel [m]                            (n_motion, n_held, 3) or own

@@ -158,8 +158,8 @@ def drag_along(lanes, shift, rate, moving, decay, velocity):
 
     With its speed w = sum of ds_m/dt d_m: v' = decay (v - w) + w + ..., so that anchored nodes keep the speed w.
 
-    In:  shift: d_m [m] (n_motion, n_node, 4) or that with a last index of lanes, rate: ds_m/dt [1/s] (n_motion,), moving: 1 where an organ moves (1,),
-         decay
+    In:  shift: d_m [m] (n_motion, n_node, 4), or with a last index n_lane each lane's own, rate: ds_m/dt [1/s]
+         (n_motion,), moving: 1 where an organ moves (1,), decay
     Out: velocity [m/s] (n_node, 4)
     """
     more, parts = (1.0 - decay) / decay, parts_of(lanes)

@@ -2,9 +2,8 @@
 
 Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, supports,
 damping, gravity and the laws by which springs stiffen and relax are shared. With `own_rest` organs of the same tets may
-also differ in their rest shape, in what is anchored, and in how foundations hold the same nodes, for a few hundredths of
-the time. In float64 an organ moves to
-the bit as `stepping.advance_organ` moves it, whoever its neighbours.
+also differ in their rest shape, in what is anchored, and in how foundations hold the same nodes, for a few hundredths
+of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its neighbours.
 """
 
 import math

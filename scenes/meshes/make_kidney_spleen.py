@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """Write ``kidney.ply`` and ``spleen.ply``: a kidney-like bean and a spleen-like cap of this project's own making.
 
-Both are ellipsoids bent by squares of their coordinates: the bean's middle bulges to the front and its poles lie back and
-towards the hilum; the cap's crown points to the front and its rim lies back.
+Both are ellipsoids bent by squares of their coordinates: the bean's middle bulges to the front and its poles lie back
+and towards the hilum; the cap's crown points to the front and its rim lies back.
 
-Axes: x to the patient's left, y to the back, z to the head; an instrument palpates the front.  Coordinates are rounded to
-one micrometre.
+Axes: x to the patient's left, y to the back, z to the head; an instrument palpates the front.  Coordinates are rounded
+to one micrometre.
 
     python scenes/meshes/make_kidney_spleen.py [folder]
 """

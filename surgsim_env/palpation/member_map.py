@@ -1,8 +1,9 @@
 """The healthy map of a member of a family, from that of its template and few presses of its own.
 
-What a mesh adds to the stiffness of a press varies from node to node, and members have the template's tets: at the same
-place of the face the ratio r of both stiffnesses varies as slowly as the deformation does. A Gaussian process with fixed
-hyperparameters (Rasmussen & Williams 2006, eq. 2.25) continues log r from PRESS_COUNT sites, far from each other, to all.
+What a mesh adds to the stiffness of a press varies from node to node, and members have the template's tets: at the
+same place of the face the ratio r of both stiffnesses varies as slowly as the deformation does. A Gaussian process with
+fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25) continues log r from PRESS_COUNT sites, far from each other,
+to all.
 """
 
 import contextlib
@@ -108,7 +109,7 @@ def _covariance(one: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def far_apart(charted: ChartedFace, sites: list[Site]) -> list[int]:
-    """Indices of at most PRESS_COUNT different sites, each as far as possible from those before; the first is in the middle."""
+    """Indices of at most PRESS_COUNT different sites, each as far as possible from those before, from the middle on."""
     places = np.array([site.place for site in sites]) * charted.chart.extent
     chosen, distance = [], np.linalg.norm(places, axis=1)
     index = int(np.argmin(distance))

@@ -79,7 +79,7 @@ class OrganRenderer:
         self.follow_anatomy()
 
     def follow_anatomy(self) -> None:
-        """Take another member of its family for the simulation's organ where an episode has one: cameras and graphics."""
+        """Take cameras and graphics of another member of the family where the simulation has one."""
         anatomy = self._simulation.anatomy
         if self._anatomy is anatomy:
             return

@@ -3,8 +3,8 @@
 A point of the organ at (u, v, w) [m] from its middle, across and along the approach, goes to
 
     1. (a s u, b s v, c t s w): size s, stretches a b c = 1, thickness t
-    2. (g u, g v, w), g = 1 + sum over m = 2, 3, 4 of e_m r^m cos(m (p - p_m)): its outline, with r e^(ip) = (u / U, v / V)
-       and the half lengths U, V
+    2. (g u, g v, w), g = 1 + sum over m = 2, 3, 4 of e_m r^m cos(m (p - p_m)): its outline, with r and p the polar
+       coordinates of (u / U, v / V) and U, V half lengths
     3. x + sum of h n exp(-|x - q|^2 / (2 d^2)): bumps and dents at places q of its surface, along a direction n
     4. (u, v, w + (k_uu u^2 + 2 k_uv u v + k_vv v^2) / 2): a bend
 
@@ -139,8 +139,8 @@ def make_member(template: Anatomy, name: MemberName) -> Anatomy:
             return replace(template, mesh=mesh, face=face, member=name, template=template, deformation=shape)
     raise ValueError(
         f"scene {template.scene.name!r}: {TRIES_MOST} draws of member {name} fold its tets, leave less than "
-        f"{family.quality_share:g} of their quality or are larger than the family's box: narrow the ranges of [family], "
-        "or lower family.quality_share"
+        f"{family.quality_share:g} of their quality or are larger than the family's box: narrow the ranges of "
+        "[family], or lower family.quality_share"
     )
 
 

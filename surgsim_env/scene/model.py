@@ -705,9 +705,8 @@ class Family:
         for name in ("size", "aspect", "thickness"):
             low, high = getattr(self, name)
             if not FACTOR_LEAST <= low <= high <= FACTOR_MOST:
-                raise ValueError(
-                    f"family.{name} = [{low:g}, {high:g}]; the rule is {FACTOR_LEAST:g} <= low <= high <= {FACTOR_MOST:g}"
-                )
+                rule = f"{FACTOR_LEAST:g} <= low <= high <= {FACTOR_MOST:g}"
+                raise ValueError(f"family.{name} = [{low:g}, {high:g}]; the rule is {rule}")
         _require_range("family.bump_width", self.bump_width)
         require_number("family.curvature", self.curvature, 0.0, "1/m")
         require_number("family.edge", self.edge, 0.0, "", most=0.5)

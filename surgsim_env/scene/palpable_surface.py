@@ -206,7 +206,7 @@ def find_palpable_face(
 
 
 def moved_face(face: PalpableFace, mesh: TetMesh, palpation: PalpationSettings) -> PalpableFace:
-    """The same triangles as a palpable face where the nodes of its organ are moved to other places (`TetMesh.moved`)."""
+    """The same triangles as a palpable face where its organ's nodes are moved to other places (`TetMesh.moved`)."""
     wanted = {tuple(one) for one in face.triangles.tolist()}
     chosen = np.array([tuple(one) in wanted for one in mesh.boundary_triangles.tolist()], dtype=np.bool_)
     return _face_of(mesh, chosen, face.approach, palpation, face.tip_radius)

@@ -108,8 +108,8 @@ class PalpateTask(Task):
     * `level`: "easy", "standard", "hard" or "clinical" (`surgsim_env.scene.levels`); None, the default: the scene's own
       ranges.
     * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
-    * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family", of
-      which each episode draws one; `info["member"]` names it.
+    * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family",
+      of which each episode draws one; `info["member"]` names it.
 
     ## Version History
     * v0: first version.

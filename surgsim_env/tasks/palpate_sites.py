@@ -113,8 +113,8 @@ class PalpateSitesTask(Task):
     * `level`: "easy", "standard" (default), "hard" or "clinical".
     * `memory`: observe all presses (default), or the last one alone.
     * `budget`: presses of an episode; by default 25, or 60 where the chart is longer than ten tip radii.
-    * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family", of
-      which each episode draws one; `info["member"]` names it.
+    * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family",
+      of which each episode draws one; `info["member"]` names it.
     * `instrument`: "probe", the name of an arm or the path of an arm's TOML file; by default the scene's own.
 
     ## Version History

@@ -209,9 +209,8 @@ def family_of(template: Anatomy, split: str | None) -> OrganFamily | None:
         ValueError: a split for a scene without a family, or an unknown one.
     """
     if split is not None and split not in SPLITS:
-        raise ValueError(
-            f"split {split!r} is unknown{nearest(str(split), list(SPLITS))}; it is one of {', '.join(SPLITS)}"
-        )
+        hint = nearest(str(split), list(SPLITS))
+        raise ValueError(f"split {split!r} is unknown; the splits are {', '.join(SPLITS)}{hint}")
     if template.scene.family is not None:
         return OrganFamily(template, split or DEFAULT_SPLIT)
     if split is not None:

@@ -71,7 +71,7 @@ def held(index: int) -> OrganModel:
     mesh = box_mesh(SIZE, CELLS)
     bent = mesh.points * size_of(index) + np.outer(mesh.points[:, 0] ** 2, [0.0, 0.0, 1.0 + 0.5 * index])
     under = np.flatnonzero(mesh.points[:, 2] <= 1e-9)
-    fixed = np.flatnonzero((mesh.points[:, 0] <= 1e-9) & (mesh.points[:, 2] > 0.011 + 0.003 * (index % 2)))
+    fixed = np.flatnonzero((mesh.points[:, 0] <= 1e-9) & (mesh.points[:, 2] > 0.009 + 0.003 * (index % 2)))
     spec = OrganSpec(
         mesh.moved(bent),
         Material(youngs_modulus=6000.0, density=1000.0, poisson_ratio=0.45),

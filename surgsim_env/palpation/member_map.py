@@ -28,8 +28,11 @@ from surgsim_env.palpation.chart import (
     press_sites,
 )
 from surgsim_env.reports.step_progress import StepProgress
-from surgsim_env.scene.anatomy import Anatomy, MemberName
+from surgsim_env.scene.anatomy import Anatomy, MemberName, load_anatomy
 from surgsim_env.scene.family import make_member
+from surgsim_env.scene.load import with_instrument
+from surgsim_env.scene.model import Scene
+from surgsim_env.scene.motions import STILL, with_motion
 
 # Sites that are pressed, three times as many as float32 has lanes.
 PRESS_COUNT = 48
@@ -43,14 +46,18 @@ _maps: OrderedDict[tuple[Anatomy, MemberName], HealthyMap] = OrderedDict()
 _lock = Lock()
 
 
-def member_map(template: Anatomy, name: MemberName) -> HealthyMap:
+def still_template(scene: Scene) -> Anatomy:
+    """The anatomy whose healthy map belongs to a scene: with the probe, and without motion."""
+    return load_anatomy(with_instrument(with_motion(scene, STILL), "probe"))
+
+
+def member_map(template: Anatomy, name: MemberName, progress: StepProgress | None = None) -> HealthyMap:
     """The healthy map of a member of a family, from memory, the cache on disk (`chart.healthy_map`) or by pressing it.
 
-    Progress is shown on standard error.
-
     Args:
-        template: the family's scene, with the probe and without motion.
+        template: `still_template` of the family's scene.
         name: of the member.
+        progress: shows the presses; None: on standard error.
 
     Raises:
         ValueError: as in `healthy_map`.
@@ -59,14 +66,14 @@ def member_map(template: Anatomy, name: MemberName) -> HealthyMap:
     with _lock:
         known = _maps.pop(key, None)
         if known is None:
-            known = _read_or_press(make_member(template, name))
+            known = _read_or_press(make_member(template, name), progress)
         _maps[key] = known
         if len(_maps) > MAPS_MOST:
             _maps.popitem(last=False)
     return known
 
 
-def _read_or_press(member: Anatomy) -> HealthyMap:
+def _read_or_press(member: Anatomy, progress: StepProgress | None) -> HealthyMap:
     template, folder = member.template, cache_folder()
     assert template is not None
     base = hashlib.blake2b(Path(__file__).read_bytes(), digest_size=12)
@@ -75,8 +82,12 @@ def _read_or_press(member: Anatomy) -> HealthyMap:
     with contextlib.suppress(OSError, ValueError, EOFError):
         if path is not None:
             return HealthyMap(np.load(path, allow_pickle=False))
-    with StepProgress(Console(stderr=True)) as progress:
-        grid = _corrected(healthy_map_of(template), member, progress)
+    base_map = healthy_map_of(template)
+    if progress is not None:
+        grid = _corrected(base_map, member, progress)
+    else:
+        with StepProgress(Console(stderr=True)) as own:
+            grid = _corrected(base_map, member, own)
     if path is not None:
         keep_map(path, grid)
     return HealthyMap(grid)

@@ -15,7 +15,7 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, HealthyMap, Site, charted_face, healthy_map_of
 from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
-from surgsim_env.palpation.member_map import member_map
+from surgsim_env.palpation.member_map import member_map, still_template
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
 from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, SiteTouches, Touch
@@ -23,7 +23,7 @@ from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.family import family_of
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
 from surgsim_env.scene.load import fill_json, make_scene, with_instrument
-from surgsim_env.scene.motions import STILL, with_motion
+from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import InfoValue, Start, Task, check_count, check_share, soft_force_share
 
@@ -298,7 +298,7 @@ class PalpateSitesTask(Task):
         moving = with_motion(with_instrument(plain, instrument), motion or chosen.motion)
         anatomy = load_anatomy(chosen.scene(moving))
         family = family_of(anatomy, split)
-        still = load_anatomy(with_instrument(chosen.healthy(with_motion(plain, STILL)), "probe"))
+        still = still_template(chosen.healthy(plain))
         task = cls(anatomy, chosen, healthy_map_of(still), memory=memory, budget=budget, **settings)
         task.family, task.still = family, still
         return Simulation(anatomy), task

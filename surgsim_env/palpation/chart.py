@@ -343,7 +343,11 @@ def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
         if path is not None:
             return HealthyMap(np.load(path, allow_pickle=False))
     with StepProgress(Console(stderr=True)) as progress:
-        grid = (_pressed_quickly if beside.is_file() else _pressed)(anatomy, progress)
+        if beside.is_file():
+            grid = _pressed_quickly(anatomy, progress)
+        else:
+            # Members of a family, whose maps are made from this one, are pressed in float32 too.
+            grid = _pressed(anatomy, progress, np.float64 if scene.family is None else np.float32)
     if path is not None:
         keep_map(path, grid)
     return HealthyMap(grid)

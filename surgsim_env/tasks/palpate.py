@@ -96,6 +96,7 @@ class PalpateTask(Task):
     soft limit, 1 at the hard one: a constraint for safe learning), `error_mm` (-1 if nothing was declared),
     `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through none),
     `added_mass` [kg] (by mass scaling, 0 without), one `reward_<term>` each.
+    Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
     the tissue, and `damaged` (bool): more than a limit is a safety stop.
 

@@ -31,8 +31,8 @@ DEFAULT_SPLIT = "train"
 TRIES_MOST = 200
 # Waves of the outline around the organ.
 WAVES = (2, 3, 4)
-# Members whose anatomy is kept, the most recently used: a liver with its surface distances takes some 20 MB.
-KEPT_MOST = 32
+# Members whose anatomy is kept, the most recently used: a liver with the tables of its chart takes some 5 MB.
+KEPT_MOST = 128
 
 
 @dataclass(frozen=True, eq=False)

@@ -168,6 +168,7 @@ def test_side_by_side_equals_one_after_the_other(blocks, env_id, settings):
 def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(blocks, tmp_path, monkeypatch):
     monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
     pressed = []
+    member_map._maps.clear()
 
     def press_sites(anatomy, sites, progress, dtype=None, name=""):
         """Twice as stiff as the template, everywhere."""

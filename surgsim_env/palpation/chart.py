@@ -338,16 +338,14 @@ def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
     grid = _shipped(beside, digest)
     if grid is not None:
         return HealthyMap(grid)
-    path = None if folder is None else folder / f"healthy-{digest}.npy"
+    # Members of a family, whose maps are made from this one, are pressed in float32.
+    dtype = np.float64 if scene.family is None else np.float32
+    path = None if folder is None else folder / f"healthy-{digest}-{np.dtype(dtype)}.npy"
     with contextlib.suppress(OSError, ValueError, EOFError):
         if path is not None:
             return HealthyMap(np.load(path, allow_pickle=False))
     with StepProgress(Console(stderr=True)) as progress:
-        if beside.is_file():
-            grid = _pressed_quickly(anatomy, progress)
-        else:
-            # Members of a family, whose maps are made from this one, are pressed in float32 too.
-            grid = _pressed(anatomy, progress, np.float64 if scene.family is None else np.float32)
+        grid = _pressed_quickly(anatomy, progress) if beside.is_file() else _pressed(anatomy, progress, dtype)
     if path is not None:
         keep_map(path, grid)
     return HealthyMap(grid)

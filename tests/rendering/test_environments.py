@@ -230,7 +230,7 @@ def test_videos_are_recorded(env_id, tmp_path):
 
 @needs_opengl
 def test_pictures_follow_the_member_of_the_episode():
-    """Of a family, of which each episode plays another organ: pictures are those of an environment made for it alone."""
+    """Each episode of a family plays another organ: pictures are those of an environment made for it alone."""
     settings = {"scene": "kidney_family", "render_mode": "rgb_array", "width": 120, "height": 90, "show_lesion": True}
     env, frames = gym.make(PALPATE, **settings), {}
     for seed in range(3):

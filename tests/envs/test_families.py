@@ -1,5 +1,6 @@
 """Environments whose scene is a family: a member each episode, everything of it, alone and side by side."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -190,8 +191,9 @@ def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(bloc
 
 
 def test_healthy_members_have_contrast_one(blocks):
-    """Between the few sites that are pressed too: within the mesh's 3 %, as on one organ."""
-    template = load_anatomy(load_scene(Path(blocks)))
+    """Between the few sites that are pressed too, of a block so thin that its tray is felt: within the mesh's 3 %."""
+    scene = load_scene(Path(blocks))
+    template = load_anatomy(replace(scene, family=replace(scene.family, thickness=(0.6, 0.62))))
     name = MemberName("train", 1)
     member = member_map.make_member(template, name)
     charted = charted_face(member)
@@ -201,4 +203,4 @@ def test_healthy_members_have_contrast_one(blocks):
     expected = member_map.member_map(template, name).stiffness(np.array([site.place for site in sites]))
     error = np.log(stiffness / expected)
     print(f"\nlog contrast of healthy presses: deviation {error.std():.4f}, largest {np.abs(error).max():.4f}")
-    assert np.abs(error).max() < 0.06 and error.std() < 0.025
+    assert np.abs(error).max() < 0.03 and error.std() < 0.01

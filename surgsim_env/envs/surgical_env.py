@@ -235,7 +235,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         scene, rooms = self.scene, EPISODE_ROOMS if self._eye is None else (*EPISODE_ROOMS, "rendering")
         own = Path(inspect.getsourcefile(type(self.task)) or __file__)
         return {
-            "scene": content_digest(scene_digest(scene, self.simulation.anatomy.mesh), *instrument_files(scene)),
+            "scene": content_digest(scene_digest(scene, self._mesh), *instrument_files(scene)),
             "source": content_digest(*source_files(*rooms), own),
         }
 

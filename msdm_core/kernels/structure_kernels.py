@@ -233,7 +233,8 @@ class LaneModel(NamedTuple):
     """The constants of organs side by side: read-only arrays, SI units; tets are shared, the lane is the last index.
 
     Rest shapes and anchors are shared too, or each lane's own. Their arrays are then (n, n_lane) in place of (n,), and
-    those of surface and supports have the lane as their first index, of which a lane uses as many rows as it has.
+    those of surface, supports and foundations have the lane as their first index; of the surface, of supports and of
+    anchored nodes a lane uses as many rows as it has.
 
     Fields:
         lanes: as many zeros as there are lanes; their number is part of the compiled type
@@ -259,8 +260,14 @@ class LaneModel(NamedTuple):
         support_nodes, support_area: as in OrganModel                            (n_support_node,) or own
         support_count: how many of them each lane has                            (n_lane,)
         support_kind and the other support_ fields: as in OrganModel
-        foundation_nodes and the other foundation_ fields: as in OrganModel
-        motion_node_shift and the other motion_ fields: as in OrganModel
+        foundation_nodes: nodes that elastic foundations hold                    (n_held,)
+        foundation_position: where those nodes are without force [m]             (n_held, 3) or own
+        foundation_stiffness: as in OrganModel [N/m]                             (n_held, 3, 3) or own
+        motion_node_shift: as in OrganModel [m]                                  (n_motion, n_node, 4) or own, lane last
+        motion_anchored_nodes: as in OrganModel                                  (n_anchored,) or own
+        anchor_count: how many of them each lane has                             (n_lane,)
+        motion_foundation_shift: as in OrganModel [m]                            (n_motion, n_held, 3) or own
+        motion_support_shift: as in OrganModel [m]                               (n_motion, n_support, 3)
         gravity: [m/s^2]                                                         (3,)
         alpha: mass-proportional damping rate [1/s]                              scalar
         beta: stiffness-proportional damping time [s]                            scalar
@@ -309,8 +316,9 @@ class LaneModel(NamedTuple):
     foundation_nodes: NDArray[np.int32]
     foundation_position: FloatArray
     foundation_stiffness: FloatArray
-    motion_node_shift: FloatArray
+    motion_node_shift: LaneArray
     motion_anchored_nodes: NDArray[np.intp]
+    anchor_count: NDArray[np.int32]
     motion_foundation_shift: FloatArray
     motion_support_shift: FloatArray
     gravity: FloatArray
@@ -511,6 +519,19 @@ class _Supports(NamedTuple):
     support_tangential_stiffness: float
 
 
+class _Ground(NamedTuple):
+    """What elastic foundations and the ground's motion read of one lane's model."""
+
+    support_position: FloatArray
+    foundation_nodes: NDArray[np.int32]
+    foundation_position: FloatArray
+    foundation_stiffness: FloatArray
+    motion_node_shift: LaneArray
+    motion_anchored_nodes: NDArray[np.intp]
+    motion_foundation_shift: FloatArray
+    motion_support_shift: FloatArray
+
+
 class _Touched(NamedTuple):
     """What contact reads and writes of one lane's state."""
 
@@ -612,6 +633,40 @@ def supports_of(lanes, model, lane):
         model.support_kind, model.support_position, model.support_rotation, model.support_size, model.support_friction,
         _numbers_of(model.support_nodes, lane, count), _numbers_of(model.support_area, lane, count),
         model.support_stiffness, model.support_damping, model.support_tangential_stiffness,
+    )  # fmt: skip
+
+
+@njit(forceinline=True, error_model="numpy")
+def _places_of(values, lane):
+    if values.ndim == 3:
+        return values[lane]
+    return values
+
+
+@njit(forceinline=True, error_model="numpy")
+def _blocks_of(values, lane):
+    if values.ndim == 4:
+        return values[lane]
+    return values
+
+
+@njit(forceinline=True, error_model="numpy")
+def _shifts_of(values, lane):
+    if values.ndim == 4:
+        return values[:, :, :, lane]
+    return values
+
+
+@njit(forceinline=True, error_model="numpy")
+def ground_of(lanes, model, lane):
+    """One lane's foundations, and how the ground moves; kernels that read them take an OrganModel as well."""
+    if len(lanes) == 0:
+        return model
+    return _Ground(
+        model.support_position, model.foundation_nodes, _places_of(model.foundation_position, lane),
+        _blocks_of(model.foundation_stiffness, lane), _shifts_of(model.motion_node_shift, lane),
+        _numbers_of(model.motion_anchored_nodes, lane, model.anchor_count[lane]),
+        _blocks_of(model.motion_foundation_shift, lane), model.motion_support_shift,
     )  # fmt: skip
 
 

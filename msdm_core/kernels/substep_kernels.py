@@ -22,6 +22,7 @@ from msdm_core.kernels.structure_kernels import (
     SpringLaw,
     column_of,
     entry_of,
+    ground_of,
     in_rows,
     lanes_of,
     part_of,
@@ -272,9 +273,13 @@ def _begin(lanes, model, state, shapes, response, duration):
             motion = part_of(lanes, state.motion, lane)
             for number in range(motion.shape[0]):
                 column_of(state.ground_rate, lane)[number] = motion[number, 1]
-            carry_anchors(model, motion, touched_of(lanes, state, lane).node_velocity)
+            ground = ground_of(lanes, model, lane)
+            carry_anchors(ground, motion, touched_of(lanes, state, lane).node_velocity)
             place_ground(
-                model, motion, part_of(lanes, state.ground_foundation, lane), part_of(lanes, state.ground_support, lane)
+                ground,
+                motion,
+                part_of(lanes, state.ground_foundation, lane),
+                part_of(lanes, state.ground_support, lane),
             )
         answer = response_of(lanes, response, lane)
         answer.tool_wrench[:, :] = 0.0
@@ -338,8 +343,8 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
             )  # fmt: skip
         if model.foundation_nodes.shape[0] > 0:
             add_foundation_forces(
-                model.foundation_nodes, part_of(lanes, state.ground_foundation, lane), model.foundation_stiffness,
-                position, force,
+                model.foundation_nodes, part_of(lanes, state.ground_foundation, lane),
+                ground_of(lanes, model, lane).foundation_stiffness, position, force,
             )  # fmt: skip
         if state.candidate_count[lane] == 0 and squeezed_count == 0 and steep_count == 0:
             continue
@@ -370,11 +375,12 @@ def _move_ground(lanes, model, state, dt, decay):
             continue
         touched = touched_of(lanes, state, lane)
         motion, foundation = part_of(lanes, state.motion, lane), part_of(lanes, state.ground_foundation, lane)
+        ground = ground_of(lanes, model, lane)
         move_ground(
-            model, touched.node_position, touched.node_force, foundation,
+            ground, touched.node_position, touched.node_force, foundation,
             part_of(lanes, state.ground_load, lane), motion, dt,
         )  # fmt: skip
-        place_ground(model, motion, foundation, part_of(lanes, state.ground_support, lane))
+        place_ground(ground, motion, foundation, part_of(lanes, state.ground_support, lane))
 
 
 @njit(forceinline=True, error_model="numpy")

@@ -141,6 +141,14 @@ def _ground_shift(lanes, shift, number, node, part):
     """What of a motion's shift belongs to a part of a node, see `layout_kernels.load_part`."""
     if len(lanes) == 0:
         return load_row(shift, number * shift.shape[1] + node)
+    return _lanes_shift(lanes, shift, number, node, part)
+
+
+@njit(forceinline=True, error_model="numpy")
+def _lanes_shift(lanes, shift, number, node, part):
+    """The number that all lanes share, or the vector of each lane's own."""
+    if shift.ndim == 4:
+        return load_item(lanes, shift, (number * shift.shape[1] + node) * shift.shape[2] + part)
     return shift[number, node, part]
 
 
@@ -150,8 +158,8 @@ def drag_along(lanes, shift, rate, moving, decay, velocity):
 
     With its speed w = sum of ds_m/dt d_m: v' = decay (v - w) + w + ..., so that anchored nodes keep the speed w.
 
-    In:  shift: d_m [m] (n_motion, n_node, 4), rate: ds_m/dt [1/s] (n_motion,), moving: 1 where an organ moves (1,),
-         decay
+    In:  shift: d_m [m] (n_motion, n_node, 4), or with a last index n_lane each lane's own, rate: ds_m/dt [1/s]
+         (n_motion,), moving: 1 where an organ moves (1,), decay
     Out: velocity [m/s] (n_node, 4)
     """
     more, parts = (1.0 - decay) / decay, parts_of(lanes)

@@ -2,8 +2,8 @@
 
 Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, supports,
 damping, gravity and the laws by which springs stiffen and relax are shared. With `own_rest` organs of the same tets may
-also differ in their rest shape and in what is anchored, for a few hundredths of the time. In float64 an organ moves to
-the bit as `stepping.advance_organ` moves it, whoever its neighbours.
+also differ in their rest shape, in what is anchored, and in how foundations hold the same nodes, for a few hundredths
+of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its neighbours.
 """
 
 import math
@@ -43,17 +43,25 @@ OWN_FIELDS = (
     "node_softness",
 )
 OWN_NUMBERS = ("averages_volume", "stable_step")
-# Fields that follow from the rest shape, shared or each lane's own; and the rows of surface and supports, which depend
-# on the anchors too and of which lanes may have different numbers.
-REST_FIELDS = ("spring_rest_length", "tet_inverse_volume", "node_inverse_volume")
-ROW_FIELDS = ("surface_triangles", "surface_rest_area", "support_nodes", "support_area")
-COUNTS = ("surface_count", "support_count")
+# Fields that follow from the rest shape, shared or each lane's own, those of foundations with the lane as first index;
+# and rows of surface, supports and anchored nodes, which depend on the anchors too and of which lanes may have
+# different numbers.
+REST_FIELDS = ("spring_rest_length", "tet_inverse_volume", "node_inverse_volume", "motion_node_shift")
+HELD_FIELDS = ("foundation_position", "foundation_stiffness", "motion_foundation_shift")
+ROW_FIELDS = ("surface_triangles", "surface_rest_area", "support_nodes", "support_area", "motion_anchored_nodes")
+# The number of rows that a lane has, and a field with that many.
+COUNTS = {
+    "surface_count": "surface_triangles",
+    "support_count": "support_nodes",
+    "anchor_count": "motion_anchored_nodes",
+}
 ALWAYS_SHARED = tuple(
     name
     for name in LaneModel._fields
-    if name not in (*OWN_FIELDS, *OWN_NUMBERS, *REST_FIELDS, *ROW_FIELDS, *COUNTS, "node_rest_position", "lanes")
+    if name
+    not in (*OWN_FIELDS, *OWN_NUMBERS, *REST_FIELDS, *HELD_FIELDS, *ROW_FIELDS, *COUNTS, "node_rest_position", "lanes")
 )
-SHARED_REST = (*REST_FIELDS, *ROW_FIELDS, "node_rest_position")
+SHARED_REST = (*REST_FIELDS, *HELD_FIELDS, *ROW_FIELDS, "node_rest_position")
 
 
 def stack_organs(
@@ -81,12 +89,13 @@ def stack_organs(
     numbers = {"averages_volume": np.zeros(count, dtype=np.bool_), "stable_step": np.zeros(count)}
     shared = {name: getattr(first, name) for name in (*ALWAYS_SHARED, "node_rest_position")}
     if own_rest:
-        rest = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in REST_FIELDS}
+        rest = {name: aligned_zeros((*getattr(first, name).shape, count), dtype) for name in REST_FIELDS}
+        rest |= {name: np.zeros((count, *getattr(first, name).shape)) for name in HELD_FIELDS}
         for name, room in surface_rooms(first).items():
             rows = getattr(first, name)
             rest[name] = np.zeros((count, room, *rows.shape[1:]), dtype=rows.dtype)
     else:
-        rest = {name: getattr(first, name) for name in (*REST_FIELDS, *ROW_FIELDS)}
+        rest = {name: getattr(first, name) for name in (*REST_FIELDS, *HELD_FIELDS, *ROW_FIELDS)}
     counts = {name: np.zeros(count, dtype=np.int32) for name in COUNTS}
     model = LaneModel(lanes=(0,) * count, **own, **numbers, **rest, **counts, **shared)
     for lane in range(count):
@@ -102,7 +111,8 @@ def surface_rooms(organ: OrganModel) -> dict[str, int]:
     outer, times = np.unique(faces, axis=0, return_counts=True)
     outer = outer[times == 1]
     nodes = len(np.unique(outer)) if len(organ.support_kind) else 0
-    return dict(zip(ROW_FIELDS, (len(outer), len(outer), nodes, nodes), strict=True))
+    anchors = len(organ.node_mass) if len(organ.motion_node_shift) else 0
+    return dict(zip(ROW_FIELDS, (len(outer), len(outer), nodes, nodes, anchors), strict=True))
 
 
 def has_own_rest(model: LaneModel) -> bool:
@@ -168,11 +178,13 @@ def _write_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
     own = has_own_rest(model)
     for name in (*OWN_FIELDS, *OWN_NUMBERS, *(REST_FIELDS if own else ())):
         _write(getattr(model, name), (..., lane), getattr(organ, name))
+    for name in HELD_FIELDS if own else ():
+        _write(getattr(model, name), lane, getattr(organ, name))
     for name in ROW_FIELDS if own else ():
         rows = getattr(organ, name)
         _write(getattr(model, name), (lane, slice(len(rows))), rows)
-    for name, rows in zip(COUNTS, (organ.surface_triangles, organ.support_nodes), strict=True):
-        _write(getattr(model, name), lane, len(rows))
+    for name, rows in COUNTS.items():
+        _write(getattr(model, name), lane, len(getattr(organ, rows)))
 
 
 def _write(array: NDArray[Any], place: Any, values: Any) -> None:
@@ -286,6 +298,8 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
     for name in CONTACT_FIELDS:
         values = getattr(organ, name)
         getattr(state, name)[lane][tuple(slice(length) for length in values.shape)] = values
+    # Where nothing moves the ground, no kernel writes it.
+    state.ground_foundation[lane] = organ.ground_foundation
     state.surface_count[lane], state.support_count[lane] = points // QUADRATURE_COUNT, len(organ.support_stretch)
     state.volume_ratio_smallest[0, lane] = organ.volume_ratio_smallest[0]
     state.lane_fault[lane] = FAULT_NONE
@@ -412,7 +426,7 @@ def _check_fit(
         "contact_engaged": (state.contact_engaged, (lanes, count, surface * QUADRATURE_COUNT)),
         "support_stretch": (state.support_stretch, (lanes, support_nodes, len(model.support_kind), 3)),
         "motion": (state.motion, (lanes, len(model.motion_node_shift), 4)),
-        "ground_foundation": (state.ground_foundation, (lanes, *model.foundation_position.shape)),
+        "ground_foundation": (state.ground_foundation, (lanes, len(model.foundation_nodes), 3)),
         "ground_support": (state.ground_support, (lanes, len(model.support_kind), 2, 3)),
         "shape_ends": (shapes.shape_ends, (len(state.lane_fault), count, 2, 3)),
         "shape_span": (shapes.shape_span, (lanes, count, 3)),

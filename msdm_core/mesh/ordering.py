@@ -66,7 +66,8 @@ _ORDERS: WeakKeyDictionary[TetMesh, SpringOrder] = WeakKeyDictionary()
 
 
 def spring_order(mesh: TetMesh) -> SpringOrder:
-    """The order of the springs of a mesh, computed once for each mesh."""
+    """The order of the springs of a mesh, computed once for each mesh; one that was moved has that of its origin."""
+    mesh = mesh if mesh.origin is None else mesh.origin
     if mesh not in _ORDERS:
         _ORDERS[mesh] = _matched(mesh)
     return _ORDERS[mesh]

@@ -55,6 +55,8 @@ class TetMesh:
     region: IntArray
     region_names: tuple[tuple[int, str], ...]
     reoriented_count: int = field(init=False, default=0)
+    # The mesh that `moved` made this one from.
+    origin: "TetMesh | None" = field(init=False, default=None)
 
     def __init__(
         self,
@@ -83,6 +85,25 @@ class TetMesh:
     def tet_count(self) -> int:
         """Number of tets."""
         return len(self.tets)
+
+    def moved(self, points: ArrayLike) -> "TetMesh":
+        """The same tets with their nodes at other places [m], (n_node, 3); both have their springs in the same order.
+
+        Raises:
+            MeshError: points of another number, or a tet that is turned inside out or flat (names it).
+        """
+        array = _checked_points(points)
+        if array.shape != self.points.shape:
+            raise MeshError(f"{len(array)} points for the {self.node_count} nodes of a mesh: give one for each node")
+        _, inverted = _oriented(array, self.tets.copy())
+        if inverted:
+            tet = int(np.flatnonzero(tet_volumes(array, self.tets) < 0.0)[0])
+            raise MeshError(f"tet {tet} (of {inverted}) is inside out where its nodes are moved to: move them less")
+        other = object.__new__(TetMesh)
+        kept = {name: getattr(self, name) for name in ("tets", "region", "region_names", "_edge_table", "_boundary")}
+        origin = self if self.origin is None else self.origin
+        vars(other).update(points=_frozen(array), reoriented_count=0, origin=origin, **kept)
+        return other
 
     def region_tag(self, name: str) -> int:
         """The tag of a named region; MeshError lists the names there are."""

@@ -182,10 +182,10 @@ def make_liver() -> tuple[Array, Faces]:
     return (v - 0.5 * (v.min(axis=0) + v.max(axis=0))) * 1e-3, f
 
 
-def write_ply(path: Path, v: Array, f: Faces) -> None:
+def write_ply(path: Path, v: Array, f: Faces, comment: str = "surgsim liver, metres, from make_liver.py") -> None:
     """Binary little-endian PLY: float32 metres, uchar-counted int32 triangles."""
     header = (
-        "ply\nformat binary_little_endian 1.0\ncomment surgsim liver, metres, from make_liver.py\n"
+        f"ply\nformat binary_little_endian 1.0\ncomment {comment}\n"
         f"element vertex {len(v)}\nproperty float x\nproperty float y\nproperty float z\n"
         f"element face {len(f)}\nproperty list uchar int vertex_indices\nend_header\n"
     )

@@ -16,6 +16,7 @@ from surgsim_env.cli.bench import Bench
 from surgsim_env.cli.doctor import Doctor
 from surgsim_env.cli.haptics import Haptics
 from surgsim_env.cli.identify import Identify
+from surgsim_env.cli.maps import Maps
 from surgsim_env.cli.materials import Materials
 from surgsim_env.cli.organ import Organ
 from surgsim_env.cli.palpate import Palpate
@@ -28,7 +29,20 @@ from surgsim_env.cli.view import View
 NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around", "--trocar")
 
 Command = (
-    Palpate | Retract | Organ | Scenes | Materials | Arm | Arms | Identify | Validate | Bench | Haptics | View | Doctor
+    Palpate
+    | Retract
+    | Organ
+    | Scenes
+    | Maps
+    | Materials
+    | Arm
+    | Arms
+    | Identify
+    | Validate
+    | Bench
+    | Haptics
+    | View
+    | Doctor
 )
 
 

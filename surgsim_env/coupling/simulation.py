@@ -126,8 +126,7 @@ class Simulation:
         self.substep_count = scene.timing.substep_count
         self.substep_dt = self.haptic_dt / self.substep_count
         margin = WORKSPACE_MARGIN + scene.instrument.tip_radius
-        points = anatomy.mesh.points
-        lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+        lower, upper = anatomy.box[0] - margin, anatomy.box[1] + margin
         self.instrument: Instrument = make_instrument(anatomy, lower, upper)
         healthy = anatomy.organ()
         surface_area = float(healthy.surface_rest_area.sum())
@@ -191,6 +190,19 @@ class Simulation:
         corners = model.node_rest_position[model.surface_triangles]
         weights = engaged * model.surface_rest_area[:, None]
         return np.einsum("tq,qc,tcx->x", weights, QUADRATURE_BARYCENTRIC, corners) / weights.sum()
+
+    def take_anatomy(self, anatomy: Anatomy) -> None:
+        """Go on with another member of the scene's family; its organ comes with the `reset` that follows.
+
+        Raises:
+            ValueError: an anatomy of another scene or other tets.
+        """
+        if anatomy.scene != self.anatomy.scene or anatomy.mesh.tets is not self.anatomy.mesh.tets:
+            raise ValueError(
+                f"the anatomy of scene {anatomy.scene.name!r} is no member of the family of this simulation's, "
+                f"{self.anatomy.scene.name!r}: make a simulation of its own"
+            )
+        self.anatomy = anatomy
 
     def reset(self, organ_model: OrganModel, tip_position: FloatArray, *, elapsed: float = 0.0) -> None:
         """Start with an organ at rest, and with the tip at rest at a position [m]; arguments as of `restart`.

@@ -83,7 +83,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             kind.default_instrument if instrument is None else instrument,
             **own,
         )
-        self.scene = simulation.anatomy.scene
+        self.scene, self._mesh = simulation.anatomy.scene, simulation.anatomy.mesh
         self.simulation = simulation
         self._view = EpisodeView(self.simulation, render_mode, settings)
         self.render_mode = render_mode
@@ -235,7 +235,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         scene, rooms = self.scene, EPISODE_ROOMS if self._eye is None else (*EPISODE_ROOMS, "rendering")
         own = Path(inspect.getsourcefile(type(self.task)) or __file__)
         return {
-            "scene": content_digest(scene_digest(scene, self.simulation.anatomy.mesh), *instrument_files(scene)),
+            "scene": content_digest(scene_digest(scene, self._mesh), *instrument_files(scene)),
             "source": content_digest(*source_files(*rooms), own),
         }
 
@@ -255,6 +255,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
         arrays["observation"] = self._observation.copy()
         arrays["running"] = np.array(self._running)
+        if self.task.family is not None:
+            arrays["member"] = np.array(str(self.task.anatomy.member))
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **arrays)
         return buffer.getvalue()
@@ -272,18 +274,23 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         arrays = unpacked(state, made_by=self._maker())
         text = np.array("")
         like = {"made_by": text, "task": text, "random": text, "observation": self._observation, "running": np.False_}
+        if self.task.family is not None:
+            like["member"] = text
         own = {name: arrays.pop(name) for name in like if name in arrays}
         try:
             check_entries(own, like)
             if wrong := self._out_of_bounds(own["observation"]):
                 raise ValueError(wrong)
             random = self._random_state(str(own["random"]))
-            task, organ = self.task.restored(str(own["task"]))
+            family = self.task.family
+            anatomy = None if family is None else family.named(str(own["member"]))
+            task, organ = self.task.restored(str(own["task"]), anatomy)
             # The first change, which leaves all as it is if it is refused.
             self.simulation.set_state(organ, arrays)
         except ValueError as error:
             raise _refused("this environment", error) from error.__cause__
         self.task.become(task)
+        self.simulation.take_anatomy(task.anatomy)
         self.np_random.bit_generator.state = random
         self._take(own["observation"])
         self._begun, self._running = True, bool(own["running"])
@@ -291,6 +298,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _draw(self) -> None:
         """Draw episodes until the task accepts one."""
         for _ in range(DRAWS_MOST):
+            if self.task.family is not None:
+                self.task.take_anatomy(self.task.family.draw(self.np_random))
+                self.simulation.take_anatomy(self.task.anatomy)
             start = self.task.reset(self.np_random)
             self.simulation.reset(start.organ, start.tip_position)
             self.simulation.draw_motion(self.np_random)
@@ -333,7 +343,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     def _maker(self) -> str:
         """What a saved state must agree with: the kind of environment, its scene and mesh, the rates."""
-        scene, mesh = self.scene, self.simulation.anatomy.mesh
+        scene, mesh = self.scene, self._mesh
         digest = scene_digest(scene, mesh, size=4)
         return (
             f"{type(self).__name__} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
@@ -380,12 +390,14 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
         residual = self.simulation.instrument.trocar_residual
+        member = {} if self.task.family is None else {"member": str(self.task.anatomy.member)}
         return {
             "sim_fault": fault,
             "sensor_saturated": saturated,
             "workspace_limited": self.simulation.instrument.workspace_limited,
             "added_mass": self.simulation.organ_model.added_mass,
             "trocar_error_mm": -1.0 if residual is None else residual * 1000.0,
+            **member,
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }

@@ -4,7 +4,7 @@ import contextlib
 import os
 import threading
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -23,6 +23,7 @@ from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
 from surgsim_env.scene.digest import content_digest, source_files
+from surgsim_env.scene.family import KEPT_MOST
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
@@ -196,6 +197,10 @@ class ChartedFace:
         best = int(np.argmin(distance))
         return Site(places[best], points[best], normals[best], float(distance[best]))
 
+    def grid_sites(self) -> list[Site]:
+        """The sites of the chart's grid, each moved to one that may be pressed."""
+        return [self.site(place) for place in self.chart.sites]
+
     @cached_property
     def _allowed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Places (n, 2), surface points [m] and normals (n, 3) of the grid's sites that may be pressed.
@@ -278,7 +283,7 @@ class HealthyMap:
         return interpolated(self.grid, places)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=KEPT_MOST + 8)
 def charted_face(anatomy: Anatomy) -> ChartedFace:
     """The palpable face of an anatomy with its chart; the same anatomy gives the same object."""
     tip_radius = anatomy.scene.instrument.tip_radius
@@ -296,7 +301,7 @@ def healthy_map(scene: Scene) -> HealthyMap:
     Raises:
         ValueError: a press on healthy tissue that ended in a fault or measured no force (says where).
     """
-    return _healthy_map(load_anatomy(with_instrument(scene, "probe")))
+    return healthy_map_of(load_anatomy(with_instrument(scene, "probe")))
 
 
 def healthy_file(scene_file: Path) -> Path:
@@ -315,7 +320,7 @@ def write_healthy_map(scene: Scene, path: Path, progress: StepProgress) -> None:
         ValueError: as in `healthy_map`.
     """
     anatomy = load_anatomy(with_instrument(scene, "probe"))
-    np.savez_compressed(path, digest=np.array(_digest(anatomy)), grid=_pressed_quickly(anatomy, progress))
+    np.savez_compressed(path, digest=np.array(map_digest(anatomy)), grid=_pressed_quickly(anatomy, progress))
 
 
 def _pressed_quickly(anatomy: Anatomy, progress: StepProgress) -> FloatArray:
@@ -326,20 +331,23 @@ def _pressed_quickly(anatomy: Anatomy, progress: StepProgress) -> FloatArray:
 
 
 @lru_cache(maxsize=8)
-def _healthy_map(anatomy: Anatomy) -> HealthyMap:
-    scene, digest, folder = anatomy.scene, _digest(anatomy), _folder()
+def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
+    """`healthy_map` of an anatomy that is loaded, with the scene's probe."""
+    scene, digest, folder = anatomy.scene, map_digest(anatomy), cache_folder()
     beside = healthy_file(scene.folder / f"{scene.name}.toml")
     grid = _shipped(beside, digest)
     if grid is not None:
         return HealthyMap(grid)
-    path = None if folder is None else folder / f"healthy-{digest}.npy"
+    # Members of a family, whose maps are made from this one, are pressed in float32.
+    dtype = np.float64 if scene.family is None else np.float32
+    path = None if folder is None else folder / f"healthy-{digest}-{np.dtype(dtype)}.npy"
     with contextlib.suppress(OSError, ValueError, EOFError):
         if path is not None:
             return HealthyMap(np.load(path, allow_pickle=False))
     with StepProgress(Console(stderr=True)) as progress:
-        grid = (_pressed_quickly if beside.is_file() else _pressed)(anatomy, progress)
+        grid = _pressed_quickly(anatomy, progress) if beside.is_file() else _pressed(anatomy, progress, dtype)
     if path is not None:
-        _keep(path, grid)
+        keep_map(path, grid)
     return HealthyMap(grid)
 
 
@@ -357,46 +365,61 @@ def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type = np.float64)
 
     A coarser grid would alias the mesh, which changes the force by some 3 % within a cell, into a slope of the organ.
     """
-    charted, phases = charted_face(anatomy), press_phases(anatomy.scene)
-    every = [charted.site(place) for place in charted.chart.sites]
+    charted = charted_face(anatomy)
+    every = charted.grid_sites()
     # Places that may not be pressed are moved to others of the grid.
-    sites = list({site.place.tobytes(): site for site in every}.values())
-    lanes = LANES[dtype]
+    sites = {site.place.tobytes(): site for site in every}
+    stiffness = press_sites(anatomy, list(sites.values()), progress, dtype)
+    found = dict(zip(sites, stiffness.tolist(), strict=True))
+    return np.array([found[site.place.tobytes()] for site in every]).reshape(charted.chart.side_count, -1)
+
+
+def press_sites(
+    anatomy: Anatomy, sites: Sequence[Site], progress: StepProgress, dtype: type = np.float64, name: str = ""
+) -> FloatArray:
+    """Stiffness of presses on the healthy organ of an anatomy at some sites [N/m], (n_site,); organs side by side.
+
+    The progress names the organ by `name` too.
+
+    Raises:
+        ValueError: a press that ended in a fault or measured no force (says where).
+    """
+    phases, lanes = press_phases(anatomy.scene), LANES[dtype]
     batches = [sites[first : first + lanes] for first in range(0, len(sites), lanes)]
     threads = min(core_count(), len(batches))
     stopped = threading.Event()
 
-    def press(number: int, advance: Callable[[int], None]) -> dict[bytes, float]:
+    stiffness = np.zeros(len(sites))
+
+    def press(number: int, advance: Callable[[int], None]) -> None:
         """Every so many batches, from one of these numbers on, in one thread."""
         simulations = [Simulation(anatomy) for _ in range(lanes)]
-        group, stiffness = LaneGroup(simulations, dtype), {}
+        group = LaneGroup(simulations, dtype)
         try:
-            for batch in batches[number::threads]:
+            for first, batch in list(zip(range(0, len(sites), lanes), batches, strict=True))[number::threads]:
                 if stopped.is_set():
                     break
                 presses = [
                     SitePress(one, site.point, site.normal) for one, site in zip(simulations, batch, strict=False)
                 ]
                 press_in_lanes(group, [*presses, *[None] * (lanes - len(presses))], phases)
-                for site, one in zip(batch, presses, strict=True):
-                    stiffness[site.place.tobytes()] = _stiffness(anatomy, one)
+                stiffness[first : first + len(batch)] = [_stiffness(anatomy, one) for one in presses]
                 advance(len(batch))
         except BaseException:
             stopped.set()
             raise
-        return stiffness
 
-    found: dict[bytes, float] = {}
-    with progress.step("pressing the healthy organ", len(sites)) as advance, ThreadPoolExecutor(threads) as pool:
+    with (
+        progress.step(f"pressing the healthy organ {name}".strip(), len(sites)) as advance,
+        ThreadPoolExecutor(threads) as pool,
+    ):
         try:
-            for part in pool.map(press, range(threads), [advance] * threads):
-                found.update(part)
+            list(pool.map(press, range(threads), [advance] * threads))
         except BaseException:
             # Ctrl-C, or an error in one thread: the others end after their current presses.
             stopped.set()
             raise
-    values = [found[site.place.tobytes()] for site in every]
-    return np.array(values).reshape(charted.chart.side_count, -1)
+    return stiffness
 
 
 def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
@@ -411,7 +434,7 @@ def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
     return force / result.depth
 
 
-def _digest(anatomy: Anatomy) -> str:
+def map_digest(anatomy: Anatomy) -> str:
     """Hash of everything that determines the map, including the source of the organ and of the press."""
     scene = anatomy.scene
     parts = (
@@ -427,7 +450,7 @@ def _digest(anatomy: Anatomy) -> str:
     return content_digest(*arrays, parts, *sources, *source_files("instruments", "coupling"), instrument)
 
 
-def _folder() -> Path | None:
+def cache_folder() -> Path | None:
     """The cache's folder; None for an account without a home."""
     named = os.environ.get(FOLDER_VARIABLE)
     if named:
@@ -438,7 +461,7 @@ def _folder() -> Path | None:
         return None
 
 
-def _keep(path: Path, grid: FloatArray) -> None:
+def keep_map(path: Path, grid: FloatArray) -> None:
     """Write the map atomically; a folder that is not writable is ignored."""
     try:
         with output_folder(path.parent) as files:

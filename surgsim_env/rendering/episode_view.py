@@ -204,6 +204,7 @@ class EpisodeView:
         """The renderer, with the lesions, target and endoscope of an episode."""
         if self._renderer is None:
             self._renderer = OrganRenderer(self._simulation, self.options)
+        self._renderer.follow_anatomy()
         self._renderer.lesions = shown.lesions
         self._renderer.target = shown.target
         if shown.endoscope is not None:

@@ -29,6 +29,7 @@ from surgsim_env.rendering.scene_model import (
 from surgsim_env.rendering.stage import LOCK, Canvas, Stage, borrow_stage, give_back_stage
 from surgsim_env.rendering.surface import Shape, drawn_surface
 from surgsim_env.rendering.tissue import Tissue
+from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
 
 # How far above the drape the shadow lies [m].
@@ -66,15 +67,25 @@ class OrganRenderer:
     ) -> None:
         """Load nothing yet; `gl_context` is a window's, None for pictures off screen."""
         self.options = options or RenderOptions()
-        aspect = self.options.width / self.options.height
-        self.cameras: dict[str, Camera] = scene_cameras(simulation.anatomy, aspect)
+        self.cameras: dict[str, Camera] = {}
         self.lesions: tuple[Lesion, ...] = tuple(lesions)
         self.target: Disc | None = None
         self._simulation = simulation
+        self._anatomy: Anatomy | None = None
         self._gl_context = gl_context
         self._stage: Stage | None = None
         self._tissue: Tissue | None = None
         self._tissue_lesions: tuple[Lesion, ...] = ()
+        self.follow_anatomy()
+
+    def follow_anatomy(self) -> None:
+        """Take cameras and graphics of another member of the family where the simulation has one."""
+        anatomy = self._simulation.anatomy
+        if self._anatomy is anatomy:
+            return
+        self.close()
+        self._anatomy = anatomy
+        self.cameras.update(scene_cameras(anatomy, self.options.width / self.options.height))
 
     def rgb(self, camera: str | Camera | None = None) -> NDArray[np.uint8]:
         """The picture, shape (height, width, 3), its first row on top.
@@ -140,9 +151,11 @@ class OrganRenderer:
             return camera
         name = self.options.camera if camera is None else camera
         check_camera(name)
+        self.follow_anatomy()
         return self.cameras[name]
 
     def _ready_stage(self) -> Stage:
+        self.follow_anatomy()
         if self._stage is None:
             context = gl.context() if self._gl_context is None else self._gl_context
             simulation = self._simulation

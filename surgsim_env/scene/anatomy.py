@@ -37,17 +37,36 @@ SIDE_ROUNDING = 1e-9
 
 # Vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3).
 Surface = tuple[FloatArray, IntArray]
+# Where points of the scene's organ [m] (n, 3) are in a member of its family [m] (n, 3).
+Deformation = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class MemberName:
+    """A member of a family: its split, one of `model.SPLITS`, and its number in it from 0 on."""
+
+    split: str
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.split} {self.number}"
 
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """A scene with its mesh, anchored nodes [n_anchor], palpable face and the elastic foundations that hold it."""
+    """A scene with its mesh, anchored nodes [n_anchor], palpable face and the elastic foundations that hold it.
+
+    Of a member of a family (`scene.family`) also its name, the scene's own organ and how that was deformed.
+    """
 
     scene: Scene
     mesh: TetMesh
     anchors: IntArray
     face: PalpableFace
     foundations: tuple[Foundation, ...] = ()
+    member: MemberName | None = None
+    template: "Anatomy | None" = None
+    deformation: Deformation | None = None
 
     @cached_property
     def fine_surface(self) -> Surface | None:
@@ -62,7 +81,22 @@ class Anatomy:
         # Imports trimesh: only where something is drawn.
         from msdm_core.mesh_files.surface_io import read_surface
 
-        return read_surface(self.scene.folder / source.file, length_unit=source.length_unit)
+        vertices, triangles = read_surface(self.scene.folder / source.file, length_unit=source.length_unit)
+        return self._moved(vertices), triangles
+
+    def _moved(self, points: FloatArray) -> FloatArray:
+        """Where points of the scene's organ [m] (n, 3) are in this one."""
+        return points if self.deformation is None else self.deformation(points)
+
+    @cached_property
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner of a box that contains the organ, and every member of its family [m], (3,) each."""
+        points, family = (self.template or self).mesh.points, self.scene.family
+        lower, upper = points.min(axis=0), points.max(axis=0)
+        if family is None:
+            return lower, upper
+        growth = (family.longest - 1.0) * 0.5 * (upper - lower)
+        return lower - growth, upper + growth
 
     @property
     def outer_surface(self) -> Surface:
@@ -271,7 +305,8 @@ class Anatomy:
         """The lesions of the scene file: regions of its mesh, and balls."""
         lesions = [region.as_lesion for region in self.scene.regions if region.lesion]
         for one in self.scene.demonstration:
-            lesions.append(self.lesion_below(np.asarray(one.below), one.radius, one.cover, one.modulus_ratio, one.name))
+            below = self._moved(np.array([one.below]))[0]
+            lesions.append(self.lesion_below(below, one.radius, one.cover, one.modulus_ratio, one.name))
         return lesions
 
 

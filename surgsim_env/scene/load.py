@@ -224,10 +224,27 @@ def load_scene(path: Path) -> Scene:
 def scene_from_table(table: dict[str, Any], *, name: str, folder: Path) -> Scene:
     """A scene from the table of a scene file; paths in it are relative to `folder`.
 
-    A table `material` with a `name` is the library's material of that name, its own entries on top.
+    A table `material` with a `name` is the library's material of that name, its own entries on top; a table `family`
+    with a `template` likewise has the entries of that scene's file under those of this one.
     """
+    table = _with_template(table, f"scene {name!r}", folder)
     table = _with_library_materials(table, f"scene {name!r}", folder)
     return fill(Scene, {**table, "name": name, "folder": folder}, f"scene {name!r}")
+
+
+def _with_template(table: dict[str, Any], where: str, folder: Path) -> dict[str, Any]:
+    """The table of a scene file over that of the scene which its family names as the template, if it names one."""
+    family = table.get("family")
+    if not isinstance(family, dict) or "template" not in family:
+        return table
+    named = family["template"]
+    if not isinstance(named, str) or Path(named).name != named:
+        raise ValueError(f"{where}: family.template is {named!r:.{SHOWN}}; it must be a scene file in the same folder")
+    template = read_toml(folder / named, "scene")
+    if "family" in template:
+        raise ValueError(f"{where}: family.template {named!r} has a family of its own; name the scene of one organ")
+    own = {name: value for name, value in family.items() if name != "template"}
+    return _laid_over(template, {**table, "family": own})
 
 
 def list_materials() -> list[str]:

@@ -656,6 +656,77 @@ class CyclicMotion:
         return Motion(self.name, self.displacement, (x, y, z), self.reach)
 
 
+# The parts of a family: an agent learns on the first, is chosen by the second and judged by the third.
+SPLITS = ("train", "validation", "test")
+# The factors on lengths of a family lie within this range.
+FACTOR_LEAST, FACTOR_MOST = 0.5, 2.0
+
+
+@dataclass(frozen=True)
+class Family:
+    """Ranges of smooth random deformations, by which the organ of a scene becomes a family of organs.
+
+    The organ is stretched, its outline changed, bumped and bent (`surgsim_env.scene.family`); directions are those of
+    its instrument: along the approach, and across it. In the scene's file, a `template` beside these entries names the
+    file of another scene whose entries hold where this file has none of its own.
+
+    A member that folds, whose cells become too poor, or that leaves a box `longest` times as large as the template's is
+    drawn again.
+
+    Args:
+        size: range of the factor on all lengths.
+        aspect: range of the stretch along each of the three directions, which together keep the volume.
+        thickness: range of the factor along the approach.
+        curvature: largest curvature of the bend towards or against the approach [1/m].
+        edge: largest change of the outline seen along the approach, as a share of the distance from its middle.
+        bump_count: number of bumps and dents.
+        bump_height: their largest height or depth [m].
+        bump_width: range of their standard deviation [m].
+        quality_share: least radius ratio of each tet over that of the same tet of the template.
+        train, validation, test: number of members of each split.
+        entropy: of the random numbers; another one gives other members.
+    """
+
+    size: Range = (1.0, 1.0)
+    aspect: Range = (1.0, 1.0)
+    thickness: Range = (1.0, 1.0)
+    curvature: float = 0.0
+    edge: float = 0.0
+    bump_count: int = 0
+    bump_height: float = 0.0
+    bump_width: Range = (0.03, 0.03)
+    quality_share: float = 0.5
+    train: int = 64
+    validation: int = 16
+    test: int = 16
+    entropy: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("size", "aspect", "thickness"):
+            low, high = getattr(self, name)
+            if not FACTOR_LEAST <= low <= high <= FACTOR_MOST:
+                rule = f"{FACTOR_LEAST:g} <= low <= high <= {FACTOR_MOST:g}"
+                raise ValueError(f"family.{name} = [{low:g}, {high:g}]; the rule is {rule}")
+        _require_range("family.bump_width", self.bump_width)
+        require_number("family.curvature", self.curvature, 0.0, "1/m")
+        require_number("family.edge", self.edge, 0.0, "", most=0.5)
+        require_number("family.bump_count", self.bump_count, 0, "", most=1000)
+        require_number("family.bump_height", self.bump_height, 0.0, "m", most=LENGTH_LARGEST)
+        require_number("family.quality_share", self.quality_share, 0.0, "", above=True, most=1.0)
+        require_number("family.entropy", self.entropy, 0, "")
+        for name in SPLITS:
+            require_number(f"family.{name}", getattr(self, name), 1, "members", most=100_000)
+
+    @property
+    def longest(self) -> float:
+        """Factor on the sides of the template's box within which every member stays."""
+        return self.size[1] * max(self.aspect[1], self.thickness[1])
+
+    def member_count(self, split: str) -> int:
+        """Number of members of a split, one of SPLITS."""
+        return {"train": self.train, "validation": self.validation, "test": self.test}[split]
+
+
 @dataclass(frozen=True)
 class Scene:
     """A scene.
@@ -690,6 +761,7 @@ class Scene:
         retract_refusal: why this organ cannot be retracted.
         motions: of what holds the organ, in every episode.
         cranial: direction of the patient's head.
+        family: makes the organ the template of many; None: it is one organ.
     """
 
     name: str
@@ -721,6 +793,7 @@ class Scene:
     retract_refusal: str | None = None
     motions: tuple[CyclicMotion, ...] = ()
     cranial: Vector = (1.0, 0.0, 0.0)
+    family: Family | None = None
 
     def __post_init__(self) -> None:
         check_stiffness_rule(self.stiffness_rule)

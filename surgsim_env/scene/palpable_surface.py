@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.kernels.ray_kernels import nearest_hits
 from msdm_core.material.regions import Material
@@ -68,6 +68,11 @@ class PalpableFace:
         nodes = self.triangles[face]
         normal = weights @ self.normals[nodes]
         return weights @ self.points[nodes], normal / np.linalg.norm(normal)
+
+    def carried(self, point: ArrayLike, other: "PalpableFace") -> FloatArray:
+        """Where a point [m] (3,) of this face is on that of another member of its family, of the same triangles."""
+        face, weights = self._nearest(np.asarray(point, dtype=np.float64))
+        return weights @ other.points[other.triangles[face]]
 
     def rim_distance(self, point: FloatArray) -> float:
         """Distance from a point to the face's border [m]."""
@@ -197,6 +202,28 @@ def find_palpable_face(
     chosen = -unit @ direction >= math.cos(math.radians(palpation.face_angle_deg))
     if not chosen.any():
         raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
+    return _face_of(mesh, chosen, direction, palpation, tip_radius)
+
+
+def moved_face(face: PalpableFace, mesh: TetMesh, palpation: PalpationSettings) -> PalpableFace:
+    """The same triangles as a palpable face where its organ's nodes are moved to other places (`TetMesh.moved`)."""
+    wanted = {tuple(one) for one in face.triangles.tolist()}
+    chosen = np.array([tuple(one) in wanted for one in mesh.boundary_triangles.tolist()], dtype=np.bool_)
+    return _face_of(mesh, chosen, face.approach, palpation, face.tip_radius)
+
+
+def _face_of(
+    mesh: TetMesh,
+    chosen: NDArray[np.bool_],
+    direction: FloatArray,
+    palpation: PalpationSettings,
+    tip_radius: float,
+) -> PalpableFace:
+    """The palpable face of some of the boundary triangles, (n_triangle,), against a unit approach (3,)."""
+    triangles = mesh.boundary_triangles
+    corners = mesh.points[triangles]
+    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
     face = triangles[chosen]
     normals = node_normals(mesh.points, face)
     sides = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)

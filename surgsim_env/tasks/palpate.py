@@ -96,6 +96,7 @@ class PalpateTask(Task):
     soft limit, 1 at the hard one: a constraint for safe learning), `error_mm` (-1 if nothing was declared),
     `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through none),
     `added_mass` [kg] (by mass scaling, 0 without), one `reward_<term>` each.
+    Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
     the tissue, and `damaged` (bool): more than a limit is a safety stop.
 
@@ -108,6 +109,8 @@ class PalpateTask(Task):
     * `level`: "easy", "standard", "hard" or "clinical" (`surgsim_env.scene.levels`); None, the default: the scene's own
       ranges.
     * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
+    * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family",
+      of which each episode draws one; `info["member"]` names it.
 
     ## Version History
     * v0: first version.
@@ -179,6 +182,12 @@ class PalpateTask(Task):
         self.declare_count = 0
         self._declare_value = 0.0
         self._error: float | None = None
+
+    def take_anatomy(self, anatomy: Anatomy) -> None:
+        """As `Task.take_anatomy`, with an empty memory on the chart of its face."""
+        super().take_anatomy(anatomy)
+        if self.memory is not None:
+            self.memory = touch_memory(anatomy)
 
     @property
     def success_distance(self) -> float:

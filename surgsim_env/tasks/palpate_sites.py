@@ -13,15 +13,17 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.palpation.chart import MAP_SIDE, HealthyMap, Site, charted_face, healthy_map
+from surgsim_env.palpation.chart import MAP_SIDE, HealthyMap, Site, charted_face, healthy_map_of
 from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
+from surgsim_env.palpation.member_map import member_map, still_template
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
 from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, SiteTouches, Touch
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.family import family_of
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
 from surgsim_env.scene.load import fill_json, make_scene, with_instrument
-from surgsim_env.scene.motions import STILL, with_motion
+from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import InfoValue, Start, Task, check_count, check_share, soft_force_share
 
@@ -101,6 +103,7 @@ class PalpateSitesTask(Task):
     `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm), `found`
     (share of lesions with an estimate within 10 mm; on an organ without lesions 1 if the estimate has none),
     `lesion_count_estimated`, `success`.
+    Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
     the tissue, and `damaged` (bool): more than a limit is a safety stop.
 
@@ -111,6 +114,8 @@ class PalpateSitesTask(Task):
     * `level`: "easy", "standard" (default), "hard" or "clinical".
     * `memory`: observe all presses (default), or the last one alone.
     * `budget`: presses of an episode; by default 25, or 60 where the chart is longer than ten tip radii.
+    * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family",
+      of which each episode draws one; `info["member"]` names it.
     * `instrument`: "probe", the name of an arm or the path of an arm's TOML file; by default the scene's own.
 
     ## Version History
@@ -237,20 +242,33 @@ class PalpateSitesTask(Task):
             ValueError: a budget that is no whole number above 0.
         """
         super().__init__(anatomy)
-        scene = anatomy.scene
+        scene, tip = anatomy.scene, anatomy.scene.instrument.tip_radius
         self.level, self.memory, self.track_motion = level, memory, track_motion
-        self.charted = charted_face(anatomy)
-        chart, tip = self.charted.chart, scene.instrument.tip_radius
-        if budget is None:
-            budget = BUDGET_WIDE if chart.extent.max() > WIDE * tip else BUDGET
-        if isinstance(budget, bool) or not isinstance(budget, int) or budget < 1:
+        # What member maps are made from, of a family: its template with the probe and without motion.
+        self.still: Anatomy | None = None
+        if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 1):
             raise ValueError(f"budget is {budget!r}; it must be a whole number of presses, at least 1")
-        self.budget = budget
+        self._budget = budget
         self.reading = ForceReading(scene.sensor)
+        self.cutoff, self.tip_scale = ospa_cutoff(tip), tip / REFERENCE_TIP
+        self._take_map(healthy)
+
+    def take_anatomy(self, anatomy: Anatomy) -> None:
+        """As `Task.take_anatomy`, with the chart of the member's face, its healthy map, estimator and budget."""
+        super().take_anatomy(anatomy)
+        assert anatomy.member is not None and self.still is not None
+        self._take_map(member_map(self.still, anatomy.member))
+
+    def _take_map(self, healthy: HealthyMap) -> None:
+        """Palpate the present anatomy, whose healthy map is given."""
+        scene = self.anatomy.scene
+        self.charted = charted_face(self.anatomy)
+        chart, tip = self.charted.chart, scene.instrument.tip_radius
+        wide = chart.extent.max() > WIDE * tip
+        self.budget = self._budget if self._budget is not None else (BUDGET_WIDE if wide else BUDGET)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
         healthy_force = float(healthy.grid.mean()) * scene.palpation.press_depth
         self.estimator = LesionEstimator(chart.extent, tip_radius=tip, noise=scene.sensor.noise / healthy_force)
-        self.cutoff, self.tip_scale = ospa_cutoff(tip), tip / REFERENCE_TIP
         self.truth = np.zeros((0, 3))
         self._clear()
 
@@ -273,14 +291,17 @@ class PalpateSitesTask(Task):
         level: str | None = "standard",
         memory: bool = True,
         budget: int | None = None,
+        split: str | None = None,
         **settings: Any,
     ) -> tuple[Simulation, Self]:
         """As `Task.make`, with the map of the scene's healthy organ."""
         chosen, plain = find_level(level or "standard"), make_scene(scene)
         moving = with_motion(with_instrument(plain, instrument), motion or chosen.motion)
         anatomy = load_anatomy(chosen.scene(moving))
-        healthy = healthy_map(chosen.healthy(with_motion(plain, STILL)))
-        task = cls(anatomy, chosen, healthy, memory=memory, budget=budget, **settings)
+        family = family_of(anatomy, split)
+        still = still_template(chosen.healthy(plain))
+        task = cls(anatomy, chosen, healthy_map_of(still), memory=memory, budget=budget, **settings)
+        task.family, task.still = family, still
         return Simulation(anatomy), task
 
     def reset(self, rng: np.random.Generator) -> Start:

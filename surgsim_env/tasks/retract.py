@@ -226,6 +226,11 @@ class RetractTask(Task):
         """
         scene = anatomy.scene
         self.table, self._endoscope = _checked_scene(anatomy)
+        if scene.family is not None:
+            raise ValueError(
+                f"scene {scene.name!r} is a family of organs, and retractions draw their lobe themselves: leave out "
+                "its [family], or palpate it"
+            )
         if isinstance(instrument, Pair) and not self.takes_pair:
             raise ValueError(
                 f"scene {scene.name!r}: instrument {scene.instrument.model!r} is two arms, and one is needed: take one "

@@ -20,6 +20,7 @@ from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.family import OrganFamily, family_of
 from surgsim_env.scene.levels import DrawnOrgan, Level, find_level
 from surgsim_env.scene.load import fill_json, make_scene, with_instrument
 from surgsim_env.scene.model import Endoscope, ForceSensor, Vector
@@ -77,7 +78,8 @@ class Task:
         weights: of the reward terms, by name
 
     Attributes:
-        anatomy, limits: of the scene
+        anatomy, limits: of the scene; of a family the member that the episode plays
+        family: the members that episodes are drawn from; None for a scene of one organ
         sensors: the sensor model of each channel that has one, by the channel's name
         sensed: what these sensors read last [N, N m]
         drawn: the organ of the episode; None before the first
@@ -113,6 +115,7 @@ class Task:
         """
         self.check_declaration()
         self.anatomy = anatomy
+        self.family: OrganFamily | None = None
         self.limits = anatomy.scene.limits
         self.sensors = {
             channel.name: ForceReading(_scaled(anatomy.scene.sensor, channel.sensor))
@@ -146,6 +149,7 @@ class Task:
         *,
         motion: str | None = None,
         level: str | None = None,
+        split: str | None = None,
         **settings: Any,
     ) -> tuple[Simulation, Self]:
         """The simulation and the task of an environment.
@@ -156,14 +160,17 @@ class Task:
             motion: "none", "calm" or "free": how the patient breathes (`surgsim_env.scene.motions`); as the scene says
                 by default.
             level: "easy", "standard", "hard" or "clinical": what the organ hides (`surgsim_env.scene.levels`).
+            split: "train" (default), "validation" or "test": the members of a scene's family that episodes are played
+                with (`surgsim_env.scene.family`); for scenes of one organ it is left out.
             settings: the keyword-only parameters of `__init__`.
         """
         chosen = None if level is None else find_level(level)
         described = with_motion(with_instrument(make_scene(scene), instrument), motion or (chosen and chosen.motion))
         anatomy = load_anatomy(described if chosen is None else chosen.scene(described))
+        family = family_of(anatomy, split)
         simulation = Simulation(anatomy)
         task = cls(anatomy, simulation.instrument, **settings)
-        task.level = chosen
+        task.level, task.family = chosen, family
         return simulation, task
 
     @classmethod
@@ -371,6 +378,14 @@ class Task:
         """Pose of the endoscope in this episode."""
         return None
 
+    def take_anatomy(self, anatomy: Anatomy) -> None:
+        """Play another member of the family from the next `reset` on.
+
+        A subclass makes anew what it made from the anatomy, as attributes of their own: no object that the task holds
+        is changed (`restored` calls it on a shallow copy).
+        """
+        self.anatomy = anatomy
+
     def reset(self, rng: np.random.Generator) -> Start:
         """Draw an episode: the organ, the sensors' biases, and what `draw` draws."""
         self.step_count = 0
@@ -535,8 +550,10 @@ class Task:
             setattr(self, name, value)
         return organ
 
-    def restored(self, text: str) -> tuple[Self, OrganModel]:
+    def restored(self, text: str, anatomy: Anatomy | None = None) -> tuple[Self, OrganModel]:
         """A copy of this task in the episode whose `get_state` is given, and that episode's organ.
+
+        With an anatomy the episode is one of that member of the family, else of the present one.
 
         This task stays as it is. The copy shares with it whatever `set_state` does not set.
 
@@ -545,6 +562,8 @@ class Task:
         """
         other = copy.copy(self)
         try:
+            if anatomy is not None:
+                other.take_anatomy(anatomy)
             organ = other.set_state(text)
             again = other.get_state()
         except ValueError:

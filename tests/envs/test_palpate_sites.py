@@ -172,30 +172,30 @@ def test_the_map_is_made_once_and_anew_where_its_file_is_broken(tmp_path, monkey
     monkeypatch.setattr(healthy_module, "_pressed", pressed)
     scene = make_scene("phantom_small")
     for times in (1, 1):
-        healthy_module._healthy_map.cache_clear()
+        healthy_module.healthy_map_of.cache_clear()
         assert healthy_module.healthy_map(scene).stiffness(MIDDLE) == 50.0
         assert len(made) == times
     (file,) = (tmp_path / "cache").iterdir()
     file.write_bytes(b"broken")
-    healthy_module._healthy_map.cache_clear()
+    healthy_module.healthy_map_of.cache_clear()
     healthy_module.healthy_map(scene)
     assert len(made) == 2
-    healthy_module._healthy_map.cache_clear()
+    healthy_module.healthy_map_of.cache_clear()
     healthy_module.healthy_map(replace(scene, material=replace(scene.material, youngs_modulus=6000.0)))
     assert len(made) == 3, "another organ has another map"
-    plain = healthy_module._digest(load_anatomy(scene))
+    plain = healthy_module.map_digest(load_anatomy(scene))
     probe = (scenes_folder() / "instruments" / "probe.xml").read_text(encoding="utf-8")
     (tmp_path / "instruments").mkdir()
     (tmp_path / "instruments" / "probe.xml").write_text(probe + "<!-- heavier -->", encoding="utf-8")
     monkeypatch.setattr(healthy_module, "scenes_folder", lambda: tmp_path)
-    assert healthy_module._digest(load_anatomy(scene)) != plain, "another probe has another map"
+    assert healthy_module.map_digest(load_anatomy(scene)) != plain, "another probe has another map"
     monkeypatch.setattr(healthy_module, "scenes_folder", scenes_folder)
     monkeypatch.setenv("SURGSIM_CACHE", "/proc/nowhere")
-    healthy_module._healthy_map.cache_clear()
+    healthy_module.healthy_map_of.cache_clear()
     assert healthy_module.healthy_map(scene).stiffness(MIDDLE) == 50.0, (
         "a folder that cannot be written costs time alone"
     )
-    healthy_module._healthy_map.cache_clear()
+    healthy_module.healthy_map_of.cache_clear()
 
 
 # ---- episodes -------------------------------------------------------------------------------------------------------

@@ -138,3 +138,16 @@ def test_a_state_saved_alone_goes_on_in_a_lane():
     ahead = envs.step(told)[0][1]
     envs.envs[2].unwrapped.load_state(state)  # type: ignore[attr-defined]
     np.testing.assert_array_equal(envs.step(np.tile(told[1], (COUNT, 1)))[0][2], ahead)
+
+
+def test_lobes_on_moving_ground_equal_environments_one_after_the_other():
+    """A ventilated patient: each lobe's nodes are carried from places of their own, by anchors of their own."""
+    together, apart = side_by_side(motion="calm"), one_after_the_other("NextStep", motion="calm")
+    assert_equal(together.reset(seed=SEED), apart.reset(seed=SEED))
+    for _ in range(3):
+        told = np.full(together.action_space.shape, -0.3, dtype=np.float32)  # type: ignore[arg-type]
+        assert_equal(together.step(told), apart.step(told))
+    models = [env.unwrapped.simulation.organ_model for env in together.envs]  # type: ignore[attr-defined]
+    assert len({len(model.motion_anchored_nodes) for model in models}) > 1, "held on different shares of their edge"
+    together.close()
+    apart.close()

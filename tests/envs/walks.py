@@ -15,7 +15,8 @@ def walk(env, rng):
             action *= (0.2, 0.2, 1.0)  # near the line
             action[2] -= 0.2
         elif "Sites" not in env.spec.id:
-            action[2] -= 0.3  # press
+            approach = env.unwrapped.scene.instrument.approach
+            action[:3] += 0.3 * np.array(approach) / np.linalg.norm(approach)  # press
         yield action.astype(np.float32)
 
 

@@ -39,9 +39,9 @@ def presses(tmp_path, monkeypatch):
 
     monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(chart, "_pressed", pressed)
-    chart._healthy_map.cache_clear()
+    chart.healthy_map_of.cache_clear()
     yield made
-    chart._healthy_map.cache_clear()
+    chart.healthy_map_of.cache_clear()
 
 
 def test_an_environment_takes_the_map_beside_the_scene(folder, presses):

@@ -226,3 +226,22 @@ def test_videos_are_recorded(env_id, tmp_path):
     env.close()
     (video,) = (tmp_path / "videos").glob("*.mp4")
     assert video.stat().st_size > 1000
+
+
+@needs_opengl
+def test_pictures_follow_the_member_of_the_episode():
+    """Each episode of a family plays another organ: pictures are those of an environment made for it alone."""
+    settings = {"scene": "kidney_family", "render_mode": "rgb_array", "width": 120, "height": 90, "show_lesion": True}
+    env, frames = gym.make(PALPATE, **settings), {}
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        frames[info["member"]] = np.asarray(env.render())
+        alone = gym.make(PALPATE, **settings)
+        alone.reset(seed=seed)
+        np.testing.assert_array_equal(frames[info["member"]], alone.render())
+        alone.close()
+    assert len(frames) > 1 and len({frame.tobytes() for frame in frames.values()}) == len(frames)
+    kinds = env.unwrapped.renderer.segmentation()
+    assert {int(kind) for kind in np.unique(kinds)} >= {stage.LABELS["organ"], stage.LABELS["lesion"]}
+    env.close()
+    assert not stage._stages, "stages of members that were played are given back"

@@ -23,6 +23,8 @@ from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.foundation import Foundation
+from msdm_core.organ.motion import Motion, ground_work, steer
 from msdm_core.organ.stepping import advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw
 from tests.core import oracle
@@ -61,6 +63,27 @@ def ball(index: int) -> ContactShapes:
     """A ball above a block, on its way down and aside."""
     place = (0.016 + 5e-4 * index, 0.0105, 0.02 * size_of(index) + 0.0041)
     return oracle.ball(place, 0.004, velocity=(2e-3 * (index % 3 - 1), 1e-3, -0.02))
+
+
+@cache
+def held(index: int) -> OrganModel:
+    """A block of another shape each on an elastic foundation, on ground that moves, part of it near one corner."""
+    mesh = box_mesh(SIZE, CELLS)
+    bent = mesh.points * size_of(index) + np.outer(mesh.points[:, 0] ** 2, [0.0, 0.0, 1.0 + 0.5 * index])
+    under = np.flatnonzero(mesh.points[:, 2] <= 1e-9)
+    fixed = np.flatnonzero((mesh.points[:, 0] <= 1e-9) & (mesh.points[:, 2] > 0.009 + 0.003 * (index % 2)))
+    spec = OrganSpec(
+        mesh.moved(bent),
+        Material(youngs_modulus=6000.0, density=1000.0, poisson_ratio=0.45),
+        anchors=fixed,
+        damping=DAMPED,
+        foundations=(Foundation("fat", under, 2e5, 7e4),),
+        motions=(
+            Motion("breathing", (1e-3, 0.0, 5e-4)),
+            Motion("heartbeat", (0.0, 4e-4, 0.0), centre=(0.01, 0.01, 0.01), reach=0.015),
+        ),
+    )
+    return varied(compile_organ(spec), index)
 
 
 @dataclass
@@ -124,6 +147,30 @@ def test_a_press_is_that_of_the_organ_alone():
     both.assert_same()
     assert (both.wrench[:, 0, 2] > 0.02).all(), "every lane is pressed"
     assert all(np.abs(single.support_stretch).max() > 1e-7 for single in both.alone), "every bed holds"
+
+
+def test_foundations_and_moving_ground_are_those_of_the_organ_alone():
+    """Blocks bent each its own way, held by fat at the same nodes and carried by the same motions: to the bit."""
+    both = Both([held(index) for index in range(6)])
+    one, other = both.organs[:2]
+    assert np.array_equal(one.foundation_nodes, other.foundation_nodes)
+    assert len(one.motion_anchored_nodes) != len(other.motion_anchored_nodes)
+    for name in ("foundation_position", "foundation_stiffness", "motion_node_shift", "motion_foundation_shift"):
+        assert not np.array_equal(getattr(one, name), getattr(other, name)), name
+    for lane, single in enumerate(both.alone):
+        steer(single, (0.5 + 0.1 * lane, -0.4), 100 * SUBSTEP * SUBSTEPS)
+        put_lane(both.state, lane, single)
+    for _ in both.press(100):
+        pass
+    both.assert_same()
+    assert (np.array([ground_work(single) for single in both.alone]) != 0.0).all(), "the ground drags every lane"
+
+
+def test_lanes_on_other_nodes_of_the_ground_are_refused():
+    one = held(0)
+    fewer = one._replace(foundation_nodes=np.ascontiguousarray(one.foundation_nodes[::-1]))
+    with pytest.raises(OrganError, match=r"lane 1 has another foundation_nodes .* share tets, supports"):
+        stack_organs([one, fewer], own_rest=True)
 
 
 def test_squeezed_tets_are_those_of_the_organ_alone():

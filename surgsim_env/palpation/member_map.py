@@ -1,0 +1,133 @@
+"""The healthy map of a member of a family, from that of its template and few presses of its own.
+
+What a mesh adds to the stiffness of a press varies from node to node, and members have the template's tets: at the
+same place of the face the ratio r of both stiffnesses varies as slowly as the deformation does. A Gaussian process with
+fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25) continues log r from PRESS_COUNT sites, far from each other,
+to all.
+"""
+
+import contextlib
+import hashlib
+from collections import OrderedDict
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from rich.console import Console
+
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.palpation.chart import (
+    ChartedFace,
+    HealthyMap,
+    Site,
+    cache_folder,
+    charted_face,
+    healthy_map_of,
+    keep_map,
+    map_digest,
+    press_sites,
+)
+from surgsim_env.reports.step_progress import StepProgress
+from surgsim_env.scene.anatomy import Anatomy, MemberName, load_anatomy
+from surgsim_env.scene.family import make_member
+from surgsim_env.scene.load import with_instrument
+from surgsim_env.scene.model import Scene
+from surgsim_env.scene.motions import STILL, with_motion
+
+# Sites that are pressed, twice as many as float32 has lanes: on `liver_family` log k is then off by 0.013 (standard
+# deviation) between them, with 96 sites by 0.011, and from these presses without the template's map by 0.08.
+PRESS_COUNT = 32
+# Standard deviation of log r about its mean, its correlation length over the longer half side of the chart, and the
+# deviation of one press, by cells that are stretched.
+RATIO_SPREAD, RATIO_LENGTH, PRESS_SPREAD = 0.15, 0.5, 0.02
+# Members whose maps are kept in memory, 5 kB each.
+MAPS_MOST = 1000
+
+_maps: OrderedDict[tuple[Anatomy, MemberName], HealthyMap] = OrderedDict()
+_lock = Lock()
+
+
+def still_template(scene: Scene) -> Anatomy:
+    """The anatomy whose healthy map belongs to a scene: with the probe, and without motion."""
+    return load_anatomy(with_instrument(with_motion(scene, STILL), "probe"))
+
+
+def member_map(template: Anatomy, name: MemberName, progress: StepProgress | None = None) -> HealthyMap:
+    """The healthy map of a member of a family, from memory, the cache on disk (`chart.healthy_map`) or by pressing it.
+
+    Args:
+        template: `still_template` of the family's scene.
+        name: of the member.
+        progress: shows the presses; None: on standard error.
+
+    Raises:
+        ValueError: as in `healthy_map`.
+    """
+    key = template, name
+    with _lock:
+        known = _maps.pop(key, None)
+        if known is None:
+            known = _read_or_press(make_member(template, name), progress)
+        _maps[key] = known
+        if len(_maps) > MAPS_MOST:
+            _maps.popitem(last=False)
+    return known
+
+
+def _read_or_press(member: Anatomy, progress: StepProgress | None) -> HealthyMap:
+    template, folder = member.template, cache_folder()
+    assert template is not None
+    base = hashlib.blake2b(Path(__file__).read_bytes(), digest_size=12)
+    base.update(map_digest(template).encode() + map_digest(member).encode())
+    path = None if folder is None else folder / f"healthy-{base.hexdigest()}.npy"
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        if path is not None:
+            return HealthyMap(np.load(path, allow_pickle=False))
+    base_map = healthy_map_of(template)
+    if progress is not None:
+        grid = _corrected(base_map, member, progress)
+    else:
+        with StepProgress(Console(stderr=True)) as own:
+            grid = _corrected(base_map, member, own)
+    if path is not None:
+        keep_map(path, grid)
+    return HealthyMap(grid)
+
+
+def _corrected(base: HealthyMap, member: Anatomy, progress: StepProgress) -> FloatArray:
+    """The map of the template times the ratio that presses of the member show; stiffness [N/m], (m, m)."""
+    template = member.template
+    assert template is not None
+    charted, own = charted_face(member), charted_face(template)
+    every = charted.grid_sites()
+    places = np.array([own.chart.place(member.face.carried(site.point, template.face)) for site in every])
+    expected = base.stiffness(np.clip(places, -1.0, 1.0))
+    spread = far_apart(charted, every)
+    pressed = press_sites(member, [every[index] for index in spread], progress, np.float32, str(member.member))
+    log_ratio = np.log(pressed / expected[spread])
+    points = np.array([site.place for site in every]) * charted.chart.extent / charted.chart.extent.max()
+    mean = float(log_ratio.mean())
+    weights = np.linalg.solve(
+        _covariance(points[spread], points[spread]) + PRESS_SPREAD**2 * np.eye(len(spread)), log_ratio - mean
+    )
+    ratio = np.exp(mean + _covariance(points, points[spread]) @ weights)
+    return (expected * ratio).reshape(charted.chart.side_count, -1)
+
+
+def _covariance(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Of log r about its mean between points (n, 2) and (m, 2), in longer half sides of the chart, shape (n, m)."""
+    square = ((one[:, None] - other) ** 2).sum(axis=2)
+    return RATIO_SPREAD**2 * np.exp(-square / (2.0 * RATIO_LENGTH**2))
+
+
+def far_apart(charted: ChartedFace, sites: list[Site]) -> list[int]:
+    """Indices of at most PRESS_COUNT different sites, each as far as possible from those before, from the middle on."""
+    places = np.array([site.place for site in sites]) * charted.chart.extent
+    chosen, distance = [], np.linalg.norm(places, axis=1)
+    index = int(np.argmin(distance))
+    nearest = np.full(len(places), np.inf)
+    while len(chosen) < PRESS_COUNT and nearest[index] > 0.0:
+        chosen.append(index)
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[index], axis=1))
+        index = int(np.argmax(nearest))
+    return chosen

@@ -53,6 +53,8 @@ from agents.scoring.results import RESULTS, SITES, Result, family, load_result, 
 from agents.scoring.site_agent import SiteAgent, site_facts
 from agents.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score, with_intervals
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import SPLITS
 from surgsim_env.scene.motions import list_motions
 from surgsim_env.scripting import oracle
 from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR
@@ -65,6 +67,8 @@ BOOTSTRAP_SEED, PROGRESS_EVERY = 0, 60.0
 POLICIES = Path(__file__).resolve().parent / "policies"
 # Where a method plays unless options say otherwise.
 PLACES = {"scene": "phantom", "level": "standard"}
+# The members of a family that scores are of.
+SCORED_SPLIT = "test"
 
 
 @dataclass(frozen=True)
@@ -171,6 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--scene", help="phantom by default; for a policy, that of its training")
     parser.add_argument("--level", help="standard by default; for a policy, that of its training")
+    parser.add_argument("--split", choices=SPLITS, help=f"of a family of organs, {SCORED_SPLIT!r} by default")
     parser.add_argument("--motion", choices=list_motions(), help="how the patient moves; as the scene says by default")
     parser.add_argument(
         "--no-tracking", action="store_true", help="presses and oracles go where the surface is at rest, as it moves"
@@ -290,14 +295,20 @@ def _declared(agent: Any) -> dict[str, bool]:
 
 
 def _places(options: argparse.Namespace, defaults: dict[str, str]) -> dict[str, Any]:
-    """Scene and level as the options or else the defaults have them; without either they are the environment's own."""
-    given = {name: getattr(options, name) for name in PLACES if getattr(options, name) is not None}
-    return {**defaults, **given}
+    """Scene, level and split as the options or else the defaults have them; else they are the environment's own.
+
+    A family of organs is scored on its test split.
+    """
+    given = {name: getattr(options, name) for name in (*PLACES, "split") if getattr(options, name) is not None}
+    places = {**defaults, **given}
+    if "scene" in places and make_scene(places["scene"]).family is not None:
+        places.setdefault("split", SCORED_SPLIT)
+    return places
 
 
 def _place_options(kwargs: dict[str, Any]) -> str:
     told = _without_folders(kwargs)
-    return "".join(f" --{name} {told[name]}" for name in PLACES if name in told)
+    return "".join(f" --{name} {told[name]}" for name in (*PLACES, "split") if name in told)
 
 
 def policy_player(path: Path, options: argparse.Namespace) -> Player:
@@ -469,6 +480,7 @@ def _group(name: str, options: argparse.Namespace) -> list[Result]:
         for one in named
         if one.scene in ("", Path(wanted["scene"]).stem)
         and one.env_kwargs.get("level") in (None, wanted["level"])
+        and one.env_kwargs.get("split") == wanted.get("split")
         and one.motion == (options.motion or "")
     ]
     if not found or len({one.place for one in found}) > 1:

@@ -58,9 +58,10 @@ class Result:
 
     @property
     def place(self) -> str:
-        """Environment, scene and level: the key that groups tables."""
+        """Environment, scene, level, a split other than "test" and motion: the key that groups tables."""
         parts = [self.env_id.removeprefix("SurgSim/").removesuffix("-v0"), self.scene]
-        parts += [self.env_kwargs.get("level") or "", self.motion]
+        split = self.env_kwargs.get("split") or ""
+        parts += [self.env_kwargs.get("level") or "", "" if split == "test" else split, self.motion]
         return "_".join(part for part in parts if part)
 
     @property

@@ -318,6 +318,7 @@ class PalpateSitesTask(Task):
         self.drawn = drawn
         self.truth = drawn.places(self.anatomy) if truth is None else truth
         self.reading.reset(rng)
+        assert self.level is not None
         if self.level.map_error:
             self.felt.map_shift = rng.normal(0.0, self.level.map_error, 2)
         self._clear()
@@ -420,6 +421,7 @@ class PalpateSitesTask(Task):
         check_count("step_count", state.step_count, self.budget)
         check_count("the number of felt.touches", len(state.felt.touches), state.step_count)
         check_share("found_before", state.found_before)
+        assert self.level is not None
         if any(state.map_shift) and not self.level.map_error:
             raise ValueError(f"map_shift is {list(state.map_shift)} m; at level {self.level.name!r} it must be 0")
         drawn = DrawnOrgan.from_json(state.drawn, self.anatomy)

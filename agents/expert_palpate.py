@@ -22,7 +22,7 @@ GOAL_NEAR = 0.006  # [m] the same on the way to the first row and to the stiffes
 ABOVE = 0.004  # [m] within this of the first row's start the tip descends
 TRAVEL_GAP = 0.001  # [m] between tip and surface before that
 CLOSE_ENOUGH = 0.0015  # [m] within this a row is reached
-DECLARE_NEAR = 0.003  # [m] within this of the stiffest place it declares
+DECLARE_NEAR = 0.0015  # [m] within this of the stiffest place it declares
 FORCE_GAIN = 20.0  # [1/N] full speed upwards at an excess force of 50 mN
 
 

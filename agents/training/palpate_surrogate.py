@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.palpation.touches import CENTROID_SITES
 from surgsim_env.tasks.palpate import (
     DECLARE_STEPS,
     DECLARE_VALUE,
@@ -200,7 +201,13 @@ class PalpateSurrogate(VectorEnv):
             sums.append((rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]).reshape(len(values), -1))
         around = np.divide(sums[0], sums[1], out=np.zeros_like(sums[0]), where=sums[1] > 0.0)
         best = np.argmax(np.where(visited, around, -np.inf), axis=1)
-        stiffest = np.column_stack([self.map.places[best], around[np.arange(len(best)), best]])
+        near = np.abs(self.map.numbers - self.map.numbers[best][:, None]).max(axis=2) <= CENTROID_SITES
+        mean = np.where(visited, around, 0.0).sum(axis=1) / np.maximum(visited.sum(axis=1), 1)
+        most = around[np.arange(len(best)), best]
+        excess = np.where(visited & near, np.maximum(around - 0.5 * (mean + most)[:, None], 0.0), 0.0)
+        total = excess.sum(axis=1, keepdims=True)
+        centroid = np.where(total > 0.0, excess @ self.map.places / np.maximum(total, 1e-300), self.map.places[best])
+        stiffest = np.column_stack([centroid, most])
         stiffest[~visited.any(axis=1)] = 0.0
         return contrast, visited.astype(np.float64), stiffest
 

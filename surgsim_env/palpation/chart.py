@@ -32,7 +32,7 @@ from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
 SITES_FEWEST, SITES_MOST = 13, 25
 # Sites on a side of the touch map, the same for every organ, and their distance in tip radii; larger where that many
 # do not span the face.
-MAP_SIDE, MAP_CELL = 33, 0.5
+MAP_SIDE, MAP_CELL = 41, 0.4
 # Subdivisions of a cell of the grid in the table of surface points.
 POINTS_BETWEEN = 2
 # Rounding puts the chart's border slightly inside the margin: sites up to this [m] within it are accepted.
@@ -137,6 +137,11 @@ class TouchMap:
     def places(self) -> FloatArray:
         """Places of all sites on the chart (MAP_SIDE**2, 2), -1 to 1 inside it."""
         return 2.0 * self.sites / self.extent - 1.0
+
+    @cached_property
+    def numbers(self) -> NDArray[np.intp]:
+        """Column and row of each site (MAP_SIDE**2, 2)."""
+        return np.stack(np.divmod(np.arange(MAP_SIDE**2), MAP_SIDE)[::-1], axis=-1)
 
     @cached_property
     def rows_and_columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

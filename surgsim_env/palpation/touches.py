@@ -16,6 +16,8 @@ from surgsim_env.scene.model import PalpationSettings, Vector
 
 # Speed of the tip between sites [m/s]; this travel is counted, not simulated.
 TRAVEL_SPEED = 0.02
+# Columns and rows of sites on each side of the stiffest one that its centroid takes in.
+CENTROID_SITES = 3
 # Log contrast is clipped to +- this; `Touch.cut` reports it.
 LOG_CONTRAST_BOUND = 2.0
 
@@ -234,12 +236,21 @@ class TouchMemory:
         return _ratio(self.product, self.square)
 
     def stiffest(self) -> FloatArray:
-        """Place (2,) and contrast of the stiffest site, averaged with its eight neighbours; zeros without a reading."""
-        if not self.square.any():
+        """Place (2,) and contrast of the stiffest spot; zeros without a reading.
+
+        The contrast is the largest of all sites with a reading, each averaged with its eight neighbours; the place is
+        the centroid of what exceeds half way from the mean contrast to it, within CENTROID_SITES of that site.
+        """
+        felt = self.square > 0.0
+        if not felt.any():
             return np.zeros(3)
         around = _ratio(self._with_neighbours(self.product), self._with_neighbours(self.square))
-        best = int(np.argmax(np.where(self.square > 0.0, around, -np.inf)))
-        return np.append(self.map.places[best], around[best])
+        best = int(np.argmax(np.where(felt, around, -np.inf)))
+        near = np.abs(self.map.numbers - self.map.numbers[best]).max(axis=1) <= CENTROID_SITES
+        excess = np.where(felt & near, np.maximum(around - 0.5 * (around[felt].mean() + around[best]), 0.0), 0.0)
+        total = excess.sum()
+        place = self.map.places[best] if total == 0.0 else excess @ self.map.places / total
+        return np.append(place, around[best])
 
     def _with_neighbours(self, values: FloatArray) -> FloatArray:
         """Sums over three by three sites."""

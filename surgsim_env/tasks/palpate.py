@@ -68,8 +68,8 @@ class PalpateTask(Task):
     `Box(-1, 1, (4,), float32)`
 
     ## Observation Space
-    `Box((10,), float32)`, all bounds finite. With `memory=True` `Box((3280,), float32)`: what the sensor felt so far
-    (`surgsim_env.palpation.touches`) on a map of n = 33 x 33 sites, half a tip's radius apart, over the middle of the
+    `Box((10,), float32)`, all bounds finite. With `memory=True` `Box((5056,), float32)`: what the sensor felt so far
+    (`surgsim_env.palpation.touches`) on a map of n = 41 x 41 sites, 0.4 tip radii apart, over the middle of the
     palpable face (`surgsim_env.palpation.chart`), row by row, the same size for every organ; farther apart where 16 tip
     radii do not span the face. `env.unwrapped.observation_slices` has the entries of each channel by its name.
 

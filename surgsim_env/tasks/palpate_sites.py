@@ -72,7 +72,7 @@ class PalpateSitesTask(Task):
     the chart's grid that may.
 
     ## Observation Space
-    With `memory=True` `Box((3277,), float32)`: maps of n x n sites, n = 33, half a tip's radius apart, over the middle
+    With `memory=True` `Box((5053,), float32)`: maps of n x n sites, n = 41, 0.4 tip radii apart, over the middle
     of the chart, row by row along its second axis, the same size for every organ; sites are farther apart where 16 tip
     radii do not span the chart, as `map_cell` shows. With `memory=False` the last six numbers alone: a true POMDP, for
     agents with a memory of their own. All bounds finite.

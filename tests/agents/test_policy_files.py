@@ -20,14 +20,12 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from agents.convert_policy import convert
-from agents.scoring.site_agent import SiteFacts
 from agents.training.networks import MOST_WEIGHTS
 from agents.training.policy_files import TrainedPolicy, describe, load_policy, save_policy
-from agents.training.site_policy import SiteBelief, SitePolicy
+from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, SitePolicy
 
 pytestmark = pytest.mark.agents
 OBSERVATION, ACTION = 10, 3
-FACTS = SiteFacts(extent=(0.04, 0.03), site_count=5, tip_radius=0.008, noise=0.04)
 
 
 class Spaces(gym.Env):
@@ -41,8 +39,8 @@ class Spaces(gym.Env):
 class Sites(gym.Env):
     """Belief maps, and a site's number."""
 
-    observation_space = SiteBelief(FACTS).space
-    action_space = gym.spaces.Discrete(FACTS.site_count**2)
+    observation_space = FEATURE_SPACE
+    action_space = CHOICE_SPACE
 
 
 SMALL = {"net_arch": [8, 4]}
@@ -74,7 +72,7 @@ def normalised() -> VecNormalize:
 
 def made(name: str) -> TrainedPolicy:
     model = MODELS[name]()
-    belief = FACTS if name == "SitePolicy" else None
+    belief = name == "SitePolicy"
     description = describe(model, model.get_vec_normalize_env(), env_id="SurgSim/Palpate-v0", belief=belief)
     return TrainedPolicy(model.policy, description)
 
@@ -198,18 +196,14 @@ WRONG_ENTRIES = {
         r"observation_mean\[0\] is nan; the rule is",
     ),
     "large": (set_entry("observation_mean", to=[1e308] * 10), r"observation_mean\[0\] is 1e\+308; the rule is"),
-    "noise": (
-        set_entry("belief", to={"extent": [1, 1], "site_count": 5, "tip_radius": 1, "noise": 1e308}),
-        r"belief is SiteFacts\(.*noise=1e\+308.*; the rule is two extents",
-    ),
     "variance": (set_entry("observation_variance", to=[-1.0] * 10), r"observation_variance\[0\] is -1\.0; the rule is"),
     "half": (set_entry("observation_variance", to=None), r"observation_mean and observation_variance go together"),
     "force": (set_entry("force_entries", to=[10]), r"force_entries\[0\] is 10; the observation has entries 0 to 9"),
     "repeat": (set_entry("action_repeat", to=0), r"action_repeat is 0; it must be 1 to 10000"),
     "repeats": (set_entry("action_repeat", to=2**64), r"action_repeat is 18446744073709551616; it must be 1 to 10000"),
     "belief": (
-        set_entry("belief", to={"extent": [1, 1], "site_count": 10**6, "tip_radius": 1, "noise": 1}),
-        r"belief\.site_count is 1000000, for n of which",
+        set_entry("belief", to=True),
+        r"belief is true, for which networks read",
     ),
     "digest": (set_entry("sha256", to="0" * 64), r"its SHA-256 is [0-9a-f]{64}, p\.json has '0{64}'"),
 }

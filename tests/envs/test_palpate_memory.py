@@ -39,8 +39,8 @@ def test_contrasts_are_the_fit_of_the_readings_to_hertz():
         depth = 0.008 + 0.030 - row[2]
         if depth < 0.002:
             continue
-        # Sites of 4 mm around the middle of the top, at 30 mm.
-        column, line = np.round((row[:2] - 0.030) / 0.004).astype(int) + MAP_SIDE // 2
+        # Sites of 3.2 mm around the middle of the top, at 30 mm.
+        column, line = np.round((row[:2] - 0.030) / 0.0032).astype(int) + MAP_SIDE // 2
         hertz = 4 / 3 * 5000 / (1 - 0.45**2) * np.sqrt(0.008) * depth**1.5
         felt[MAP_SIDE * line + column] += row[8] * hertz
         healthy[MAP_SIDE * line + column] += hertz**2
@@ -59,8 +59,9 @@ def test_the_stiffest_place_is_where_most_was_felt():
     u, v, contrast = seen[-1, -3:]
     touch_map = env.unwrapped.task.memory.map
     site = touch_map.nearest([u, v])
-    assert seen[-1, VISITED][site] == 1.0
-    np.testing.assert_allclose(touch_map.places[site], [u, v], atol=1e-6)
+    # The centroid of few sites lies among them.
+    near = np.abs(touch_map.numbers - touch_map.numbers[site]).max(axis=1) <= 3
+    assert (seen[-1, VISITED][near] == 1.0).any()
     felt = seen[-1, CONTRAST][seen[-1, VISITED] > 0.0]
     assert felt.mean() <= contrast <= felt.max()
 
@@ -70,7 +71,7 @@ def test_an_episode_begins_with_nothing_remembered():
     assert walked(env)[-1, VISITED].any()
     begun = env.reset()[0]
     assert not begun[10 : FACE.start].any() and not begun[FACE.stop :].any()
-    assert begun[FACE].sum() == 11 * 11
+    assert begun[FACE].sum() == 13 * 13
 
 
 def test_passes_gymnasiums_checker_and_bounds_are_finite():

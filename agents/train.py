@@ -1,6 +1,6 @@
 """Train an agent from a configuration file; the same command resumes a run that was stopped or killed.
 
-    python -m agents.train agents/configs/palpate_phantom_small_ppo.yaml
+    python -m agents.train agents/configs/palpate_phantom_ppo_formula.yaml
     python -m agents.train agents/configs/sites_ppo.yaml --seed 3     # the same with another seed
     python -m agents.train agents/configs/retract_ppo.yaml --warm-start runs/clone.safetensors
     tensorboard --logdir runs

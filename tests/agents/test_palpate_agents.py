@@ -224,4 +224,4 @@ def test_committed_policies_search_as_they_were_taught(path: Path):
     if policy.description.force_entries:
         assert found < 0.2  # more than a fixed declaration finds on phantom
     else:
-        assert found >= (0.6 if policy.description.algorithm == "RecurrentPPO" else 0.8)
+        assert found >= 0.8

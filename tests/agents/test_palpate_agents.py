@@ -28,7 +28,7 @@ def surrogate(count: int, **settings):
 
 def test_the_formula_presses_as_the_organ_does():
     """Down to 3.5 mm, away from the lesion: within 15 % or 15 mN, where the sensor's noise is 10 mN (standard)."""
-    env = gym.make(ID).unwrapped
+    env = gym.make(ID, scaled=False).unwrapped
     made = surrogate(1)
     compared = 0
     for seed in range(30):
@@ -199,10 +199,7 @@ def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script
 
 @pytest.mark.parametrize("path", sorted(POLICIES.glob("palpate_*.json")), ids=lambda path: path.stem)
 def test_committed_policies_search_as_they_were_taught(path: Path):
-    """By formula, which is quick: four of five find their lesion, or what is said below. On the organ: agents/results.
-
-    A memory of one's own is harder to learn than one that is observed; who feels nothing finds nothing.
-    """
+    """By formula, which is quick: four of five find their lesion; who feels nothing finds nothing."""
     from agents.training.policy_files import load_policy
 
     policy = load_policy(path.with_suffix(".safetensors"))

@@ -1,0 +1,221 @@
+"""Learning from scratch: the curriculum of rewards, a new policy's first actions, sampled policies, the touch summary."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.agents
+pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
+
+PALPATION = {"id": "SurgSim/Palpate-v0", "kind": "surrogate", "count": 3}
+SMALL = {"scene": "phantom_small", "memory": True}
+HYPERPARAMETERS = {"n_steps": 16, "batch_size": 16, "n_epochs": 1}
+
+
+def environments(stage: dict | None, **changes):
+    """Environments with the rewards of a stage, or bare ones."""
+    from agents.training.config import EnvironmentSettings, Stage
+    from agents.training.environments import StagedRewards, make_environments
+
+    bare = make_environments(EnvironmentSettings(**{**PALPATION, "kwargs": SMALL, **changes}))
+    return bare if stage is None else StagedRewards(bare, Stage(**stage))
+
+
+def pressed_down(stage: dict | None, **changes):
+    """Rewards and sites felt, (n_step, n_env) each, and the last infos, of a way straight down to the hard limit."""
+    envs = environments(stage, **changes)
+    envs.seed(3)
+    envs.reset()
+    visited = envs.get_attr("unwrapped", indices=[0])[0].task.observation_slices["visited"]
+    rewards, felt, last = [], [], [{}] * envs.num_envs
+    down = np.tile(np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32), (envs.num_envs, 1))
+    for _ in range(60):
+        observation, reward, done, infos = envs.step(down)
+        rewards.append(reward)
+        felt.append(np.asarray(observation)[:, visited].sum(axis=1))
+        last = [info if over else old for info, over, old in zip(infos, done, last, strict=True)]
+        if all(last):
+            break
+    return np.array(rewards), np.array(felt), last
+
+
+@pytest.mark.parametrize("kind", ["surrogate", "lanes"])
+def test_a_stage_pays_its_share_of_a_failure_and_nothing_else(kind: str):
+    bare, _, ends = pressed_down(None, kind=kind)
+    full, _, _ = pressed_down({}, kind=kind)
+    none, _, _ = pressed_down({"failure": 0.0}, kind=kind)
+    some, _, _ = pressed_down({"failure": 0.25}, kind=kind)
+    assert all(end["hard_limit"] for end in ends)
+    np.testing.assert_array_equal(full, bare)
+    # A failure costs 5 and 0.015 for each control step left; what remains are time and force, at most 0.015 a step.
+    assert bare.min() < -12.0 and none.min() >= -0.0151
+    np.testing.assert_allclose(some, none + 0.25 * (bare - none), atol=1e-5)
+    assert (none[bare > -1.0] == bare[bare > -1.0]).all()
+
+
+def test_each_site_pays_once_in_an_episode():
+    bare, felt, _ = pressed_down(None)
+    paid, _, _ = pressed_down({"novelty": 0.5})
+    before = np.vstack([np.zeros(felt.shape[1]), felt[:-1]])
+    ended = bare < -1.0
+    new = np.where(ended, 0.0, felt - before)
+    assert new.sum() == felt.shape[1]  # straight down: one site each
+    np.testing.assert_allclose(paid - bare, 0.5 * new, atol=1e-6)
+
+
+def test_novelty_needs_a_touch_map():
+    with pytest.raises(ValueError, match=r"pays 0.5 .* no touch map.*memory: true"):
+        environments({"novelty": 0.5}, kwargs={"scene": "phantom_small", "memory": False})
+    envs = environments({}, kwargs={"scene": "phantom_small", "memory": False})
+    from agents.training.config import Stage
+
+    with pytest.raises(ValueError, match="no touch map"):
+        envs.stage = Stage(novelty=0.1)
+
+
+# ---- configurations and runs -----------------------------------------------------------------------------------
+
+
+def config(**changes):
+    from agents.training.config import TrainingConfig
+    from surgsim_env.scene.load import fill
+
+    table = {
+        "name": "tiny",
+        "algorithm": "PPO",
+        "environment": {**PALPATION, "kwargs": SMALL, "action_repeat": 5, "normalize_observation": False},
+        "total_steps": 96,
+        "hyperparameters": {**HYPERPARAMETERS, "policy_kwargs": {"features_extractor_class": "TouchSummary"}},
+        "evaluation": {"every": 0},
+        "checkpoint": {"every": 48},
+    }
+    return fill(TrainingConfig, table | changes, "test")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stages": [{"failure": 1.5}]}, "stage.failure is 1.5; it is a share"),
+        ({"stages": [{"novelty": -0.1}]}, "stage.novelty is -0.1"),
+        ({"stages": [{"begin": 5}]}, r"stages begin at \[5\]; the first begins at 0"),
+        ({"stages": [{}, {"begin": 9}, {"begin": 9}]}, r"stages begin at \[0, 9, 9\]"),
+        ({"stages": [{"novlty": 0.1}]}, "did you mean 'novelty'"),
+        ({"initial_spread": [0.5, 0.0]}, r"initial_spread is \[0.5, 0.0\]; standard deviations are above 0"),
+        ({"initial_spread": [0.5], "warm_start": "x.safetensors"}, "warm_start names a trained one"),
+        ({"initial_action": [0.5], "warm_start": "x.safetensors"}, "initial_action is of a new policy"),
+    ],
+)
+def test_wrong_entries_are_refused(change: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        config(**change)
+
+
+def test_a_run_goes_through_its_stages_also_when_it_is_resumed(tmp_path: Path):
+    from agents.train import train
+    from agents.training.config import Stage
+    from agents.training.run import BetweenRollouts, Run
+
+    stages = [{"failure": 0.0, "novelty": 0.1}, {"begin": 48, "failure": 0.5}, {"begin": 96}]
+    settings = config(stages=stages)
+    run = Run(settings, tmp_path)
+    assert run.staged is not None and run.staged.stage == Stage(0, 0.0, 0.1)
+    run.model.learn(96, BetweenRollouts(run))
+    assert run.staged.stage == Stage(48, 0.5, 0.0)
+    run.save()
+    run.bare.close()
+    resumed = Run(replace(settings, total_steps=144), tmp_path)
+    assert resumed.resumed_from is not None and resumed.staged is not None
+    resumed.between_rollouts()
+    assert resumed.staged.stage == Stage(96)
+    resumed.bare.close()
+    assert train(replace(settings, total_steps=144), tmp_path) == 144
+
+
+def test_a_new_policy_begins_with_the_actions_of_the_configuration(tmp_path: Path):
+    from agents.training.run import Run
+
+    given = {"initial_action": [0.0, 0.1, 0.2, -0.4], "initial_spread": [0.8, 0.7, 0.4, 0.5]}
+    run = Run(config(**given), tmp_path / "ppo")
+    policy = run.model.policy
+    np.testing.assert_allclose(policy.log_std.detach().exp(), given["initial_spread"], rtol=1e-6)
+    # Orthogonal weights of gain 0.01 on 64 features in [-1, 1]: means lie near the bias.
+    action = policy.predict(np.asarray(run.bare.reset()), deterministic=True)[0]
+    np.testing.assert_allclose(action, np.tile(given["initial_action"], (3, 1)), atol=0.08)
+    run.bare.close()
+    with pytest.raises(ValueError, match="initial_spread has 3 values; an action has 4 entries"):
+        Run(config(initial_spread=[0.1, 0.1, 0.1]), tmp_path / "three")
+    with pytest.raises(ValueError, match="initial_action: the actions of SAC are not Gaussian with one standard"):
+        Run(config(algorithm="SAC", hyperparameters={}, initial_action=[0.0] * 4), tmp_path / "sac")
+
+
+def test_a_sampled_policy_repeats_its_draws_and_leaves_torchs_alone(tmp_path: Path):
+    import torch
+
+    from agents.training.policy_files import TrainedPolicy, load_policy, save_policy
+    from agents.training.run import Run
+
+    run = Run(config(evaluation={"every": 0, "sampled": True}), tmp_path / "run")
+    seen = np.asarray(run.bare.reset())
+    save_policy(run.model.policy, run.description(), tmp_path / "policy.safetensors")
+    policy = load_policy(tmp_path / "policy.safetensors")
+    assert policy.description.sampled
+    once = TrainedPolicy(policy.networks, replace(policy.description, action_repeat=1))
+    mean = TrainedPolicy(policy.networks, replace(policy.description, action_repeat=1, sampled=False))
+    state = torch.get_rng_state()
+    rows = []
+    for _ in range(2):
+        once.reset(3)
+        rows.append(np.array([once.act(seen) for _ in range(400)]))
+    assert torch.equal(torch.get_rng_state(), state)
+    np.testing.assert_array_equal(rows[0], rows[1])
+    mean.reset(3)
+    # 400 draws of a unit normal, cut to [-1, 1]: variance 0.516, so that a mean is off by 3 x 0.72 / 20 at most.
+    assert rows[0].std(axis=0).min() > 0.6
+    np.testing.assert_allclose(rows[0].mean(axis=0), mean.act(seen), atol=0.15)
+    run.bare.close()
+
+
+# ---- the touch summary ------------------------------------------------------------------------------------------
+
+
+def test_the_touch_summary_is_what_it_says():
+    import torch
+
+    from agents.training.extractors import TouchSummary
+
+    envs = environments(None, count=8, kind="surrogate")
+    envs.seed(5)
+    observation = np.asarray(envs.reset())
+    rng = np.random.default_rng(0)
+    extractor = TouchSummary(envs.observation_space)
+    assert (extractor(torch.tensor(observation))[:, 8:10] == 0.0).all()
+    for step in range(40):
+        way = np.column_stack([rng.uniform(-1.0, 1.0, (8, 2)), np.full(8, -0.3 if step < 25 else 0.0), np.zeros(8)])
+        observation = np.asarray(envs.step(way.astype(np.float32))[0])
+    features = extractor(torch.tensor(observation)).numpy()
+    assert features.shape == (8, extractor.features_dim) == (8, 14)
+    env = envs.get_attr("unwrapped", indices=[0])[0]
+    channel = {name: env.si_values(observation)[:, part] for name, part in env.task.observation_slices.items()}
+    felt = channel["visited"].sum(axis=1)
+    assert (felt > 0).any()
+    for row in np.flatnonzero(felt):
+        sites = channel["visited"][row] > 0.5
+        mean, most = channel["contrast"][row][sites].mean(), channel["stiffest"][row, 2]
+        share = felt[row] / channel["face"][row].sum()
+        np.testing.assert_allclose(features[row, 8:11], [share, 1.0, mean], rtol=1e-4)
+        np.testing.assert_allclose(features[row, 11], np.clip(4.0 * (most / max(mean, 0.1) - 1.0), -4, 4), atol=1e-3)
+        # The outermost sites lie up to half a cell, 2 mm, nearer to the middle than the summary takes them to be.
+        place = env.task.memory.chart.plane_point(channel["stiffest"][row, :2])
+        np.testing.assert_allclose(features[row, 12:], (place - channel["tip_position"][row, :2]) / 0.01, atol=0.21)
+    np.testing.assert_allclose(features[:, 3], 4.0 * channel["contact_force"][:, 2] / 0.5, rtol=1e-4, atol=1e-4)
+    assert np.abs(features).max() < 8.0
+
+
+def test_the_touch_summary_refuses_an_observation_without_memory():
+    from agents.training.extractors import TouchSummary
+
+    envs = environments(None, kwargs={"scene": "phantom_small", "memory": False})
+    with pytest.raises(ValueError, match="not that of Palpate-v0 with memory=True"):
+        TouchSummary(envs.observation_space)

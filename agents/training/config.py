@@ -58,8 +58,8 @@ class Stage:
 
     Fields:
         begin: environment steps at which it begins; the first stage begins at 0
-        failure: share of the reward terms of a failure (`per` "failure" or "step left") that training pays; 1 all. Below
-            1 a policy that still fails by chance does not learn to do nothing instead
+        failure: share of the reward terms of a failure (`per` "failure" or "step left") that training pays; below 1 a
+            policy that still fails by chance does not learn to do nothing instead
         novelty: reward of each site of the touch map that is felt for the first time in an episode
             (`count-based exploration`, Bellemare et al. 2016), for SurgSim/Palpate-v0 with memory
     """
@@ -169,7 +169,7 @@ class TrainingConfig:
             raise ValueError(f"initial_spread is {list(self.initial_spread)}; standard deviations are above 0")
         for name in ("initial_action", "initial_spread"):
             if self.warm_start is not None and getattr(self, name) is not None:
-                raise ValueError(f"{name} is of a new policy, and warm_start names a trained one: leave one of them out")
+                raise ValueError(f"{name} is of a new policy, and warm_start names a trained one: leave one out")
         begins = [stage.begin for stage in self.stages]
         if begins and (begins[0] != 0 or sorted(set(begins)) != begins):
             raise ValueError(f"stages begin at {begins}; the first begins at 0, and each later than the one before")

@@ -59,11 +59,11 @@ class TouchSummary(_Entries):
     """Of Palpate-v0 with memory, for learning from scratch: 14 numbers of order 1.
 
     Tip position (3), force along z (1, times 4), time left (1), stiffest place and contrast (3), share of the face that
-    was felt (1), whether anything was (1), mean contrast c of the sites felt (1), the stiffest contrast's excess over it,
+    was felt (1), whether anything was (1), mean contrast c of the sites felt (1), the excess of the stiffest over it,
     4 (c_max / c - 1) (1), and the way from the tip to the stiffest place (2), which is about right on a block whose
-    middle is that of the workspace, under a tip of 8 mm radius. Force and excess are multiplied because a press is about
-    a quarter of the soft limit, and a lesion about a quarter stiffer than what surrounds it. The observation is that of
-    the environment, not normalised.
+    middle is that of the workspace, under a tip of 8 mm radius. Force and excess are multiplied because a press is
+    about a quarter of the soft limit, and a lesion about a quarter stiffer than what surrounds it. The observation is
+    that of the environment, not normalised.
     """
 
     def __init__(self, observation_space: gym.Space) -> None:

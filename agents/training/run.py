@@ -279,8 +279,8 @@ def set_initial(model: BaseAlgorithm, entry: str, values: Sequence[float]) -> No
     spread = getattr(policy, "log_std", None)
     if spread is None or spread.ndim != 1:
         raise ValueError(
-            f"{entry}: the actions of {type(model).__name__} are not Gaussian with one standard deviation each; leave it "
-            "out, or train with PPO without use_sde"
+            f"{entry}: the actions of {type(model).__name__} are not Gaussian with one standard deviation each; leave "
+            "it out, or train with PPO without use_sde"
         )
     if len(values) != len(spread):
         raise ValueError(f"{entry} has {len(values)} values; an action has {len(spread)} entries")

@@ -1,4 +1,4 @@
-"""Learning from scratch: the curriculum of rewards, a new policy's first actions, sampled policies, the touch summary."""
+"""Learning from scratch: a curriculum of rewards, a new policy's first actions, sampled policies, the touch summary."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -43,10 +43,11 @@ def pressed_down(stage: dict | None, **changes):
 
 @pytest.mark.parametrize("kind", ["surrogate", "lanes"])
 def test_a_stage_pays_its_share_of_a_failure_and_nothing_else(kind: str):
-    bare, _, ends = pressed_down(None, kind=kind)
-    full, _, _ = pressed_down({}, kind=kind)
-    none, _, _ = pressed_down({"failure": 0.0}, kind=kind)
-    some, _, _ = pressed_down({"failure": 0.25}, kind=kind)
+    count = {"surrogate": 3, "lanes": 16}[kind]
+    bare, _, ends = pressed_down(None, kind=kind, count=count)
+    full, _, _ = pressed_down({}, kind=kind, count=count)
+    none, _, _ = pressed_down({"failure": 0.0}, kind=kind, count=count)
+    some, _, _ = pressed_down({"failure": 0.25}, kind=kind, count=count)
     assert all(end["hard_limit"] for end in ends)
     np.testing.assert_array_equal(full, bare)
     # A failure costs 5 and 0.015 for each control step left; what remains are time and force, at most 0.015 a step.
@@ -219,3 +220,25 @@ def test_the_touch_summary_refuses_an_observation_without_memory():
     envs = environments(None, kwargs={"scene": "phantom_small", "memory": False})
     with pytest.raises(ValueError, match="not that of Palpate-v0 with memory=True"):
         TouchSummary(envs.observation_space)
+
+
+# ---- curves -----------------------------------------------------------------------------------------------------
+
+
+def test_curves_are_drawn_over_control_steps(tmp_path: Path, monkeypatch):
+    from matplotlib.image import imread
+
+    from agents import learning_curves
+
+    curve, out = tmp_path / "seed0.csv", tmp_path / "deeper" / "curve.png"
+    curve.write_text("steps,return,success\n20000,-1.5,0.25\n40000,3,0.875\n")
+    assert learning_curves.read_curve(curve, 5) == ([0.1, 0.2], [25.0, 87.5])
+    monkeypatch.setattr("sys.argv", ["learning_curves", str(curve), "--action-repeat", "5", "--out", str(out)])
+    learning_curves.main()
+    assert len(np.unique(imread(out).reshape(-1, 4), axis=0)) > 10
+    for wrong in ("steps,return\n1,2\n", "steps,success\n1,x\n"):
+        curve.write_text(wrong)
+        with pytest.raises(ValueError, match="needs columns steps and success"):
+            learning_curves.read_curve(curve, 5)
+    with pytest.raises(ValueError, match="cannot be read"):
+        learning_curves.read_curve(tmp_path / "none.csv", 5)

@@ -62,11 +62,13 @@ class Stage:
             policy that still fails by chance does not learn to do nothing instead
         novelty: reward of each site of the touch map that is felt for the first time in an episode
             (`count-based exploration`, Bellemare et al. 2016), for SurgSim/Palpate-v0 with memory
+        near: distance from the lesion [m] up to which a wrong declaration of SurgSim/Palpate-v0 is paid as a right one
     """
 
     begin: int = 0
     failure: float = 1.0
     novelty: float = 0.0
+    near: float = 0.0
 
     def __post_init__(self) -> None:
         _at_least("stage.begin", self.begin, 0)
@@ -74,6 +76,8 @@ class Stage:
             raise ValueError(f"stage.failure is {self.failure}; it is a share, 0 to 1")
         if not 0.0 <= self.novelty < math.inf:
             raise ValueError(f"stage.novelty is {self.novelty}; it is the reward of a site, finite and at least 0")
+        if not 0.0 <= self.near < math.inf:
+            raise ValueError(f"stage.near is {self.near}; it is a distance in m, finite and at least 0")
 
 
 @dataclass(frozen=True)

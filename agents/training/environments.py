@@ -129,6 +129,7 @@ class StagedRewards(VecEnvWrapper):
         super().__init__(envs)
         task = envs.get_attr("unwrapped", indices=[0])[0].task
         self.failure_terms = [f"reward_{one.name}" for one in task.rewards if one.per in ("failure", "step left")]
+        self.found = sum(one.weight for one in task.rewards if one.per == "success")
         self.visited: slice | None = task.observation_slices.get("visited")
         self._felt = np.zeros(envs.num_envs)
         self._stage = self._checked(stage)
@@ -167,7 +168,9 @@ class StagedRewards(VecEnvWrapper):
         self._felt = felt
         for index in np.flatnonzero(done):
             cost = sum(float(infos[index][name]) for name in self.failure_terms)
-            paid[index] -= (1.0 - self._stage.failure) * cost
+            # A declaration has an error of at least 0 mm, other ends one of -1 mm.
+            close = not infos[index]["success"] and 0.0 <= infos[index].get("error_mm", -1.0) <= 1e3 * self._stage.near
+            paid[index] += self.found - cost if close else -(1.0 - self._stage.failure) * cost
         return observation, paid, done, infos
 
     def _count(self, observation: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ from surgsim_env.tasks.task import LENGTH_SCALE
 
 # Radius of the blocks' tip [m], for `TouchSummary`.
 TIP_RADIUS = 0.008
+# Reach of its search over sites that were not felt, in the unit of positions.
+SEARCH_REACH = 0.8
 
 
 class _Entries(BaseFeaturesExtractor):
@@ -56,11 +58,13 @@ class MemorySummary(_Entries):
 
 
 class TouchSummary(_Entries):
-    """Of Palpate-v0 with memory, for learning from scratch: 14 numbers of order 1.
+    """Of Palpate-v0 with memory, for learning from scratch: 18 numbers of order 1.
 
     Tip position (3), force along z (1, times 4), time left (1), stiffest place and contrast (3), share of the face that
     was felt (1), whether anything was (1), mean contrast c of the sites felt (1), the excess of the stiffest over it,
-    4 (c_max / c - 1) (1), and the way from the tip to the stiffest place (2), which is about right on a block whose
+    4 (c_max / c - 1) (1); the way from the tip to the stiffest place (2), to the centroid of the sites weighted by
+    max(c_i - c, 0)^2, which is finer than the map (2), and to that of the sites not felt weighted by
+    exp(-(d / 8 mm)^2 / 2) of their distance d, the direction of a search (2). Ways are about right on a block whose
     middle is that of the workspace, under a tip of 8 mm radius. Force and excess are multiplied because a press is
     about a quarter of the soft limit, and a lesion about a quarter stiffer than what surrounds it. The observation is
     that of the environment, not normalised.
@@ -75,14 +79,18 @@ class TouchSummary(_Entries):
         check_length(observation_space, WITH_MEMORY, memory=True)
         time, stiffest = WITH_MEMORY["time_left"], WITH_MEMORY["stiffest"]
         entries = [*place_and_force(WITH_MEMORY), time.start, *range(stiffest.start, stiffest.stop)]
-        super().__init__(observation_space, entries, added=6)
+        super().__init__(observation_space, entries, added=10)
         gain = torch.ones(len(entries))
         gain[FORCE_PLACE] = 4.0
         self.gain: torch.Tensor
         self.register_buffer("gain", gain, persistent=False)
+        steps = (torch.arange(MAP_SIDE, dtype=torch.float32) - MAP_SIDE // 2) * MAP_CELL * TIP_RADIUS / LENGTH_SCALE
+        y, x = torch.meshgrid(steps, steps, indexing="ij")
+        self.sites: torch.Tensor
+        self.register_buffer("sites", torch.stack([x, y], dim=-1).reshape(-1, 2), persistent=False)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """The features (n, 14) of observations (n, n_observation)."""
+        """The features (n, 18) of observations (n, n_observation)."""
         contrast, visited, face = (observations[:, WITH_MEMORY[name]] for name in ("contrast", "visited", "face"))
         stiffest = observations[:, WITH_MEMORY["stiffest"].stop - 1]
         count = visited.sum(dim=1)
@@ -92,13 +100,23 @@ class TouchSummary(_Entries):
         excess = felt * (4.0 * (stiffest / mean.clamp(min=0.1) - 1.0)).clamp(-4.0, 4.0)
         share = count / face.sum(dim=1).clamp(min=1.0)
         # Half of the chart's sides, in the unit of positions: columns and rows of its sites, MAP_CELL tip radii apart.
-        sites = face.reshape(-1, MAP_SIDE, MAP_SIDE)
-        sides = torch.stack([sites.amax(dim=1).sum(dim=1), sites.amax(dim=2).sum(dim=1)], dim=1)
+        rows = face.reshape(-1, MAP_SIDE, MAP_SIDE)
+        sides = torch.stack([rows.amax(dim=1).sum(dim=1), rows.amax(dim=2).sum(dim=1)], dim=1)
         half = 0.5 * (sides - 1.0) * MAP_CELL * TIP_RADIUS / LENGTH_SCALE
         place = observations[:, WITH_MEMORY["stiffest"].start : WITH_MEMORY["stiffest"].stop - 1]
-        way = felt[:, None] * (half * place - observations[:, self.entries[:2]])
+        tip = observations[:, self.entries[:2]]
+        way = felt[:, None] * (half * place - tip)
+        weight = visited * (contrast - mean[:, None]).clamp(min=0.0) ** 2
+        total = weight.sum(dim=1, keepdim=True)
+        distance = ((self.sites - tip[:, None]) ** 2).sum(dim=2)
+        open_sites = face * (1.0 - visited) * torch.exp(-0.5 * distance / SEARCH_REACH**2)
+        fresh = open_sites @ self.sites / open_sites.sum(dim=1, keepdim=True).clamp(min=1e-6) - tip
+        fresh = fresh * (open_sites.sum(dim=1, keepdim=True) > 1e-6)
+        # Without an excess, as after the first touch, there is no centroid: the stiffest place stands for it.
+        centroid = torch.where(total > 1e-6, weight @ self.sites / total.clamp(min=1e-6) - tip, way)
         added = torch.stack([share, felt, mean, excess], dim=1)
-        return torch.cat([super().forward(observations) * self.gain, added, way], dim=1)
+        read = super().forward(observations) * self.gain
+        return torch.cat([read, added, way, felt[:, None] * centroid, fresh], dim=1)
 
 
 class PlaceAndForce(_Entries):

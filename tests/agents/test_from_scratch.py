@@ -66,6 +66,33 @@ def test_each_site_pays_once_in_an_episode():
     np.testing.assert_allclose(paid - bare, 0.5 * new, atol=1e-6)
 
 
+@pytest.mark.parametrize(("near", "paid_as_right"), [(0.0, False), (0.05, True)])
+def test_a_near_declaration_is_paid_as_a_right_one(near: float, paid_as_right: bool):
+    envs = environments({"failure": 0.5, "near": near})
+    bare = environments(None)
+    rewards, ends = [], []
+    for one in (envs, bare):
+        one.seed(4)
+        one.reset()
+        # Down into the tissue, and the lesion declared at once: on 30 mm no place is 50 mm away.
+        act = np.tile(np.array([0.0, 0.0, -0.5, 1.0], dtype=np.float32), (3, 1))
+        seen = [one.step(act) for _ in range(20)]
+        rewards.append(np.array([reward for _, reward, _, _ in seen]))
+        ends.append([(done, infos) for _, _, done, infos in seen])
+    wrong = 0
+    for step, (done, infos) in enumerate(ends[0]):
+        for index in np.flatnonzero(done):
+            assert infos[index]["declared"]
+            if infos[index]["success"]:
+                continue
+            wrong += 1
+            cost = infos[index]["reward_wrong"] + infos[index]["reward_forgone"]
+            # A right declaration pays 10 and costs nothing; a wrong one costs half here.
+            added = 10.0 - cost if paid_as_right else -0.5 * cost
+            assert cost < -5.0 and rewards[0][step, index] == pytest.approx(rewards[1][step, index] + added, abs=1e-4)
+    assert wrong
+
+
 def test_novelty_needs_a_touch_map():
     with pytest.raises(ValueError, match=r"pays 0.5 .* no touch map.*memory: true"):
         environments({"novelty": 0.5}, kwargs={"scene": "phantom_small", "memory": False})
@@ -100,6 +127,7 @@ def config(**changes):
     [
         ({"stages": [{"failure": 1.5}]}, "stage.failure is 1.5; it is a share"),
         ({"stages": [{"novelty": -0.1}]}, "stage.novelty is -0.1"),
+        ({"stages": [{"near": -0.01}]}, "stage.near is -0.01; it is a distance in m"),
         ({"stages": [{"begin": 5}]}, r"stages begin at \[5\]; the first begins at 0"),
         ({"stages": [{}, {"begin": 9}, {"begin": 9}]}, r"stages begin at \[0, 9, 9\]"),
         ({"stages": [{"novlty": 0.1}]}, "did you mean 'novelty'"),
@@ -196,7 +224,7 @@ def test_the_touch_summary_is_what_it_says():
         way = np.column_stack([rng.uniform(-1.0, 1.0, (8, 2)), np.full(8, -0.3 if step < 25 else 0.0), np.zeros(8)])
         observation = np.asarray(envs.step(way.astype(np.float32))[0])
     features = extractor(torch.tensor(observation)).numpy()
-    assert features.shape == (8, extractor.features_dim) == (8, 14)
+    assert features.shape == (8, extractor.features_dim) == (8, 18)
     env = envs.get_attr("unwrapped", indices=[0])[0]
     channel = {name: env.si_values(observation)[:, part] for name, part in env.task.observation_slices.items()}
     felt = channel["visited"].sum(axis=1)
@@ -209,7 +237,16 @@ def test_the_touch_summary_is_what_it_says():
         np.testing.assert_allclose(features[row, 11], np.clip(4.0 * (most / max(mean, 0.1) - 1.0), -4, 4), atol=1e-3)
         # The outermost sites lie up to half a cell, 2 mm, nearer to the middle than the summary takes them to be.
         place = env.task.memory.chart.plane_point(channel["stiffest"][row, :2])
-        np.testing.assert_allclose(features[row, 12:], (place - channel["tip_position"][row, :2]) / 0.01, atol=0.21)
+        np.testing.assert_allclose(features[row, 12:14], (place - channel["tip_position"][row, :2]) / 0.01, atol=0.21)
+        # The centroid of the excess, and the mean way to sites not felt, of the touch map's own sites.
+        sites = env.task.memory.chart.plane_point(env.task.memory.map.places)
+        excess = channel["visited"][row] * np.maximum(channel["contrast"][row] - mean, 0.0) ** 2
+        tip = channel["tip_position"][row, :2]
+        if excess.sum() > 1e-4:
+            np.testing.assert_allclose(features[row, 14:16], (excess @ sites / excess.sum() - tip) / 0.01, atol=0.21)
+        unfelt = channel["face"][row] * (1.0 - channel["visited"][row])
+        unfelt = unfelt * np.exp(-0.5 * ((sites - tip) ** 2).sum(axis=1) / 0.008**2)
+        np.testing.assert_allclose(features[row, 16:], (unfelt @ sites / unfelt.sum() - tip) / 0.01, atol=0.21)
     np.testing.assert_allclose(features[:, 3], 4.0 * channel["contact_force"][:, 2] / 0.5, rtol=1e-4, atol=1e-4)
     assert np.abs(features).max() < 8.0
 

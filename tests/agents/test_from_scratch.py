@@ -41,13 +41,11 @@ def pressed_down(stage: dict | None, **changes):
     return np.array(rewards), np.array(felt), last
 
 
-@pytest.mark.parametrize("kind", ["surrogate", "lanes"])
-def test_a_stage_pays_its_share_of_a_failure_and_nothing_else(kind: str):
-    count = {"surrogate": 3, "lanes": 16}[kind]
-    bare, _, ends = pressed_down(None, kind=kind, count=count)
-    full, _, _ = pressed_down({}, kind=kind, count=count)
-    none, _, _ = pressed_down({"failure": 0.0}, kind=kind, count=count)
-    some, _, _ = pressed_down({"failure": 0.25}, kind=kind, count=count)
+def test_a_stage_pays_its_share_of_a_failure_and_nothing_else():
+    bare, _, ends = pressed_down(None)
+    full, _, _ = pressed_down({})
+    none, _, _ = pressed_down({"failure": 0.0})
+    some, _, _ = pressed_down({"failure": 0.25})
     assert all(end["hard_limit"] for end in ends)
     np.testing.assert_array_equal(full, bare)
     # A failure costs 5 and 0.015 for each control step left; what remains are time and force, at most 0.015 a step.

@@ -202,7 +202,7 @@ class TrainedPolicy:
             self._state = state
         return self._actions.copy()
 
-    def _predicted(self, seen: NDArray[np.float32], begins: NDArray[np.bool_]) -> tuple[NDArray, Any]:
+    def _predicted(self, seen: NDArray[np.float32], begins: NDArray[np.bool_] | None) -> tuple[NDArray, Any]:
         if not self.description.sampled:
             return self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=True)  # type: ignore[return-value]
         # Torch's random state, which a training run goes on with, is kept.

@@ -30,7 +30,7 @@ ORDER = {
         *("__init__", "command_line", "scoring", "press_library", "training", "site_search", "raster", "keyboard"),
         *("expert_palpate", "expert_retract", "learn_palpate", "learn_palpate_recurrent", "learn_retract"),
         *("record_demonstrations", "behaviour_cloning", "train", "train_rllib", "evaluate"),
-        *("palpation_figures", "convert_policy"),
+        *("palpation_figures", "learning_curves", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

@@ -1,5 +1,6 @@
 """Configuration of a training run: one YAML file read into frozen dataclasses, every entry checked."""
 
+import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -52,17 +53,48 @@ class EnvironmentSettings:
 
 
 @dataclass(frozen=True)
+class Stage:
+    """A part of a run's curriculum: what training pays beside the environment's rewards. Evaluations pay none of it.
+
+    Fields:
+        begin: environment steps at which it begins; the first stage begins at 0
+        failure: share of the reward terms of a failure (`per` "failure" or "step left") that training pays; below 1 a
+            policy that still fails by chance does not learn to do nothing instead
+        novelty: reward of each site of the touch map that is felt for the first time in an episode
+            (`count-based exploration`, Bellemare et al. 2016), for SurgSim/Palpate-v0 with memory
+        near: distance from the lesion [m] up to which a wrong declaration of SurgSim/Palpate-v0 is paid as a right one
+    """
+
+    begin: int = 0
+    failure: float = 1.0
+    novelty: float = 0.0
+    near: float = 0.0
+
+    def __post_init__(self) -> None:
+        _at_least("stage.begin", self.begin, 0)
+        if not 0.0 <= self.failure <= 1.0:
+            raise ValueError(f"stage.failure is {self.failure}; it is a share, 0 to 1")
+        if not 0.0 <= self.novelty < math.inf:
+            raise ValueError(f"stage.novelty is {self.novelty}; it is the reward of a site, finite and at least 0")
+        if not 0.0 <= self.near < math.inf:
+            raise ValueError(f"stage.near is {self.near}; it is a distance in m, finite and at least 0")
+
+
+@dataclass(frozen=True)
 class EvaluationSettings:
-    """Periodic deterministic evaluation on separate seeds.
+    """Periodic evaluation on separate seeds.
 
     Fields:
         every: environment steps between evaluations; 0 for none
+        sampled: actions are drawn from the policy's distribution as in training, also by the policies that the run
+            writes; otherwise the distribution's mean or mode acts
         episodes: of each evaluation
         score: criterion of the best policy: "return", or an entry of the episodes' last info
         score_sign: 1 if more is better, -1 if less is
     """
 
     every: int = 50_000
+    sampled: bool = False
     episodes: int = 16
     score: str = "return"
     score_sign: Literal[1, -1] = 1
@@ -106,6 +138,9 @@ class TrainingConfig:
         warm_start: initial policy file, with its normalisation
         warm_spread: initial standard deviation of a warm start's actions; by default the file's
         critic_first: first steps that train the value function alone, which a cloned policy lacks
+        initial_action, initial_spread: mean and standard deviation of each entry of a new policy's actions; by default
+            near 0, and what `log_std_init` in `policy_kwargs` says. For algorithms whose actions are Gaussian, as PPO
+        stages: the curriculum; empty: the environment's rewards alone
         torch_threads: threads of torch
     """
 
@@ -119,6 +154,9 @@ class TrainingConfig:
     warm_start: str | None = None
     warm_spread: float | None = None
     critic_first: int = 0
+    initial_action: tuple[float, ...] | None = None
+    initial_spread: tuple[float, ...] | None = None
+    stages: tuple[Stage, ...] = ()
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     checkpoint: CheckpointSettings = field(default_factory=CheckpointSettings)
     torch_threads: int = 1
@@ -131,6 +169,14 @@ class TrainingConfig:
                 f"warm_spread is {self.warm_spread} and warm_start {self.warm_start}: it is the positive standard "
                 "deviation of a warm start's actions"
             )
+        if self.initial_spread is not None and not all(0.0 < one < math.inf for one in self.initial_spread):
+            raise ValueError(f"initial_spread is {list(self.initial_spread)}; standard deviations are above 0")
+        for name in ("initial_action", "initial_spread"):
+            if self.warm_start is not None and getattr(self, name) is not None:
+                raise ValueError(f"{name} is of a new policy, and warm_start names a trained one: leave one out")
+        begins = [stage.begin for stage in self.stages]
+        if begins and (begins[0] != 0 or sorted(set(begins)) != begins):
+            raise ValueError(f"stages begin at {begins}; the first begins at 0, and each later than the one before")
         _refuse_texts_of_numbers(self.hyperparameters, "hyperparameters")
         _refuse_texts_of_numbers(self.environment.kwargs, "environment.kwargs")
 

@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper,
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.training.config import EnvironmentSettings
+from agents.training.config import EnvironmentSettings, Stage
 from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, belief_features, site_actions
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
@@ -108,6 +108,75 @@ class RepeatedAction(VecEnvWrapper):
             self._actions[over] = 0.0
         infos = [ended.get(index, info) for index, info in enumerate(infos)]
         return observation, total.astype(np.float32), over, infos
+
+
+class StagedRewards(VecEnvWrapper):
+    """Environments whose rewards are those of a stage of the curriculum.
+
+    The reward of a failure is multiplied by `stage.failure`, term by term, and each site of the touch map that is felt
+    for the first time in an episode pays `stage.novelty`.
+
+    Attributes:
+        stage: the current one; it may be replaced between steps
+    """
+
+    def __init__(self, envs: VecEnv, stage: Stage) -> None:
+        """Begin with a stage.
+
+        Raises:
+            ValueError: novelty is paid, and the observation has no map of what was felt.
+        """
+        super().__init__(envs)
+        task = envs.get_attr("unwrapped", indices=[0])[0].task
+        self.failure_terms = [f"reward_{one.name}" for one in task.rewards if one.per in ("failure", "step left")]
+        self.found = sum(one.weight for one in task.rewards if one.per == "success")
+        self.visited: slice | None = task.observation_slices.get("visited")
+        self._felt = np.zeros(envs.num_envs)
+        self._stage = self._checked(stage)
+
+    @property
+    def stage(self) -> Stage:
+        """The current stage."""
+        return self._stage
+
+    @stage.setter
+    def stage(self, stage: Stage) -> None:
+        self._stage = self._checked(stage)
+
+    def _checked(self, stage: Stage) -> Stage:
+        if stage.novelty and self.visited is None:
+            raise ValueError(
+                f"the stage that begins at {stage.begin} pays {stage.novelty} for a site felt for the first time, and "
+                "the observation has no touch map: train SurgSim/Palpate-v0 with kwargs {memory: true}, or leave "
+                "novelty out"
+            )
+        return stage
+
+    def reset(self) -> VecEnvObs:
+        """Start an episode everywhere."""
+        observation = self.venv.reset()
+        self._felt = self._count(np.asarray(observation))
+        return observation
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One step of all."""
+        observation, reward, done, infos = self.venv.step_wait()
+        paid = np.array(reward, dtype=np.float32)
+        felt = self._count(np.asarray(observation))
+        # The observation of an environment that is done is the first of its next episode.
+        paid += self._stage.novelty * np.where(done, 0.0, felt - self._felt)
+        self._felt = felt
+        for index in np.flatnonzero(done):
+            cost = sum(float(infos[index][name]) for name in self.failure_terms)
+            # A declaration has an error of at least 0 mm, other ends one of -1 mm.
+            close = not infos[index]["success"] and 0.0 <= infos[index].get("error_mm", -1.0) <= 1e3 * self._stage.near
+            paid[index] += self.found - cost if close else -(1.0 - self._stage.failure) * cost
+        return observation, paid, done, infos
+
+    def _count(self, observation: np.ndarray) -> np.ndarray:
+        if self.visited is None:
+            return np.zeros(self.num_envs)
+        return observation[:, self.visited].sum(axis=1)
 
 
 class Observed(VecEnvWrapper):

@@ -237,6 +237,10 @@ class PalpateSurrogate(VectorEnv):
                 "declared": bool(declared[index]),
                 "hard_limit": bool(hard[index]),
                 "error_mm": float(error[index]) * 1000.0 if declared[index] else -1.0,
+                "reward_wrong": weights["wrong"] * float(declared[index] and not found[index]),
+                "reward_hard_force": weights["hard_force"] * float(hard[index]),
+                "reward_fault": 0.0,
+                "reward_forgone": weights["forgone"] * float(terminated[index] and not found[index]) * int(left[index]),
             }
 
         return rewards, terminated, ~terminated & (left <= 0), ending

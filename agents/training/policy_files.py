@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import safetensors
 import safetensors.torch
+import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -43,6 +44,8 @@ VARIANCE_SLACK = 1e-8
 CUT = 10.0
 # Most control steps of a decision; the longest episode has fewer.
 REPEAT_MOST = 10_000
+# First random number of sampled actions.
+SAMPLING_SEED = 0
 # Of a normalisation.
 LARGEST = 1e30
 # Sizes beyond which a file is not read [bytes].
@@ -57,6 +60,7 @@ class PolicyDescription:
         algorithm: class of stable-baselines3 or sb3-contrib that trained it
         env_id, env_kwargs: environment of the policy
         action_repeat: control steps per decision
+        sampled: actions are drawn from the policy's distribution; otherwise its mean or mode acts
         force_entries: entries of the observation that are set to 0; empty for a policy with force
         observation: declaration of what it reads (`observation_declaration`); None for environments without one
         belief: whether it reads belief maps and its action is a site's number
@@ -70,6 +74,7 @@ class PolicyDescription:
     env_id: str
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     action_repeat: int = 1
+    sampled: bool = False
     force_entries: list[int] = field(default_factory=list)
     observation: dict[str, Any] | None = None
     belief: bool = False
@@ -169,11 +174,14 @@ class TrainedPolicy:
     def reset(self, count: int) -> None:
         """Begin episodes in `count` environments."""
         self._state: Any = None
+        self._random = torch.Generator().manual_seed(SAMPLING_SEED).get_state()
         self._since = np.zeros(count, dtype=np.int64)
         self._actions = np.zeros((count, *self.action_space.shape), dtype=self.action_space.dtype)
 
     def act(self, observations: NDArray[Any], begins: NDArray[np.bool_] | None = None) -> NDArray:
-        """Deterministic actions (n, n_action) for raw observations (n, n_observation).
+        """Actions (n, n_action) for raw observations (n, n_observation).
+
+        They are deterministic, or drawn by random numbers of the policy's own that `reset` begins anew.
 
         An episode begins where `begins` (n,) is true; without it at the first call after `reset` alone.
         """
@@ -183,7 +191,7 @@ class TrainedPolicy:
         self._since += 1
         if deciding.any():
             seen = self.seen(observations)
-            actions, state = self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=True)
+            actions, state = self._predicted(seen, begins)
             if self.description.belief:
                 actions = site_actions(observations, actions)
             self._actions[deciding] = actions[deciding]
@@ -193,6 +201,16 @@ class TrainedPolicy:
                 state = tuple(np.where(deciding[None, :, None], new, old) for old, new in pairs)
             self._state = state
         return self._actions.copy()
+
+    def _predicted(self, seen: NDArray[np.float32], begins: NDArray[np.bool_] | None) -> tuple[NDArray, Any]:
+        if not self.description.sampled:
+            return self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=True)  # type: ignore[return-value]
+        # Torch's random state, which a training run goes on with, is kept.
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._random)
+            made = self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=False)
+            self._random = torch.get_rng_state()
+        return made  # type: ignore[return-value]
 
     def seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
         """Observations as the network reads them: force removed, then belief maps, then normalised."""

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.training.config import TrainingConfig, config_text
-from agents.training.environments import force_entries, make_environments
+from agents.training.environments import StagedRewards, force_entries, make_environments
 from agents.training.networks import POLICIES, algorithm_class, describe_networks, with_classes
 from agents.training.policy_files import PolicyDescription, TrainedPolicy, describe, load_policy, save_policy
 
@@ -59,6 +59,7 @@ class Run:
         saved = whole_folders(folder / "checkpoints")
         self.resumed_from = saved[-1] if saved else None
         self.bare = make_environments(config.environment)
+        self.staged = StagedRewards(self.bare, config.stages[0]) if config.stages else None
         self.blind_entries = force_entries(self.bare) if config.environment.without_force else []
         self.model = self._begin() if self.resumed_from is None else self._resume(self.resumed_from)
         # Refused now, and not when the first policy is written.
@@ -91,6 +92,7 @@ class Run:
             env_id=settings.id,
             env_kwargs=settings.kwargs,
             action_repeat=settings.action_repeat,
+            sampled=self.config.evaluation.sampled,
             force_entries=self.blind_entries,
             belief=settings.belief,
             trained_steps=self.model.num_timesteps,
@@ -104,6 +106,8 @@ class Run:
         A resumed run thus has the same rollouts as an uninterrupted one, and ends with the same number of steps.
         """
         now, every = self.model.num_timesteps, self.config.evaluation.every
+        if self.staged is not None:
+            self.staged.stage = [stage for stage in self.config.stages if stage.begin <= now][-1]
         if every and now - self.evaluated_at >= every:
             self.evaluate()
         if now - self.saved_at >= self.config.checkpoint.every:
@@ -180,7 +184,7 @@ class Run:
         write_file(file, text)
 
     def _begin(self) -> BaseAlgorithm:
-        config, envs = self.config, self.bare
+        config, envs = self.config, self.staged or self.bare
         seen, paid = config.environment.normalize_observation, config.environment.normalize_reward
         if seen or paid:
             gamma = float(config.hyperparameters.get("gamma", 0.99))
@@ -190,6 +194,9 @@ class Run:
         model = algorithm_class(config.algorithm)(policy, envs, **settings)
         if config.warm_start is not None:
             self._warm(model, Path(config.warm_start))
+        for entry in ("initial_action", "initial_spread"):
+            if getattr(config, entry) is not None:
+                set_initial(model, entry, getattr(config, entry))
         envs.seed(training_seed(config.seed, 0))
         return model
 
@@ -225,9 +232,9 @@ class Run:
             statistics.count = WARM_COUNT
 
     def _resume(self, saved: Path) -> BaseAlgorithm:
-        envs: VecEnv = self.bare
+        envs: VecEnv = self.staged or self.bare
         if (saved / "normalization.pkl").exists():
-            envs = VecNormalize.load(str(saved / "normalization.pkl"), self.bare)
+            envs = VecNormalize.load(str(saved / "normalization.pkl"), envs)
         model = algorithm_class(self.config.algorithm).load(saved / "model.zip", env=envs, device="cpu")
         if (saved / "replay_buffer.pkl").exists():
             assert isinstance(model, OffPolicyAlgorithm)
@@ -260,6 +267,29 @@ class BetweenRollouts(BaseCallback):
                 parameter.requires_grad_(learns)
                 if not learns:
                     parameter.grad = None
+
+
+def set_initial(model: BaseAlgorithm, entry: str, values: Sequence[float]) -> None:
+    """Set mean ("initial_action") or standard deviation ("initial_spread") of a new policy's actions, (n_action,).
+
+    Raises:
+        ValueError: actions that are not Gaussian with one standard deviation each, or another number of values.
+    """
+    policy: Any = model.policy
+    spread = getattr(policy, "log_std", None)
+    if spread is None or spread.ndim != 1:
+        raise ValueError(
+            f"{entry}: the actions of {type(model).__name__} are not Gaussian with one standard deviation each; leave "
+            "it out, or train with PPO without use_sde"
+        )
+    if len(values) != len(spread):
+        raise ValueError(f"{entry} has {len(values)} values; an action has {len(spread)} entries")
+    given = torch.tensor(values, dtype=spread.dtype)
+    with torch.no_grad():
+        if entry == "initial_spread":
+            spread.copy_(given.log())
+        else:
+            policy.action_net.bias.copy_(given)
 
 
 def keywords(hyperparameters: dict[str, Any]) -> dict[str, Any]:

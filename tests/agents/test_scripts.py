@@ -28,6 +28,7 @@ ELSEWHERE = {
     "learn_palpate": "test_palpate_agents.py",
     "learn_palpate_recurrent": "test_palpate_agents.py",
     "learn_retract": "test_retract_agents.py",
+    "learning_curves": "test_from_scratch.py",
     "press_library": "test_press_library.py",
     "raster": "test_agents.py",
     "record_demonstrations": "test_demonstrations.py",

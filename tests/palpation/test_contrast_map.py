@@ -208,7 +208,7 @@ def test_readings_along_normals_are_those_of_the_three_axes():
     force, sensor = np.array([0.5, 0.2, 0.9]), ForceSensor(noise=0.01, bias=0.05, range=10.0)
     rng, reading = np.random.default_rng(3), ForceReading(sensor)
     reading.reset(rng)
-    single = [reading.read(one * normal, rng)[0] @ normal for one, normal in zip(force, normals, strict=True)]
+    single = [reading.read(one * normal, rng, 0.0)[0] @ normal for one, normal in zip(force, normals, strict=True)]
     np.testing.assert_allclose(scanned(force, normals, sensor), single, rtol=1e-12)
 
 

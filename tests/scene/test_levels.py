@@ -87,7 +87,7 @@ def test_a_draw_survives_json_to_the_bit_and_differs_from_the_scenes_organ():
 def test_a_level_changes_sensor_and_mass_scaling_alone():
     scene = make_scene("phantom")
     hard = LEVELS["hard"].scene(scene)
-    assert (hard.sensor.noise, hard.sensor.bias) == (4.0 * scene.sensor.noise, 2.0 * scene.sensor.bias)
+    assert (hard.sensor.noise, hard.sensor.bias) == (3.0 * scene.sensor.noise, 2.0 * scene.sensor.bias)
     assert hard.timing.mass_scaling and not scene.timing.mass_scaling
     assert replace(hard, sensor=scene.sensor, timing=scene.timing) == scene
 
@@ -110,10 +110,12 @@ def test_scenes_that_a_level_cannot_draw_from_are_refused(monkeypatch):
     with pytest.raises(ValueError, match=r"scene 'lobe' has no \[lesion\] table"):
         LEVELS["easy"].scene(make_scene("lobe"))
     scene = make_scene("phantom")
-    weak = replace(scene, lesion=replace(scene.lesion, modulus_ratio=(1.5, 12.0)))
-    LEVELS["standard"].scene(weak)
-    with pytest.raises(ValueError, match=r"level 'hard' of scene 'phantom' draws lesion\.modulus_ratio from \[-2, 6"):
-        LEVELS["hard"].scene(weak)
+    wide = replace(scene, lesion=replace(scene.lesion, radius=(0.002, 0.012)))
+    LEVELS["standard"].scene(wide)
+    with pytest.raises(
+        ValueError, match=r"level 'hard' of scene 'phantom' draws lesion\.radius from \[-0\.001, 0\.004"
+    ):
+        LEVELS["hard"].scene(wide)
     monkeypatch.setattr(levels, "TRIES_MOST", 3)
     crowded = load_anatomy(LEVELS["standard"].scene(make_scene("phantom_small")))
     with pytest.raises(ValueError, match=r"9 lesions of level 'standard' found no room beside each other"):

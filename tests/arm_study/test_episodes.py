@@ -115,7 +115,7 @@ def test_which_arms_can_do_the_task():
 def test_arms_that_cannot_do_it_have_stand_ins_and_are_named(monkeypatch, given, ran, sides):
     made = []
 
-    def refuse(env_id, *, scene, instrument):
+    def refuse(env_id, *, scene, instrument, scaled):
         made.append(instrument)
         raise ValueError("the right arm\ndoes not reach")
 

@@ -94,7 +94,7 @@ def test_lesions_that_a_scene_draws_find_room_in_it(phantom):
     [
         ({"rim_distance": 0.029}, "nearer than 29 mm to the border of the palpable face"),
         ({"cover": (0.02, 0.03)}, "another side of the organ"),
-        ({"radius": (0.0095, 0.0105)}, "balls of"),
+        ({"radius": (0.0115, 0.0125)}, "balls of"),
     ],
 )
 def test_why_lesions_do_not_fit(changes, words, phantom):

@@ -24,12 +24,17 @@ def test_nearest_boundary_points_are_those_of_all_triangles(mesh):
     np.testing.assert_allclose(found.weights.sum(axis=1), 1.0)
 
 
-def test_a_point_is_carried_to_a_share_of_its_tet_s_longest_edge():
+def test_a_point_is_carried_to_a_share_of_the_longest_edges_around_it():
+    """Of the mean around each node, interpolated in the nearest triangle."""
     mesh = box_mesh((0.04, 0.04, 0.04), (4, 4, 4))
-    tets = mesh.points[mesh.tets]
-    longest = np.linalg.norm(tets[:, :, None] - tets[:, None], axis=3).max()
+    longest = [max(np.linalg.norm(a - b) for a in corners for b in corners) for corners in mesh.points[mesh.tets]]
     above = np.array([[0.021, 0.017, 0.04]])
-    gaps = REACH * longest * np.array([0.99, 1.01])
+    nearest = find_carriers(above, mesh)
+    around = [
+        np.mean([length for length, tet in zip(longest, mesh.tets, strict=True) if node in tet])
+        for node in mesh.boundary_triangles[nearest.triangle[0]]
+    ]
+    gaps = REACH * float(nearest.weights[0] @ around) * np.array([0.99, 1.01])
     found = find_carriers(above + gaps[:, None] * np.array([0.0, 0.0, 1.0]), mesh)
     np.testing.assert_allclose(found.distance, gaps)
     assert found.beyond.tolist() == [False, True]

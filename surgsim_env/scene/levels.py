@@ -84,7 +84,8 @@ class Level:
             drift=own.drift + self.sensor_drift * own.range,
             hysteresis=own.hysteresis + self.sensor_hysteresis * own.range,
         )
-        return replace(self.healthy(scene), sensor=sensor, timing=replace(scene.timing, mass_scaling=True))
+        healthy = self.healthy(scene)
+        return replace(healthy, sensor=sensor, timing=replace(healthy.timing, mass_scaling=True))
 
     def healthy(self, scene: Scene) -> Scene:
         """A scene with this level's healthy tissue, before an operation."""

@@ -70,6 +70,7 @@ def test_clinical_has_all_that_a_patient_brings():
     law, own = made.material, scene.material
     assert law.stiffening is not None and law.relaxation is not None
     assert (law.youngs_modulus, law.density) == (own.youngs_modulus, own.density)
+    assert made.timing.substep_count == 2 * scene.timing.substep_count
     env = gym.make("SurgSim/Palpate-v0", scene="phantom_small", level="clinical").unwrapped
     assert env.scene.motions and not gym.make("SurgSim/Palpate-v0", scene="phantom_small").unwrapped.scene.motions
     still = gym.make("SurgSim/Palpate-v0", scene="phantom_small", level="clinical", motion="none").unwrapped

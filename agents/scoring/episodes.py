@@ -188,7 +188,7 @@ class AgentActor:
 
         Args:
             make: a `SiteAgent` or an `EpisodeAgent`.
-            facts: what it is told of its environment.
+            facts: gives an agent the constants of its environment, by default `SiteFacts`.
         """
         self.make, self.facts = make, facts
         self.agents: dict[int, Any] = {}

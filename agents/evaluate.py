@@ -409,7 +409,7 @@ def evaluate(player: Player, options: argparse.Namespace) -> Result:
             records = play_tasks(actor, envs, seeds, bar.update)
         succeeded = [bool(record.last["success"]) for record in records]
         scored = {
-            "budget": gym.spec(env_id).max_episode_steps or 0,
+            "budget": first.task.episode_steps or 0,
             "figures": task_figures(records, control_step, soft_force, rng),
         }
     taken = time.perf_counter() - start

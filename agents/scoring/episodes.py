@@ -169,7 +169,7 @@ def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeF
         observation_slices=single.observation_slices,
         action_size=single.action_space.shape[0],
         control_step=single.scene.timing.control_step,
-        step_count=gym.spec(env_id).max_episode_steps or 0,
+        step_count=single.task.episode_steps or 0,
         soft_force=single.scene.limits.soft_force,
         hard_force=single.scene.limits.hard_force,
     )

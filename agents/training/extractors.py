@@ -132,9 +132,13 @@ class PlaceAndForce(_Entries):
         super().__init__(observation_space, place_and_force(WITHOUT_MEMORY))
 
 
+# Sizes of the channels of frame="face" in frame="world".
+WORLD = dict.fromkeys(("tip_place", "tip_depth", "surface_normal", "face_force", "map_cell", "chart_share"), 0)
 # Channels of Palpate-v0's observation without and with memory.
-WITHOUT_MEMORY = PalpateTask.channel_slices(contrast=0, visited=0, face=0, stiffest=0)
-WITH_MEMORY = PalpateTask.channel_slices(contrast=MAP_SIDE**2, visited=MAP_SIDE**2, face=MAP_SIDE**2, stiffest=3)
+WITHOUT_MEMORY = PalpateTask.channel_slices(contrast=0, visited=0, face=0, stiffest=0, **WORLD)
+WITH_MEMORY = PalpateTask.channel_slices(
+    contrast=MAP_SIDE**2, visited=MAP_SIDE**2, face=MAP_SIDE**2, stiffest=3, **WORLD
+)
 # Directions of the map's diagonals.
 DIAGONALS = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 

@@ -65,9 +65,10 @@ def summary_table(id: str) -> str:
     import gymnasium as gym
 
     env: Any = gym.make(id)
-    spec, inner = gym.spec(id), env.unwrapped
+    inner: Any = env.unwrapped
     observed = env.observation_space
-    limit = f"{spec.max_episode_steps} control steps" if spec.max_episode_steps else f"{inner.task.budget} presses"
+    steps = inner.task.episode_steps
+    limit = f"{steps} control steps" if steps else f"{inner.task.budget} presses"
     channels = ", ".join(
         f"`{name}` {part.start}" + (f"\N{NON-BREAKING HYPHEN}{part.stop - 1}" if part.stop > part.start + 1 else "")
         for name, part in inner.observation_slices.items()

@@ -55,8 +55,8 @@ class LaneVectorEnv(SyncVectorEnv):
             raise ValueError(f'render_mode "human" shows one environment, not {num_envs}: use "rgb_array"')
 
         def make() -> gym.Env:
-            env: gym.Env = self.single(render_mode=render_mode, **settings)
-            if max_episode_steps is None or max_episode_steps >= (self.single.task_class.episode_steps or math.inf):
+            env = self.single(render_mode=render_mode, **settings)
+            if max_episode_steps is None or max_episode_steps >= (env.task.episode_steps or math.inf):
                 return env
             return gym.wrappers.TimeLimit(env, max_episode_steps)
 

@@ -90,7 +90,7 @@ class View:
         moved = np.array(action, dtype=np.float64)
         for name in {"velocity", "right"} & set(self.task.action_slices):
             part = self.task.action_slices[name]
-            moved[part] = np.clip(moved[part] + velocity / self.task.speed_limit, -1.0, 1.0)
+            moved[part] = np.clip(moved[part] + self.task.action(**{name: velocity})[part], -1.0, 1.0)
         return moved
 
     def from_surface(self, shift: FloatArray, contact_shift: FloatArray) -> "View":

@@ -1,7 +1,10 @@
 """Palpation: find one hidden lesion by touch and declare it while pressing on it."""
 
 import json
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,11 +14,13 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, charted_face
+from surgsim_env.palpation.face_frame import FaceFrame
 from surgsim_env.palpation.touches import Indenter, TouchMemory
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import DrawnOrgan
-from surgsim_env.scene.load import fill_json
+from surgsim_env.scene.load import fill_json, nearest
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.palpate_sites import CELL_BOUND, WIDE
 from surgsim_env.tasks.task import (
     CONTACT_FORCE,
     SPEED_FULL_SCALE,
@@ -25,10 +30,18 @@ from surgsim_env.tasks.task import (
     InfoValue,
     Task,
     check_count,
+    force_scale,
     soft_force_share,
 )
 
-EPISODE_STEPS = 600
+# Control steps of an episode; EPISODE_STEPS_WIDE where the chart's longer side exceeds WIDE tip radii.
+EPISODE_STEPS, EPISODE_STEPS_WIDE = 600, 1200
+# Axes of commands, and what they are relative to.
+FRAMES = ("world", "face")
+# Bound of the depth and of the place of the tip over its radius, beyond any workspace.
+PLACE_BOUND = 1000.0
+# Largest force of a sensor over its range on each axis, on turned axes, with room for rounding.
+FORCE_SLACK = math.sqrt(3.0) * (1.0 + 1e-6)
 DECLARE_VALUE = 0.8
 DECLARE_STEPS = 3
 
@@ -44,6 +57,7 @@ def touch_memory(anatomy: Anatomy) -> TouchMemory:
         Indenter(scene.instrument.tip_radius, scene.material),
         press_depth=scene.palpation.press_depth,
         force_range=scene.sensor.range,
+        force_noise=scene.sensor.noise,
     )
 
 
@@ -54,6 +68,15 @@ def _site_count(task: "PalpateTask") -> int:
 def _stiffest_bound(task: "PalpateTask", instrument: Instrument) -> FloatArray:
     assert task.memory is not None
     return np.array([1.0, 1.0, task.memory.bound])
+
+
+def _in_frame(size: int, *, memory: bool = False) -> Callable[["PalpateTask"], int]:
+    """Size of a channel that there is with frame="face", and where it says so only with memory=True."""
+    return lambda task: size if task.frame is not None and (task.memory is not None or not memory) else 0
+
+
+def _tip_radius(task: "PalpateTask", instrument: Instrument | None) -> float:
+    return task.anatomy.scene.instrument.tip_radius
 
 
 class PalpateTask(Task):
@@ -73,6 +96,10 @@ class PalpateTask(Task):
     palpable face (`surgsim_env.palpation.chart`), row by row, the same size for every organ; farther apart where 16 tip
     radii do not span the face. `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
+    With `frame="face"` ten numbers more, with `memory=True` 13: where the tip is on the organ's registered surface at
+    rest, in tip radii and on the axes of its face (`surgsim_env.palpation.face_frame`), which commands are along too.
+    A policy that reads these and the maps alone can play organs of any size and pose.
+
     ## Rewards
     `info["reward_<term>"]` shows what each term paid. A failure (a wrong declaration, the hard limit, a fault) also
     costs as much as the most expensive control step for each control step left, so that continuing the search never
@@ -88,7 +115,8 @@ class PalpateTask(Task):
     Terminated: the lesion was declared (success within the radius of the smallest lesion that the scene hides, measured
     along the surface from the point nearest to its centre: 6 mm on `phantom`, 18 mm on `liver`); the contact
     force exceeded the hard limit in a haptic step; the simulation faulted (`info["sim_fault"]` says how, the
-    observation is the last finite one). Truncated: 600 control steps (30 s).
+    observation is the last finite one). Truncated: 600 control steps (30 s), or 1200 (60 s) where the chart of the face
+    is longer than ten tip radii, as on `liver`.
 
     ## Info
     Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited` (by the box, or by an
@@ -109,6 +137,9 @@ class PalpateTask(Task):
     * `level`: "easy", "standard", "hard" or "clinical" (`surgsim_env.scene.levels`); None, the default: the scene's own
       ranges.
     * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
+    * `frame`: "world" (default), or "face": the velocity command is along the axes of the palpable face, across, along
+      and outward, and the observation has the channels of that frame.
+    * `episode_steps`: control steps until truncation; by default 600 or 1200, as above.
     * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family",
       of which each episode draws one; `info["member"]` names it.
 
@@ -117,7 +148,7 @@ class PalpateTask(Task):
     """
 
     commands = (
-        Command("velocity", 3, SPEED_FULL_SCALE, "m/s", "tip velocity along x, y, z"),
+        Command("velocity", 3, SPEED_FULL_SCALE, "m/s", "tip velocity along x, y, z, or along the axes of `frame`"),
         Command("declare", 1, meaning='above 0.8 for 3 successive control steps, in contact: "the lesion is here"'),
     )
     channels = (
@@ -147,8 +178,50 @@ class PalpateTask(Task):
             "stiffest", lambda task: 0 if task.memory is None else 3,
             low=lambda task, instrument: -_stiffest_bound(task, instrument), high=_stiffest_bound,
             read=lambda task, simulation: task.memory.stiffest(),
-            meaning="with `memory`: the place on the face's chart where it was stiffest, and the contrast there",
+            meaning="with `memory`: where on the face's chart it is stiffest, by a fit, and the contrast there",
             felt=True, size_text="3 or 0", bounds_text="+-1, +-bound",
+        ),
+        Channel(
+            "tip_place", _in_frame(3), "m",
+            low=lambda task, instrument: -PLACE_BOUND * _tip_radius(task, instrument),
+            high=lambda task, instrument: PLACE_BOUND * _tip_radius(task, instrument),
+            read=lambda task, simulation: task.frame.point(task.resting_place(simulation)),
+            meaning='with `frame="face"`: tip position from the middle of the chart, on the axes of the face',
+            size_text="3 or 0", bounds_text="+-1000 tip radii", scale=_tip_radius, scale_text="tip radius",
+        ),
+        Channel(
+            "tip_depth", _in_frame(1), "m",
+            low=lambda task, instrument: -PLACE_BOUND * _tip_radius(task, instrument),
+            high=lambda task, instrument: PLACE_BOUND * _tip_radius(task, instrument),
+            read=lambda task, simulation: task.tip_depth,
+            meaning='with `frame="face"`: depth of the ball below the surface at rest',
+            size_text="1 or 0", bounds_text="+-1000 tip radii", scale=_tip_radius, scale_text="tip radius",
+        ),
+        Channel(
+            "surface_normal", _in_frame(3), "", -1.0, 1.0,
+            read=lambda task, simulation: task.frame.vector(task.surface_normal),
+            meaning='with `frame="face"`: outward normal of the surface at rest where it is nearest to the tip',
+            size_text="3 or 0",
+        ),
+        Channel(
+            "face_force", _in_frame(3), "N",
+            low=lambda task, instrument: -FORCE_SLACK * task.anatomy.scene.sensor.range,
+            high=lambda task, instrument: FORCE_SLACK * task.anatomy.scene.sensor.range,
+            read=lambda task, simulation: task.frame.vector(task.sensed["contact_force"]),
+            meaning='with `frame="face"`: `contact_force` on the axes of the face', felt=True,
+            size_text="3 or 0", bounds_text="+-sqrt(3) range", scale=force_scale, scale_text="soft limit",
+        ),
+        Channel(
+            "map_cell", _in_frame(1, memory=True), "", 0.0, CELL_BOUND,
+            read=lambda task, simulation: task.charted.cell / task.charted.tip_radius,
+            meaning='with `frame="face"` and `memory`: distance between neighbouring sites over the tip\'s radius',
+            size_text="1 or 0",
+        ),
+        Channel(
+            "chart_share", _in_frame(2, memory=True), "", 0.0, 1.0,
+            read=lambda task, simulation: task.charted.chart.extent / (task.charted.cell * (MAP_SIDE - 1)),
+            meaning='with `frame="face"` and `memory`: lengths of the chart\'s sides over the map\'s',
+            size_text="2 or 0",
         ),
     )  # fmt: skip
     rewards = (
@@ -163,31 +236,64 @@ class PalpateTask(Task):
         Reward("fault", -5.0, "failure", "the simulation could not go on"),
         Reward("forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less"),
     )  # fmt: skip
-    episode_steps = EPISODE_STEPS
+    # Of each environment, by the size of its face.
+    episode_steps = None
     drawn: DrawnOrgan | None
 
-    def __init__(self, anatomy: Anatomy, instrument: Instrument | None = None, *, memory: bool = False) -> None:
-        """Palpate an anatomy; with `memory` the observation holds what was felt so far.
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        instrument: Instrument | None = None,
+        *,
+        memory: bool = False,
+        frame: str = "world",
+        episode_steps: int | None = None,
+    ) -> None:
+        """Palpate an anatomy.
+
+        Args:
+            anatomy: of a scene that says how a lesion is drawn.
+            instrument: that acts on it.
+            memory: the observation holds what was felt so far.
+            frame: "world", or "face": commands are along the axes of the face, in which the tip is observed too.
+            episode_steps: control steps of an episode; by default 600, or 1200 on a face longer than ten tip radii.
 
         Raises:
-            ValueError: the scene does not say how a lesion is drawn.
+            ValueError: the scene does not say how a lesion is drawn, an unknown frame (names the known), or
+                `episode_steps` that is no whole number above 0.
         """
         if anatomy.scene.lesion is None:
             raise ValueError(
                 f"scene {anatomy.scene.name!r} has no [lesion] table, so that there is nothing to find in it: "
                 "add one, or take a scene that has it, such as 'phantom'"
             )
+        if frame not in FRAMES:
+            raise ValueError(f"frame {frame!r} is unknown{nearest(frame, list(FRAMES))}; the frames are {', '.join(FRAMES)}")
+        if episode_steps is not None and (
+            isinstance(episode_steps, bool) or not isinstance(episode_steps, int) or episode_steps < 1
+        ):
+            raise ValueError(f"episode_steps is {episode_steps!r}; it must be a whole number of steps, at least 1")
         super().__init__(anatomy, instrument)
+        self.charted = charted_face(anatomy)
+        wide = self.charted.chart.extent.max() > WIDE * self.charted.tip_radius
+        # The members of a family have the number of their template.
+        self.episode_steps = episode_steps or (EPISODE_STEPS_WIDE if wide else EPISODE_STEPS)  # type: ignore[misc]
         self.memory = touch_memory(anatomy) if memory else None
+        self.frame = FaceFrame.of(self.charted) if frame == "face" else None
+        # Depth of the ball below the surface at rest [m], and the outward normal there.
+        self.tip_depth, self.surface_normal = 0.0, np.zeros(3)
         self.declare_count = 0
         self._declare_value = 0.0
         self._error: float | None = None
 
     def take_anatomy(self, anatomy: Anatomy) -> None:
-        """As `Task.take_anatomy`, with an empty memory on the chart of its face."""
+        """As `Task.take_anatomy`, with an empty memory on the chart of its face, and its frame."""
         super().take_anatomy(anatomy)
+        self.charted = charted_face(anatomy)
         if self.memory is not None:
             self.memory = touch_memory(anatomy)
+        if self.frame is not None:
+            self.frame = FaceFrame.of(self.charted)
 
     @property
     def success_distance(self) -> float:
@@ -216,21 +322,38 @@ class PalpateTask(Task):
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
         return above + outward * gap
 
+    def action(self, velocity: FloatArray | None = None, **commands: Any) -> FloatArray:
+        """As `Task.action`, for a velocity of the world [m/s] in any frame."""
+        if velocity is not None and self.frame is not None:
+            velocity = self.frame.vector(velocity)
+        return super().action(velocity, **commands)
+
+    def command(self, action: FloatArray, instrument: Instrument) -> None:
+        """Give the instrument the velocity of an action (action_size,), which is along the axes of the frame."""
+        velocity = self.commanded(action, "velocity")
+        instrument.command_velocity(velocity if self.frame is None else self.frame.in_world(velocity))
+
     def begin(self, action: FloatArray) -> None:
         """Begin a control step: count it and keep what the action declares."""
         super().begin(action)
         self._declare_value = float(self.commanded(action, "declare")[0])
 
-    def look(self, simulation: Simulation) -> None:
-        """Add the force reading to the memory, at the depth of the ball below the surface at rest on its ground."""
-        memory = self.memory
-        if memory is None:
-            return
+    def resting_place(self, simulation: Simulation) -> FloatArray:
+        """The tip's position [m] (3,) beside the organ at rest: less the way that its ground has moved there."""
         tip = simulation.instrument.tip_position
-        tip = tip - simulation.ground_shift(tip)
+        return tip - simulation.ground_shift(tip)
+
+    def look(self, simulation: Simulation) -> None:
+        """Find the ball's depth below the surface at rest on its ground, and add the force reading to the memory."""
+        memory, frame = self.memory, self.frame
+        if memory is None and frame is None:
+            return
+        tip = self.resting_place(simulation)
         surface, normal = self.anatomy.face.project(tip)
-        depth = memory.indenter.radius - float((tip - surface) @ normal)
-        memory.feel(memory.chart.place(surface), depth, float(self.sensed["contact_force"] @ normal))
+        depth = self.charted.tip_radius - float((tip - surface) @ normal)
+        self.tip_depth, self.surface_normal = depth, normal
+        if memory is not None:
+            memory.feel(memory.chart.place(surface), depth, float(self.sensed["contact_force"] @ normal))
 
     def end(self, step: ControlStep) -> str:
         """A fault, the hard limit, or a declaration: "found" or "wrong"."""

@@ -18,6 +18,7 @@ from agents.scoring.episodes import (
 )
 from agents.site_search import Middle, OracleSites, RandomSites, TruthAgent
 from surgsim_env.palpation.scores import MapScore, press_errors
+from surgsim_env.tasks.palpate import EPISODE_STEPS
 
 pytestmark = pytest.mark.agents
 SITES = "SurgSim/PalpateSites-v0"
@@ -165,7 +166,7 @@ def test_an_agent_plays_an_environment_of_control_steps():
     records = play_tasks(AgentActor(Still, lambda env: episode_facts(env, env_id, kwargs)), envs, [8, 9])
     assert [record.steps for record in records] == [3, 3]
     (first, facts), (second, _) = Still.told
-    assert facts.env_kwargs == kwargs and facts.step_count == gym.spec(env_id).max_episode_steps
+    assert facts.env_kwargs == kwargs and facts.step_count == EPISODE_STEPS
     assert facts.observation_slices["contact_force"].stop <= envs.single_observation_space.shape[0]  # type: ignore[index]
     assert 0.0 < facts.soft_force < facts.hard_force and facts.control_step == 0.05
     assert first.random() == agent_generator(8).random() and second.random() == agent_generator(9).random()

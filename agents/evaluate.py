@@ -67,6 +67,8 @@ BOOTSTRAP_SEED, PROGRESS_EVERY = 0, 60.0
 POLICIES = Path(__file__).resolve().parent / "policies"
 # Where a method plays unless options say otherwise.
 PLACES = {"scene": "phantom", "level": "standard"}
+# Arguments of SurgSim/Palpate-v0 with which organs of any size and pose are alike.
+IN_FACE = {"memory": True, "frame": "face"}
 # The members of a family that scores are of.
 SCORED_SPLIT = "test"
 
@@ -118,6 +120,17 @@ class TaskAgent:
     has_places: bool = False
 
 
+def _organ_expert(*, blind: bool) -> Callable[[dict[str, Any]], Actor]:
+    """Makes the expert for any organ, which needs torch."""
+
+    def make(kwargs: dict[str, Any]) -> Actor:
+        from agents.expert_organs import OrganExpert
+
+        return OrganExpert(blind=blind).act
+
+    return make
+
+
 TASK_AGENTS = {
     "expert_retract": TaskAgent(
         "SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all, "expert_retract.py", {"scaled": False}
@@ -128,6 +141,12 @@ TASK_AGENTS = {
         "expert_palpate.py",
         {"memory": True},
         has_places=True,
+    ),
+    "expert_organs": TaskAgent(
+        "SurgSim/Palpate-v0", _organ_expert(blind=False), "expert_organs.py", IN_FACE, has_places=True
+    ),
+    "blind_middle": TaskAgent(
+        "SurgSim/Palpate-v0", _organ_expert(blind=True), "expert_organs.py", IN_FACE, has_places=True
     ),
 }
 

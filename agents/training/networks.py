@@ -18,11 +18,17 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from agents.training.extractors import MemorySummary, PlaceAndForce, TouchSummary
+from agents.training.face_features import FaceSummary
 from agents.training.site_policy import SitePolicy
 from surgsim_env.scene.load import nearest
 
 # Classes that a configuration and a policy's file name, beside the policies of stable-baselines3's algorithms.
-EXTRACTORS = {"MemorySummary": MemorySummary, "PlaceAndForce": PlaceAndForce, "TouchSummary": TouchSummary}
+EXTRACTORS = {
+    "FaceSummary": FaceSummary,
+    "MemorySummary": MemorySummary,
+    "PlaceAndForce": PlaceAndForce,
+    "TouchSummary": TouchSummary,
+}
 ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU}
 POLICIES = {"SitePolicy": SitePolicy}
 # Arguments whose values are classes, and those that acting does not need.

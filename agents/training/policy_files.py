@@ -142,7 +142,8 @@ class TrainedPolicy:
 
         Raises:
             ValueError: it observes other channels, or in other scales, has actions of another shape, or is another
-                scene than that of its training, which a policy on belief maps alone can play.
+                scene than that of its training, which only a policy on belief maps or in the frame of the face can
+                play.
         """
         reads, given = self.description.observation, observation_declaration(env)
         if given is not None and reads != given:
@@ -161,8 +162,10 @@ class TrainedPolicy:
                     f"{name} has {what} of shape {shape}, {self.description.env_id} with "
                     f"{shortened(self.description.env_kwargs)} those of {space.shape}: env_id or env_kwargs are wrong"
                 )
-        if self.description.belief or given is None:
-            # Belief maps are relative to the tip and the face; of an environment that is not ours nothing is known.
+        in_face = self.description.env_kwargs.get("frame") == "face"
+        if self.description.belief or in_face or given is None:
+            # Belief maps and the frame of the face are relative to the tip and the face; of an environment that is not
+            # ours nothing is known.
             return
         home, scene = home_scene(self.description.env_id, self.description.env_kwargs), env.unwrapped.scene.name  # type: ignore[attr-defined]
         if scene != home:

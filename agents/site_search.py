@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from agents.scoring.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
-from surgsim_env.palpation.lesion_estimator import EXCESS_LEAST, EXCESS_LEAST_NOISE
 from surgsim_env.palpation.scores import MapScore
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
@@ -131,8 +130,7 @@ class GpLevelSet(GpVariance):
     def worth(self, belief: Belief) -> NDArray[np.float64]:
         """The ambiguity; the level is at least the least excess that the estimator reports as a lesion."""
         excess, margin = belief.excess, LEVEL_BETA * belief.spread
-        least = EXCESS_LEAST + EXCESS_LEAST_NOISE * self.process.facts.noise
-        level = max(least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
+        level = max(self.process.facts.excess_least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
         return np.minimum(excess + margin - level, level - excess + margin)
 
 

@@ -29,8 +29,10 @@ SLICES = PalpateSitesTask.channel_slices(
     map_cell=1,
     chart_share=2,
     contrast_noise=1,
+    excess_least=1,
+    lesion_radius=1,
 )
-FACTS = ("map_cell", "chart_share", "contrast_noise")
+FACTS = ("map_cell", "chart_share", "contrast_noise", "excess_least", "lesion_radius")
 OBSERVATION_SIZE = max(part.stop for part in SLICES.values())
 
 
@@ -41,13 +43,17 @@ class SiteFacts:
     Fields:
         map: the sites of the touch map; lengths in metres, or in tip radii with a tip_radius of 1
         tip_radius: of the ball that presses [m]
+        lesion_radius: mean radius of the lesions that are looked for [m]
         noise: standard deviation of one log contrast by the force sensor
+        excess_least: least excess of the log contrast that the estimator takes for a lesion
         budget: presses of an episode
     """
 
     map: TouchMap
     tip_radius: float
+    lesion_radius: float
     noise: float
+    excess_least: float
     budget: int = 25
 
     @property
@@ -73,9 +79,10 @@ def remembered(observation: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDA
 
 def observed_facts(observation: NDArray[np.floating]) -> SiteFacts:
     """The facts that an observation with memory holds, lengths in tip radii."""
-    cell, share, noise = (np.asarray(observation[SLICES[name]], dtype=np.float64) for name in FACTS)
+    cell, share, noise, least, radius = (np.asarray(observation[SLICES[name]], dtype=np.float64) for name in FACTS)
     face = np.asarray(observation[SLICES["face_map"]]) > 0.5
-    return SiteFacts(TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face), 1.0, float(noise[0]))
+    observed_map = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face)
+    return SiteFacts(observed_map, 1.0, float(radius[0]), float(noise[0]), float(least[0]))
 
 
 class SiteAgent(Protocol):
@@ -93,7 +100,15 @@ class SiteAgent(Protocol):
 def site_facts(env: Any) -> SiteFacts:
     """The facts of an environment (its wrappers do not matter)."""
     task = env.unwrapped.task
-    return SiteFacts(task.charted.touch_map, task.estimator.tip_radius, task.estimator.noise, task.budget)
+    charted, estimator = task.charted, task.estimator
+    return SiteFacts(
+        charted.touch_map,
+        charted.tip_radius,
+        estimator.lesion_radius,
+        estimator.noise,
+        estimator.excess_least,
+        task.budget,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +128,7 @@ class SiteProcess:
     def __init__(self, facts: SiteFacts) -> None:
         self.facts = facts
         self.process = contrast_process(
-            facts.map.axes, tip_radius=facts.tip_radius, noise=facts.noise, length_share=LENGTH_SHARE
+            facts.map.axes, lesion_radius=facts.lesion_radius, noise=facts.noise, length_share=LENGTH_SHARE
         )
         from_border = np.minimum(facts.sites, facts.extent - facts.sites) / facts.extent
         self.candidates = facts.map.pressable & (from_border.min(axis=1) >= BORDER)

@@ -14,7 +14,7 @@ from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, HealthyMap, Site, charted_face, healthy_map_of
-from surgsim_env.palpation.lesion_estimator import LesionEstimate, LesionEstimator
+from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimate, LesionEstimator
 from surgsim_env.palpation.member_map import member_map, still_template
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
@@ -37,8 +37,8 @@ SUCCESS_ERROR = 0.005
 DEPTH_BOUND = 2.0
 
 
-# Bounds of a map's cell over the tip's radius, and of the deviation of a log contrast.
-CELL_BOUND, NOISE_BOUND = 100.0, 100.0
+# Bounds of a map's cell and a lesion's radius over the tip's radius, and of numbers of log contrast.
+CELL_BOUND, LESION_BOUND, NOISE_BOUND = 100.0, 100.0, 100.0
 
 
 def _map_size(task: "PalpateSitesTask") -> int:
@@ -72,7 +72,7 @@ class PalpateSitesTask(Task):
     the chart's grid that may.
 
     ## Observation Space
-    With `memory=True` `Box((5053,), float32)`: maps of n x n sites, n = 41, 0.4 tip radii apart, over the middle
+    With `memory=True` `Box((5055,), float32)`: maps of n x n sites, n = 41, 0.4 tip radii apart, over the middle
     of the chart, row by row along its second axis, the same size for every organ; sites are farther apart where 16 tip
     radii do not span the chart, as `map_cell` shows. With `memory=False` the last six numbers alone: a true POMDP, for
     agents with a memory of their own. All bounds finite.
@@ -151,6 +151,16 @@ class PalpateSitesTask(Task):
             "contrast_noise", _with_memory(1), "", 0.0, NOISE_BOUND,
             read=lambda task, simulation: task.estimator.noise,
             meaning="standard deviation of one log contrast by the force sensor", size_text="1 or 0",
+        ),
+        Channel(
+            "excess_least", _with_memory(1), "", 0.0, NOISE_BOUND,
+            read=lambda task, simulation: task.estimator.excess_least,
+            meaning="least excess of the log contrast that the estimator takes for a lesion", size_text="1 or 0",
+        ),
+        Channel(
+            "lesion_radius", _with_memory(1), "", 0.0, LESION_BOUND,
+            read=lambda task, simulation: task.estimator.lesion_radius / task.charted.tip_radius,
+            meaning="mean radius of the lesions that the scene hides over the tip's", size_text="1 or 0",
         ),
         Channel(
             "last_place", 2, "", -1.0, 1.0, read=lambda task, simulation: task.felt.last.place,
@@ -268,7 +278,13 @@ class PalpateSitesTask(Task):
         self.budget = self._budget if self._budget is not None else (BUDGET_WIDE if wide else BUDGET)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
         healthy_force = float(healthy.grid.mean()) * scene.palpation.press_depth
-        self.estimator = LesionEstimator(chart.extent, tip_radius=tip, noise=scene.sensor.noise / healthy_force)
+        assert scene.lesion is not None
+        self.estimator = LesionEstimator(
+            chart.extent,
+            lesion_radius=0.5 * sum(scene.lesion.radius),
+            noise=scene.sensor.noise / healthy_force,
+            map_spread=0.0 if scene.mesh.block is not None else ORGAN_MAP_SPREAD,
+        )
         self.truth = np.zeros((0, 3))
         self._clear()
 

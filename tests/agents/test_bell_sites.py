@@ -11,7 +11,7 @@ from agents.training.bell_sites import TIP, BellDraws, BellSites
 from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, PalpateSitesTask
 
 pytestmark = pytest.mark.agents
-QUIET = BellDraws(background=0.0, model=0.0, noise=(1e-6, 1.0001e-6), count_weights=(0.0, 1.0))
+QUIET = BellDraws(background=0.0, model=(0.0, 0.0), offset=0.0, noise=(1e-6, 1.0001e-6), count_weights=(0.0, 1.0))
 
 
 def test_it_observes_what_the_environment_does():

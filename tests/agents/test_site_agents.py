@@ -15,7 +15,13 @@ from surgsim_env.palpation.lesion_estimator import LesionEstimator
 pytestmark = pytest.mark.agents
 # Under a tip of 8 mm: 11 x 11 sites of the map, 4 mm apart.
 FACE = np.pad(np.ones((11, 11), dtype=bool), (MAP_SIDE - 11) // 2)
-FACTS = SiteFacts(TouchMap(np.array([0.04, 0.04]), 0.004, FACE.ravel()), tip_radius=0.008, noise=0.05, budget=25)
+FACTS = SiteFacts(
+    TouchMap(np.array([0.04, 0.04]), 0.004, FACE.ravel()),
+    tip_radius=0.008,
+    lesion_radius=0.0075,
+    noise=0.05,
+    excess_least=0.1,
+)
 NAMES = [name for name in AGENTS if name not in BOUNDS]
 
 
@@ -65,7 +71,7 @@ def test_every_agent_finds_one_lesion(name: str) -> None:
     chart = Chart([(0.0125, 0.0285)])
     # A raster that is not done has left out a part of the chart.
     played(name, chart, presses=max(25, int(name[-1]) ** 2 if name.startswith("raster") else 0))
-    estimator = LesionEstimator(FACTS.extent, tip_radius=FACTS.tip_radius, noise=FACTS.noise)
+    estimator = LesionEstimator(FACTS.extent, lesion_radius=FACTS.lesion_radius, noise=FACTS.noise)
     said = estimator.estimate(np.array(chart.places), np.array(chart.values)).points
     assert said.shape == (1, 2)
     assert np.linalg.norm(said[0] - chart.centres[0]) < 0.003

@@ -40,10 +40,11 @@ from surgsim_env.palpation.lesion_estimator import (
 pytestmark = pytest.mark.agents
 # A chart of 40 x 32 mm under a tip of 8 mm: 11 x 9 sites of the map, 4 mm apart, around its middle.
 EXTENT, TIP, CELL, NOISE = np.array([0.04, 0.032]), 0.008, 0.004, 0.04
+LESION_RADIUS, EXCESS_LEAST = 0.0075, 0.1
 MIDDLE = MAP_SIDE // 2
 FACE = np.zeros((MAP_SIDE, MAP_SIDE), dtype=bool)
 FACE[MIDDLE - 4 : MIDDLE + 5, MIDDLE - 5 : MIDDLE + 6] = True
-SETTINGS = SiteFacts(TouchMap(EXTENT, CELL, FACE.ravel()), TIP, NOISE)
+SETTINGS = SiteFacts(TouchMap(EXTENT, CELL, FACE.ravel()), TIP, LESION_RADIUS, NOISE, EXCESS_LEAST)
 # Those off the chart's border, and not in a corner that was cut off.
 INSIDE = np.zeros((MAP_SIDE, MAP_SIDE), dtype=bool)
 INSIDE[MIDDLE - 3 : MIDDLE + 4, MIDDLE - 4 : MIDDLE + 5] = True
@@ -63,6 +64,8 @@ def observed(contrast: dict[int, float], left: float = 0.6) -> np.ndarray:
     values[SLICES["map_cell"]] = CELL / TIP
     values[SLICES["chart_share"]] = EXTENT / (CELL * (MAP_SIDE - 1))
     values[SLICES["contrast_noise"]] = NOISE
+    values[SLICES["excess_least"]] = EXCESS_LEAST
+    values[SLICES["lesion_radius"]] = LESION_RADIUS / TIP
     values[SLICES["presses_left"]] = left
     return values
 
@@ -104,7 +107,7 @@ def test_belief_is_that_of_scikit_learn(pressed):
     np.testing.assert_allclose(spread_read * EXCESS_SPREAD, belief.spread, atol=1e-6)
     assert np.flatnonzero(touched).tolist() == sorted(pressed) and (face > 0.5).tolist() == INSIDE.ravel().tolist()
     # A belief of the estimator's own length is another one.
-    longer = contrast_process(SETTINGS.map.axes, tip_radius=SETTINGS.tip_radius, noise=SETTINGS.noise)
+    longer = contrast_process(SETTINGS.map.axes, lesion_radius=SETTINGS.lesion_radius, noise=SETTINGS.noise)
     _, other = longer.mean(sites[list(pressed)], observation[list(pressed)])
     assert np.abs(belief.excess - other.ravel()).max() > 0.01
 

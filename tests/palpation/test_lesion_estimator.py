@@ -7,12 +7,12 @@ from surgsim_env.palpation import lesion_estimator as module
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
 EXTENT = (0.040, 0.044)
-TIP_RADIUS = 0.008
+LESION_RADIUS = 0.0075
 NOISE = 0.03
 
 
 def estimator() -> LesionEstimator:
-    return LesionEstimator(EXTENT, tip_radius=TIP_RADIUS, noise=NOISE)
+    return LesionEstimator(EXTENT, lesion_radius=LESION_RADIUS, noise=NOISE)
 
 
 def scattered(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -117,13 +117,25 @@ def test_outline_is_a_disc_around_the_lesion() -> None:
     assert radius == pytest.approx(0.006 * np.sqrt(-2.0 * np.log(module.OUTLINE_SHARE)), rel=0.15)
 
 
-def test_lengths_go_with_the_tip() -> None:
+def test_lengths_scale_with_the_lesions() -> None:
     """Everything twice as large gives the same estimate, twice as large."""
     places = raster()
     values = bumps(places, [(0.012, 0.030), (0.030, 0.012)])
     small = estimator().estimate(places, values)
-    large = LesionEstimator(2.0 * np.array(EXTENT), tip_radius=2.0 * TIP_RADIUS, noise=NOISE)
+    large = LesionEstimator(2.0 * np.array(EXTENT), lesion_radius=2.0 * LESION_RADIUS, noise=NOISE)
     np.testing.assert_allclose(large.estimate(2.0 * places, values).points, 2.0 * small.points, atol=1e-12)
+
+
+def test_a_map_that_deviates_asks_for_more_excess() -> None:
+    """A maximum of 0.12 is a lesion beside a map of a block, and none beside one that deviates by 0.05."""
+    places = raster()
+    values = bumps(places, [(0.020, 0.022)], height=0.15)
+    plain = estimator().estimate(places, values)
+    assert len(plain.points) == 1
+    doubtful = LesionEstimator(EXTENT, lesion_radius=LESION_RADIUS, noise=NOISE, map_spread=0.05)
+    assert doubtful.excess_least == pytest.approx(estimator().excess_least + module.EXCESS_LEAST_MAP * 0.05)
+    assert estimator().excess_least < plain.strength[0] < doubtful.excess_least
+    assert len(doubtful.estimate(places, values).points) == 0
 
 
 @pytest.mark.parametrize(
@@ -131,13 +143,14 @@ def test_lengths_go_with_the_tip() -> None:
     [
         ({"extent": (0.04, 0.0)}, "extent is"),
         ({"extent": (0.04,)}, "extent is"),
-        ({"tip_radius": 0.0}, "tip_radius is 0 m"),
+        ({"lesion_radius": 0.0}, "lesion_radius is 0 m"),
         ({"noise": -0.1}, "noise is -0.1"),
+        ({"map_spread": -0.1}, "map_spread is -0.1"),
     ],
 )
 def test_refusals_at_construction(arguments: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        LesionEstimator(**({"extent": EXTENT, "tip_radius": TIP_RADIUS, "noise": NOISE} | arguments))
+        LesionEstimator(**({"extent": EXTENT, "lesion_radius": LESION_RADIUS, "noise": NOISE} | arguments))
 
 
 def test_refusals_of_presses() -> None:

@@ -63,8 +63,8 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
     if settings.kind == "surrogate":
         from agents.training.palpate_surrogate import PalpateSurrogate
 
-        chosen = {name: value for name, value in settings.kwargs.items() if name != "level"}
-        return VectorEnvForStableBaselines(PalpateSurrogate(count, **chosen))
+        # As gym.make: no level unless one is given.
+        return VectorEnvForStableBaselines(PalpateSurrogate(count, **{"level": None, **settings.kwargs}))
     return DummyVecEnv([lambda: gym.make(settings.id, **settings.kwargs)] * count)
 
 

@@ -58,16 +58,15 @@ class MemorySummary(_Entries):
 
 
 class TouchSummary(_Entries):
-    """Of Palpate-v0 with memory, for learning from scratch: 18 numbers of order 1.
+    """Of Palpate-v0 with memory, for learning from scratch: 16 numbers of order 1.
 
     Tip position (3), force along z (1, times 4), time left (1), stiffest place and contrast (3), share of the face that
     was felt (1), whether anything was (1), mean contrast c of the sites felt (1), the excess of the stiffest over it,
-    4 (c_max / c - 1) (1); the way from the tip to the stiffest place (2), to the centroid of the sites weighted by
-    max(c_i - c, 0)^2, which is finer than the map (2), and to that of the sites not felt weighted by
-    exp(-(d / 8 mm)^2 / 2) of their distance d, the direction of a search (2). Ways are about right on a block whose
-    middle is that of the workspace, under a tip of 8 mm radius. Force and excess are multiplied because a press is
-    about a quarter of the soft limit, and a lesion about a quarter stiffer than what surrounds it. The observation is
-    that of the environment, not normalised.
+    4 (c_max / c - 1) (1); the way from the tip to the stiffest place (2), and to the centroid of the sites not felt
+    weighted by exp(-(d / 8 mm)^2 / 2) of their distance d, the direction of a search (2). Ways are about right on a
+    block whose middle is that of the workspace, under a tip of 8 mm radius. Force and excess are multiplied because a
+    press is about a quarter of the soft limit, and a lesion about a quarter stiffer than what surrounds it. The
+    observation is that of the environment, not normalised.
     """
 
     def __init__(self, observation_space: gym.Space) -> None:
@@ -79,7 +78,7 @@ class TouchSummary(_Entries):
         check_length(observation_space, WITH_MEMORY, memory=True)
         time, stiffest = WITH_MEMORY["time_left"], WITH_MEMORY["stiffest"]
         entries = [*place_and_force(WITH_MEMORY), time.start, *range(stiffest.start, stiffest.stop)]
-        super().__init__(observation_space, entries, added=10)
+        super().__init__(observation_space, entries, added=8)
         gain = torch.ones(len(entries))
         gain[FORCE_PLACE] = 4.0
         self.gain: torch.Tensor
@@ -90,33 +89,31 @@ class TouchSummary(_Entries):
         self.register_buffer("sites", torch.stack([x, y], dim=-1).reshape(-1, 2), persistent=False)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """The features (n, 18) of observations (n, n_observation)."""
+        """The features (n, 16) of observations (n, n_observation)."""
         contrast, visited, face = (observations[:, WITH_MEMORY[name]] for name in ("contrast", "visited", "face"))
-        stiffest = observations[:, WITH_MEMORY["stiffest"].stop - 1]
-        count = visited.sum(dim=1)
-        felt = (count > 0.5).to(observations.dtype)
-        mean = (contrast * visited).sum(dim=1) / count.clamp(min=1.0)
-        # A mean near 0 is noise: the excess is bounded there.
-        excess = felt * (4.0 * (stiffest / mean.clamp(min=0.1) - 1.0)).clamp(-4.0, 4.0)
-        share = count / face.sum(dim=1).clamp(min=1.0)
         # Half of the chart's sides, in the unit of positions: columns and rows of its sites, MAP_CELL tip radii apart.
         rows = face.reshape(-1, MAP_SIDE, MAP_SIDE)
         sides = torch.stack([rows.amax(dim=1).sum(dim=1), rows.amax(dim=2).sum(dim=1)], dim=1)
         half = 0.5 * (sides - 1.0) * MAP_CELL * TIP_RADIUS / LENGTH_SCALE
+        # Most of the map lies beyond a small face.
+        used = face.amax(dim=0) > 0.5
+        contrast, visited, face, sites = contrast[:, used], visited[:, used], face[:, used], self.sites[used]
+        count = visited.sum(dim=1)
+        felt = (count > 0.5).to(observations.dtype)
+        mean = (contrast * visited).sum(dim=1) / count.clamp(min=1.0)
+        # A mean near 0 is noise: the excess is bounded there.
+        stiffest = observations[:, WITH_MEMORY["stiffest"].stop - 1]
+        excess = felt * (4.0 * (stiffest / mean.clamp(min=0.1) - 1.0)).clamp(-4.0, 4.0)
+        share = count / face.sum(dim=1).clamp(min=1.0)
         place = observations[:, WITH_MEMORY["stiffest"].start : WITH_MEMORY["stiffest"].stop - 1]
         tip = observations[:, self.entries[:2]]
         way = felt[:, None] * (half * place - tip)
-        weight = visited * (contrast - mean[:, None]).clamp(min=0.0) ** 2
-        total = weight.sum(dim=1, keepdim=True)
-        distance = ((self.sites - tip[:, None]) ** 2).sum(dim=2)
-        open_sites = face * (1.0 - visited) * torch.exp(-0.5 * distance / SEARCH_REACH**2)
-        fresh = open_sites @ self.sites / open_sites.sum(dim=1, keepdim=True).clamp(min=1e-6) - tip
-        fresh = fresh * (open_sites.sum(dim=1, keepdim=True) > 1e-6)
-        # Without an excess, as after the first touch, there is no centroid: the stiffest place stands for it.
-        centroid = torch.where(total > 1e-6, weight @ self.sites / total.clamp(min=1e-6) - tip, way)
+        distance = ((sites - tip[:, None]) ** 2).sum(dim=2)
+        unfelt = face * (1.0 - visited) * torch.exp(-0.5 * distance / SEARCH_REACH**2)
+        total = unfelt.sum(dim=1, keepdim=True)
+        fresh = (total > 1e-6) * (unfelt @ sites / total.clamp(min=1e-6) - tip)
         added = torch.stack([share, felt, mean, excess], dim=1)
-        read = super().forward(observations) * self.gain
-        return torch.cat([read, added, way, felt[:, None] * centroid, fresh], dim=1)
+        return torch.cat([super().forward(observations) * self.gain, added, way, fresh], dim=1)
 
 
 class PlaceAndForce(_Entries):

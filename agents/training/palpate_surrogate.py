@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.palpation.touches import CENTROID_SITES
+from surgsim_env.palpation.touches import stiffest_spots
 from surgsim_env.tasks.palpate import (
     DECLARE_STEPS,
     DECLARE_VALUE,
@@ -62,7 +62,7 @@ TOUCH_MODELS = {
     "phantom_small": TouchModel(587.0, 1.42, 0.315, 3.06, (0.13, 0.50), (0.0045, 0.0066), 0.2),
 }
 
-# The range of b: the level's moduli times the effect of a capsule.
+# The range of b at level "standard": its moduli times the effect of a capsule.
 BACKGROUND = (0.7, 1.4)
 
 
@@ -71,20 +71,25 @@ class PalpateSurrogate(VectorEnv):
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
-    def __init__(self, count: int, scene: str = "phantom", *, memory: bool = True) -> None:
-        """Make the environments with spaces, limits, sensor and memory of the original.
+    def __init__(
+        self, count: int, scene: str = "phantom", *, level: str | None = "standard", memory: bool = True
+    ) -> None:
+        """Make the environments with spaces, limits, sensor and memory of the original, at level "standard" or none.
 
         Raises:
-            ValueError: a scene that no touch model was fitted to.
+            ValueError: a scene or a level that no touch model was fitted to.
         """
+        if level not in (None, "standard"):
+            raise ValueError(f'level is {level!r}; touch models were fitted at level "standard", or None')
         if scene not in TOUCH_MODELS:
             raise ValueError(f"scene {scene!r} has no touch model; there are: {', '.join(TOUCH_MODELS)}")
-        env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level="standard", memory=memory).unwrapped
+        env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level=level, memory=memory).unwrapped
         self.touch, self.scene, self.task = TOUCH_MODELS[scene], env.scene, env.task
         remembered = touch_memory(env.simulation.anatomy)
-        self.chart, self.map = remembered.chart, remembered.map
+        self.chart, self.map, self.bell_fit = remembered.chart, remembered.map, remembered.bell_fit
         self.indenter, self.least_depth = remembered.indenter, remembered.least_depth
         self.memory = memory
+        self.background_range = (1.0, 1.0) if level is None else BACKGROUND
         timing = env.scene.timing
         self.control_step = timing.haptic_step * timing.haptic_steps_per_control
         instrument = env.simulation.instrument
@@ -154,7 +159,7 @@ class PalpateSurrogate(VectorEnv):
         self.lesion[which] = rng.uniform(rim, self.block[:2] - rim, (count, 2))
         self.excess[which] = rng.uniform(*self.touch.excess, count)
         self.width[which] = rng.uniform(*self.touch.width, count)
-        self.background[which] = rng.uniform(*BACKGROUND, count)
+        self.background[which] = rng.uniform(*self.background_range, count)
         self.bias[which] = rng.uniform(-scene.sensor.bias, scene.sensor.bias, (count, 3))
         place = rng.uniform(margin, self.block[:2] - margin, (count, 2))
         height = self.surface + rng.uniform(*START_GAP, count)
@@ -192,24 +197,9 @@ class PalpateSurrogate(VectorEnv):
 
     def _recalled(self) -> tuple[NDArray[np.float64], ...]:
         """Contrasts, visited marks and the stiffest place, as `TouchMemory` gives them."""
-        side, visited = MAP_SIDE, self.square > 0.0
+        visited = self.square > 0.0
         contrast = np.divide(self.product, self.square, out=np.zeros_like(self.product), where=visited)
-        sums = []
-        for values in (self.product, self.square):
-            padded = np.pad(values.reshape(-1, side, side), ((0, 0), (1, 1), (1, 1)))
-            rows = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
-            sums.append((rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]).reshape(len(values), -1))
-        around = np.divide(sums[0], sums[1], out=np.zeros_like(sums[0]), where=sums[1] > 0.0)
-        best = np.argmax(np.where(visited, around, -np.inf), axis=1)
-        near = np.abs(self.map.numbers - self.map.numbers[best][:, None]).max(axis=2) <= CENTROID_SITES
-        mean = np.where(visited, around, 0.0).sum(axis=1) / np.maximum(visited.sum(axis=1), 1)
-        most = around[np.arange(len(best)), best]
-        excess = np.where(visited & near, np.maximum(around - 0.5 * (mean + most)[:, None], 0.0), 0.0)
-        total = excess.sum(axis=1, keepdims=True)
-        centroid = np.where(total > 0.0, excess @ self.map.places / np.maximum(total, 1e-300), self.map.places[best])
-        stiffest = np.column_stack([centroid, most])
-        stiffest[~visited.any(axis=1)] = 0.0
-        return contrast, visited.astype(np.float64), stiffest
+        return contrast, visited.astype(np.float64), stiffest_spots(self.bell_fit, self.product, self.square)
 
     def _judge(
         self, force: NDArray[np.float64]

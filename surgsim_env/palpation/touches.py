@@ -10,14 +10,13 @@ from numpy.typing import ArrayLike
 
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.chart import MAP_SIDE, ChartedFace, HealthyMap, Site
+from surgsim_env.palpation.bell_fit import BellFit, framed
+from surgsim_env.palpation.chart import ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.scene.model import PalpationSettings, Vector
 
 # Speed of the tip between sites [m/s]; this travel is counted, not simulated.
 TRAVEL_SPEED = 0.02
-# Columns and rows of sites on each side of the stiffest one that its centroid takes in.
-CENTROID_SITES = 3
 # Log contrast is clipped to +- this; `Touch.cut` reports it.
 LOG_CONTRAST_BOUND = 2.0
 
@@ -184,7 +183,9 @@ class TouchMemory:
     (`bound`).
     """
 
-    def __init__(self, charted: ChartedFace, indenter: Indenter, *, press_depth: float, force_range: float) -> None:
+    def __init__(
+        self, charted: ChartedFace, indenter: Indenter, *, press_depth: float, force_range: float, force_noise: float
+    ) -> None:
         """Start with an empty record.
 
         Args:
@@ -192,10 +193,12 @@ class TouchMemory:
             indenter: model of the healthy press.
             press_depth: of the scene [m].
             force_range: of the sensor, each axis [N].
+            force_noise: of the sensor, standard deviation of a reading [N].
         """
         self.chart, self.map, self.indenter = charted.chart, charted.touch_map, indenter
         self.least_depth = 0.5 * press_depth
         self.bound = math.sqrt(3.0) * force_range / indenter.force(self.least_depth)
+        self.bell_fit = BellFit(self.map, indenter.radius, force_noise)
         self.forget()
 
     def forget(self) -> None:
@@ -236,27 +239,32 @@ class TouchMemory:
         return _ratio(self.product, self.square)
 
     def stiffest(self) -> FloatArray:
-        """Place (2,) and contrast of the stiffest spot; zeros without a reading.
+        """Place (2,) and contrast of the stiffest spot; zeros without a reading."""
+        return stiffest_spots(self.bell_fit, self.product[None], self.square[None])[0]
 
-        The contrast is the largest of all sites with a reading, each averaged with its eight neighbours; the place is
-        the centroid of what exceeds half way from the mean contrast to it, within CENTROID_SITES of that site.
-        """
-        felt = self.square > 0.0
-        if not felt.any():
-            return np.zeros(3)
-        around = _ratio(self._with_neighbours(self.product), self._with_neighbours(self.square))
-        best = int(np.argmax(np.where(felt, around, -np.inf)))
-        near = np.abs(self.map.numbers - self.map.numbers[best]).max(axis=1) <= CENTROID_SITES
-        excess = np.where(felt & near, np.maximum(around - 0.5 * (around[felt].mean() + around[best]), 0.0), 0.0)
-        total = excess.sum()
-        place = self.map.places[best] if total == 0.0 else excess @ self.map.places / total
-        return np.append(place, around[best])
 
-    def _with_neighbours(self, values: FloatArray) -> FloatArray:
-        """Sums over three by three sites."""
-        padded = np.pad(values.reshape(MAP_SIDE, MAP_SIDE), 1)
-        rows = padded[:-2] + padded[1:-1] + padded[2:]
-        return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]).ravel()
+def stiffest_spots(bell_fit: BellFit, product: FloatArray, square: FloatArray) -> FloatArray:
+    """Place and contrast of the stiffest spot of n records (n, 3), from their sums of readings (n, n_site) each.
+
+    The place is the middle of the bell that fits the record best (`BellFit`); where no bell fits better than none, the
+    site of the largest contrast. The contrast is that of the nearest site, averaged with its eight neighbours. A record
+    without a reading gives zeros.
+    """
+    sums = bell_fit.cropped(np.stack([product, square]))
+    bell = bell_fit.best(*sums)
+    around = _ratio(*_with_neighbours(sums)).reshape(len(product), -1)
+    felt = sums[1].reshape(len(product), -1) > 0.0
+    best = np.where(bell.site >= 0, bell.site, np.argmax(np.where(felt, around, -np.inf), axis=1))
+    place = np.where((bell.site >= 0)[:, None], bell.place, bell_fit.places[best])
+    spots = np.column_stack([place, around[np.arange(len(best)), best]])
+    return np.where(felt.any(axis=1)[:, None], spots, 0.0)
+
+
+def _with_neighbours(values: FloatArray) -> FloatArray:
+    """Sums over three by three sites, for values (..., row, column)."""
+    larger = framed(values.reshape(-1, *values.shape[-2:]), 0.0)
+    rows = larger[:, :-2] + larger[:, 1:-1] + larger[:, 2:]
+    return (rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]).reshape(values.shape)
 
 
 def _ratio(product: FloatArray, square: FloatArray) -> FloatArray:

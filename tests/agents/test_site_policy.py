@@ -18,12 +18,15 @@ from agents.scoring.site_agent import (
     SiteProcess,
     observed_facts,
 )
+from agents.site_search import UCB_BETA
 from agents.training.policy_files import describe, load_policy, save_policy
 from agents.training.site_policy import (
     CHOICE_SPACE,
-    CURIOSITY,
     FEATURE_SPACE,
+    MAPS,
+    NUMBERS,
     SHARPNESS,
+    Acquisition,
     SitePolicy,
     belief_features,
     site_actions,
@@ -102,7 +105,7 @@ def test_belief_is_that_of_scikit_learn(pressed):
     np.testing.assert_allclose(belief.excess[inside], (covariance @ peer.alpha_)[inside], atol=1e-12)
     np.testing.assert_allclose(belief.spread[inside], expected[inside], atol=1e-10)
     # What a policy reads of the observation, in tip radii, is the same in single precision.
-    excess_read, spread_read, touched, face = belief_features(observation[None])[0][:-2].reshape(4, -1)
+    excess_read, spread_read, touched, face = belief_features(observation[None])[0][:-NUMBERS].reshape(MAPS, -1)
     np.testing.assert_allclose(excess_read * EXCESS_SPREAD, belief.excess, atol=1e-6)
     np.testing.assert_allclose(spread_read * EXCESS_SPREAD, belief.spread, atol=1e-6)
     assert np.flatnonzero(touched).tolist() == sorted(pressed) and (face > 0.5).tolist() == INSIDE.ravel().tolist()
@@ -149,8 +152,8 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
     # A site of the border, which is no candidate, and others.
     features = belief_features(np.stack([observed({at(-4, 0): 0.1, at(0, 2): 0.5}), observed({at(3, 3): 0.3})]))
     logits = policy.get_distribution(torch.as_tensor(features)).distribution.logits
-    excess, spread, pressed, face = np.moveaxis(features[:, :-2].reshape(2, 4, -1), 1, 0)
-    bound = SHARPNESS * (excess + CURIOSITY * spread)
+    excess, spread, pressed, face = np.moveaxis(features[:, :-NUMBERS].reshape(2, MAPS, -1), 1, 0)
+    bound = SHARPNESS * (excess + UCB_BETA * spread)
     touched = (pressed > 0.5) | (face < 0.5)
     assert (~touched).sum(axis=1).tolist() == [63 - 1, 63 - 1]
     assert (logits.exp().detach().numpy()[touched] == 0.0).all()
@@ -168,6 +171,32 @@ def test_shipped_policies_load(path):
     assert policy.description.observation is not None
     actions = policy.act(observed({})[None], np.ones(1, dtype=bool))
     assert (np.abs(actions) < 1.0).all()
+
+
+def test_the_acquisition_function_is_its_formula():
+    """Against plain sums over all sites, for numbers at which every term counts."""
+    values = (2.0, 1.5, 0.7, 0.4, -0.5, 0.25, 1.3, 0.9, 1.2, 0.5, 0.2, 1.1, 0.5)
+    bound, gain, hot, hot_spread, hot_excess, told, power, reach, room, share, softness, onset, width = values
+    features = belief_features(observed({at(-2, 0): 0.1, at(0, 2): 0.5, at(2, -1): 0.3})[None])[0].astype(np.float64)
+    excess, spread, _, candidates = features[:-NUMBERS].reshape(MAPS, -1)
+    cell, radius, least = features[-3:]
+    assert (cell, radius, least) == pytest.approx((CELL / TIP, LESION_RADIUS / TIP, EXCESS_LEAST / EXCESS_SPREAD))
+    steps = np.stack(np.divmod(np.arange(SITE_COUNT), MAP_SIDE), axis=-1) * cell
+    squared = ((steps[:, None] - steps) ** 2).sum(axis=2)
+
+    def blurred(what: np.ndarray, deviation: float) -> np.ndarray:
+        return np.exp(-0.5 * squared / deviation**2) @ what * cell**2 / (2.0 * np.pi * deviation**2)
+
+    fits = candidates / (1.0 + np.exp(-(blurred(candidates, room * radius) - share) / softness))
+    unknown = np.maximum((spread - told) / (1.0 - told), 1e-6) ** power
+    found = 1.0 / (1.0 + np.exp(-(excess / least - onset) / width))
+    around = found * (hot + hot_spread * spread + hot_excess * excess)
+    expected = excess + bound * spread + gain * blurred(fits * unknown, reach * radius) + around
+    made = Acquisition()
+    made.values.data = torch.tensor(values)
+    maps = torch.as_tensor(features[:-NUMBERS].reshape(1, MAPS, MAP_SIDE, MAP_SIDE), dtype=torch.float32)
+    worth = made(maps, torch.as_tensor(features[None, -NUMBERS:], dtype=torch.float32)).detach().numpy().ravel()
+    np.testing.assert_allclose(worth, expected, atol=2e-5)
 
 
 def test_a_face_that_is_pressed_everywhere_is_pressed_again():
@@ -191,7 +220,7 @@ def test_a_saved_policy_presses_what_its_scores_say(tmp_path):
     policy.reset(2)
     observations = np.stack([observed({at(-4, 0): 0.1, at(0, 2): 0.5}), observed({at(3, 3): 0.3})])
     actions = policy.act(observations, np.ones(2, dtype=bool))
-    excess, spread, pressed, face = np.moveaxis(belief_features(observations)[:, :-2].reshape(2, 4, -1), 1, 0)
-    bound = np.where((pressed > 0.5) | (face < 0.5), -np.inf, excess + CURIOSITY * spread)
+    excess, spread, pressed, face = np.moveaxis(belief_features(observations)[:, :-NUMBERS].reshape(2, MAPS, -1), 1, 0)
+    bound = np.where((pressed > 0.5) | (face < 0.5), -np.inf, excess + UCB_BETA * spread)
     np.testing.assert_array_equal(actions, site_actions(observations, bound.argmax(axis=1)))
     assert actions.dtype == np.float32

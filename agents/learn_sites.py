@@ -1,0 +1,216 @@
+"""Learn where to press on any organ: an evolution strategy finds the acquisition function of a site policy.
+
+    python -m agents.learn_sites --out runs/sites.safetensors
+
+The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
+`cma`) changes the 13 numbers of `agents.training.site_policy.Acquisition`, beginning at the upper confidence bound of
+`gp_ucb`. All candidates of a generation play the same episodes of `agents/training/bell_sites.py`; each generation has
+new ones. An episode costs
+
+    mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
+
+with the lines 5 mm and 3.3 mm, as a score is in presses to a line. The result is a policy of stable-baselines3's PPO,
+whose convolutional part is 0; `agents.train` can go on from it (`warm_start`). A generation takes about a minute of
+processor time; after each one the policy so far is written.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from agents.command_line import one_line_errors
+
+with one_line_errors(__name__, "agents"):
+    import cma
+    import torch
+    from stable_baselines3 import PPO
+
+    from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
+    from agents.training.bell_sites import BellSites
+    from agents.training.policy_files import describe, policy_path, save_policy
+    from agents.training.site_policy import (
+        CHOICE_SPACE,
+        FEATURE_SPACE,
+        MAPS,
+        NUMBERS,
+        Acquisition,
+        SitePolicy,
+        open_sites,
+        stacked_features,
+    )
+    from surgsim_env.palpation.chart import MAP_SIDE
+    from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
+
+ID = "SurgSim/PalpateSites-v0"
+# Steps of the parameters that count alike, in the order of `Acquisition.values`.
+PARAMETER_STEPS = (0.7, 1.5, 1.0, 0.7, 0.7, 0.2, 0.5, 0.3, 0.3, 0.2, 0.1, 0.6, 0.4)
+# Standard deviation of the first generation in these steps.
+FIRST_SPREAD = 0.5
+# Lines of the cost [mm].
+LINES_MM = (1000.0 * ERROR_LINE, 1000.0 * ERROR_LINE / 1.5)
+# Episodes of generation g are drawn from seeds after FIRST_SEED + g GENERATION_SEEDS; those that generations are
+# compared by have seeds of their own.
+FIRST_SEED, GENERATION_SEEDS, CHECK_SEED = 4_000_000, 1000, 3_900_000
+
+
+class SitesSpaces(gym.Env):
+    """The spaces of a policy that reads belief maps; it is never stepped."""
+
+    observation_space = FEATURE_SPACE
+    action_space = CHOICE_SPACE
+
+
+def play(acquisition: Acquisition, seeds: Sequence[int]) -> list[NDArray[np.float64]]:
+    """Errors [mm] after each press (budget,) of episodes that an acquisition function plays side by side."""
+    envs = [BellSites() for _ in seeds]
+    begun = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+    processes = [SiteProcess(observed_facts(observation)) for observation in begun]
+    beliefs = [GrowingBelief(process, env.budget) for process, env in zip(processes, envs, strict=True)]
+    pressed = np.zeros((len(envs), MAP_SIDE**2))
+    errors: list[list[float]] = [[] for _ in envs]
+    while playing := [index for index, env in enumerate(envs) if len(errors[index]) < env.budget]:
+        features = np.stack(
+            [
+                stacked_features(
+                    processes[index],
+                    beliefs[index].belief.excess,
+                    beliefs[index].belief.spread,
+                    pressed[index],
+                    1.0 - len(errors[index]) / envs[index].budget,
+                )
+                for index in playing
+            ]
+        )
+        values = torch.as_tensor(features)
+        maps = values[:, :-NUMBERS].reshape(len(playing), MAPS, MAP_SIDE, MAP_SIDE)
+        with torch.no_grad():
+            worth = acquisition(maps, values[:, -NUMBERS:]).masked_fill(~open_sites(maps), -torch.inf)
+        for index, site in zip(playing, worth.flatten(1).argmax(dim=1).tolist(), strict=True):
+            env = envs[index]
+            _, _, _, _, info = env.step(env.map.places[site].astype(np.float32))
+            beliefs[index].add(site, env.values[-1])
+            pressed[index, site] = 1.0
+            errors[index].append(info["error_mm"])
+    return [np.array(one) for one in errors]
+
+
+def presses_to_stay(errors: NDArray[np.float64], line: float) -> int:
+    """Presses after which errors (n,) are and stay at most a line; n + 1 if they never do."""
+    above = np.flatnonzero(errors > line)
+    return int(above[-1]) + 2 if len(above) else 1
+
+
+def cost(errors: Sequence[NDArray[np.float64]]) -> float:
+    """The mean cost of episodes from their errors [mm]."""
+    means = [one.mean() / (1000.0 * CUTOFF) for one in errors]
+    shares = [np.mean([presses_to_stay(one, line) / len(one) for line in LINES_MM]) for one in errors]
+    return float(np.mean(means) + np.mean(shares))
+
+
+@dataclass
+class Evolution:
+    """The search: `step` plays a generation, `best` is the mean of its distribution.
+
+    Args:
+        population: candidates of a generation.
+        episodes: of each candidate.
+        seed: of the candidates and the episodes.
+    """
+
+    population: int
+    episodes: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.seed)
+        # A seed of 0 or above would set numpy's global generator.
+        settings = {
+            "popsize": self.population,
+            "randn": lambda *shape: rng.standard_normal(shape),
+            "seed": np.nan,
+            "verbose": -9,
+        }
+        self.strategy = cma.CMAEvolutionStrategy(np.zeros(len(PARAMETER_STEPS)), FIRST_SPREAD, settings)
+        self.generation = self.episode_count = 0
+
+    def acquisition(self, steps: NDArray[np.float64]) -> Acquisition:
+        """The acquisition function so many steps from the first one (13,)."""
+        made = Acquisition()
+        with torch.no_grad():
+            made.values += torch.as_tensor(steps * PARAMETER_STEPS, dtype=torch.float32)
+        return made
+
+    @property
+    def best(self) -> Acquisition:
+        """The mean of the candidates' distribution."""
+        return self.acquisition(self.strategy.mean)
+
+    def step(self) -> None:
+        """Play one generation."""
+        first = FIRST_SEED + (1000 * self.seed + self.generation) * GENERATION_SEEDS
+        seeds = range(first, first + self.episodes)
+        candidates = self.strategy.ask()
+        shown = tqdm(candidates, desc=f"generation {self.generation + 1}", leave=False)
+        self.strategy.tell(candidates, [cost(play(self.acquisition(one), seeds)) for one in shown])
+        self.generation += 1
+        self.episode_count += self.population * self.episodes
+
+
+def as_policy(acquisition: Acquisition, seed: int) -> PPO:
+    """A model of stable-baselines3 whose policy is an acquisition function."""
+    model = PPO(SitePolicy, SitesSpaces(), n_steps=8, batch_size=8, seed=seed, device="cpu")
+    with torch.no_grad():
+        model.policy.mlp_extractor.acquisition.values.copy_(acquisition.values)
+    return model
+
+
+def learn(arguments: argparse.Namespace) -> None:
+    """Search; write the policy and print a line after each generation."""
+    torch.set_num_threads(1)
+    evolution = Evolution(arguments.population, arguments.episodes, arguments.seed)
+    check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
+    made = gym.make(ID, scene="phantom_small").unwrapped
+    print(f"upper confidence bound: cost {cost(play(evolution.best, check)):.3f}", flush=True)
+    while evolution.generation < arguments.generations:
+        evolution.step()
+        said = cost(play(evolution.best, check))
+        print(
+            f"generation {evolution.generation}: cost {said:.3f} on {len(check)} other episodes, "
+            f"{time.time() - began:.0f} s",
+            flush=True,
+        )
+        model = as_policy(evolution.best, arguments.seed)
+        description = describe(
+            model,
+            None,
+            made,  # type: ignore[arg-type]
+            env_id=ID,
+            belief=True,
+            trained_steps=evolution.episode_count,
+            seed=arguments.seed,
+            score=-said,
+        )
+        save_policy(model.policy, description, arguments.out)
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
+    parser.add_argument("--generations", type=int, default=40)
+    parser.add_argument("--population", type=int, default=12, help="candidates of a generation")
+    parser.add_argument("--episodes", type=int, default=96, help="of each candidate")
+    parser.add_argument("--check-episodes", type=int, default=192, help="that generations are compared by")
+    parser.add_argument("--seed", type=int, default=0)
+    learn(parser.parse_args())
+
+
+if __name__ == "__main__":
+    with one_line_errors(__name__, "agents"):
+        main()

@@ -1,0 +1,66 @@
+"""The evolution strategy that finds an acquisition function: its belief, its cost, and that a short search helps."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+import torch
+
+from agents import learn_sites
+from agents.learn_sites import PARAMETER_STEPS, Evolution, as_policy, cost, play, presses_to_stay
+from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
+from agents.training.bell_sites import BellSites
+from agents.training.site_policy import Acquisition, belief_features, site_actions
+
+pytestmark = pytest.mark.agents
+
+
+def test_a_growing_belief_is_that_of_all_presses_at_once():
+    env, rng = BellSites(), np.random.default_rng(0)
+    observation, _ = env.reset(seed=11)
+    process = SiteProcess(observed_facts(observation))
+    growing = GrowingBelief(process, 20)
+    for site in rng.choice(np.flatnonzero(env.map.pressable), 20, replace=False).tolist():
+        observation, *_ = env.step(env.map.places[site].astype(np.float32))
+        growing.add(site, env.values[-1])
+    whole = process.belief(observation)
+    # The observation holds contrasts and lengths in single precision.
+    np.testing.assert_allclose(growing.belief.excess, whole.excess, atol=1e-6)
+    np.testing.assert_allclose(growing.belief.spread, whole.spread, atol=1e-6)
+
+
+def test_play_presses_what_the_policy_chooses():
+    acquisition = Acquisition()
+    acquisition.values.data += 0.1
+    (errors,) = play(acquisition, [7])
+    policy, env = as_policy(acquisition, 0).policy, BellSites()
+    observation, _ = env.reset(seed=7)
+    said, over = [], False
+    while not over:
+        sites, _ = policy.predict(belief_features(observation[None]), deterministic=True)
+        observation, _, over, _, info = env.step(site_actions(observation[None], sites)[0])
+        said.append(info["error_mm"])
+    np.testing.assert_allclose(errors, said, atol=1e-9)
+
+
+def test_the_cost_is_lower_the_earlier_a_lesion_is_found():
+    assert [presses_to_stay(np.array(one), 5.0) for one in ([4.0, 3.0], [9.0, 4.0], [4.0, 9.0])] == [1, 2, 3]
+    early, late = (np.where(np.arange(25) < found, 20.0, 1.0) for found in (5, 15))
+    # Means 4.8 and 12.4 mm over 20 mm; 6 and 16 of 25 presses.
+    assert cost([early]) == pytest.approx(4.8 / 20.0 + 6 / 25)
+    assert cost([early, late]) == pytest.approx(0.5 * (4.8 / 20.0 + 6 / 25 + 12.4 / 20.0 + 16 / 25))
+
+
+def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
+    """On a cost whose least is known, so that the test says nothing of luck."""
+    steps = torch.tensor(PARAMETER_STEPS)
+    wanted = torch.tensor(Acquisition.INITIAL) + 0.7 * steps
+    monkeypatch.setattr(learn_sites, "play", lambda acquisition, seeds: acquisition.values.detach())
+    monkeypatch.setattr(learn_sites, "cost", lambda values: float((((values - wanted) / steps) ** 2).sum()))
+    first, again = (Evolution(population=12, episodes=1, seed=3) for _ in range(2))
+    begin = learn_sites.cost(first.best.values.detach())
+    for _ in range(30):
+        first.step()
+        again.step()
+    assert learn_sites.cost(first.best.values.detach()) < 0.2 * begin
+    assert first.best.values.tolist() == again.best.values.tolist() and first.episode_count == 360

@@ -48,6 +48,7 @@ from agents.scoring.episodes import (
     task_figures,
 )
 from agents.scoring.leaderboard import write_leaderboard
+from agents.scoring.leaderboard_plots import IMAGES, draw_leaderboard
 from agents.scoring.origin import check_origin, describe_origin
 from agents.scoring.results import RESULTS, SITES, Result, family, load_result, load_results, read_seeds, seeds_text
 from agents.scoring.site_agent import SiteAgent, site_facts
@@ -178,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what.add_argument("--agent", help=f"MODULE:CLASS, or one of {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
     what.add_argument("--policy", type=Path, help="NAME.safetensors, with NAME.json beside it")
     what.add_argument("--reach", action="store_true", help="count the lesions below the sensor's reach")
-    what.add_argument("--leaderboard", action="store_true", help="write the leaderboard only")
+    what.add_argument("--leaderboard", action="store_true", help="write the leaderboard and its pictures only")
     what.add_argument(
         "--compare", nargs=2, metavar=("A", "B"), help="two methods of --results on this scene and level, or two files"
     )
@@ -243,6 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check(options.check, options)
     if options.leaderboard:
         write_leaderboard()
+        draw_leaderboard(load_results(), IMAGES)
 
 
 def evaluate_all(options: argparse.Namespace) -> None:
@@ -470,6 +472,7 @@ def _write(result: Result, player: Player, options: argparse.Namespace) -> Path 
         return None
     if path.parent.resolve() == RESULTS:
         write_leaderboard()
+        draw_leaderboard(load_results(), IMAGES)
     return path
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
-from agents.scoring.results import RESULTS, SITES, Result, family, load_results, seeds_text
+from agents.scoring.results import RESULTS, SITES, Result, family, load_results, picture_name, seeds_text
 from surgsim_env.palpation.scores import ScoreEstimate
 
 LEADERBOARD = RESULTS.with_name("LEADERBOARD.md")
@@ -59,12 +59,18 @@ TASKS: tuple[Column, ...] = (
 
 
 def write_leaderboard(folder: Path = RESULTS, path: Path = LEADERBOARD) -> None:
-    """Write the tables of all results of a folder."""
+    """Write the tables of all results of a folder, a scene's under its picture (`agents.scoring.leaderboard_plots`)."""
     results = load_results(folder)
     places = sorted({result.place for result in results}, key=_order)
-    parts = [HEADER]
+    parts, shown = [HEADER], set[str]()
     for place in places:
         rows = [result for result in results if result.place == place]
+        picture = picture_name(rows[0])
+        if picture not in shown and not all(row.own_estimate for row in rows):
+            shown.add(picture)
+            parts.append(
+                f"\n![Values and intervals of the tables, all levels of one scene](../docs/images/{picture})\n"
+            )
         parts.append(_sites(place, rows, folder) if rows[0].env_id == SITES else _tasks(place, rows))
     parts.append(_commands(results))
     path.write_text("\n".join(parts), encoding="utf-8")
@@ -92,8 +98,15 @@ def _order(place: str) -> tuple[int, str]:
     return (0 if place.startswith("PalpateSites") else 1, f"{place.rsplit('_', 1)[0]}{found[0] if found else 9}")
 
 
+def ranked(rows: Sequence[Result]) -> list[Result]:
+    """The rows of one place as the leaderboard shows them, best first: the best raster alone, training seeds as one."""
+    if rows[0].env_id == SITES:
+        return sorted(over_training_seeds(best_raster_alone(rows)), key=_merit)
+    return sorted(over_training_seeds(rows), key=lambda result: -(result.figures["success"].value or 0.0))
+
+
 def _sites(place: str, rows: list[Result], folder: Path) -> str:
-    rows = sorted(over_training_seeds(best_raster_alone(rows)), key=_merit)
+    rows = ranked(rows)
     first = max(rows, key=lambda row: row.budget)
     lesions = first.lesion_counts
     organs = (
@@ -104,7 +117,7 @@ def _sites(place: str, rows: list[Result], folder: Path) -> str:
 
 
 def _tasks(place: str, rows: list[Result]) -> str:
-    rows = sorted(over_training_seeds(rows), key=lambda result: -(result.figures["success"].value or 0.0))
+    rows = ranked(rows)
     used = [column for column in TASKS if any(column[1] in _figures(row) for row in rows)]
     counts = {row.method: len(row.seeds) for row in rows}
     most = max(counts.values())
@@ -189,12 +202,14 @@ def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def shown_name(result: Result) -> str:
+    """A method's name as tables and pictures show it."""
+    side = result.method.removeprefix("raster_")
+    return f"raster {side} x {side}" if side != result.method else result.method
+
+
 def _name(result: Result) -> str:
-    name = result.method
-    if name.startswith("raster_"):
-        side = name.removeprefix("raster_")
-        name = f"raster {side} x {side}"
-    return name + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate
+    return shown_name(result) + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate
 
 
 def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:

@@ -116,6 +116,12 @@ def load_results(folder: Path = RESULTS) -> list[Result]:
     return [load_result(path) for path in sorted(folder.glob("*.json")) if not path.name.startswith("reach_")]
 
 
+def picture_name(result: Result) -> str:
+    """File name of the leaderboard's picture of a result's environment and scene."""
+    env_name = result.env_id.removeprefix("SurgSim/").removesuffix("-v0")
+    return "_".join(part for part in ("leaderboard", env_name, result.scene) if part) + ".png"
+
+
 def family(method: str) -> str:
     """The name that policies of one configuration and several training seeds share: sites_ppo of sites_ppo_seed3."""
     return re.sub(r"_seed\d+(?=_untracked$|$)", "", method)

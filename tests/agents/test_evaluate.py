@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents import evaluate
-from agents.scoring import leaderboard
+from agents.scoring import leaderboard, leaderboard_plots
 from agents.scoring.origin import file_digest
 from agents.scoring.results import SITES, Result, load_result, load_results, read_seeds, seeds_text
 from surgsim_env.palpation.scores import ScoreEstimate
@@ -72,6 +74,35 @@ def test_the_leaderboard_has_a_table_a_place_and_the_best_raster_alone(tmp_path:
     assert order.index("gp_ucb") < order.index("raster 3 x 3") < order.index("middle")
     # Every file's command is there, that of the raster which is not shown too.
     assert "--agent raster_4`" in text
+
+
+def test_the_leaderboard_shows_a_picture_a_scene(tmp_path: Path) -> None:
+    """All levels of a scene in one; what never comes, what none has and who estimates by itself can be drawn too."""
+    made = [
+        *(result(method, presses) for method, presses in (("gp_ucb", 4.0), ("raster_3", 6.0), ("random", math.inf))),
+        result("sites_ppo", env_kwargs={"scene": "phantom", "level": "easy"}, command="... --policy sites_ppo ..."),
+        result("gp_ucb", env_kwargs={"scene": "liver", "level": "easy"}),
+        result("middle", env_kwargs={"scene": "phantom_wide"}, own_estimate=True),
+        result("oracle_retract", env_id="SurgSim/Retract-v0", env_kwargs={}, sees_truth=True),
+    ]
+    made[-1].figures["seconds"] = ScoreEstimate(None, None, None)
+    for one in made:
+        one.save(tmp_path)
+    pictures = leaderboard_plots.draw_leaderboard(load_results(tmp_path), tmp_path)
+    names = {"leaderboard_PalpateSites_phantom.png", "leaderboard_PalpateSites_liver.png", "leaderboard_Retract.png"}
+    assert {picture.name for picture in pictures} == names
+    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    shown = re.findall(r"!\[.*\]\(../docs/images/(.*)\)", (tmp_path / "board.md").read_text())
+    assert sorted(shown) == sorted(names)
+    assert imread(pictures[0]).std() > 0.05
+    kinds = {one.method: leaderboard_plots.kind(one) for one in made}
+    assert kinds["sites_ppo"] == "learned" and kinds["gp_ucb"] == "searches by belief"
+    assert kinds["random"] == "scripted" and kinds["oracle_retract"] == "sees the truth"
+
+
+def test_the_pictures_of_the_leaderboard_are_there() -> None:
+    shown = re.findall(r"!\[.*\]\(../docs/images/(.*)\)", leaderboard.LEADERBOARD.read_text(encoding="utf-8"))
+    assert shown and all((leaderboard_plots.IMAGES / name).is_file() for name in shown)
 
 
 def test_results_name_policies_that_are_there() -> None:

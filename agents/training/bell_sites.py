@@ -62,7 +62,7 @@ class BellDraws:
     noise: tuple[float, float] = (0.012, 0.07)
 
 
-# By presses on `phantom` at level "standard" (lesion_radius 0.94): amplitudes 0.22 to 0.62, spreads 0.78 to 0.93 of
+# By presses on `phantom` at level "standard" (lesion_radius 1): amplitudes 0.22 to 0.62, spreads 0.78 to 0.93 of
 # single lesions and residuals of 0.007 to 0.016 without noise; the noise of the sensor is 0.047 there. On 16 members of
 # the training split of `liver_family` (lesion_radius 1.38): amplitudes 0.36 to 0.57, spreads from 1.1 on, residuals of
 # 0.026 to 0.049, lesions 0.24 beside the maximum of their bells (median); the noise of the sensor is 0.012.

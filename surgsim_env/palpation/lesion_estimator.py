@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 
-# The numbers below hold for lesions of 7.5 mm, the mean of those that `phantom` hides; lengths scale with the lesions'
+# The numbers below hold for lesions of 8 mm, the mean of those that `phantom` hides; lengths scale with the lesions'
 # radius, as the bell curves of their contrast do. They were chosen on organs that no evaluation uses, for the smallest
 # mean error over random presses (docs/palpation.md).
-REFERENCE_LESION_RADIUS = 0.0075
+REFERENCE_LESION_RADIUS = 0.008
 # Prior of the background's log contrast, one number for the organ: moduli of +-30 % and a capsule.
 BACKGROUND_SPREAD = 0.25
 # Prior of the excess that lesions add: standard deviation, and correlation length [m]. A press over a lesion sees a

@@ -18,7 +18,7 @@ FACE = np.pad(np.ones((11, 11), dtype=bool), (MAP_SIDE - 11) // 2)
 FACTS = SiteFacts(
     TouchMap(np.array([0.04, 0.04]), 0.004, FACE.ravel()),
     tip_radius=0.008,
-    lesion_radius=0.0075,
+    lesion_radius=0.008,
     noise=0.05,
     excess_least=0.1,
 )

@@ -43,7 +43,7 @@ from surgsim_env.palpation.lesion_estimator import (
 pytestmark = pytest.mark.agents
 # A chart of 40 x 32 mm under a tip of 8 mm: 11 x 9 sites of the map, 4 mm apart, around its middle.
 EXTENT, TIP, CELL, NOISE = np.array([0.04, 0.032]), 0.008, 0.004, 0.04
-LESION_RADIUS, EXCESS_LEAST = 0.0075, 0.1
+LESION_RADIUS, EXCESS_LEAST = 0.008, 0.1
 MIDDLE = MAP_SIDE // 2
 FACE = np.zeros((MAP_SIDE, MAP_SIDE), dtype=bool)
 FACE[MIDDLE - 4 : MIDDLE + 5, MIDDLE - 5 : MIDDLE + 6] = True

@@ -7,7 +7,7 @@ from surgsim_env.palpation import lesion_estimator as module
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
 EXTENT = (0.040, 0.044)
-LESION_RADIUS = 0.0075
+LESION_RADIUS = 0.008
 NOISE = 0.03
 
 

@@ -40,6 +40,8 @@ GRIP_FORCE = 0.22  # [N] it lifts above this grip
 # Goals of the tip with the edge, y and z [m]: first up, then over.
 RISEN, FOLDED = (0.0465, 0.031), (0.024, 0.050)
 SEEN_ENOUGH = 0.9
+# Share of the target that must be visible for its place to be seen.
+IN_SIGHT = 0.1
 CARRYING_SPEED, APPROACH_SPEED = 0.015, 0.015
 
 
@@ -48,6 +50,15 @@ class RetractExpert:
 
     It reads SI units: the environment is made with `scaled=False`.
     """
+
+    def __init__(self, *, grasp_along: float | None = None) -> None:
+        """Act on the target's place from the beginning, or only once the target is in sight.
+
+        Args:
+            grasp_along: where along the edge it grasps [m] without knowing where the target is hidden, to shift the
+                lobe above it once some of it is visible; by default it grasps above the target.
+        """
+        self._grasp_along = grasp_along
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
         """The action (5,) for an observation (56,) in SI units."""
@@ -69,11 +80,12 @@ class RetractExpert:
         if now[VISIBLE] >= SEEN_ENOUGH:
             return still, 0.0, -1.0
         goal = RISEN if tip[2] < RISEN[1] - 0.002 and tip[1] > 0.040 else FOLDED
-        velocity = towards(np.array([tip[0], *goal]) - tip, CARRYING_SPEED)
+        aside = tip[0] if self._grasp_along is None or now[VISIBLE] < IN_SIGHT else now[TARGET][0]
+        velocity = towards(np.array([aside, *goal]) - tip, CARRYING_SPEED)
         return velocity, _levelling(now), -1.0
 
     def _approach(self, now: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
-        tip, grasp = now[TIP], grasp_place(now)
+        tip, grasp = now[TIP], grasp_place(now, self._grasp_along)
         off = grasp - tip
         waiting = np.array([grasp[0], grasp[1] + GRASP_DEPTH + WAITING_GAP, grasp[2]])
         across = math.hypot(off[0], off[2])
@@ -89,10 +101,13 @@ class RetractExpert:
         return towards(waiting - tip, SPEED), turning, 1.0
 
 
-def grasp_place(now: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Place where the tip grasps the free edge above the target [m] (3,), from the observed points of the edge."""
+def grasp_place(now: NDArray[np.float64], along: float | None = None) -> NDArray[np.float64]:
+    """Place where the tip grasps the free edge [m] (3,), from the observed points of the edge.
+
+    It lies above the target, or at a place along the edge [m].
+    """
     edge = now[EDGE].reshape(5, 3)
-    along = float(now[TARGET][0])
+    along = float(now[TARGET][0]) if along is None else along
     border = float(np.interp(along, edge[:, 0], edge[:, 1]))
     top = float(np.interp(along, edge[:, 0], edge[:, 2]))
     return np.array([along, max(border - GRASP_DEPTH, NEAREST), top - HALF_THICKNESS])

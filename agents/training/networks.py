@@ -19,6 +19,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from agents.training.extractors import MemorySummary, PlaceAndForce, TouchSummary
 from agents.training.face_features import FaceSummary
+from agents.training.picture_features import PictureAndForce
 from agents.training.site_policy import SitePolicy
 from surgsim_env.scene.load import nearest
 
@@ -26,6 +27,7 @@ from surgsim_env.scene.load import nearest
 EXTRACTORS = {
     "FaceSummary": FaceSummary,
     "MemorySummary": MemorySummary,
+    "PictureAndForce": PictureAndForce,
     "PlaceAndForce": PlaceAndForce,
     "TouchSummary": TouchSummary,
 }
@@ -38,6 +40,7 @@ NOT_DESCRIBED = {"observation_space", "action_space", "lr_schedule", "optimizer_
 MOST_WEIGHTS = 50_000_000
 MOST_LAYERS = 64
 MOST_ENTRIES = 100_000
+MOST_PARTS = 16
 # Products of larger weights overflow, and actions are no numbers.
 LARGEST_WEIGHT = 1e6
 NUMBERS = ("float32", "float64", "int64", "int32", "int8", "uint8")
@@ -90,9 +93,9 @@ class SpaceDescription:
     """A Gymnasium space.
 
     Fields:
-        kind: "Box" or "Discrete"
-        dtype: of its elements
-        shape: of its elements; empty for Discrete
+        kind: "Box", "Discrete" or "Dict", whose parts stand elsewhere (`NetworkDescription.observation_parts`)
+        dtype: of its elements; empty for Dict
+        shape: of its elements; empty for Discrete and Dict
         low, high: bounds: one number, or a list of all entries row by row; null where there is no bound
     """
 
@@ -107,15 +110,19 @@ class SpaceDescription:
         """Describe a space.
 
         Raises:
-            ValueError: another space than a Box or a Discrete.
+            ValueError: another space than a Box, a Discrete or a Dict.
         """
+        if isinstance(space, spaces.Dict):
+            return cls("Dict", "", (), None, None)
         if isinstance(space, spaces.Box):
             bounds = (_written(space.low), _written(space.high))
             return cls("Box", str(space.dtype), space.shape, *bounds)
         if isinstance(space, spaces.Discrete):
             low = int(space.start)
             return cls("Discrete", str(space.dtype), (), low, low + int(space.n) - 1)
-        raise ValueError(f"a policy's file holds a Box or a Discrete, not the space {shortened(space)}")
+        raise ValueError(
+            f"a policy's file holds a Box, a Discrete or a Dict of these, not the space {shortened(space)}"
+        )
 
     def space(self, where: str) -> spaces.Space:
         """The space.
@@ -189,12 +196,31 @@ class NetworkDescription:
         arguments: of that class, without spaces, learning rate and optimiser: net_arch, activation_fn, ...
         observation_space: of what the networks read, after preprocessing
         action_space: of what they return
+        observation_parts: of an observation_space of kind "Dict", by name
     """
 
     policy: str
     observation_space: SpaceDescription
     action_space: SpaceDescription
     arguments: dict[str, Any] = field(default_factory=dict)
+    observation_parts: dict[str, SpaceDescription] = field(default_factory=dict)
+
+    def read_space(self, where: str) -> spaces.Space:
+        """The space of what the networks read.
+
+        Raises:
+            ValueError: an entry that is wrong, or parts that do not go with the kind of space (names it after `where`).
+        """
+        whole = self.observation_space
+        if (whole.kind == "Dict") != bool(self.observation_parts) or len(self.observation_parts) > MOST_PARTS:
+            raise ValueError(
+                f"{where}.observation_parts has {len(self.observation_parts)} entries with observation_space.kind "
+                f"{shortened(whole.kind)}; the rule is 1 to {MOST_PARTS} for 'Dict', and none for another kind"
+            )
+        if whole.kind != "Dict":
+            return whole.space(f"{where}.observation_space")
+        parts = self.observation_parts.items()
+        return spaces.Dict({name: one.space(f"{where}.observation_parts.{name}") for name, one in parts})
 
 
 def describe_networks(model: BaseAlgorithm) -> NetworkDescription:
@@ -225,7 +251,9 @@ def describe_networks(model: BaseAlgorithm) -> NetworkDescription:
         arguments[entry] = value
     _check_plain(arguments, "policy_kwargs")
     spaces_of = (SpaceDescription.of(space) for space in (model.observation_space, model.action_space))
-    return NetworkDescription(names[0], *spaces_of, arguments=arguments)
+    read = model.observation_space.spaces if isinstance(model.observation_space, spaces.Dict) else {}
+    parts = {name: SpaceDescription.of(space) for name, space in read.items()}
+    return NetworkDescription(names[0], *spaces_of, arguments=arguments, observation_parts=parts)
 
 
 def build_networks(algorithm: str, network: NetworkDescription, where: str) -> BasePolicy:
@@ -250,7 +278,7 @@ def build_networks(algorithm: str, network: NetworkDescription, where: str) -> B
             )
     _check_plain(network.arguments, f"{where}.arguments")
     arguments: dict[str, Any] = {
-        "observation_space": network.observation_space.space(f"{where}.observation_space"),
+        "observation_space": network.read_space(where),
         "action_space": network.action_space.space(f"{where}.action_space"),
         **with_classes(network.arguments, f"{where}.arguments"),
     }
@@ -309,7 +337,8 @@ def _check_size(network: NetworkDescription, where: str) -> None:
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
             raise ValueError(f"{where}.arguments.{name} holds {shortened(value)}; the rule is 1 to {most}")
     # As many as there are without a features extractor, twice for the critic, or more.
-    width = math.prod(network.observation_space.shape)
+    read = network.observation_parts.values() or [network.observation_space]
+    width = sum(math.prod(one.shape) for one in read)
     hidden = arguments.get("lstm_hidden_size", 0)
     weights, width = 4 * hidden * (width + hidden), hidden or width
     for one in layers:

@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.scoring.site_agent import OBSERVATION_SIZE
@@ -88,13 +89,23 @@ class PolicyDescription:
 
 
 def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
-    """Size and scale of each channel that an environment observes, by name; None for one without a task of ours."""
+    """Size and scale of each channel that an environment observes, by name; None for one without a task of ours.
+
+    Beside a picture these are the channels of force alone.
+    """
     inner = getattr(env, "unwrapped", env)
     task = getattr(inner, "task", None)
     if not isinstance(task, Task):
         return None
-    return {
-        name: [size, scale if getattr(inner, "scaled", True) else "SI"] for name, (size, scale) in task.declared.items()
+    space = inner.observation_space
+    read, pictures = set(task.declared), {}
+    if space.shape is None or len(space.shape) > 1:
+        parts = space.spaces if isinstance(space, gym.spaces.Dict) else {"picture": space}
+        read = {one.name for one in task.channels if one.felt and "force" in parts}
+        pictures = {"picture": [list(parts["picture"].shape or ()), "uint8"]}
+    channels = {name: one for name, one in task.declared.items() if name in read}
+    return pictures | {
+        name: [size, scale if getattr(inner, "scaled", True) else "SI"] for name, (size, scale) in channels.items()
     }
 
 
@@ -127,9 +138,9 @@ class TrainedPolicy:
         self.reset(1)
 
     @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """Shape of the raw observation."""
-        return (OBSERVATION_SIZE,) if self.description.belief else self.networks.observation_space.shape or ()
+    def observation_shape(self) -> tuple[int, ...] | dict[str, tuple[int, ...]]:
+        """Shape of the raw observation; of a dictionary that of each part, by name."""
+        return (OBSERVATION_SIZE,) if self.description.belief else raw_shape(self.networks.observation_space)
 
     @property
     def action_space(self) -> gym.spaces.Box:
@@ -157,10 +168,10 @@ class TrainedPolicy:
             ("observations", env.observation_space, self.observation_shape),
             ("actions", env.action_space, self.action_space.shape),
         ):
-            if space.shape != shape:
+            if (given_shape := raw_shape(space)) != shape:
                 raise ValueError(
                     f"{name} has {what} of shape {shape}, {self.description.env_id} with "
-                    f"{shortened(self.description.env_kwargs)} those of {space.shape}: env_id or env_kwargs are wrong"
+                    f"{shortened(self.description.env_kwargs)} those of {given_shape}: env_id or env_kwargs are wrong"
                 )
         in_face = self.description.env_kwargs.get("frame") == "face"
         if self.description.belief or in_face or given is None:
@@ -181,8 +192,8 @@ class TrainedPolicy:
         self._since = np.zeros(count, dtype=np.int64)
         self._actions = np.zeros((count, *self.action_space.shape), dtype=self.action_space.dtype)
 
-    def act(self, observations: NDArray[Any], begins: NDArray[np.bool_] | None = None) -> NDArray:
-        """Actions (n, n_action) for raw observations (n, n_observation).
+    def act(self, observations: Any, begins: NDArray[np.bool_] | None = None) -> NDArray:
+        """Actions (n, n_action) for raw observations (n, n_observation), or a dictionary of arrays (n, ...).
 
         They are deterministic, or drawn by random numbers of the policy's own that `reset` begins anew.
 
@@ -205,7 +216,7 @@ class TrainedPolicy:
             self._state = state
         return self._actions.copy()
 
-    def _predicted(self, seen: NDArray[np.float32], begins: NDArray[np.bool_] | None) -> tuple[NDArray, Any]:
+    def _predicted(self, seen: Any, begins: NDArray[np.bool_] | None) -> tuple[NDArray, Any]:
         if not self.description.sampled:
             return self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=True)  # type: ignore[return-value]
         # Torch's random state, which a training run goes on with, is kept.
@@ -215,7 +226,7 @@ class TrainedPolicy:
             self._random = torch.get_rng_state()
         return made  # type: ignore[return-value]
 
-    def seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
+    def seen(self, observations: Any) -> Any:
         """Observations as the network reads them: force removed, then belief maps, then normalised."""
         one = self.description
         values = blinded(observations, one.force_entries) if one.force_entries else observations
@@ -225,6 +236,16 @@ class TrainedPolicy:
             return values
         scale = np.sqrt(np.asarray(one.observation_variance) + VARIANCE_SLACK)
         return np.clip((values - np.asarray(one.observation_mean)) / scale, -CUT, CUT).astype(np.float32)
+
+
+def raw_shape(space: gym.Space) -> tuple[int, ...] | dict[str, tuple[int, ...]]:
+    """Shape of what an environment observes; pictures, whose colours networks read first, have them last."""
+    if isinstance(space, gym.spaces.Dict):
+        return {name: raw_shape(part) for name, part in space.spaces.items()}  # type: ignore[misc]
+    shape = space.shape or ()
+    if is_image_space(space) and is_image_space_channels_first(space):  # type: ignore[arg-type]
+        return (*shape[1:], *shape[:1])
+    return shape
 
 
 def home_scene(env_id: str, env_kwargs: dict[str, Any]) -> str:
@@ -414,9 +435,16 @@ def _try(policy: TrainedPolicy, path: Path) -> None:
     """Refuse networks that fail on the first observation, or answer it with what is no action."""
     space = policy.networks.observation_space
     try:
-        actions, _ = policy.networks.predict(np.zeros((1, *(space.shape or ())), dtype=space.dtype), deterministic=True)
+        actions, _ = policy.networks.predict(_zeros(space), deterministic=True)
     except Exception as error:  # networks that do not fit their spaces may raise anything
         said = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"policy {path} cannot act: {said}") from None
     if not np.isfinite(actions).all():
         raise ValueError(f"policy {path} answers an observation of zeros with {actions[0]}; actions must be finite")
+
+
+def _zeros(space: gym.Space) -> Any:
+    """One observation of a space, all of it 0."""
+    if isinstance(space, gym.spaces.Dict):
+        return {name: _zeros(part) for name, part in space.spaces.items()}
+    return np.zeros((1, *(space.shape or ())), dtype=space.dtype)

@@ -4,6 +4,7 @@ import inspect
 import io
 import json
 import zipfile
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,13 +15,15 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import check_entries
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
+from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scene.digest import content_digest, instrument_files, scene_digest, source_files
+from surgsim_env.scene.load import fill_json
 from surgsim_env.tasks.declaration import documentation
 from surgsim_env.tasks.task import Task
 
-# Numbers as float32, or a picture as uint8.
-Observation = NDArray[Any]
+# Numbers as float32, a picture as uint8, or a table of both.
+Observation = Any
 Action = NDArray[np.float32]
 Info = dict[str, Any]
 
@@ -29,7 +32,7 @@ ACTION_SLACK = 1e-6
 # Draws of an episode until the task has to accept one.
 DRAWS_MOST = 20
 # Kinds of observation, and the size of an observed picture [pixels].
-OBSERVATION_MODES = ("state", "rgb")
+OBSERVATION_MODES = ("state", "rgb", "rgb_force")
 PICTURE_SIZE = 84
 # Rooms of surgsim_env whose code decides an episode.
 EPISODE_ROOMS = ("scene", "instruments", "coupling", "palpation", "tasks", "envs")
@@ -45,13 +48,16 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     Args:
         scene: name or file of a scene; the task's default by default.
         instrument: name of an arm, or its TOML file; the task's default, else the scene's own, by default.
-        obs_mode: "state" observes the task's vector, "rgb" the endoscope's picture, uint8 of shape (84, 84, 3).
+        obs_mode: "state" observes the task's vector, "rgb" the endoscope's picture, uint8 of shape (84, 84, 3),
+            "rgb_force" a dictionary of the "picture" and, as "force", the channels that depend on force sensing.
         observe_force: False observes all channels that depend on force sensing as 0.
+        looks: "train" or "test" draws a look of all pictures for each episode (`take_looks`), None takes the scene's.
         render_mode: None, "rgb_array" or "human".
         settings: the task's own arguments, and fields of `RenderOptions`.
 
     Raises:
-        ValueError: an obs_mode, a render_mode or a setting that is unknown, or what the task refuses.
+        ValueError: an obs_mode, looks, a render_mode or a setting that is unknown, looks where no picture is drawn,
+            forces of a task without force sensing, or what the task refuses.
     """
 
     metadata: ClassVar[Info] = {"render_modes": list(RENDER_MODES), "render_fps": 20}
@@ -71,6 +77,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         obs_mode: str = "state",
         scaled: bool = True,
         observe_force: bool = True,
+        looks: str | LookRanges | None = None,
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
@@ -96,28 +103,67 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self.scaled = scaled
         self._origin, self._scale = (origin, scale) if scaled else (np.zeros_like(origin), np.ones_like(scale))
         self._eye: EpisodeView | None = None
-        if obs_mode == "rgb":
-            sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_force": False}
+        # Entries of the task's vector that are observed beside a picture; None: the picture alone.
+        self._felt: list[int] | None = None
+        if obs_mode != "state":
+            sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE}
+            sight |= {"show_force": False, "smooth_edges": False}
             self._eye = EpisodeView(self.simulation, "rgb_array", sight)
             self.observation_space = gym.spaces.Box(0, 255, (PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
-        else:
-            low, high = self.as_observed(self._low), self.as_observed(self._high)
+        low, high = self.as_observed(self._low), self.as_observed(self._high)
+        if obs_mode == "rgb_force":
+            self._felt = task.force_entries
+            if not self._felt:
+                raise ValueError(
+                    f'obs_mode is "rgb_force", and {type(task).__name__} has no channel that depends on force sensing: '
+                    'mark one as felt, or observe "rgb"'
+                )
+            force = gym.spaces.Box(low[self._felt], high[self._felt], dtype=np.float32)
+            self.observation_space = gym.spaces.Dict({"picture": self.observation_space, "force": force})
+        elif obs_mode == "state":
             self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (task.action_size,), dtype=np.float32)
         self._observation = np.zeros(self._low.shape, dtype=np.float32)
         self._unobserved = [] if observe_force else task.force_entries
         # The eye's picture of the last observation; None until it is drawn.
         self._picture: NDArray[np.uint8] | None = None
+        self._look_ranges: LookRanges | None = None
+        self._look_random = np.random.default_rng(0)
+        self._look: Look | None = None
+        if looks is not None:
+            self.take_looks(looks)
         # The action of the last step, after wrappers changed it.
         self.last_action = np.zeros(task.action_size)
         self._begun = False
         self._running = False
+
+    def take_looks(self, looks: str | LookRanges) -> None:
+        """Draw a look of the pictures for each episode from the next reset on, of a split or of ranges of your own.
+
+        Looks have random numbers of their own, which follow from the seed of the reset: nothing else is changed.
+
+        Raises:
+            ValueError: an unknown split (lists the known), or no picture is observed or rendered.
+        """
+        if self._eye is None and self.render_mode is None:
+            raise ValueError(
+                f'looks is {looks!r}, and no picture is drawn: give obs_mode="rgb" or "rgb_force", or '
+                'render_mode="rgb_array"'
+            )
+        self._look_ranges = find_look_ranges(looks)
+        self._begun = self._running = False
+
+    @property
+    def look(self) -> Look | None:
+        """The look of this episode's pictures; None for the scene's own."""
+        return self._look
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
         """Draw an episode and put its organ and instrument at rest; no options are known."""
         super().reset(seed=seed)
         if options:
             raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
+        self._draw_look(seed)
         self._draw()
         values, saturated = self.task.observe(self.simulation, self.np_random)
         if wrong := self._out_of_bounds(values):
@@ -255,6 +301,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
         arrays["observation"] = self._observation.copy()
         arrays["running"] = np.array(self._running)
+        if self._look is not None:
+            arrays["look"] = np.array(json.dumps(asdict(self._look)))
+            arrays["look_random"] = np.array(json.dumps(self._look_random.bit_generator.state))
         if self.task.family is not None:
             arrays["member"] = np.array(str(self.task.anatomy.member))
         buffer = io.BytesIO()
@@ -276,12 +325,16 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         like = {"made_by": text, "task": text, "random": text, "observation": self._observation, "running": np.False_}
         if self.task.family is not None:
             like["member"] = text
+        if self._look_ranges is not None:
+            like |= {"look": text, "look_random": text}
         own = {name: arrays.pop(name) for name in like if name in arrays}
         try:
             check_entries(own, like)
             if wrong := self._out_of_bounds(own["observation"]):
                 raise ValueError(wrong)
             random = self._random_state(str(own["random"]))
+            seen = None if self._look_ranges is None else fill_json(Look, str(own["look"]), "look")
+            look_random = None if seen is None else self._random_state(str(own["look_random"]), "look_random")
             family = self.task.family
             anatomy = None if family is None else family.named(str(own["member"]))
             task, organ = self.task.restored(str(own["task"]), anatomy)
@@ -292,8 +345,22 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self.task.become(task)
         self.simulation.take_anatomy(task.anatomy)
         self.np_random.bit_generator.state = random
+        if seen is not None and look_random is not None:
+            self._look, self._look_random = seen, np.random.default_rng(0)
+            self._look_random.bit_generator.state = look_random
         self._take(own["observation"])
         self._begun, self._running = True, bool(own["running"])
+
+    def _draw_look(self, seed: int | None) -> None:
+        """Draw the look of the next episode; a seed begins the random numbers of looks anew."""
+        ranges = self._look_ranges
+        if ranges is None:
+            return
+        if self._look is None or seed is not None:
+            # Without a seed of the first reset the environment's generator has drawn one.
+            assert self.np_random is not None
+            self._look_random = look_generator(ranges, self.np_random_seed)
+        self._look = draw_look(ranges, self._look_random)
 
     def _draw(self) -> None:
         """Draw episodes until the task accepts one."""
@@ -323,19 +390,35 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _observed(self) -> Observation:
         """The last observation, as obs_mode has it."""
         if self._eye is None:
-            observed = self.as_observed(self._observation)
-            observed[self._unobserved] = 0.0
-            return observed
+            return self._observed_numbers()
         if self._picture is None:
             self._picture = self._eye.frame(self._shown())
-        return self._picture.copy()
+        if self._felt is None:
+            return self._picture.copy()
+        return {"picture": self._picture.copy(), "force": self._observed_numbers()[self._felt]}
+
+    def picture(self, look: Look | None) -> NDArray[np.uint8]:
+        """The observed picture of this moment as another look has it, shape (84, 84, 3); nothing is changed by it.
+
+        Raises:
+            ResetNeeded: before the first reset there is nothing to show.
+            ValueError: obs_mode observes no picture.
+        """
+        if self._eye is None:
+            raise ValueError('obs_mode is "state", which observes no picture: make it with "rgb" or "rgb_force"')
+        return self._eye.frame(replace(self._shown(), look=look))
+
+    def _observed_numbers(self) -> NDArray[np.float32]:
+        observed = self.as_observed(self._observation)
+        observed[self._unobserved] = 0.0
+        return observed
 
     def _shown(self) -> Shown:
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
         target = self.task.target
         moved = None if target is None else target.moved(self.simulation.ground_shift(target.centre))
-        return Shown(self.task.lesions, moved, self.task.endoscope)
+        return Shown(self.task.lesions, moved, self.task.endoscope, self._look, self.task.step_count)
 
     def _show(self) -> None:
         if self.render_mode == "human":
@@ -350,8 +433,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest})"
         )
 
-    def _random_state(self, text: str) -> dict[str, Any]:
-        """The state in a saved JSON text, which must be one of this environment's kind of bit generator."""
+    def _random_state(self, text: str, name: str = "random") -> dict[str, Any]:
+        """The state in the saved JSON text of an entry, which must be one of this environment's bit generator."""
         # Asking for np_random would make a generator where there is none yet.
         own = self._np_random
         kind = np.random.PCG64 if own is None else type(own.bit_generator)
@@ -363,7 +446,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         except (ValueError, TypeError, KeyError, OverflowError, RecursionError, AttributeError):
             # What a bit generator raises for a state that it cannot take.
             pass
-        raise ValueError(f"random is {text!r:.60}; it must be the state of a {kind.__name__} generator")
+        raise ValueError(f"{name} is {text!r:.60}; it must be the state of a {kind.__name__} generator")
 
     def _checked(self, action: Action | FloatArray) -> FloatArray:
         values = np.asarray(action, dtype=np.float64)

@@ -98,14 +98,14 @@ def embedded_surface(vertices: FloatArray, faces: IntArray, mesh: TetMesh) -> Em
 
 
 @lru_cache(maxsize=4)
-def organ_surface(anatomy: Anatomy) -> DrawnSurface | EmbeddedSurface:
-    """The surface of an organ that is drawn: the scene's fine surface, or without one the mesh's boundary, smoothed.
+def organ_surface(anatomy: Anatomy, triangles_most: int = TRIANGLES_MOST) -> DrawnSurface | EmbeddedSurface:
+    """The surface of an organ that is drawn: the scene's fine surface, or without one `boundary_surface`.
 
     Raises:
         MeshError: the fine surface's file cannot be read, or is not of this organ.
     """
     if anatomy.fine_surface is None:
-        return boundary_surface(anatomy)
+        return boundary_surface(anatomy, triangles_most)
     return embedded_surface(*anatomy.fine_surface, anatomy.mesh)
 
 

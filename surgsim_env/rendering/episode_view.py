@@ -17,6 +17,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, placed_endoscope
+from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import CAMERAS, render_options
 from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scene.model import Endoscope
@@ -163,11 +164,15 @@ class Shown:
         lesions: hidden in the organ; shown where the options ask for them
         target: a disc to be drawn, None for none
         endoscope: pose of the endoscope; None: that of the scene
+        look: of the pictures; None: the scene's own
+        moment: counts the steps of the episode
     """
 
     lesions: tuple[Lesion, ...] = ()
     target: Disc | None = None
     endoscope: Endoscope | None = None
+    look: Look | None = None
+    moment: int = 0
 
 
 class EpisodeView:
@@ -207,6 +212,7 @@ class EpisodeView:
         self._renderer.follow_anatomy()
         self._renderer.lesions = shown.lesions
         self._renderer.target = shown.target
+        self._renderer.look, self._renderer.moment = shown.look, shown.moment
         if shown.endoscope is not None:
             self._renderer.cameras["endoscope"] = placed_endoscope(self._simulation.anatomy, shown.endoscope)
         return self._renderer

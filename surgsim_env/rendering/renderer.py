@@ -17,6 +17,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, scene_cameras
+from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import RenderOptions, check_camera
 from surgsim_env.rendering.scene_model import (
     add_instrument,
@@ -54,7 +55,9 @@ class OrganRenderer:
         frame = renderer.rgb()
 
     Assign the episode's lesions to `lesions`: they are shown where the options ask for them; `target` is a disc to be
-    shown. OpenGL is loaded with the first picture. Renderers of one anatomy and size share one stage.
+    shown. With a `look` cameras called by name are moved, and colour pictures have its noise of the `moment`, which is
+    the number of the episode's step. OpenGL is loaded with the first picture. Renderers of one anatomy and size share
+    one stage.
     """
 
     def __init__(
@@ -70,6 +73,8 @@ class OrganRenderer:
         self.cameras: dict[str, Camera] = {}
         self.lesions: tuple[Lesion, ...] = tuple(lesions)
         self.target: Disc | None = None
+        self.look: Look | None = None
+        self.moment = 0
         self._simulation = simulation
         self._anatomy: Anatomy | None = None
         self._gl_context = gl_context
@@ -100,6 +105,8 @@ class OrganRenderer:
         view = self._camera(camera)
         with self._shown(view) as stage:
             frame = stage.canvas.colour()
+        if self.look is not None:
+            frame = self.look.exposed(frame, self.moment)
         if self.options.show_force:
             draw_forces(frame, self._simulation, view, self.options.force_mm_per_newton)
         return frame
@@ -152,7 +159,8 @@ class OrganRenderer:
         name = self.options.camera if camera is None else camera
         check_camera(name)
         self.follow_anatomy()
-        return self.cameras[name]
+        seen = self.cameras[name]
+        return seen if self.look is None else self.look.seen_from(seen)
 
     def _ready_stage(self) -> Stage:
         self.follow_anatomy()
@@ -175,9 +183,10 @@ class OrganRenderer:
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
             triangles = simulation.anatomy.mesh.boundary_triangles
-            shapes["shadow"] = ground_shadow(nodes, triangles, scene.light, scene.ground, up)
+            light = scene.light if self.look is None else self.look.lit(scene.light, -up)
+            shapes["shadow"] = ground_shadow(nodes, triangles, light, scene.ground, up)
         lesions = list(zip(tissue.lesion_centres(nodes), axes)) if options.show_lesion else []
-        stage.show(camera, shapes, simulation.instrument.data, lesions, self.target)
+        stage.show(camera, shapes, simulation.instrument.data, lesions, self.target, self.look)
 
 
 def ground_shadow(

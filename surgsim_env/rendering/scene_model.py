@@ -15,6 +15,7 @@ from surgsim_env.rendering.embedding import EmbeddedSurface
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.surface import DrawnSurface, Shape
 from surgsim_env.rendering.tissue import SECTION_SPLITS, most_tets_cut
+from surgsim_env.rendering.vessels import TEXTURE_SIZE, texture_places
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.palpable_surface import tangent_axes
 
@@ -33,7 +34,7 @@ _NO_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 
 
 @dataclass(frozen=True)
-class Look:
+class Finish:
     """Colour (red, green, blue), strength and narrowness of highlights, and light that a material emits."""
 
     colour: Colour
@@ -43,12 +44,12 @@ class Look:
 
 
 # The organ, where it is held by ligaments or a tray, its cut faces, and its shadow on the drape.
-LOOKS = {
-    "organ": Look((0.455, 0.130, 0.100), 0.75, 0.80),
-    "held": Look((0.560, 0.235, 0.185), 0.60, 0.45),
-    "section": Look((0.590, 0.235, 0.195), 0.10, 0.20, 0.25),
-    "section_lesion": Look((0.980, 0.860, 0.500), 0.10, 0.20, 0.25),
-    "shadow": Look((0.055, 0.150, 0.170), 0.0, 0.0),
+FINISHES = {
+    "organ": Finish((0.455, 0.130, 0.100), 0.75, 0.80),
+    "held": Finish((0.560, 0.235, 0.185), 0.60, 0.45),
+    "section": Finish((0.590, 0.235, 0.195), 0.10, 0.20, 0.25),
+    "section_lesion": Finish((0.980, 0.860, 0.500), 0.10, 0.20, 0.25),
+    "shadow": Finish((0.055, 0.150, 0.170), 0.0, 0.0),
 }
 LESION_COLOUR = (0.98, 0.84, 0.42)
 TARGET_COLOUR = (0.20, 0.75, 0.35)
@@ -59,6 +60,8 @@ BACKGROUND_COLOUR = (0.045, 0.105, 0.120)
 # Half the drape's width in radii of the organ, and its distance below it [m].
 DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
+# Name of the texture of vessels, white until a look draws them.
+VESSELS = "vessels"
 # Clipping planes of the cameras [m].
 NEAR, FAR = 0.005, 5.0
 # MuJoCo accepts no empty or flat mesh: until the first picture a mesh consists of copies of this tetrahedron.
@@ -89,6 +92,8 @@ class DrawnMesh:
         first = model.mesh_faceadr[mesh]
         for array in (model.mesh_face, model.mesh_facenormal):
             array[first : first + len(shape.faces)] = shape.faces
+        if shape.face_places is not None:
+            model.mesh_facetexcoord[first : first + len(shape.faces)] = shape.face_places
         self._face_count = len(shape.faces)
         self.show(True, context)
 
@@ -122,10 +127,11 @@ class SceneModel:
 
     Fields:
         model, data: MuJoCo's
-        meshes: the meshes that change with each picture, by name, a key of LOOKS
+        meshes: the meshes that change with each picture, by name, a key of FINISHES
         instrument: the geoms that follow the instrument
         light: unit direction of the lamp's light                                   (3,)
         ground: a point of the drape [m]                                            (3,)
+        downward: unit direction in which instruments come                          (3,)
     """
 
     model: mujoco.MjModel
@@ -134,6 +140,7 @@ class SceneModel:
     instrument: InstrumentGeoms
     light: FloatArray
     ground: FloatArray
+    downward: FloatArray
 
 
 def build_scene(
@@ -144,12 +151,17 @@ def build_scene(
     light = add_lights(spec, anatomy.downward, shadows=options.shadows)
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
+    places = None if options.cut_away else texture_places(surface.follow(anatomy.mesh.points)[0], surface.faces)[0]
+    vessels = spec.add_texture(name=VESSELS, type=mujoco.mjtTexture.mjTEXTURE_2D, width=TEXTURE_SIZE)
+    vessels.height, vessels.builtin = TEXTURE_SIZE, mujoco.mjtBuiltin.mjBUILTIN_FLAT
+    vessels.rgb1 = vessels.rgb2 = [1.0, 1.0, 1.0]
     for name, (vertices, faces) in meshes.items():
-        opacity = TRANSLUCENT if options.show_lesion and name in ("organ", "held") else 1.0
-        add_tissue(spec, name, vertices, faces, opacity)
+        whole = name in ("organ", "held")
+        opacity = TRANSLUCENT if options.show_lesion and whole else 1.0
+        add_tissue(spec, name, vertices, faces, opacity, places if whole else None)
     add_instrument(spec, instrument)
     model, data, drawn = compile_scene(spec, meshes)
-    return SceneModel(model, data, drawn, find_instrument(model, instrument), light, ground)
+    return SceneModel(model, data, drawn, find_instrument(model, instrument), light, ground, anatomy.downward)
 
 
 def empty_scene(width: int, height: int, background: Colour, *, samples: int = 4, far: float = FAR) -> mujoco.MjSpec:
@@ -167,12 +179,22 @@ def empty_scene(width: int, height: int, background: Colour, *, samples: int = 4
     return spec
 
 
-def add_tissue(spec: mujoco.MjSpec, name: str, vertex_count: int, face_count: int, opacity: float = 1.0) -> None:
-    """Add a mesh with the look of its name, with room for `vertex_count` vertices and `face_count` triangles."""
-    look = LOOKS[name]
-    material = spec.add_material(name=name, specular=look.specular, shininess=look.shininess)
-    material.rgba = [*look.colour, opacity]
-    material.emission = look.emission
+def add_tissue(
+    spec: mujoco.MjSpec,
+    name: str,
+    vertex_count: int,
+    face_count: int,
+    opacity: float = 1.0,
+    texture_places: NDArray[np.float32] | None = None,
+) -> None:
+    """Add a mesh with the finish of its name, with room for `vertex_count` vertices and `face_count` triangles.
+
+    With places on a texture (n_place, 2) its triangles can be textured.
+    """
+    finish = FINISHES[name]
+    material = spec.add_material(name=name, specular=finish.specular, shininess=finish.shininess)
+    material.rgba = [*finish.colour, opacity]
+    material.emission = finish.emission
     corner = np.resize(np.arange(4), max(vertex_count, 4))
     faces = np.resize(_TETRAHEDRON_FACES.ravel(), 3 * max(face_count, 4))
     mesh = spec.add_mesh(name=name)
@@ -180,6 +202,9 @@ def add_tissue(spec: mujoco.MjSpec, name: str, vertex_count: int, face_count: in
     mesh.usernormal = np.resize([0.0, 0.0, 1.0], 3 * len(corner))
     mesh.userface = faces
     mesh.userfacenormal = faces
+    if texture_places is not None:
+        mesh.usertexcoord = texture_places.ravel()
+        mesh.userfacetexcoord = np.zeros_like(faces)
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     spec.worldbody.add_geom(
         name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, contype=0, conaffinity=0
@@ -251,8 +276,10 @@ def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
     mujoco.mju_mat2Quat(quaternion, np.column_stack([across, np.cross(-down, across), -down]).ravel())
     cloth = spec.add_texture(name="drape", type=mujoco.mjtTexture.mjTEXTURE_2D, width=64, height=64)
     cloth.builtin = mujoco.mjtBuiltin.mjBUILTIN_CHECKER
-    cloth.rgb1, cloth.rgb2 = DRAPE_COLOURS
+    # Relative to the lighter squares, whose colour is the material's.
+    cloth.rgb1, cloth.rgb2 = np.divide(DRAPE_COLOURS, DRAPE_COLOURS[1])
     material = spec.add_material(name="drape", specular=0.0, shininess=0.0)
+    material.rgba = [*DRAPE_COLOURS[1], 1.0]
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "drape"
     # A uniform texture repeats for each metre; one repeat holds two squares.
     material.texuniform, material.texrepeat = True, [0.5 / DRAPE_SQUARE, 0.5 / DRAPE_SQUARE]

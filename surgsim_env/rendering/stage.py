@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera
+from surgsim_env.rendering.drawn_look import DrawnLook
 from surgsim_env.rendering.embedding import boundary_surface, organ_surface
+from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import RenderOptions
-from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, PREFIX, TARGET_COLOUR, build_scene
-from surgsim_env.rendering.surface import Shape
+from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, PREFIX, build_scene
+from surgsim_env.rendering.surface import TRIANGLES_MOST, Shape
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
 
@@ -34,6 +36,8 @@ LABELS = {"background": 0, "organ": 1, "instrument": 2, "lesion": 3, "target": 4
 MESH_LABELS = dict.fromkeys(("organ", "held", "section"), LABELS["organ"]) | {"section_lesion": LABELS["lesion"]}
 # Largest number of lesions in a picture; they and a target are geoms that the model does not have.
 LESIONS_MOST = 100
+# A picture has at most one triangle of the organ for so many pixels; a small one then takes half the time.
+PIXELS_OF_TRIANGLE = 4
 # A target is drawn this thick [m], all of it below the disc itself.
 TARGET_THICKNESS = 2e-4
 
@@ -140,11 +144,13 @@ class Stage:
         """Make the scene and load it into a context."""
         self.users = 0
         # A section is of tets: in a cut-open view their boundary is drawn, which meets it.
-        self.surface = boundary_surface(anatomy) if options.cut_away else organ_surface(anatomy)
+        most = min(TRIANGLES_MOST, options.width * options.height // PIXELS_OF_TRIANGLE)
+        self.surface = boundary_surface(anatomy, most) if options.cut_away else organ_surface(anatomy, most)
         self.scene = build_scene(anatomy, self.surface, instrument, options)
         self.canvas = Canvas(
             self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1, shadows=options.shadows
         )
+        self._look = DrawnLook(self.scene, self.canvas.context, has_vessels=not options.cut_away)
         # Labels of geoms that a picture has beyond those of the model, by their places in it.
         self._added: dict[int, int] = {}
 
@@ -155,6 +161,7 @@ class Stage:
         instrument: mujoco.MjData,
         lesions: Sequence[tuple[FloatArray, FloatArray]],
         target: Disc | None,
+        look: Look | None = None,
     ) -> None:
         """Upload the shapes and poses of a picture and look at them through a camera.
 
@@ -164,19 +171,21 @@ class Stage:
             instrument: the instrument's data, which is read.
             lesions: centre [m] (3,), half axes [m] (3,) of each solid lesion.
             target: a disc to be drawn, None for none.
+            look: of the picture; None: the scene's own.
         """
+        self._look.put_on(look)
         self.scene.instrument.pose(instrument, self.scene.data)
         self.canvas.select()
         for name, shape in shapes.items():
             self.scene.meshes[name].upload(shape, self.canvas.context)
-        self.canvas.look(camera, sky=camera.sees_above_level())
+        self.canvas.look(camera, sky=look is not None or camera.sees_above_level())
         self._added.clear()
         for centre, half_axes in lesions[:LESIONS_MOST]:
             self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, half_axes, centre, np.eye(3), LESION_COLOUR, "lesion")
         if target is not None:
             size = np.array([target.radius, 0.5 * TARGET_THICKNESS, 0.0])
             centre = target.centre - 0.5 * TARGET_THICKNESS * target.normal
-            self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, target.rotation, TARGET_COLOUR, "target")
+            self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, target.rotation, self._look.target_colour, "target")
 
     def depth(self) -> NDArray[np.float32]:
         """Distance from the camera's plane [m], infinite where there is nothing, shape (height, width)."""

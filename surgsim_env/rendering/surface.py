@@ -29,11 +29,13 @@ class Shape:
         vertices: [m]                                                               (n_vertex, 3)
         normals: unit, outward                                                      (n_vertex, 3)
         faces: vertices of the triangles, outward                                   (n_face, 3)
+        face_places: places of their corners on a texture; None without one         (n_face, 3)
     """
 
     vertices: FloatArray
     normals: FloatArray
     faces: IntArray
+    face_places: IntArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.embedding import EmbeddedSurface
 from surgsim_env.rendering.surface import DrawnSurface, Shape, smooth_normals
+from surgsim_env.rendering.vessels import texture_places
 from surgsim_env.scene.anatomy import Anatomy
 
 # Edges of a section's triangles are split into this number of parts, so that a lesion's outline looks round.
@@ -45,13 +46,16 @@ class Tissue:
         self.lesions = [lesion_ball(anatomy.mesh, lesion) for lesion in lesions]
         held = surface.faces_among(anatomy.anchors)
         self._faces = {"organ": surface.faces[~held], "held": surface.faces[held]}
+        _, places = texture_places(surface.follow(self._rest)[0], surface.faces)
+        self._face_places = {"organ": places[~held], "held": places[held]}
         self._cut = _CutAway(anatomy, surface, self.lesions, self._faces) if cut_away else None
 
     def shapes(self, node_position: FloatArray) -> dict[str, Shape]:
         """Surface and cut faces by their names in the scene, with the nodes at their positions [m] (n_node, 3)."""
         vertices, normals = self._surface.follow(node_position)
         if self._cut is None:
-            return {name: Shape(vertices, normals, faces) for name, faces in self._faces.items()}
+            places = self._face_places
+            return {name: Shape(vertices, normals, faces, places[name]) for name, faces in self._faces.items()}
         return self._cut.surfaces(vertices, normals) | self._cut.sections(node_position)
 
     def lesion_centres(self, node_position: FloatArray) -> list[FloatArray]:

@@ -204,6 +204,8 @@ class TouchMemory:
     def forget(self) -> None:
         """Begin an episode."""
         self.product, self.square = np.zeros((2, len(self.map.pressable)))
+        # Fitted when it is asked for after a reading.
+        self._stiffest: FloatArray | None = None
 
     def restored(self, product: ArrayLike, square: ArrayLike) -> Self:
         """A copy with other sums of the readings, (n_site,) each; this one stays as it is.
@@ -217,6 +219,7 @@ class TouchMemory:
         if other.product.shape != sites or other.square.shape != sites or (other.square < 0.0).any():
             shapes = f"{other.product.shape} and {other.square.shape}"
             raise ValueError(f"memory: sums of shapes {shapes}; they must be {sites}, and squares at least 0")
+        other._stiffest = None
         return other
 
     def feel(self, place: FloatArray, depth: float, force: float) -> None:
@@ -227,6 +230,7 @@ class TouchMemory:
         healthy = self.indenter.force(depth)
         self.product[site] += force * healthy
         self.square[site] += healthy**2
+        self._stiffest = None
 
     @property
     def visited(self) -> FloatArray:
@@ -240,7 +244,9 @@ class TouchMemory:
 
     def stiffest(self) -> FloatArray:
         """Place (2,) and contrast of the stiffest spot; zeros without a reading."""
-        return stiffest_spots(self.bell_fit, self.product[None], self.square[None])[0]
+        if self._stiffest is None:
+            self._stiffest = stiffest_spots(self.bell_fit, self.product[None], self.square[None])[0]
+        return self._stiffest.copy()
 
 
 def stiffest_spots(bell_fit: BellFit, product: FloatArray, square: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401
 from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.palpation.touches import stiffest_spots
 
 ID = "SurgSim/Palpate-v0"
 SITES = MAP_SIDE**2
@@ -64,6 +65,23 @@ def test_the_stiffest_place_is_where_most_was_felt():
     assert (seen[-1, VISITED][near] == 1.0).any()
     felt = seen[-1, CONTRAST][seen[-1, VISITED] > 0.0]
     assert felt.mean() <= contrast <= felt.max()
+
+
+def test_the_stiffest_place_follows_each_reading():
+    """What is kept of it between readings is that of the readings so far, also in a restored memory."""
+    env = gym.make(ID, memory=True).unwrapped
+    env.reset(seed=3)
+    memory, rng = env.task.memory, np.random.default_rng(0)
+    for place in rng.uniform(-0.9, 0.9, (30, 2)):
+        memory.feel(place, 0.003, float(rng.uniform(0.1, 0.3)))
+        fresh = stiffest_spots(memory.bell_fit, memory.product[None], memory.square[None])[0]
+        np.testing.assert_array_equal(memory.stiffest(), fresh)
+    last = memory.stiffest()
+    other = memory.restored(2.0 * memory.product, memory.square)
+    assert other.stiffest()[2] == pytest.approx(2.0 * last[2])
+    np.testing.assert_array_equal(memory.stiffest(), last)
+    memory.forget()
+    np.testing.assert_array_equal(memory.stiffest(), 0.0)
 
 
 def test_an_episode_begins_with_nothing_remembered():

@@ -301,7 +301,9 @@ middle of their bounds; with `scaled=False` SI units. Numbers and places of entr
 
 COMMON_ARGUMENTS = """* `scaled`: each value over its channel's scale, of order 1 (default); False: SI units.
 * `observe_force`: False observes all channels that depend on force sensing as 0.
-* `obs_mode`: "state" (default), or "rgb" for the endoscope's picture, `Box(0, 255, (84, 84, 3), uint8)` (needs OpenGL).
+* `obs_mode`: "state" (default), "rgb" for the endoscope's picture, `Box(0, 255, (84, 84, 3), uint8)` (needs OpenGL), or
+  "rgb_force" for a dictionary of it ("picture") and of the channels that depend on force sensing ("force").
+* `looks`: None (default), or "train" or "test" for pictures with a random look in each episode (docs/rendering.md).
 * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
 * `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of
   `surgsim_env.rendering.options.RenderOptions`: what pictures show."""

@@ -33,7 +33,7 @@ LINE_COLOURS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#999999", "#0072B2"
 # An organ with two lesions that no evaluation uses, and the presses after which it is shown.
 SHOWN_SEED, SHOWN_PRESSES = 3_000_003, (4, 9, 16)
 # The trained agent, an organ with two lesions that neither its training nor an evaluation uses, and the presses shown.
-SHOWN_POLICY, AGENT_SEED, AGENT_PRESSES = "sites_ppo.safetensors", 4_000_009, (4, 12)
+SHOWN_POLICY, AGENT_SEED, AGENT_PRESSES = "sites_evolved.safetensors", 4_000_009, (4, 12)
 
 
 def draw_errors(results: list[Result], path: Path) -> None:

@@ -19,6 +19,7 @@ SHOWN = 0.5
 def main() -> None:
     """Fold the lobe until half of the target is visible, and draw it under six looks of each split."""
     env = gym.make("SurgSim/Retract-v0", render_mode="rgb_array", width=SIDE, height=SIDE, show_force=False).unwrapped
+    env.reset(seed=EPISODE)
     run = run_script(env, oracle_script(env), seed=EPISODE)
     step = next(index for index, info in enumerate(run.infos) if info["visible"] >= SHOWN)
     env.reset(seed=EPISODE)

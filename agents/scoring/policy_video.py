@@ -50,7 +50,12 @@ def episode_frames(policy: Any, env: gym.Env, seed: int) -> list[NDArray[np.uint
     tips: list[NDArray[np.float64]] = []
     frames: list[NDArray[np.uint8]] = []
     while not over:
-        observation, _, terminated, truncated, info = env.step(policy.act(observation[None])[0])
+        seen: Any = (
+            {name: part[None] for name, part in observation.items()}
+            if isinstance(observation, dict)
+            else observation[None]
+        )
+        observation, _, terminated, truncated, info = env.step(policy.act(seen)[0])
         over, steps = terminated or truncated, steps + 1
         forces.append(float(info["force_peak"]))
         tips.append(env.unwrapped.simulation.instrument.tip_position.copy())  # type: ignore[attr-defined]

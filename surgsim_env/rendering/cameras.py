@@ -45,12 +45,12 @@ class Camera:
     def looking(cls, position: FloatArray, target: FloatArray, up: FloatArray, fov: float) -> "Camera":
         """A camera at a position that looks at a target [m], with `up` upright in the picture."""
         back = (position - target) / np.linalg.norm(position - target)
-        right = np.cross(up, back)
+        right = cross(up, back)
         if np.linalg.norm(right) < 1e-6:
             # It looks along `up`: any other upright direction will do.
             right, _ = tangent_axes(back)
         right /= np.linalg.norm(right)
-        return cls(position, target, up, np.column_stack([right, np.cross(back, right), back]), fov)
+        return cls(position, target, up, np.column_stack([right, cross(back, right), back]), fov)
 
     def sees_above_level(self) -> bool:
         """Whether some ray of its picture does not meet the drape, which lies below: background is seen there."""
@@ -62,6 +62,12 @@ class Camera:
         x, y, z = ((points - self.position) @ self.rotation).T
         focal = 0.5 * height / math.tan(math.radians(0.5 * self.fov))
         return np.column_stack([0.5 * width - focal * x / z, 0.5 * height + focal * y / z]), -z
+
+
+def cross(one: FloatArray, other: FloatArray) -> FloatArray:
+    """The cross product of two vectors (3,), in a tenth of numpy's time, which counts in small pictures."""
+    (a, b, c), (d, e, f) = one.tolist(), other.tolist()
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Camera]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.rendering.cameras import Camera
+from surgsim_env.rendering.cameras import Camera, cross
 from surgsim_env.scene.palpable_surface import tangent_axes
 
 Range = tuple[float, float]
@@ -202,7 +202,7 @@ class Look:
         view = (target - position) / np.linalg.norm(target - position)
         # Rodrigues: `up` turned about the view.
         angle = math.radians(self.roll)
-        across, along = np.cross(view, camera.up), view * (view @ camera.up)
+        across, along = cross(view, camera.up), view * (view @ camera.up)
         turned = (camera.up - along) * math.cos(angle) + across * math.sin(angle) + along
         rotation = Camera.looking(position, target, turned, camera.fov).rotation
         return Camera(position, target, camera.up, rotation, camera.fov * self.fov_factor)

@@ -1,4 +1,4 @@
-"""Draw a contact sheet of random looks: python docs/make_looks_picture.py (half a minute, once kernels are compiled)."""
+"""Draw a contact sheet of random looks: python docs/make_looks_picture.py (half a minute with compiled kernels)."""
 
 from pathlib import Path
 

@@ -155,6 +155,34 @@ class OracleSites(GpVariance):
         return self.places[left - 1] if left <= len(self.places) else action
 
 
+class OracleNear(OracleSites):
+    """Presses the true lesions first, then a place far from all of them, then around each, then as `OracleSites`.
+
+    A search has to find lesions before it can do so: it bounds how few presses locate them by the common estimator.
+    """
+
+    # Directions around a lesion, and the distance over the lesions' mean radius.
+    around: ClassVar[NDArray[np.float64]] = np.array([[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]])
+    distance: ClassVar[float] = 0.9
+
+    def see(self, task: PalpateSitesTask) -> None:
+        """Take the truth of the episode that `reset` has begun."""
+        super().see(task)
+        facts = self.process.facts
+        lesions = 0.5 * (np.array(self.places, dtype=np.float64).reshape(-1, 2) + 1.0) * facts.extent
+        squared = ((facts.sites[:, None] - lesions) ** 2).sum(axis=2).min(axis=1, initial=np.inf)
+        far = facts.sites[np.argmax(np.where(self.process.candidates, squared, -np.inf))]
+        rings = [lesions + self.distance * facts.lesion_radius * way for way in self.around]
+        self.first_places = np.concatenate([lesions, far[None], *rings])
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        if self.count < len(self.first_places):
+            self.count += 1
+            return self.process.facts.action(self.first_places[self.count - 1])
+        return super().act(observation)
+
+
 class Middle:
     """The blind guess: one lesion in the middle of the chart, regardless of the presses.
 
@@ -207,6 +235,7 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "gp_ucb": GpUcb,
     "gp_level_set": GpLevelSet,
     "oracle": OracleSites,
+    "oracle_near": OracleNear,
     "truth": TruthAgent,
     "middle": Middle,
 }
@@ -214,4 +243,4 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
 # Methods whose estimates do not depend on what their presses feel.
 REFERENCES = ("truth", "middle")
 # Methods that know the truth, or do not search.
-BOUNDS = (*REFERENCES, "oracle")
+BOUNDS = (*REFERENCES, "oracle", "oracle_near")

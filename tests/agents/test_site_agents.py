@@ -118,6 +118,22 @@ def test_the_oracle_presses_lesions_last() -> None:
     np.testing.assert_array_equal(pressed.places[:-2], played("gp_variance", Chart([]))[:-2])
 
 
+def test_the_near_oracle_presses_lesions_first() -> None:
+    agent = find_agent("oracle_near")()
+    agent.reset(np.random.default_rng(0), FACTS)
+    truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
+    chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)
+    agent.see(SimpleNamespace(truth=truth, charted=SimpleNamespace(chart=chart)))
+    pressed = Chart([])
+    for _ in range(9):
+        pressed.press(agent.act(pressed.observation()))
+    places = np.array(pressed.places)
+    np.testing.assert_allclose(places[:2], truth[:, :2], atol=1e-8)
+    away = np.linalg.norm(places[2:, None] - truth[:, :2], axis=2).min(axis=1)
+    assert away[0] > 0.015
+    np.testing.assert_allclose(away[1:], 0.9 * FACTS.lesion_radius, rtol=0.01)
+
+
 def test_unknown_agents_are_refused() -> None:
     with pytest.raises(ValueError, match="agent 'gp_ubc' is unknown"):
         find_agent("gp_ubc")

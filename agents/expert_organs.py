@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from agents.scoring.episodes import make_envs, play_tasks, print_episodes
-from agents.training.face_features import FACE, FaceFeatures, face_features
+from agents.training.face_features import FACE, UPRIGHT, FaceFeatures, face_features
 
 DEPTH = 0.42  # [tip radii] of the sliding ball
 GAP = 0.15  # [tip radii] between tip and surface on the way to the first row
@@ -56,7 +56,7 @@ def _actions(seen: FaceFeatures, way: torch.Tensor, low: torch.Tensor, declare: 
     wanted = torch.where(low, DEPTH, -GAP)
     rise = torch.maximum((seen.depth - wanted) / DEPTH_SLOW, FORCE_GAIN * (seen.force - FORCE_MOST)).clamp(-1.0, 1.0)
     # A slope that would need more than full speed slows the tip down.
-    slope = -(seen.normal[:, :2] * sideways).sum(dim=1) / seen.normal[:, 2].clamp(min=0.3)
+    slope = -(seen.normal[:, :2] * sideways).sum(dim=1) / seen.normal[:, 2].clamp(min=UPRIGHT)
     along = torch.cat([sideways, slope[:, None]], dim=1) / slope.abs().clamp(min=1.0)[:, None]
     velocity = (along + rise[:, None] * seen.normal).clamp(-1.0, 1.0)
     return torch.cat([velocity, declare[:, None].to(velocity.dtype)], dim=1)

@@ -3,8 +3,9 @@
     python -m agents.learn_palpate_organs --out runs/palpate_organs.safetensors
 
 The network sees the observation alone, through `agents.training.face_features.FaceSummary`. It is fitted to imagined
-features, which fill their ranges, and to the states that it reaches on organs, all labelled by the expert
-(`agents.expert_organs`). Features are kept in place of observations of 5069 numbers.
+features, which fill their ranges, and to the states that it reaches on organs whose forces a formula gives
+(`agents.training.face_surrogate`), all labelled by the expert (`agents.expert_organs`). Features are kept in place of
+observations of 5069 numbers.
 """
 
 import argparse
@@ -22,7 +23,6 @@ with one_line_errors(__name__, "agents"):
     from stable_baselines3 import PPO
 
     from agents.expert_organs import DEPTH, expert_actions
-    from agents.scoring.episodes import make_envs
     from agents.training.face_features import (
         LATE,
         OBSERVATION_SIZE,
@@ -33,16 +33,19 @@ with one_line_errors(__name__, "agents"):
         face_features,
         face_summary,
     )
+    from agents.training.face_surrogate import FaceSurrogate
     from agents.training.imitation import CloningOptions, clone
     from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 
 ENV_ID = "SurgSim/Palpate-v0"
-NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.ELU}
+NETWORK = {"net_arch": [192, 192], "activation_fn": torch.nn.ELU}
 KWARGS = {"memory": True, "frame": "face"}
 # Errors of the player: first-order autoregressive noise on the velocity of every other organ.
 ERROR, ERROR_KEPT = 0.15, 0.9
-# First seed of the organs; each round takes others.
-SEED = 2_000_000
+# Weight of a state that was reached over that of an imagined one.
+REPEAT = 4.0
+# The organs of a round; the first scene stands in the policy's file.
+SCENES = ["liver"] * 3 + ["liver_family"] * 2 + ["kidney_family"] * 2 + ["spleen_family", "phantom", "phantom"]
 
 
 class _Spaces(gym.Env):
@@ -90,53 +93,47 @@ def _ways(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     return size * way / np.abs(way).max(axis=1, keepdims=True)
 
 
-def play_round(
-    scene: str, level: str | None, policy: TrainedPolicy, count: int, steps: int, seed: int, threads: int = 1
-) -> tuple[NDArray, NDArray, list[bool]]:
-    """Features (n, SUMMARY_SIZE) of states that a policy reaches on `count` organs, and the expert's actions (n, 4).
+def play_round(envs: FaceSurrogate, policy: TrainedPolicy | None) -> tuple[NDArray, NDArray, list[bool]]:
+    """Features (n, SUMMARY_SIZE) of the states that a policy reaches, the expert's actions there (n, 4), and successes.
 
-    Also whether each episode that ended succeeded.
+    The policy plays an episode in each environment, or the expert if there is none.
     """
-    envs = make_envs(ENV_ID, count, scene=scene, level=level, threads=threads, **KWARGS)
-    rng = np.random.default_rng(seed)
-    observations, _ = envs.reset(seed=[seed + index for index in range(count)])
-    policy.reset(count)
-    error, over, begins = np.zeros((count, 3)), np.zeros(count, dtype=np.bool_), np.ones(count, dtype=np.bool_)
-    seen, labels, won = [], [], []
-    for _ in range(steps):
+    count = len(envs.envs)
+    observations, begins = envs.reset(), np.ones(count, dtype=np.bool_)
+    if policy is not None:
+        policy.reset(count)
+    error = np.zeros((count, 3))
+    seen, labels = [], []
+    while not envs.over.all():
         with torch.no_grad():
             found = face_features(torch.as_tensor(observations))
             wanted, features = expert_actions(found).numpy(), face_summary(found).numpy()
-        seen.append(features[~over])
-        labels.append(wanted[~over])
-        action = policy.act(observations, begins)
+        seen.append(features[~envs.over])
+        labels.append(wanted[~envs.over])
+        action = wanted.copy() if policy is None else policy.act(observations, begins)
         begins[:] = False
-        error = ERROR_KEPT * error + ERROR * rng.normal(size=error.shape)
+        error = ERROR_KEPT * error + ERROR * envs.rng.normal(size=error.shape)
         action[:, :3] = np.clip(action[:, :3] + error * (np.arange(count) % 2 == 0)[:, None], -1.0, 1.0)
-        observations, _, terminated, truncated, infos = envs.step(action.astype(np.float32))
-        ended = (terminated | truncated) & ~over
-        won += [bool(infos["success"][index]) for index in np.flatnonzero(ended)]
-        over |= ended
-        if over.all():
-            break
-        envs.unwrapped.pause(over)  # type: ignore[attr-defined]
-    envs.close()
-    return np.concatenate(seen), np.concatenate(labels), won
+        observations = envs.step(action)
+    return np.concatenate(seen), np.concatenate(labels), [bool(info["success"]) for info in envs.infos]
 
 
 def fitted(
-    seen: NDArray, labels: NDArray, imagined_count: int, epochs: int, seed: int, model: PPO | None = None
+    seen: NDArray, labels: NDArray, *, imagined_count: int, options: CloningOptions, model: PPO | None = None
 ) -> tuple[PPO, float]:
-    """A network on features, and its loss: fitted to labelled features, and to so many imagined ones."""
-    rng = np.random.default_rng(seed)
+    """A network on features, and its loss: fitted to labelled features, each REPEAT times, and to imagined ones."""
+    rng = np.random.default_rng(options.seed)
     with torch.no_grad():
         made = imagined(imagined_count, rng)
         inputs, wanted = face_summary(made).numpy(), expert_actions(made).numpy()
     action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
     space = gym.spaces.Box(-np.inf, np.inf, (SUMMARY_SIZE,), np.float32)
-    model = model or PPO("MlpPolicy", _Spaces(space, action_space), policy_kwargs=NETWORK, device="cpu", seed=seed)
-    options = CloningOptions(epochs=epochs, patience=6, batch_size=512, std=0.05, seed=seed)
-    curve = clone(model, np.concatenate([seen, inputs]), np.concatenate([labels, wanted]), options=options)
+    model = model or PPO("MlpPolicy", _Spaces(space, action_space), policy_kwargs=NETWORK, device="cpu", seed=0)
+    weight = np.concatenate([np.full(len(seen), REPEAT), np.ones(imagined_count)])
+    curve = clone(
+        *(model, np.concatenate([seen, inputs]), np.concatenate([labels, wanted])),
+        sample_weight=weight, options=options,
+    )  # fmt: skip
     return model, curve.validation[curve.best]
 
 
@@ -163,33 +160,34 @@ def main() -> None:
     """Train; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
-    parser.add_argument(
-        "--rounds", nargs="*", default=["liver", "liver_family", "liver", "phantom"], help="scenes to play on, in order"
-    )
+    parser.add_argument("--scenes", nargs="+", default=SCENES, help="organs of a round, each played once")
     parser.add_argument("--level", default="standard")
-    parser.add_argument("--steps", type=int, default=900, help="most control steps of an episode of a round")
-    parser.add_argument("--envs", type=int, default=16, help="organs of a round, each played once")
-    parser.add_argument("--imagined", type=int, default=400_000, help="imagined features of each fit")
-    parser.add_argument("--epochs", type=int, default=40, help="epochs of the first fit; later ones have half as many")
-    parser.add_argument("--threads", type=int, default=1, help="of the organs")
+    parser.add_argument("--rounds", type=int, default=5, help="the first is the expert's")
+    parser.add_argument("--imagined", type=int, default=100_000, help="imagined features of each fit")
+    parser.add_argument("--epochs", type=int, default=12, help="of a fit; the last one has four times as many")
+    parser.add_argument("--seed", type=int, default=2_000_000)
     given = parser.parse_args()
     torch.set_num_threads(1)
     begin = time.time()
+    envs = FaceSurrogate(
+        [gym.make(ENV_ID, scene=scene, level=given.level, **KWARGS) for scene in given.scenes],
+        np.random.default_rng(given.seed),
+    )
     seen, labels = np.zeros((0, SUMMARY_SIZE), np.float32), np.zeros((0, 4), np.float32)
-    model, loss = fitted(seen, labels, given.imagined, given.epochs, 0)
-    print(f"{time.time() - begin:6.0f} s imagined: loss {loss:.5f}", flush=True)
-    for index, scene in enumerate(given.rounds):
-        env = gym.make(ENV_ID, scene=scene, level=given.level, **KWARGS)
-        policy = save(model, env, given.rounds[0], given.level, len(seen), given.out)
-        new_seen, new_labels, won = play_round(
-            scene, given.level, policy, given.envs, given.steps, SEED + 1000 * index, given.threads
-        )
+    model, policy = None, None
+    for index in range(given.rounds):
+        new_seen, new_labels, won = play_round(envs, policy)
         seen, labels = np.concatenate([seen, new_seen]), np.concatenate([labels, new_labels])
-        model, loss = fitted(seen, labels, given.imagined, max(given.epochs // 2, 1), index + 1, model)
-        save(model, env, given.rounds[0], given.level, len(seen), given.out)
+        last = index == given.rounds - 1
+        options = CloningOptions(
+            epochs=given.epochs * (4 if last else 1), patience=8, batch_size=512, std=0.05, seed=index,
+            learning_rate=3e-4 if last else 1e-3,
+        )  # fmt: skip
+        model, loss = fitted(seen, labels, imagined_count=given.imagined, options=options, model=model)
+        policy = save(model, envs.envs[0], given.scenes[0], given.level, len(seen), given.out)
         print(
-            f"{time.time() - begin:6.0f} s round {index} on {scene}: success {sum(won)} of {given.envs}, {len(seen)} "
-            f"steps, loss {loss:.5f}",
+            f"{time.time() - begin:6.0f} s round {index}: success {np.mean(won):.2f}, {len(seen)} steps, "
+            f"loss {loss:.5f}",
             flush=True,
         )
 

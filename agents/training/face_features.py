@@ -25,10 +25,14 @@ PASSED = (0.8, 2.4)
 # Largest distance that a way is told as [tip radii]; farther ones have their direction.
 WAY_MOST = 3.0
 FAR = 1e6
+# Least height of a normal that slopes are computed with.
+UPRIGHT = 0.3
+# An excess that may be a lesion, and the range around it that is magnified.
+EXCESS_MIDDLE, EXCESS_NEAR = 0.3, 0.1
 # Share of the time left below which it is told.
 LATE = 0.2
 # Entries of `face_summary`, the distance near a way's end, and the depth in the middle of its range [tip radii].
-SUMMARY_SIZE, WAY_NEAR, DEPTH_MIDDLE = 24, 0.4, 0.4
+SUMMARY_SIZE, WAY_NEAR, DEPTH_MIDDLE = 28, 0.4, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,17 +182,21 @@ class FaceSummary(BaseFeaturesExtractor):
 def face_summary(seen: FaceFeatures) -> torch.Tensor:
     """Features as the entries of a network's input, shape (n, SUMMARY_SIZE).
 
-    Ways are given twice, as they are and magnified near their ends, where a tip slows down; depth and force are
-    magnified around those of a sliding tip.
+    Ways are given twice, as they are and magnified near their ends, where a tip slows down, the latter also with the
+    heights that they climb along the surface; the excess, too, and depth and force around those of a sliding tip.
     """
-    ways = torch.cat([seen.row_way, seen.across_way, seen.stiffest_way], dim=1)
+    ways = torch.stack([seen.row_way, seen.across_way, seen.stiffest_way], dim=1)
+    near = (ways / WAY_NEAR).clamp(-1.0, 1.0)
+    normal = seen.normal
+    climbs = -(near * normal[:, None, :2]).sum(dim=2) / normal[:, 2:].clamp(min=UPRIGHT)
     late = (LATE - seen.time_left).clamp(min=0.0) / LATE
     rest = [
         *((seen.depth - DEPTH_MIDDLE) * 4.0, seen.force * 2.0, seen.begun, seen.rows_left, seen.across_left),
         *((seen.rows_left == 0.0).to(ways.dtype), seen.excess * 2.0, seen.passed, late),
+        ((seen.excess - EXCESS_MIDDLE) / EXCESS_NEAR).clamp(-1.0, 1.0),
     ]
     others = torch.stack(rest, dim=1).clamp(-3.0, 3.0)
-    return torch.cat([ways / WAY_MOST, (ways / WAY_NEAR).clamp(-1.0, 1.0), others, seen.normal], dim=1)
+    return torch.cat([ways.flatten(1) / WAY_MOST, near.flatten(1), climbs, others, normal], dim=1)
 
 
 def _rows(face: torch.Tensor, cell: torch.Tensor) -> torch.Tensor:

@@ -17,6 +17,7 @@ AGENTS = ROOT / "agents"
 
 # Arguments that make a run short, and what it has said by then.
 SMALL: dict[str, tuple[list[str], str]] = {
+    "expert_organs": (["--scene", "phantom", "--blind", "--envs", "1", "--episodes", "1"], r"1 episodes: success"),
     "expert_palpate": (["--envs", "1", "--episodes", "1"], r"1 episodes: success"),
 }
 # Scripts that other tests run.
@@ -26,9 +27,11 @@ ELSEWHERE = {
     "evaluate": "test_evaluate.py",
     "expert_retract": "test_retract_agents.py",
     "learn_palpate": "test_palpate_agents.py",
+    "learn_palpate_organs": "test_organ_agents.py",
     "learn_palpate_recurrent": "test_palpate_agents.py",
     "learn_retract": "test_retract_agents.py",
     "learning_curves": "test_from_scratch.py",
+    "organ_film": "test_evaluate.py",
     "press_library": "test_press_library.py",
     "raster": "test_agents.py",
     "record_demonstrations": "test_demonstrations.py",

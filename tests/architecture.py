@@ -31,7 +31,7 @@ ORDER = {
         *("expert_palpate", "expert_organs", "expert_retract", "learn_palpate", "learn_palpate_organs"),
         *("learn_palpate_recurrent", "learn_retract", "learn_retract_pixels"),
         *("record_demonstrations", "behaviour_cloning", "train", "train_rllib", "evaluate"),
-        *("palpation_figures", "learning_curves", "convert_policy"),
+        *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents import evaluate
@@ -363,3 +364,30 @@ def test_a_policy_is_filmed(tmp_path: Path) -> None:
     assert first[:, left].std() > 10.0, "an organ is seen"
     assert np.abs(first[:, right].astype(float) - last[:, right]).max() > 100.0, "the second press was drawn"
     clip.close()
+
+
+def test_organs_are_filmed_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture a press, and one of the truth, which is shown for longer; what is hidden is not in the others."""
+    from agents import organ_film
+    from surgsim_env.rendering import gl
+
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    monkeypatch.setattr(organ_film, "load_policy", lambda path: MiddleOfAll())
+    monkeypatch.setattr(organ_film, "ORGANS", {"first": ({"scene": "phantom"}, 3), "second": ({"scene": "phantom"}, 4)})
+    organ_film.main(["--organs", "first", "second", "--budget", "2", "--out", str(tmp_path / "film.webp")])
+    with Image.open(tmp_path / "film.webp") as film:
+        assert (film.n_frames, film.info["loop"]) == (3, 0)
+        times, pictures = [], []
+        for number in range(film.n_frames):
+            film.seek(number)
+            pictures.append(np.asarray(film.convert("RGB"), dtype=float))
+            times.append(film.info["duration"])
+    assert times == [organ_film.PRESS_TIME] * 2 + [organ_film.END_TIME]
+    maps = [one[len(one) // 2 :] for one in pictures]
+    red = [(one[..., 0] - one[..., 1:].max(axis=-1) > 80.0).sum() for one in maps]
+    assert red[2] > 200 > max(red[:2]), "places of lesions are marked in the last picture alone"
+    with pytest.raises(ValueError, match=r"let its name end in \.webp"):
+        organ_film.main(["--out", "film.gif"])

@@ -1,11 +1,12 @@
 """Learn where to press on any organ: an evolution strategy finds the acquisition function of a site policy.
 
     python -m agents.learn_sites --out runs/sites.safetensors
+    python -m agents.learn_sites --start agents/policies/sites_evolved.safetensors --out runs/sites.safetensors
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
 `cma`) changes the 13 numbers of `agents.training.site_policy.Acquisition`, beginning at the upper confidence bound of
-`gp_ucb`. All candidates of a generation play the same episodes of `agents/training/bell_sites.py`; each generation has
-new ones. An episode costs
+`gp_ucb` or at a policy. All candidates of a generation play the same episodes of `agents/training/bell_sites.py`; each
+generation has new ones. An episode costs
 
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
 
@@ -18,6 +19,7 @@ import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -33,7 +35,7 @@ with one_line_errors(__name__, "agents"):
 
     from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
     from agents.training.bell_sites import BellSites
-    from agents.training.policy_files import describe, policy_path, save_policy
+    from agents.training.policy_files import describe, load_policy, policy_path, save_policy
     from agents.training.site_policy import (
         CHOICE_SPACE,
         FEATURE_SPACE,
@@ -121,11 +123,13 @@ class Evolution:
         population: candidates of a generation.
         episodes: of each candidate.
         seed: of the candidates and the episodes.
+        start: the acquisition function to begin at.
     """
 
     population: int
     episodes: int
     seed: int
+    start: Acquisition
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
@@ -143,7 +147,7 @@ class Evolution:
         """The acquisition function so many steps from the first one (13,)."""
         made = Acquisition()
         with torch.no_grad():
-            made.values += torch.as_tensor(steps * PARAMETER_STEPS, dtype=torch.float32)
+            made.values.copy_(self.start.values + torch.as_tensor(steps * PARAMETER_STEPS, dtype=torch.float32))
         return made
 
     @property
@@ -170,14 +174,27 @@ def as_policy(acquisition: Acquisition, seed: int) -> PPO:
     return model
 
 
+def policy_acquisition(path: Path) -> Acquisition:
+    """The acquisition function of a policy's file.
+
+    Raises:
+        ValueError: a policy that has none.
+    """
+    networks = load_policy(path).networks
+    if not isinstance(networks, SitePolicy):
+        raise ValueError(f"--start {path} has no acquisition function: take a policy of agents.learn_sites")
+    return networks.mlp_extractor.acquisition  # type: ignore[union-attr, return-value]
+
+
 def learn(arguments: argparse.Namespace) -> None:
     """Search; print a line after each generation, and write the policy where it costs less than all before."""
     torch.set_num_threads(1)
-    evolution = Evolution(arguments.population, arguments.episodes, arguments.seed)
+    start = Acquisition() if arguments.start is None else policy_acquisition(arguments.start)
+    evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, start)
     check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
     made = gym.make(ID, scene="phantom_small").unwrapped
     least = cost(play(evolution.best, check))
-    print(f"upper confidence bound: cost {least:.3f}", flush=True)
+    print(f"begins at cost {least:.3f}", flush=True)
     while evolution.generation < arguments.generations:
         evolution.step()
         said = cost(play(evolution.best, check))
@@ -207,6 +224,7 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
+    parser.add_argument("--start", type=Path, help="a policy to begin at, in place of the upper confidence bound")
     parser.add_argument("--generations", type=int, default=40)
     parser.add_argument("--population", type=int, default=12, help="candidates of a generation")
     parser.add_argument("--episodes", type=int, default=96, help="of each candidate")

@@ -7,7 +7,8 @@ pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 import torch
 
 from agents import learn_sites
-from agents.learn_sites import PARAMETER_STEPS, Evolution, as_policy, cost, play, presses_to_stay
+from agents.evaluate import POLICIES
+from agents.learn_sites import PARAMETER_STEPS, Evolution, as_policy, cost, play, policy_acquisition, presses_to_stay
 from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
 from agents.training.bell_sites import BellSites
 from agents.training.site_policy import Acquisition, belief_features, site_actions
@@ -27,6 +28,14 @@ def test_a_growing_belief_is_that_of_all_presses_at_once():
     # The observation holds contrasts and lengths in single precision.
     np.testing.assert_allclose(growing.belief.excess, whole.excess, atol=1e-6)
     np.testing.assert_allclose(growing.belief.spread, whole.spread, atol=1e-6)
+
+
+def test_a_search_goes_on_from_a_policy():
+    start = policy_acquisition(POLICIES / "sites_evolved.safetensors")
+    evolution = Evolution(population=4, episodes=1, seed=0, start=start)
+    assert evolution.best.values.tolist() == start.values.tolist() != Acquisition().values.tolist()
+    with pytest.raises(ValueError, match="has no acquisition function"):
+        policy_acquisition(POLICIES / "retract_ppo.safetensors")
 
 
 def test_play_presses_what_the_policy_chooses():
@@ -57,7 +66,7 @@ def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
     wanted = torch.tensor(Acquisition.INITIAL) + 0.7 * steps
     monkeypatch.setattr(learn_sites, "play", lambda acquisition, seeds: acquisition.values.detach())
     monkeypatch.setattr(learn_sites, "cost", lambda values: float((((values - wanted) / steps) ** 2).sum()))
-    first, again = (Evolution(population=12, episodes=1, seed=3) for _ in range(2))
+    first, again = (Evolution(population=12, episodes=1, seed=3, start=Acquisition()) for _ in range(2))
     begin = learn_sites.cost(first.best.values.detach())
     for _ in range(30):
         first.step()

@@ -186,9 +186,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ValueError: an --out that does not end in .webp.
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--policy", type=Path, default=POLICIES / "sites_ppo.safetensors")
+    parser.add_argument("--policy", type=Path, default=POLICIES / "sites_evolved.safetensors")
     parser.add_argument("--organs", nargs="+", choices=list(ORGANS), default=list(ORGANS))
-    parser.add_argument("--budget", type=int, default=25, help="presses of each organ")
+    parser.add_argument("--budget", type=int, default=20, help="presses of each organ")
     parser.add_argument("--out", type=Path, required=True, help="the film, NAME.webp")
     given = parser.parse_args(arguments)
     if given.out.suffix != ".webp":

@@ -69,6 +69,16 @@ def test_its_memory_is_the_environments():
     np.testing.assert_allclose(seen[slices["stiffest"]], memory.stiffest(), rtol=1e-4)
 
 
+def test_it_has_the_ranges_of_the_scene_or_of_level_standard():
+    plain, standard = surrogate(16, scene="phantom_small", level=None), surrogate(16, scene="phantom_small")
+    plain.reset(seed=3), standard.reset(seed=3)
+    assert (plain.background == 1.0).all() and np.ptp(standard.background) > 0.3
+    # The level doubles the sensor's noise.
+    assert standard.scene.sensor.noise == 2.0 * plain.scene.sensor.noise
+    with pytest.raises(ValueError, match="level is 'hard'; touch models were fitted"):
+        surrogate(1, level="hard")
+
+
 def test_its_spaces_rewards_and_ends_are_the_environments():
     from agents.expert_palpate import PalpateExpert
 
@@ -204,9 +214,10 @@ def test_committed_policies_search_as_they_were_taught(path: Path):
 
     policy = load_policy(path.with_suffix(".safetensors"))
     kwargs = dict(policy.description.env_kwargs)
-    assert kwargs.pop("level") == "standard" and policy.description.env_id == ID
+    level = kwargs.pop("level", None)
+    assert level in (None, "standard") and policy.description.env_id == ID
     assert path.with_suffix(".safetensors").stat().st_size < 2e6
-    envs = surrogate(32, **kwargs)
+    envs = surrogate(32, level=level, **kwargs)
     observation, _ = envs.reset(seed=11)
     begins, first = np.ones(32, dtype=bool), np.full(32, np.nan)
     policy.reset(32)

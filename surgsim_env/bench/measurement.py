@@ -28,6 +28,8 @@ class Effort:
         longer_steps: steps to try with flex, in multiples of 1 ms.
         starts: warm starts.
         memory_envs: number of environments over which memory is measured.
+        rollout_steps: control steps of each environment between two updates of PPO.
+        training_rounds: updates of PPO.
     """
 
     blocks: tuple[Cells, ...]
@@ -43,6 +45,8 @@ class Effort:
     longer_steps: tuple[int, ...]
     starts: int
     memory_envs: int
+    rollout_steps: int
+    training_rounds: int
 
 
 SCENES = ("phantom", "liver", "bovine_liver_block")
@@ -52,12 +56,12 @@ BLOCKS: tuple[Cells, ...] = ((7, 7, 3), (9, 9, 3), (12, 12, 6), (15, 15, 10), (2
 FULL = Effort(
     blocks=BLOCKS, substep_rounds=9, scenes=SCENES, haptic_steps=2000, env_counts=(1, 4, 16, 64), control_steps=20,
     control_rounds=3, organ_cells=(12, 12, 6), grid=(15, 15, 9), press_rounds=3, longer_steps=(2, 3, 4, 5, 8, 10),
-    starts=3, memory_envs=8,
+    starts=3, memory_envs=8, rollout_steps=128, training_rounds=3,
 )  # fmt: skip
 QUICK = Effort(
     blocks=BLOCKS[:3], substep_rounds=5, scenes=SCENES, haptic_steps=400, env_counts=(1, 4, 16), control_steps=8,
     control_rounds=2, organ_cells=(8, 8, 4), grid=(11, 11, 6), press_rounds=2, longer_steps=(2, 5), starts=1,
-    memory_envs=4,
+    memory_envs=4, rollout_steps=32, training_rounds=2,
 )  # fmt: skip
 # A timing shorter than this [s] is mostly that of the clock and the call.
 SHORTEST_TIMING = 0.01

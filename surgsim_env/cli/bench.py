@@ -26,7 +26,7 @@ class Bench:
         Raises:
             OSError: the folder cannot be written (checked before the work).
         """
-        from surgsim_env.bench import control, haptic, measurement, report, side_by_side, start, substeps
+        from surgsim_env.bench import control, haptic, measurement, report, side_by_side, start, substeps, training
 
         folder = report_folder(self.out, "benchmarks", quick=self.quick)
         with output_folder(folder, [report.REPORT_NAME]) as files:
@@ -35,7 +35,7 @@ class Bench:
             # In the order of the report.
             parts = (
                 *(substeps.measure, substeps.measure_laws, haptic.measure),
-                *(control.measure, side_by_side.measure, start.measure),
+                *(control.measure, training.measure, side_by_side.measure, start.measure),
             )
             for measure in parts:
                 section = measure(measurement.QUICK if self.quick else measurement.FULL)

@@ -13,7 +13,7 @@ from surgsim_env.cli.main import main
 TINY = Effort(
     blocks=((4, 4, 4), (7, 7, 5), (8, 8, 5)), substep_rounds=1, scenes=("bovine_liver_block",), haptic_steps=20,
     env_counts=(1, 2), control_steps=2, control_rounds=1, organ_cells=(6, 6, 3), grid=(4, 4, 3), press_rounds=1,
-    longer_steps=(2,), starts=1, memory_envs=1,
+    longer_steps=(2,), starts=1, memory_envs=1, rollout_steps=2, training_rounds=1,
 )  # fmt: skip
 
 
@@ -35,6 +35,7 @@ def test_bench(tmp_path, monkeypatch, capsys):
         assert re.fullmatch(r"\S+ (-?[\d.e+-]+|nan|absent) \S+( \(.*\))?", line), line
     for name in ("substep/189_nodes/single", "substep/exponent", "haptic_step/bovine_liver_block/p99",
                  "control_steps/single/1_env", "control_steps/processes/2_envs", "side_by_side/surgsim/force",
+                 "training/Palpate,_phantom_small,_memory/stepping,_wall", "training/Retract,_pictures/stepping,_wall",
                  "start/start/warm 1.5 s"):  # fmt: skip
         assert any(line.startswith(name) for line in lines), name
     report = (tmp_path / "deep" / "benchmarks.md").read_text(encoding="utf-8")

@@ -1,0 +1,63 @@
+"""Rates of training: what is listed of them, and what is absent with its reason; nothing looks at how long it takes."""
+
+import sys
+
+import pytest
+
+from surgsim_env.bench import training
+from surgsim_env.bench.measurement import QUICK
+from surgsim_env.bench.report import AbsentError
+from surgsim_env.rendering.gl import NoGLError
+
+
+def test_rates_are_medians_and_what_cannot_run_says_why(monkeypatch):
+    def step(one, effort):
+        if "pictures" in one.case:
+            raise AbsentError("no OpenGL here")
+        clock = training.Clock()
+        clock.rates = {training.WALL: [100.0, 500.0, 300.0], training.PROCESSOR: [50.0, 60.0, 70.0]}
+        return clock
+
+    def learn(one, effort):
+        raise AbsentError("stable-baselines3 cannot be imported")
+
+    monkeypatch.setattr(training, "step", step)
+    monkeypatch.setattr(training, "learn", learn)
+    lines = training.measure(QUICK).lines()
+    assert "training/Palpate,_phantom_small,_memory/stepping,_wall 300 1/s" in lines
+    assert "training/Palpate,_phantom_small,_memory/stepping,_processor 60 1/s" in lines
+    assert "training/Retract,_pictures/stepping,_wall absent 1/s (no OpenGL here)" in lines
+    assert sum("PPO,_wall absent 1/s (stable-baselines3 cannot be imported)" in line for line in lines) == 3
+
+
+def test_without_stable_baselines_nothing_is_learned(monkeypatch):
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(AbsentError, match=r"stable-baselines3 cannot be imported .*surgsim\[agents\]"):
+        training.learn(training.TRAININGS[0], QUICK)
+
+
+def test_without_opengl_no_picture_is_learned(monkeypatch):
+    class Blind:
+        def reset(self, seed):
+            raise NoGLError("OpenGL is missing")
+
+        def close(self):
+            self.closed = True
+
+    blind = Blind()
+    blind.action_space = training.gym.spaces.Box(-1.0, 1.0, (2,))
+    monkeypatch.setattr(training.Training, "envs", lambda self: blind)
+    with pytest.raises(AbsentError, match="OpenGL is missing"):
+        training.step(training.TRAININGS[-1], QUICK)
+    assert blind.closed
+
+
+def test_a_round_ends_where_the_next_begins(monkeypatch):
+    """Two rounds of 100 and 300 steps, after 1 s and 3 s of wall clock, 0.5 s and 1 s of processor time."""
+    walls, processors = iter([10.0, 11.0, 13.0]), iter([1.0, 1.5, 2.0])
+    monkeypatch.setattr(training.time, "perf_counter", lambda: next(walls))
+    monkeypatch.setattr(training.time, "process_time", lambda: next(processors))
+    clock = training.Clock()
+    clock.end_round(100)
+    clock.end_round(300)
+    assert clock.rates == {training.WALL: [100.0, 150.0], training.PROCESSOR: [200.0, 600.0]}

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from agents.expert_retract import RetractExpert
+from agents.expert_retract import TolerantExpert
 from surgsim_env.rendering.looks import draw_look, find_look_ranges
 
 with one_line_errors(__name__, "agents"):
@@ -31,7 +31,7 @@ with one_line_errors(__name__, "agents"):
     from stable_baselines3 import PPO
 
     from agents.training.picture_features import PictureAndForce
-    from agents.training.policy_files import describe, policy_path, save_policy
+    from agents.training.policy_files import describe, load_policy, policy_path, save_policy
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
 
 ID = "SurgSim/Retract-v0"
@@ -86,9 +86,10 @@ class Player:
         self._look_count = look_count
         self._rng = np.random.default_rng(seed)
         self._ranges = find_look_ranges(SETTINGS["looks"])
-        self._expert = RetractExpert(grasp_along=GRASP_ALONG)
+        self._expert = TolerantExpert(grasp_along=GRASP_ALONG)
         parts = [self._singles[0].observation_slices[name] for name in TAUGHT]
         self._taught = np.concatenate([np.arange(part.start, part.stop) for part in parts])
+        self.taught_count = len(self._taught)
         self._seen, _ = envs.reset(seed=FIRST_SEED + 10_000 * seed)
 
     def play(self, model: PPO, steps: int, expert_share: float, disturbance: float) -> tuple[Samples, list[bool]]:
@@ -157,6 +158,19 @@ class Fit:
             order = order[batch:]
 
 
+def kept_rounds(folder: Path | None) -> list[Path]:
+    """The files of rounds in a folder, the first round first."""
+    return [] if folder is None else sorted(folder.glob("round_*.npz"))
+
+
+def kept_samples(folder: Path | None) -> Samples | None:
+    """The states of all rounds in a folder; None without one."""
+    tables = [np.load(path) for path in kept_rounds(folder)]
+    if not tables:
+        return None
+    return Samples(*(np.concatenate([table[name] for table in tables]) for name in tables[0].files))
+
+
 def learn(arguments: argparse.Namespace) -> None:
     """Run DAgger; save the policy and print a line of figures after each round."""
     torch.set_num_threads(1)
@@ -171,16 +185,23 @@ def learn(arguments: argparse.Namespace) -> None:
         seed=arguments.seed,
         device="cpu",
     )
-    player = Player(envs, arguments.looks, arguments.seed)
-    samples, fit, began = None, None, time.time()
-    for index in range(arguments.rounds):
+    if arguments.start is not None:
+        model.policy.load_state_dict(load_policy(arguments.start).networks.state_dict())
+    samples, began = kept_samples(arguments.keep), time.time()
+    first = 0 if samples is None else len(kept_rounds(arguments.keep))
+    # Rounds that were read begin other episodes than those that were played then.
+    player = Player(envs, arguments.looks, arguments.seed + first)
+    fit = Fit(model, player.taught_count, arguments.seed + first)
+    if samples is not None:
+        loss = fit.run(samples, arguments.updates * first, (1e-3, 3e-4))
+        print(json.dumps({"rounds_read": first, "samples": len(samples.actions), "loss": loss}), flush=True)
+    for index in range(first, arguments.rounds):
         share = EXPERT_SHARES[index] if index < len(EXPERT_SHARES) else 0.0
         more, won = player.play(model, arguments.steps, share, arguments.disturbance)
         if arguments.keep is not None:
             arguments.keep.mkdir(parents=True, exist_ok=True)
-            np.savez(arguments.keep / f"round_{index}.npz", *more.arrays())
+            np.savez(arguments.keep / f"round_{index:03}.npz", *more.arrays())
         samples = more if samples is None else samples.joined(more)
-        fit = fit or Fit(model, samples.taught.shape[1], arguments.seed)
         last = index == arguments.rounds - 1
         updates = arguments.last_updates if last else arguments.updates
         loss = fit.run(samples, updates, (1e-3, 3e-5) if last else (1e-3, 3e-4))
@@ -222,7 +243,8 @@ def main() -> None:
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float32")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--keep", type=Path, help="folder for the states of each round")
+    parser.add_argument("--keep", type=Path, help="folder for the states of each round; those in it are read first")
+    parser.add_argument("--start", type=policy_path, help="begin with the weights of this policy")
     learn(parser.parse_args())
 
 

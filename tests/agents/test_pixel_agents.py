@@ -131,17 +131,21 @@ def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, capsys):
 
     out = tmp_path / "policy.safetensors"
     settings = {"envs": 2, "dtype": "float64", "threads": 1, "rounds": 2, "steps": 3, "looks": 2, "updates": 2}
-    settings |= {"last_updates": 3, "disturbance": 0.05, "seed": 0, "keep": tmp_path / "states"}
+    settings |= {"last_updates": 3, "disturbance": 0.05, "seed": 0, "keep": tmp_path / "states", "start": None}
     learn_retract_pixels.learn(Namespace(out=out, **settings))
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
     assert [line["samples"] for line in lines] == [12, 24]
-    kept = np.load(tmp_path / "states" / "round_0.npz")
+    kept = np.load(tmp_path / "states" / "round_000.npz")
     pictures, forces, actions, _ = (kept[name] for name in kept.files)
     for step in range(3):
         own, other = slice(4 * step, 4 * step + 2), slice(4 * step + 2, 4 * step + 4)
         np.testing.assert_array_equal(forces[own], forces[other])
         np.testing.assert_array_equal(actions[own], actions[other])
         assert (pictures[own] != pictures[other]).mean() > 0.3
+    learn_retract_pixels.learn(Namespace(out=out, **{**settings, "rounds": 3, "start": out}))
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
+    assert lines[0]["rounds_read"] == 2 and [line.get("round") for line in lines] == [None, 2]
+    assert lines[1]["samples"] == 36
     policy = load_policy(out)
     envs = make_envs("SurgSim/Retract-v0", 1, max_episode_steps=3, **policy.description.env_kwargs)
     (record,) = play_tasks(policy.act, envs, [5])

@@ -244,9 +244,10 @@ class TouchMemory:
 
     def stiffest(self) -> FloatArray:
         """Place (2,) and contrast of the stiffest spot; zeros without a reading."""
-        if self._stiffest is None:
-            self._stiffest = stiffest_spots(self.bell_fit, self.product[None], self.square[None])[0]
-        return self._stiffest.copy()
+        spot = self._stiffest
+        if spot is None:
+            spot = self._stiffest = stiffest_spots(self.bell_fit, self.product[None], self.square[None])[0]
+        return spot.copy()
 
 
 def stiffest_spots(bell_fit: BellFit, product: FloatArray, square: FloatArray) -> FloatArray:

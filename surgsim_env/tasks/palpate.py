@@ -268,7 +268,8 @@ class PalpateTask(Task):
                 "add one, or take a scene that has it, such as 'phantom'"
             )
         if frame not in FRAMES:
-            raise ValueError(f"frame {frame!r} is unknown{nearest(frame, list(FRAMES))}; the frames are {', '.join(FRAMES)}")
+            known = ", ".join(FRAMES)
+            raise ValueError(f"frame {frame!r} is unknown{nearest(frame, list(FRAMES))}; the frames are {known}")
         if episode_steps is not None and (
             isinstance(episode_steps, bool) or not isinstance(episode_steps, int) or episode_steps < 1
         ):

@@ -29,7 +29,7 @@ ORDER = {
     "agents": (
         *("__init__", "command_line", "scoring", "press_library", "training", "site_search", "raster", "keyboard"),
         *("expert_palpate", "expert_organs", "expert_retract", "learn_palpate", "learn_palpate_organs"),
-        *("learn_palpate_recurrent", "learn_retract", "learn_retract_pixels"),
+        *("learn_palpate_recurrent", "learn_retract", "learn_retract_pixels", "learn_sites"),
         *("record_demonstrations", "behaviour_cloning", "train", "train_rllib", "evaluate"),
         *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
     ),

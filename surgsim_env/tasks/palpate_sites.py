@@ -160,7 +160,7 @@ class PalpateSitesTask(Task):
         Channel(
             "lesion_radius", _with_memory(1), "", 0.0, LESION_BOUND,
             read=lambda task, simulation: task.estimator.lesion_radius / task.charted.tip_radius,
-            meaning="mean radius of the lesions that the scene hides over the tip's", size_text="1 or 0",
+            meaning="mean radius of the lesions that the scene hides over the tip's, at least 1", size_text="1 or 0",
         ),
         Channel(
             "last_place", 2, "", -1.0, 1.0, read=lambda task, simulation: task.felt.last.place,
@@ -281,7 +281,8 @@ class PalpateSitesTask(Task):
         assert scene.lesion is not None
         self.estimator = LesionEstimator(
             chart.extent,
-            lesion_radius=0.5 * sum(scene.lesion.radius),
+            # Lesions smaller than the tip are felt as wide as the tip.
+            lesion_radius=max(tip, 0.5 * sum(scene.lesion.radius)),
             noise=scene.sensor.noise / healthy_force,
             map_spread=0.0 if scene.mesh.block is not None else ORGAN_MAP_SPREAD,
         )

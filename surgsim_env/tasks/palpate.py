@@ -79,6 +79,12 @@ def _tip_radius(task: "PalpateTask", instrument: Instrument | None) -> float:
     return task.anatomy.scene.instrument.tip_radius
 
 
+def _step_weight(task: "PalpateTask", step: ControlStep) -> float:
+    """What a control step counts: episodes of any length cost alike, and finding a lesion always pays."""
+    assert task.episode_steps is not None
+    return EPISODE_STEPS / task.episode_steps
+
+
 class PalpateTask(Task):
     """Find a hidden lesion by touch.
 
@@ -225,16 +231,20 @@ class PalpateTask(Task):
         ),
     )  # fmt: skip
     rewards = (
-        Reward("time", -0.005, "step", "each control step"),
+        Reward("time", -0.005, "step", "each control step, times 600 over those of the episode", _step_weight),
         Reward(
-            "soft_force", -0.010, "step", "largest force of the step, 0 at the soft and 1 at the hard limit",
-            soft_force_share,
+            "soft_force", -0.010, "step",
+            "largest force of the step, 0 at the soft and 1 at the hard limit, times 600 over the steps of the episode",
+            lambda task, step: _step_weight(task, step) * soft_force_share(task, step),
         ),
         Reward("found", 10.0, "success", "declared within the success distance"),
         Reward("wrong", -5.0, "failure", "declared elsewhere"),
         Reward("hard_force", -5.0, "failure", "the force exceeded the hard limit: a safety stop"),
         Reward("fault", -5.0, "failure", "the simulation could not go on"),
-        Reward("forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less"),
+        Reward(
+            "forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less",
+            lambda task, step: _step_weight(task, step) * (task.episode_steps - task.step_count),
+        ),
     )  # fmt: skip
     # Of each environment, by the size of its face.
     episode_steps = None

@@ -47,7 +47,7 @@ CARRYING_SPEED, APPROACH_SPEED = 0.015, 0.015
 # to which it goes straight in, and from which it waits before the edge; how far from the grasp it closes the jaw, too
 # far out, too far in and in height; and how far off a jaw that has begun to close goes on [m].
 ALONG_SLACK, HEIGHT_FREE, HEIGHT_WAITING = 0.008, 0.002, 0.005
-CLOSES_OUT, CLOSES_IN, CLOSES_HIGH, CLOSING_REACH = 0.0025, 0.0015, 0.003, 0.007
+CLOSES_OUT, CLOSES_IN, CLOSES_HIGH, CLOSING_REACH = 0.001, 0.0015, 0.003, 0.007
 
 
 class RetractExpert:
@@ -104,12 +104,19 @@ class TolerantExpert(RetractExpert):
     """A teacher of policies that see pictures: what it does changes little where a picture changes little.
 
     It does not know where the target is hidden. It grasps near the middle of the edge, approaches it in a funnel, so
-    that it need not be aligned to a millimetre, and shifts the lobe above the target once some of that is in sight.
+    that it need not be aligned to a millimetre, and shifts the lobe above the target once some of that is in sight. It
+    leaves the wrist as it is: the jaw begins level, and a picture does not show a tilt of two degrees.
     """
 
     def __init__(self, *, grasp_along: float) -> None:
         """Grasp the edge within ALONG_SLACK of a place along it [m]."""
         self._grasp_along = grasp_along
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """As `RetractExpert.act`, without turning the wrist."""
+        action = super().act(observation)
+        action[3] = 0.0
+        return action
 
     def _aside(self, now: NDArray[np.float64]) -> float:
         return float(now[TIP][0] if now[VISIBLE] < IN_SIGHT else now[TARGET][0])

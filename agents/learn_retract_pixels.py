@@ -89,6 +89,7 @@ class Player:
         self._expert = TolerantExpert(grasp_along=GRASP_ALONG)
         parts = [self._singles[0].observation_slices[name] for name in TAUGHT]
         self._taught = np.concatenate([np.arange(part.start, part.stop) for part in parts])
+        self._turning = self._singles[0].task.action_slices["turning"]
         self.taught_count = len(self._taught)
         self._seen, _ = envs.reset(seed=FIRST_SEED + 10_000 * seed)
 
@@ -105,7 +106,10 @@ class Player:
             if expert_share < 1.0:
                 by_expert = self._rng.random(len(wanted)) < expert_share
                 taken = np.where(by_expert[:, None], wanted, model.predict(self._seen, deterministic=True)[0])
-            taken = np.clip(taken + self._rng.normal(scale=disturbance, size=taken.shape), -1.0, 1.0)
+            noise = self._rng.normal(scale=disturbance, size=taken.shape)
+            # The teacher does not turn the wrist back.
+            noise[:, self._turning] = 0.0
+            taken = np.clip(taken + noise, -1.0, 1.0)
             self._seen, _, terminated, truncated, info = self._envs.step(taken.astype(np.float32))
             over = np.flatnonzero(terminated | truncated)
             won += [bool(info["final_info"]["success"][index]) for index in over]

@@ -24,7 +24,6 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from agents.command_line import one_line_errors
 
@@ -32,6 +31,7 @@ with one_line_errors(__name__, "agents"):
     import cma
     import torch
     from stable_baselines3 import PPO
+    from tqdm import tqdm
 
     from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
     from agents.training.bell_sites import BellSites

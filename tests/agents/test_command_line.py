@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
 # Names that packages of the extras are imported by.
 PACKAGES = {
-    *("minari", "moviepy", "msgspec", "pettingzoo", "ray", "safetensors", "sb3_contrib", "sklearn"),
+    *("cma", "minari", "moviepy", "msgspec", "pettingzoo", "ray", "safetensors", "sb3_contrib", "sklearn"),
     *("stable_baselines3", "tensorboard", "torch", "tqdm", "viser", "websockets", "yaml"),
 }
 # Of ours, what imports them; imported anew here.

@@ -368,6 +368,7 @@ def test_a_policy_is_filmed(tmp_path: Path) -> None:
 
 def test_organs_are_filmed_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A picture a press, and one of the truth, which is shown for longer; what is hidden is not in the others."""
+    pytest.importorskip("safetensors", reason="needs the `agents` extra")
     from agents import organ_film
     from surgsim_env.rendering import gl
 

@@ -57,7 +57,14 @@ UNSEEN = {"grip_force[0]", "holds[0]", "visible[0]"}
 STILL = {
     "SurgSim/PalpateSites-v0": {
         *(f"{name}[{site}]" for name in ("contrast_map", "pressed_map", "face_map") for site in range(MAP_SIDE**2)),
-        *("map_cell[0]", "chart_share[0]", "chart_share[1]", "contrast_noise[0]"),
+        *(
+            "map_cell[0]",
+            "chart_share[0]",
+            "chart_share[1]",
+            "contrast_noise[0]",
+            "excess_least[0]",
+            "lesion_radius[0]",
+        ),
     },
     "SurgSim/Retract-v0": HINGE | UNSEEN,
     "SurgSim/BimanualRetract-v0": UNSEEN | {"touch_force[0]", "uncovered[0]"},

@@ -1,5 +1,8 @@
 """The evolution strategy that finds an acquisition function: its belief, its cost, and that a short search helps."""
 
+import argparse
+import re
+
 import numpy as np
 import pytest
 
@@ -8,9 +11,19 @@ import torch
 
 from agents import learn_sites
 from agents.evaluate import POLICIES
-from agents.learn_sites import PARAMETER_STEPS, Evolution, as_policy, cost, play, policy_acquisition, presses_to_stay
+from agents.learn_sites import (
+    PARAMETER_STEPS,
+    Evolution,
+    as_policy,
+    cost,
+    learn,
+    play,
+    policy_acquisition,
+    presses_to_stay,
+)
 from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
 from agents.training.bell_sites import BellSites
+from agents.training.policy_files import load_policy
 from agents.training.site_policy import Acquisition, belief_features, site_actions
 
 pytestmark = pytest.mark.agents
@@ -73,3 +86,15 @@ def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
         again.step()
     assert learn_sites.cost(first.best.values.detach()) < 0.2 * begin
     assert first.best.values.tolist() == again.best.values.tolist() and first.episode_count == 360
+
+
+def test_the_script_writes_a_policy_that_presses(tmp_path, capsys):
+    out = tmp_path / "sites.safetensors"
+    sizes = {"generations": 6, "population": 4, "episodes": 4, "check_episodes": 4}
+    learn(argparse.Namespace(out=out, start=None, seed=0, **sizes))
+    said = [float(cost) for cost in re.findall(r"cost (\d+\.\d+)", capsys.readouterr().out)]
+    assert len(said) == 7 and min(said[1:]) < said[0]
+    policy = load_policy(out)
+    assert policy.description.score == pytest.approx(-min(said), abs=1e-3)
+    observation, _ = BellSites().reset(seed=1)
+    assert (np.abs(policy.act(observation[None], np.ones(1, dtype=bool))) <= 1.0).all()

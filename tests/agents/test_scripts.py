@@ -30,6 +30,8 @@ ELSEWHERE = {
     "learn_palpate_organs": "test_organ_agents.py",
     "learn_palpate_recurrent": "test_palpate_agents.py",
     "learn_retract": "test_retract_agents.py",
+    "learn_retract_pixels": "test_pixel_agents.py",
+    "learn_sites": "test_learn_sites.py",
     "learning_curves": "test_from_scratch.py",
     "organ_film": "test_evaluate.py",
     "press_library": "test_press_library.py",

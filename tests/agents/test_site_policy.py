@@ -147,6 +147,11 @@ def test_facts_are_those_of_the_observation():
     assert facts.noise == pytest.approx(NOISE) and facts.map.pressable.tolist() == FACE.ravel().tolist()
 
 
+def test_an_observation_without_a_map_is_refused():
+    with pytest.raises(ValueError, match=r"map_cell is .* must be above 0"):
+        belief_features(np.zeros((1, OBSERVATION_SIZE), dtype=np.float32))
+
+
 def test_an_untrained_policy_is_an_upper_confidence_bound():
     policy = SitePolicy(FEATURE_SPACE, CHOICE_SPACE, lambda _: 1e-3)
     # A site of the border, which is no candidate, and others.

@@ -27,7 +27,7 @@ SLOW = 0.3  # [tip radii] below this distance speed is proportional to it
 DEPTH_SLOW = 0.2  # [tip radii] the same of depth
 START_NEAR = 0.6  # [tip radii] from the first row's start the tip descends
 DECLARE_NEAR = 0.2  # [tip radii] from the stiffest place it declares
-EXCESS = 0.3  # of a contrast over the median that is a lesion
+EXCESS = 0.5  # of a contrast over the median that is a lesion
 LAST = 0.12  # share of the time left at which the search is over
 
 

@@ -19,7 +19,7 @@ OBSERVATION_SIZE = max(part.stop for part in FACE.values())
 # Largest distance between the rows of a search, and of the outermost ones from the border of the face [tip radii].
 ROW_SPACING, BORDER = 2.4, 0.8
 # Reach of the second search, across the rows, around the stiffest place [tip radii].
-ACROSS_REACH = 1.4
+ACROSS_REACH = 2.0
 # A peak along its row is passed where something was felt this far to both sides of it [tip radii].
 PASSED = (0.8, 2.4)
 # Largest distance that a way is told as [tip radii]; farther ones have their direction.

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 
-# Width of the bell, its standard deviation, in tip radii: that of contrast over lesions of the blocks is 0.56 to 0.98.
+# Width of the bell, its standard deviation, over the radius of the lesion that is felt (`touches.felt_lesion_radius`):
+# that of contrast over lesions of the blocks is 0.56 to 0.98.
 BELL_WIDTH = 0.7
 # Standard deviations a priori, of contrast: the mean, the other terms of the background, the bell's height, and what
 # the model leaves out at a site, beside the sensor's noise.
@@ -45,12 +46,12 @@ class BellFit:
         places: theirs on the chart                                                                  (n_site, 2)
     """
 
-    def __init__(self, touch_map: TouchMap, tip_radius: float, noise: float) -> None:
+    def __init__(self, touch_map: TouchMap, lesion_radius: float, noise: float) -> None:
         """Prepare the fit on a map.
 
         Args:
             touch_map: the sites.
-            tip_radius: [m].
+            lesion_radius: mean radius of the lesions that are looked for, as a tip feels them [m].
             noise: standard deviation of a reading of force [N].
         """
         rows, columns = (slice(numbers[0], numbers[-1] + 1) for numbers in touch_map.rows_and_columns)
@@ -62,7 +63,7 @@ class BellFit:
         first, second = touch_map.axes
         self._axes = second[rows], first[columns]
         self._pressable = touch_map.pressable.reshape(MAP_SIDE, MAP_SIDE)[rows, columns]
-        self._bells = [np.exp(-0.5 * ((axis[:, None] - axis) / (BELL_WIDTH * tip_radius)) ** 2) for axis in self._axes]
+        self._bells = [np.exp(-0.5 * ((axis[:, None] - axis) / (BELL_WIDTH * lesion_radius)) ** 2) for axis in self._axes]
         v, u = np.meshgrid(
             *(2.0 * axis / side - 1.0 for axis, side in zip(self._axes, self._extent[::-1], strict=True)), indexing="ij"
         )

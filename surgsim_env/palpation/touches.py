@@ -13,7 +13,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.bell_fit import BellFit, framed
 from surgsim_env.palpation.chart import ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.press import PressResult
-from surgsim_env.scene.model import PalpationSettings, Vector
+from surgsim_env.scene.model import PalpationSettings, Scene, Vector
 
 # Speed of the tip between sites [m/s]; this travel is counted, not simulated.
 TRAVEL_SPEED = 0.02
@@ -156,6 +156,12 @@ class SiteTouches:
         return other
 
 
+def felt_lesion_radius(scene: Scene) -> float:
+    """Mean radius of the lesions that a scene hides [m]; those smaller than the tip are felt as wide as the tip."""
+    assert scene.lesion is not None
+    return max(scene.instrument.tip_radius, 0.5 * sum(scene.lesion.radius))
+
+
 @dataclass(frozen=True)
 class Indenter:
     """A ball on a soft half space: the model of a press on healthy tissue.
@@ -184,7 +190,14 @@ class TouchMemory:
     """
 
     def __init__(
-        self, charted: ChartedFace, indenter: Indenter, *, press_depth: float, force_range: float, force_noise: float
+        self,
+        charted: ChartedFace,
+        indenter: Indenter,
+        *,
+        press_depth: float,
+        lesion_radius: float,
+        force_range: float,
+        force_noise: float,
     ) -> None:
         """Start with an empty record.
 
@@ -192,13 +205,14 @@ class TouchMemory:
             charted: the face, whose touch map is recorded.
             indenter: model of the healthy press.
             press_depth: of the scene [m].
+            lesion_radius: mean radius of the lesions that are looked for, as the tip feels them [m].
             force_range: of the sensor, each axis [N].
             force_noise: of the sensor, standard deviation of a reading [N].
         """
         self.chart, self.map, self.indenter = charted.chart, charted.touch_map, indenter
         self.least_depth = 0.5 * press_depth
         self.bound = math.sqrt(3.0) * force_range / indenter.force(self.least_depth)
-        self.bell_fit = BellFit(self.map, indenter.radius, force_noise)
+        self.bell_fit = BellFit(self.map, lesion_radius, force_noise)
         self.forget()
 
     def forget(self) -> None:

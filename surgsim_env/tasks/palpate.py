@@ -15,7 +15,7 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, charted_face
 from surgsim_env.palpation.face_frame import FaceFrame
-from surgsim_env.palpation.touches import Indenter, TouchMemory
+from surgsim_env.palpation.touches import Indenter, TouchMemory, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import DrawnOrgan
 from surgsim_env.scene.load import fill_json, nearest
@@ -56,6 +56,7 @@ def touch_memory(anatomy: Anatomy) -> TouchMemory:
         charted_face(anatomy),
         Indenter(scene.instrument.tip_radius, scene.material),
         press_depth=scene.palpation.press_depth,
+        lesion_radius=felt_lesion_radius(scene),
         force_range=scene.sensor.range,
         force_noise=scene.sensor.noise,
     )

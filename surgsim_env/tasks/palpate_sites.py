@@ -18,7 +18,7 @@ from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstim
 from surgsim_env.palpation.member_map import member_map, still_template
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
-from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, SiteTouches, Touch
+from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, SiteTouches, Touch, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.family import family_of
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
@@ -273,16 +273,14 @@ class PalpateSitesTask(Task):
         """Palpate the present anatomy, whose healthy map is given."""
         scene = self.anatomy.scene
         self.charted = charted_face(self.anatomy)
-        chart, tip = self.charted.chart, scene.instrument.tip_radius
-        wide = chart.extent.max() > WIDE * tip
+        chart = self.charted.chart
+        wide = chart.extent.max() > WIDE * scene.instrument.tip_radius
         self.budget = self._budget if self._budget is not None else (BUDGET_WIDE if wide else BUDGET)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
         healthy_force = float(healthy.grid.mean()) * scene.palpation.press_depth
-        assert scene.lesion is not None
         self.estimator = LesionEstimator(
             chart.extent,
-            # Lesions smaller than the tip are felt as wide as the tip.
-            lesion_radius=max(tip, 0.5 * sum(scene.lesion.radius)),
+            lesion_radius=felt_lesion_radius(scene),
             noise=scene.sensor.noise / healthy_force,
             map_spread=0.0 if scene.mesh.block is not None else ORGAN_MAP_SPREAD,
         )

@@ -96,3 +96,20 @@ def test_one_touch_is_the_stiffest_place(force: float):
     square[0, site] = 0.1**2
     spot = stiffest_spots(BellFit(touch_map, TIP, NOISE), square * force / 0.1, square)[0]
     np.testing.assert_allclose(spot, [*touch_map.places[site], force / 0.1], atol=1e-9)
+
+
+def test_a_wide_lesion_is_fitted_with_a_wide_bell():
+    """Two rows of touches of a wide bell between them: the fit that knows its width places it better."""
+    touch_map, rng = block_map(), np.random.default_rng(4)
+    numbers = touch_map.numbers
+    in_rows = touch_map.pressable & np.isin(numbers[:, 1], (MAP_SIDE // 2 - 4, MAP_SIDE // 2 + 3))
+    errors = {1.0: [], 1.8: []}
+    for _ in range(30):
+        middle = 0.5 * SIDE + rng.uniform(-0.005, 0.005, 2)
+        spread = 1.8 * BELL_WIDTH * TIP
+        contrast = 1.0 + 0.4 * np.exp(-0.5 * ((touch_map.sites - middle) ** 2).sum(axis=1) / spread**2)
+        product, square = record(touch_map, contrast, 2.0 * in_rows, rng, 0.003)
+        for share, listed in errors.items():
+            place = stiffest_spots(BellFit(touch_map, share * TIP, NOISE), product[None], square[None])[0, :2]
+            listed.append(np.linalg.norm(0.5 * (place + 1.0) * SIDE - middle))
+    assert np.mean(errors[1.8]) < 0.8 * np.mean(errors[1.0]), {k: np.mean(v) for k, v in errors.items()}

@@ -24,7 +24,9 @@ CONTROL_STEP = 0.05  # [s]
 SLICES = RetractTask.channel_slices(tip_axes=6)
 TIP, EDGE, TARGET = (SLICES[name] for name in ("tip_position", "edge_points", "target_place"))
 POINTS_ALONG = slice(SLICES["tip_axes"].start + 3, SLICES["tip_axes"].stop)
-GAP, GRIP, HOLDS, VISIBLE = (SLICES[name].start for name in ("opening", "grip_force", "holds", "visible"))
+GAP, GRIP, PULL, HOLDS, VISIBLE = (
+    SLICES[name].start for name in ("opening", "grip_force", "pull_force", "holds", "visible")
+)
 
 # Distance of the waiting jaw from the free edge; depth of its middle over the edge in a grasp [m].
 WAITING_GAP, GRASP_DEPTH = 0.016, 0.0065
@@ -48,6 +50,8 @@ CARRYING_SPEED, APPROACH_SPEED = 0.015, 0.015
 # far out, too far in and in height; and how far off a jaw that has begun to close goes on [m].
 ALONG_SLACK, HEIGHT_FREE, HEIGHT_WAITING = 0.008, 0.002, 0.005
 CLOSES_OUT, CLOSES_IN, CLOSES_HIGH, CLOSING_REACH = 0.001, 0.0015, 0.003, 0.007
+# Pull above which it gives way [N]: the expert's own peaks are 0.3 to 0.6 N, tissue tears at 1.2 N.
+PULL_MOST = 0.7
 
 
 class RetractExpert:
@@ -105,7 +109,8 @@ class TolerantExpert(RetractExpert):
 
     It does not know where the target is hidden. It grasps near the middle of the edge, approaches it in a funnel, so
     that it need not be aligned to a millimetre, and shifts the lobe above the target once some of that is in sight. It
-    leaves the wrist as it is: the jaw begins level, and a picture does not show a tilt of two degrees.
+    leaves the wrist as it is: the jaw begins level, and a picture does not show a tilt of two degrees. It gives way,
+    back to where it came from, where it pulls hard: what a policy does wrong, the force tells it.
     """
 
     def __init__(self, *, grasp_along: float) -> None:
@@ -117,6 +122,11 @@ class TolerantExpert(RetractExpert):
         action = super().act(observation)
         action[3] = 0.0
         return action
+
+    def _carry(self, now: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
+        if now[PULL] > PULL_MOST:
+            return towards(np.array([now[TIP][0], *RISEN]) - now[TIP], CARRYING_SPEED), 0.0, -1.0
+        return super()._carry(now)
 
     def _aside(self, now: NDArray[np.float64]) -> float:
         return float(now[TIP][0] if now[VISIBLE] < IN_SIGHT else now[TARGET][0])

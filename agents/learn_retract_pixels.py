@@ -5,7 +5,9 @@
 The policy sees the endoscope's picture and the readings of the force sensor (obs_mode="rgb_force") and nothing else:
 not where the tip, the lobe or the target are, nor how far the jaw is open. The expert that labels its states knows them
 all, but acts on the target's place only once the target is in sight, so that a policy can know what it knows. Each
-state is kept under several looks of the split "train". The result is a policy of stable-baselines3's PPO.
+state is kept under several looks of the split "train". Hard pulls are rare, and tear tissue: they are imagined. Forces
+of states in which the jaw holds tissue are scaled up, and the expert, which gives way to them, labels these too. The
+result is a policy of stable-baselines3's PPO.
 """
 
 import argparse
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from agents.expert_retract import TolerantExpert
+from agents.expert_retract import PULL, SLICES, TolerantExpert
 from surgsim_env.rendering.looks import draw_look, find_look_ranges
 
 with one_line_errors(__name__, "agents"):
@@ -48,6 +50,8 @@ NETWORK = {
 # Channels that a layer beside the policy, which is not kept, predicts from its features: they teach what to look at.
 TAUGHT = ("tip_position", "opening", "holds", "edge_points", "visible")
 TAUGHT_WEIGHT = 0.1
+# Share of states with a pull above PULL_LEAST [N] that are kept a second time, with an imagined pull [N].
+IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL = 0.2, 0.05, (0.6, 1.3)
 # Of the first rounds, the share of steps that the expert plays.
 EXPERT_SHARES = (1.0, 0.5, 0.2)
 
@@ -90,6 +94,9 @@ class Player:
         parts = [self._singles[0].observation_slices[name] for name in TAUGHT]
         self._taught = np.concatenate([np.arange(part.start, part.stop) for part in parts])
         self._turning = self._singles[0].task.action_slices["turning"]
+        # All readings but the grip's grow with the pull.
+        grip = SLICES["grip_force"].start
+        self._pulled = np.array([entry != grip for entry in self._singles[0].task.force_entries])
         self.taught_count = len(self._taught)
         self._seen, _ = envs.reset(seed=FIRST_SEED + 10_000 * seed)
 
@@ -102,6 +109,7 @@ class Player:
             taught = np.array([one.as_observed(one.task_observation)[self._taught] for one in self._singles])
             views = [self._seen["picture"]] + [self._other_look() for _ in range(self._look_count - 1)]
             kept += [(view.copy(), self._seen["force"].copy(), wanted, taught) for view in views]
+            kept.append(self._imagined(taught))
             taken = wanted
             if expert_share < 1.0:
                 by_expert = self._rng.random(len(wanted)) < expert_share
@@ -114,6 +122,20 @@ class Player:
             over = np.flatnonzero(terminated | truncated)
             won += [bool(info["final_info"]["success"][index]) for index in over]
         return Samples(*(np.concatenate(part) for part in zip(*kept))), won
+
+    def _imagined(self, taught: NDArray[np.float32]) -> tuple[NDArray, ...]:
+        """Some of the present states with a harder pull, as a row of `Samples` each; maybe none."""
+        pulls = np.array([one.task_observation[PULL] for one in self._singles])
+        chosen = np.flatnonzero((pulls > PULL_LEAST) & (self._rng.random(len(pulls)) < IMAGINED_SHARE))
+        forces = self._seen["force"][chosen].copy()
+        wanted = np.zeros((len(chosen), self._envs.single_action_space.shape[0]), np.float32)  # type: ignore[index]
+        for row, index in enumerate(chosen):
+            observation = self._singles[index].task_observation.copy()
+            factor = self._rng.uniform(*IMAGINED_PULL) / observation[PULL]
+            observation[PULL] *= factor
+            forces[row, self._pulled] *= factor
+            wanted[row] = self._expert.act(observation)
+        return self._seen["picture"][chosen].copy(), forces, wanted, taught[chosen]
 
     def _other_look(self) -> NDArray[np.uint8]:
         return np.stack([one.picture(draw_look(self._ranges, self._rng)) for one in self._singles])

@@ -3,6 +3,7 @@
 import json
 from argparse import Namespace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +15,9 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import surgsim_env  # noqa: F401
-from agents.learn_retract_pixels import NETWORK, Samples
+from agents import expert_retract
+from agents.expert_retract import GRIP, HOLDS, PULL, SLICES, TIP, TolerantExpert
+from agents.learn_retract_pixels import NETWORK, Player, Samples
 from agents.training.picture_features import PictureAndForce
 from agents.training.policy_files import describe, load_policy, save_policy
 from surgsim_env.rendering import gl
@@ -120,6 +123,52 @@ def test_the_shipped_policy_sees_a_picture_and_the_force_alone():
     assert actions.shape == (4, 5) and (np.abs(actions) <= 1.0).all() and len(np.unique(actions, axis=0)) == 4
     policy.reset(4)
     np.testing.assert_array_equal(policy.act(seen), actions)
+
+
+def held_lobe(pull: float) -> np.ndarray:
+    """An observation in SI units of a jaw that holds a lobe half folded, the target hidden, and pulls it [N]."""
+    observation = np.zeros(max(part.stop for part in SLICES.values()))
+    observation[TIP], observation[[HOLDS, GRIP, PULL]] = [0.04, 0.030, 0.045], [1.0, 0.3, pull]
+    return observation
+
+
+def test_the_teacher_gives_way_to_a_hard_pull():
+    """Back towards the place between lifting and folding, the jaw closed; below the limit it goes on folding."""
+    teacher, limit = TolerantExpert(grasp_along=0.04), expert_retract.PULL_MOST
+    goes_on, gives_way = (teacher.act(held_lobe(limit + change)) for change in (-0.01, 0.01))
+    back, on = (np.array(goal) - [0.030, 0.045] for goal in (expert_retract.RISEN, expert_retract.FOLDED))
+    for action, way in ((gives_way, back), (goes_on, on)):
+        assert action[1:3] @ way > 0.99 * np.linalg.norm(action[1:3]) * np.linalg.norm(way) > 0.0
+        assert action[3] == 0.0 and action[4] == -1.0
+    # The plain expert pulls on.
+    np.testing.assert_array_equal(
+        expert_retract.RetractExpert().act(held_lobe(limit + 0.01))[:3],
+        expert_retract.RetractExpert().act(held_lobe(0.3))[:3],
+    )
+
+
+def test_imagined_pulls_scale_all_readings_but_the_grip_and_are_labelled():
+    """Of jaws that hold tissue some states come again, with forces of a harder pull and the teacher's answer to it."""
+    count = 400
+    player = Player.__new__(Player)
+    pulls = np.where(np.arange(count) % 2 == 0, 0.4, 0.0)
+    player._singles = [SimpleNamespace(task_observation=held_lobe(pull)) for pull in pulls]
+    player._envs = SimpleNamespace(single_action_space=gym.spaces.Box(-1.0, 1.0, (5,)))  # type: ignore[assignment]
+    player._rng, player._expert = np.random.default_rng(0), TolerantExpert(grasp_along=0.04)
+    player._pulled = np.arange(8) != 6
+    taught = np.arange(count, dtype=np.float32)[:, None]
+    force = np.full((count, 8), 0.4, dtype=np.float32)
+    player._seen = {"picture": np.zeros((count, 2, 2, 3), np.uint8), "force": force}
+    pictures, forces, actions, kept = player._imagined(taught)
+    assert 0.1 * count / 2 < len(kept) < 0.3 * count / 2 and (kept % 2 == 0).all()
+    assert len(pictures) == len(forces) == len(actions) == len(kept)
+    made = forces[:, 7]
+    np.testing.assert_allclose(forces, np.where(player._pulled, made[:, None], 0.4), rtol=1e-6)
+    assert made.min() >= 0.6 and made.max() <= 1.3 and np.ptp(made) > 0.5
+    for pull, action in zip(made, actions, strict=True):
+        np.testing.assert_array_equal(action, player._expert.act(held_lobe(float(pull))))
+    # The states themselves stay as they are.
+    assert (force == np.float32(0.4)).all() and all(s.task_observation[PULL] in (0.0, 0.4) for s in player._singles)
 
 
 @pytest.mark.slow

@@ -63,7 +63,8 @@ class BellFit:
         first, second = touch_map.axes
         self._axes = second[rows], first[columns]
         self._pressable = touch_map.pressable.reshape(MAP_SIDE, MAP_SIDE)[rows, columns]
-        self._bells = [np.exp(-0.5 * ((axis[:, None] - axis) / (BELL_WIDTH * lesion_radius)) ** 2) for axis in self._axes]
+        width = BELL_WIDTH * lesion_radius
+        self._bells = [np.exp(-0.5 * ((axis[:, None] - axis) / width) ** 2) for axis in self._axes]
         v, u = np.meshgrid(
             *(2.0 * axis / side - 1.0 for axis, side in zip(self._axes, self._extent[::-1], strict=True)), indexing="ij"
         )

@@ -109,8 +109,9 @@ class TolerantExpert(RetractExpert):
 
     It does not know where the target is hidden. It grasps near the middle of the edge, approaches it in a funnel, so
     that it need not be aligned to a millimetre, and shifts the lobe above the target once some of that is in sight. It
-    leaves the wrist as it is: the jaw begins level, and a picture does not show a tilt of two degrees. It gives way,
-    back to where it came from, where it pulls hard: what a policy does wrong, the force tells it.
+    leaves the wrist as it is: the jaw begins level, and a picture does not show a tilt of two degrees. It gives way
+    where it pulls hard, back to where it came from, and with an open jaw where that does not hold the edge: what a
+    policy does wrong, the force tells it.
     """
 
     def __init__(self, *, grasp_along: float) -> None:
@@ -132,6 +133,8 @@ class TolerantExpert(RetractExpert):
         return float(now[TIP][0] if now[VISIBLE] < IN_SIGHT else now[TARGET][0])
 
     def _approach(self, now: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
+        if now[PULL] > PULL_MOST:
+            return np.array([0.0, APPROACH_SPEED, 0.0]), 0.0, 1.0
         tip = now[TIP]
         nearest = float(np.clip(tip[0], self._grasp_along - ALONG_SLACK, self._grasp_along + ALONG_SLACK))
         off = grasp_place(now, nearest) - tip

@@ -140,6 +140,11 @@ def test_the_teacher_gives_way_to_a_hard_pull():
     for action, way in ((gives_way, back), (goes_on, on)):
         assert action[1:3] @ way > 0.99 * np.linalg.norm(action[1:3]) * np.linalg.norm(way) > 0.0
         assert action[3] == 0.0 and action[4] == -1.0
+    # Where the edge has slipped out of the jaw, the pads still push: outwards, and the jaw opens.
+    slipped = held_lobe(limit + 0.01)
+    slipped[HOLDS] = 0.0
+    away = teacher.act(slipped)
+    assert away[1] > 0.0 and away[0] == away[2] == 0.0 and away[4] == 1.0
     # The plain expert pulls on.
     np.testing.assert_array_equal(
         expert_retract.RetractExpert().act(held_lobe(limit + 0.01))[:3],

@@ -1,11 +1,17 @@
 """`surgsim bench`: timings of the tissue, the environments and the start, beside other simulators."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from surgsim_env.cli.values import MaybePath, report_folder
 from surgsim_env.reports.output_folder import output_folder
+
+if TYPE_CHECKING:
+    from surgsim_env.bench.measurement import Effort
+    from surgsim_env.bench.report import Section
 
 
 @dataclass(frozen=True)
@@ -26,18 +32,13 @@ class Bench:
         Raises:
             OSError: the folder cannot be written (checked before the work).
         """
-        from surgsim_env.bench import control, haptic, measurement, report, side_by_side, start, substeps, training
+        from surgsim_env.bench import measurement, report
 
         folder = report_folder(self.out, "benchmarks", quick=self.quick)
         with output_folder(folder, [report.REPORT_NAME]) as files:
             before = report.load()
             sections: list[report.Section] = []
-            # In the order of the report.
-            parts = (
-                *(substeps.measure, substeps.measure_laws, haptic.measure),
-                *(control.measure, training.measure, side_by_side.measure, start.measure),
-            )
-            for measure in parts:
+            for measure in measured_parts():
                 section = measure(measurement.QUICK if self.quick else measurement.FULL)
                 sections.append(section)
                 for line in section.lines():
@@ -46,3 +47,13 @@ class Bench:
         path = folder / report.REPORT_NAME
         console.print(f"written: {path}", highlight=False, soft_wrap=True)
         return 0
+
+
+def measured_parts() -> "tuple[Callable[[Effort], Section], ...]":
+    """What measures each section, in the order of the report."""
+    from surgsim_env.bench import control, haptic, side_by_side, start, substeps, training
+
+    return (
+        *(substeps.measure, substeps.measure_laws, haptic.measure),
+        *(control.measure, training.measure, side_by_side.measure, start.measure),
+    )

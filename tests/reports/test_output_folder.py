@@ -314,8 +314,7 @@ def validate(patch):
 
 
 def bench(patch):
-    for part in ("substeps", "haptic", "control", "side_by_side", "start"):
-        patch(f"surgsim_env.bench.{part}.measure", lambda _: SimpleNamespace(lines=list))
+    patch("surgsim_env.cli.bench.measured_parts", lambda: [lambda _: SimpleNamespace(lines=list)])
     patch("surgsim_env.bench.report.write_report", lambda _, __, folder, quick: stop(folder / "benchmarks.md"))
     return ["bench", "--quick"], ["benchmarks.md"]
 

@@ -6,7 +6,7 @@ The policy sees the endoscope's picture and the readings of the force sensor (ob
 not where the tip, the lobe or the target are, nor how far the jaw is open. The expert that labels its states knows them
 all, but acts on the target's place only once the target is in sight, so that a policy can know what it knows. Each
 state is kept under several looks of the split "train". Hard pulls are rare, and tear tissue: they are imagined. Forces
-of states in which the jaw holds tissue are scaled up, and the expert, which gives way to them, labels these too. The
+of states in which something is pulled are scaled up, and the expert, which gives way to them, labels these too. The
 result is a policy of stable-baselines3's PPO.
 """
 

@@ -153,7 +153,7 @@ def test_the_teacher_gives_way_to_a_hard_pull():
 
 
 def test_imagined_pulls_scale_all_readings_but_the_grip_and_are_labelled():
-    """Of jaws that hold tissue some states come again, with forces of a harder pull and the teacher's answer to it."""
+    """Of states that pull some come again, with forces of a harder pull and the teacher's answer to it."""
     count = 400
     player = Player.__new__(Player)
     pulls = np.where(np.arange(count) % 2 == 0, 0.4, 0.0)

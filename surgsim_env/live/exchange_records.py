@@ -145,19 +145,19 @@ def hand_type(arm_count: int) -> np.dtype:
 def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
     """Physics to page, some 60 times a second.
 
-    phase, organ (its number, from 1), recording and replaying, whether the breath is held, time [s] since the reset, a
-    message (a fault or a refusal), added_mass [kg]; for each arm: tip and target [m], the forces of tissue and device
-    on it [N], the share of the force that the watchdog passes, whether a limit acts; nodes [m]; positions [m] and
-    rotations of geoms.
+    phase, organ (its number, from 1), recording, the number of recordings begun, replaying, whether the breath is held,
+    time [s] since the reset, a message (a fault or a refusal), added_mass [kg]; for each arm: tip and target [m], the
+    forces of tissue and device on it [N], the share of the force that the watchdog passes, whether a limit acts; nodes
+    [m]; positions [m] and rotations of geoms.
     """
     arms = (arm_count, 3)
     return np.dtype(
         [
-            ("phase", "i4"), ("organ", "i8"), ("recording", "?"), ("replaying", "?"), ("breath_held", "?"),
-            ("time", "f8"), ("said", f"S{TEXT_MOST}"), ("added_mass", "f8"), ("tip", "f8", arms), ("place", "f8", arms),
-            ("force", "f8", arms), ("pushed", "f8", arms), ("share", "f8", (arm_count,)),
-            ("limited", "?", (arm_count,)), ("node", "f4", (node_count, 3)), ("geom", "f4", (geom_count, 3)),
-            ("turn", "f4", (geom_count, 9)),
+            ("phase", "i4"), ("organ", "i8"), ("recording", "?"), ("recordings", "i8"), ("replaying", "?"),
+            ("breath_held", "?"), ("time", "f8"), ("said", f"S{TEXT_MOST}"), ("added_mass", "f8"),
+            ("tip", "f8", arms), ("place", "f8", arms), ("force", "f8", arms), ("pushed", "f8", arms),
+            ("share", "f8", (arm_count,)), ("limited", "?", (arm_count,)), ("node", "f4", (node_count, 3)),
+            ("geom", "f4", (geom_count, 3)), ("turn", "f4", (geom_count, 9)),
         ]
     )  # fmt: skip
 

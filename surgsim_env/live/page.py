@@ -140,7 +140,8 @@ class Page:
         self._grabs: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._held: set[int] = set()
         self._shows_lesions = False
-        self._was_recording = False
+        # Number of recordings written; the physics counts those begun.
+        self._recordings_written = 0
         self._doing: tuple[int, bool, bool] | None = None
         self._said = ""
         # None: neither a browser nor the user has chosen yet.
@@ -229,17 +230,16 @@ class Page:
         Call it after `run` has ended, also by an error: the recorded steps lie in shared memory, which outlives the
         physics' process.
         """
-        session, runs = self.session, self._was_recording
-        with contextlib.suppress(LiveError):
-            runs = runs or bool(session.frame()["recording"])
-        if not runs:
+        session = self.session
+        begun = int(session.exchange.frame.peek["recordings"])
+        if begun == self._recordings_written:
             return ""
         session.ask(Record(False))
         with contextlib.suppress(LiveError):
             deadline = time.monotonic() + END_TIMEOUT
             while session.alive and session.frame()["recording"] and time.monotonic() < deadline:
                 time.sleep(0.005)
-        self._was_recording = False
+        self._recordings_written = begun
         return f"{self._out}: {write_recording(session.exchange.recorded.steps.copy(), self._out)}"
 
     def _pulled(self, arm: int, phase: str, place: FloatArray) -> None:
@@ -283,10 +283,10 @@ class Page:
             if self._shows_lesions:
                 self._show_lesions(True)
         self._feel()
-        recording = bool(frame["recording"])
-        if self._was_recording and not recording:
+        recording, begun = bool(frame["recording"]), int(frame["recordings"])
+        if begun > self._recordings_written and not recording:
+            self._recordings_written = begun
             self._said = write_recording(session.exchange.recorded.steps.copy(), self._out)
-        self._was_recording = recording
         doing = (int(frame["phase"]), recording, bool(frame["replaying"]))
         if doing != self._doing:
             self._doing = doing

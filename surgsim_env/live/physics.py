@@ -170,7 +170,8 @@ class Physics:
         self._geoms = np.array(shown_geoms(instrument.model), dtype=np.int64)
         self._pacer = Pacer(pace, exchange.timing.peek)
         self._phase, self._said = Phase.RUNNING, ""
-        self._recording = False
+        # The page counts recordings: one may begin and end between two of its looks.
+        self._recording, self._recordings = False, 0
         self._start_state: dict[str, np.ndarray] | None = None
         self._peak = np.zeros(len(self._hands))
         # Number of requests handled; earlier ones wait in the pipe.
@@ -277,6 +278,7 @@ class Physics:
             self._start_state = self._simulation.get_state()
             for held in self._loop.held:
                 held.restart()
+            self._recordings += 1
         self._recording = on and not self._replaying
 
     def _replay(self, request: Replay) -> None:
@@ -347,7 +349,8 @@ class Physics:
         data = simulation.instrument.data
         with self._exchange.frame.writing() as frame:
             frame["phase"], frame["organ"] = int(self._phase), self._organ_number
-            frame["recording"], frame["replaying"] = self._recording, self._replaying
+            frame["recording"], frame["recordings"] = self._recording, self._recordings
+            frame["replaying"] = self._replaying
             frame["breath_held"] = simulation.holds_breath
             frame["time"], frame["said"] = simulation.time, encoded(self._said)
             frame["added_mass"] = self._organ.added_mass

@@ -2,6 +2,7 @@
 
 import asyncio
 
+import numpy as np
 import pytest
 
 from surgsim_env.live.exchange_records import Pause, Phase, Record, Reset
@@ -11,6 +12,11 @@ from tests.live.packets import write_hand, write_report
 from tests.live.served import send, setting, wait_until
 
 pytestmark = pytest.mark.usefixtures("fresh")
+
+
+def has_place(session) -> bool:
+    """Whether some recorded step has a hand's place."""
+    return bool(np.isfinite(session.exchange.recorded.steps["hand"]).all(axis=2).any())
 
 
 def test_panel_settings_reach_the_physics(served):
@@ -38,10 +44,8 @@ def test_a_click_means_what_the_physics_is_doing(served, monkeypatch, tmp_path):
         clicked = setting(panel._pause, True)
         asyncio.run(send(served, clicked, until=lambda phase=phase: session.frame()["phase"] == phase))
     clicked = setting(panel._record, True)
-    # A recording without a step is not written.
-    asyncio.run(
-        send(served, clicked, until=lambda: session.frame()["recording"] and session.exchange.recorded.count > 0)
-    )
+    # A recording without a hand's place is not written.
+    asyncio.run(send(served, clicked, until=lambda: session.frame()["recording"] and has_place(session)))
     asyncio.run(send(served, clicked, until=lambda: not session.frame()["recording"]))
     wait_until((tmp_path / "recording-1.csv").is_file)
 
@@ -54,6 +58,19 @@ def test_buttons_are_renamed_with_the_next_picture(served, monkeypatch):
     wait_until(lambda: panel._pause.label == "Continue")
     session.ask(Pause(False))
     wait_until(lambda: panel._pause.label == "Pause")
+
+
+def test_a_recording_shorter_than_a_picture_is_written(served, monkeypatch, tmp_path):
+    session = served.session
+    monkeypatch.setattr(served.page, "_out", tmp_path)
+    with monkeypatch.context() as patch:
+        # The page does not look while it runs.
+        patch.setattr(served.page, "_attend", lambda _: None)
+        session.ask(Record(True))
+        wait_until(lambda: session.frame()["recording"] and has_place(session))
+        session.ask(Record(False))
+        wait_until(lambda: not session.frame()["recording"])
+    wait_until((tmp_path / "recording-1.csv").is_file)
 
 
 def test_a_recording_is_written_to_its_folder_alone(served):

@@ -4,7 +4,7 @@
 
 The dataset names its environment (`agents/record_demonstrations.py` writes such datasets). The result is a PPO or
 RecurrentPPO of stable-baselines3 with its normalisation; reinforcement learning starts from it with
-`warm_start: runs/clone.safetensors` in a configuration of `agents/train.py`.
+`warm_start: runs/clone.safetensors` in a configuration of `surgsim_env/training/run.py`.
 """
 
 import argparse
@@ -15,15 +15,15 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from agents.command_line import one_line_errors
-from agents.scoring.episodes import play_tasks
+from surgsim_env.scoring.episodes import play_tasks
 
 with one_line_errors(__name__, "agents", "demonstrations"):
     import minari
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    from agents.training.imitation import CloningCurve, CloningOptions, clone, normalise_by, pad
-    from agents.training.networks import algorithm_class
-    from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
+    from surgsim_env.training.imitation import CloningCurve, CloningOptions, clone, normalise_by, pad
+    from surgsim_env.training.networks import algorithm_class
+    from surgsim_env.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 
 # Episodes are scored on seeds from here on; demonstrations come from lower ones.
 FIRST_SEED = 500_000

@@ -1,11 +1,9 @@
-"""What scripts share as commands: wrong input and missing packages end them with one line; classes are named."""
+"""What scripts share as commands: wrong input and missing packages end them with one line."""
 
-import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 OUR_PACKAGES = ("agents", "benchmarks", "msdm_core", "surgsim_env", "tests")
 
@@ -31,35 +29,6 @@ def one_line_errors(script: str, *extras: str) -> Iterator[None]:
         if script != "__main__":
             raise
         _end(" ".join(str(error).split()))
-
-
-def named_class(text: str, option: str) -> Any:
-    """The class (or any function that makes an agent) of MODULE:CLASS.
-
-    Importing the module runs its code.
-
-    Args:
-        text: MODULE:CLASS.
-        option: where it was given, for messages.
-
-    Raises:
-        ValueError: another text, or no such module or class.
-    """
-    module, _, name = text.partition(":")
-    if not (module and name):
-        raise ValueError(f"{option} is {text!r}; the rule is MODULE:CLASS")
-    try:
-        found = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise
-        raise ValueError(
-            f"{option} {text}: there is no module {error.name!r} on Python's path: run from its folder, or add that to "
-            "PYTHONPATH"
-        ) from None
-    if not callable(getattr(found, name, None)):
-        raise ValueError(f"{option} {text}: {found.__file__ or module} has no class {name!r}")
-    return getattr(found, name)
 
 
 def _end(line: str) -> None:

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.command_line import one_line_errors
-from agents.scoring.site_agent import SITE_COUNT, SLICES
+from surgsim_env.training.site_agent import SITE_COUNT, SLICES
 
 with one_line_errors(__name__, "agents"):
-    from agents.training.networks import describe_networks
-    from agents.training.policy_files import (
+    from surgsim_env.training.networks import describe_networks
+    from surgsim_env.training.policy_files import (
         TrainedPolicy,
         load_model,
         load_policy,

@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.command_line import one_line_errors
-from agents.expert_palpate import PalpateExpert
-from agents.training.palpate_surrogate import PalpateSurrogate
 from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.scoring.expert_palpate import PalpateExpert
+from surgsim_env.training.palpate_surrogate import PalpateSurrogate
 
 with one_line_errors(__name__, "agents"):
     import torch
     from stable_baselines3 import PPO
 
-    from agents.training.environments import blinded
-    from agents.training.extractors import MemorySummary
-    from agents.training.imitation import CloningOptions, clone
-    from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.training.environments import blinded
+    from surgsim_env.training.extractors import MemorySummary
+    from surgsim_env.training.imitation import CloningOptions, clone
+    from surgsim_env.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "features_extractor_class": MemorySummary}
 # Rounds that the expert plays, with random errors, so that the data show how to correct them.

@@ -2,10 +2,10 @@
 
     python -m agents.learn_palpate_organs --out runs/palpate_organs.safetensors
 
-The network sees the observation alone, through `agents.training.face_features.FaceSummary`. It is fitted to imagined
-features, which fill their ranges, and to the states that it reaches on organs whose forces a formula gives
-(`agents.training.face_surrogate`), all labelled by the expert (`agents.expert_organs`). Features are kept in place of
-observations of 5069 numbers.
+The network sees the observation alone, through `surgsim_env.training.face_features.FaceSummary`. It is fitted to
+imagined features, which fill their ranges, and to the states that it reaches on organs whose forces a formula gives
+(`surgsim_env.training.face_surrogate`), all labelled by the expert (`surgsim_env.scoring.expert_organs`). Features are
+kept in place of observations of 5069 numbers.
 """
 
 import argparse
@@ -22,8 +22,8 @@ with one_line_errors(__name__, "agents"):
     import torch
     from stable_baselines3 import PPO
 
-    from agents.expert_organs import DEPTH, expert_actions
-    from agents.training.face_features import (
+    from surgsim_env.scoring.expert_organs import DEPTH, expert_actions
+    from surgsim_env.training.face_features import (
         LATE,
         OBSERVATION_SIZE,
         SUMMARY_SIZE,
@@ -33,9 +33,9 @@ with one_line_errors(__name__, "agents"):
         face_features,
         face_summary,
     )
-    from agents.training.face_surrogate import FaceSurrogate
-    from agents.training.imitation import CloningOptions, clone
-    from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
+    from surgsim_env.training.face_surrogate import FaceSurrogate
+    from surgsim_env.training.imitation import CloningOptions, clone
+    from surgsim_env.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 
 ENV_ID = "SurgSim/Palpate-v0"
 NETWORK = {"net_arch": [192, 192], "activation_fn": torch.nn.ELU}

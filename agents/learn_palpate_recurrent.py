@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.command_line import one_line_errors
-from agents.expert_palpate import PalpateExpert
-from agents.training.palpate_surrogate import PalpateSurrogate
+from surgsim_env.scoring.expert_palpate import PalpateExpert
+from surgsim_env.training.palpate_surrogate import PalpateSurrogate
 
 with one_line_errors(__name__, "agents"):
     import torch
@@ -23,10 +23,10 @@ with one_line_errors(__name__, "agents"):
     from stable_baselines3.common.vec_env import VecNormalize
 
     from agents.learn_palpate import ERROR, ERROR_KEPT
-    from agents.training.extractors import WITHOUT_MEMORY, PlaceAndForce
-    from agents.training.imitation import CloningOptions, clone, normalise_by, pad
-    from agents.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.training.extractors import WITHOUT_MEMORY, PlaceAndForce
+    from surgsim_env.training.imitation import CloningOptions, clone, normalise_by, pad
+    from surgsim_env.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
 
 NETWORK = {
     "lstm_hidden_size": 96,

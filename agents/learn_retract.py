@@ -4,7 +4,7 @@
     python -m agents.learn_retract --rounds 6 --without-force --out runs/retract_dagger_without_force.safetensors
 
 With `--without-force` the policy sees 0 in place of the jaw's wrench, its grip and its pull; the expert sees all
-channels. The result is a policy of stable-baselines3's PPO, from which `agents.train` can start (`warm_start`).
+channels. The result is a policy of stable-baselines3's PPO, from which `surgsim train` can start (`warm_start`).
 """
 
 import argparse
@@ -20,20 +20,20 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from agents.expert_retract import RetractExpert
+from surgsim_env.scoring.expert_retract import RetractExpert
 
 with one_line_errors(__name__, "agents"):
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from agents.training.environments import blinded
-    from agents.training.imitation import CloningOptions, dagger
-    from agents.training.policy_files import describe, policy_path, save_policy
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.training.environments import blinded
+    from surgsim_env.training.imitation import CloningOptions, dagger
+    from surgsim_env.training.policy_files import describe, policy_path, save_policy
 
 ID = "SurgSim/Retract-v0"
-# The same as in the configurations of `agents.train` that start from the result.
+# The same as in the configurations of `surgsim train` that start from the result.
 NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh}
 # Training seeds; scores use seeds from 1,000,000, periodic evaluations from 500,000.
 FIRST_SEED = 2_000_000

@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from agents.expert_retract import PULL, SLICES, TolerantExpert
 from surgsim_env.rendering.looks import draw_look, find_look_ranges
+from surgsim_env.scoring.expert_retract import HOLDS, PULL, SLICES, TolerantExpert
 
 with one_line_errors(__name__, "agents"):
     import torch
     from stable_baselines3 import PPO
 
-    from agents.training.picture_features import PictureAndForce
-    from agents.training.policy_files import describe, load_policy, policy_path, save_policy
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.training.picture_features import PictureAndForce
+    from surgsim_env.training.policy_files import describe, load_policy, policy_path, save_policy
 
 ID = "SurgSim/Retract-v0"
 SETTINGS: dict[str, Any] = {"obs_mode": "rgb_force", "looks": "train"}
@@ -50,8 +50,9 @@ NETWORK = {
 # Channels that a layer beside the policy, which is not kept, predicts from its features: they teach what to look at.
 TAUGHT = ("tip_position", "opening", "holds", "edge_points", "visible")
 TAUGHT_WEIGHT = 0.1
-# Share of states with a pull above PULL_LEAST [N] that are kept a second time, with an imagined pull [N].
-IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL = 0.2, 0.05, (0.6, 1.3)
+# Share of states with a pull above PULL_LEAST [N] that are kept a second time, with an imagined pull [N]. States in
+# which the jaw pushes without holding anything are rare: all of them are kept, with UNHELD_PULLS imagined pulls each.
+IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL, UNHELD_PULLS = 0.2, 0.05, (0.6, 1.3), 4
 # Of the first rounds, the share of steps that the expert plays.
 EXPERT_SHARES = (1.0, 0.5, 0.2)
 
@@ -125,8 +126,10 @@ class Player:
 
     def _imagined(self, taught: NDArray[np.float32]) -> tuple[NDArray, ...]:
         """Some of the present states with a harder pull, as a row of `Samples` each; maybe none."""
-        pulls = np.array([one.task_observation[PULL] for one in self._singles])
-        chosen = np.flatnonzero((pulls > PULL_LEAST) & (self._rng.random(len(pulls)) < IMAGINED_SHARE))
+        pulls, holds = np.array([one.task_observation[[PULL, HOLDS]] for one in self._singles]).T
+        held = (holds > 0.5) & (self._rng.random(len(pulls)) < IMAGINED_SHARE)
+        count = np.where(holds > 0.5, held, UNHELD_PULLS)
+        chosen = np.repeat(np.arange(len(pulls)), np.where(pulls > PULL_LEAST, count, 0))
         forces = self._seen["force"][chosen].copy()
         wanted = np.zeros((len(chosen), self._envs.single_action_space.shape[0]), np.float32)  # type: ignore[index]
         for row, index in enumerate(chosen):

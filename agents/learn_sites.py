@@ -4,14 +4,14 @@
     python -m agents.learn_sites --start agents/policies/sites_evolved.safetensors --out runs/sites.safetensors
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
-`cma`) changes the 13 numbers of `agents.training.site_policy.Acquisition`, beginning at the upper confidence bound of
-`gp_ucb` or at a policy. All candidates of a generation play the same episodes of `agents/training/bell_sites.py`; each
-generation has new ones. An episode costs
+`cma`) changes the 13 numbers of `surgsim_env.training.site_policy.Acquisition`, beginning at the upper confidence
+bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes of
+`surgsim_env/training/bell_sites.py`; each generation has new ones. An episode costs
 
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
 
 with the lines 5 mm and 3.3 mm, as a score is in presses to a line. The result is a policy of stable-baselines3's PPO,
-whose convolutional part is 0; `agents.train` can go on from it (`warm_start`). A generation takes about a minute of
+whose convolutional part is 0; `surgsim train` can go on from it (`warm_start`). A generation takes about a minute of
 processor time. The policy of the generation that costs least on other episodes is kept.
 """
 
@@ -33,10 +33,12 @@ with one_line_errors(__name__, "agents"):
     from stable_baselines3 import PPO
     from tqdm import tqdm
 
-    from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
-    from agents.training.bell_sites import BellSites
-    from agents.training.policy_files import describe, load_policy, policy_path, save_policy
-    from agents.training.site_policy import (
+    from surgsim_env.palpation.chart import MAP_SIDE
+    from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
+    from surgsim_env.training.bell_sites import BellSites
+    from surgsim_env.training.policy_files import describe, load_policy, policy_path, save_policy
+    from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
+    from surgsim_env.training.site_policy import (
         CHOICE_SPACE,
         FEATURE_SPACE,
         MAPS,
@@ -46,8 +48,6 @@ with one_line_errors(__name__, "agents"):
         open_sites,
         stacked_features,
     )
-    from surgsim_env.palpation.chart import MAP_SIDE
-    from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
 
 ID = "SurgSim/PalpateSites-v0"
 # Steps of the parameters that count alike, in the order of `Acquisition.values`.

@@ -1,7 +1,7 @@
 """A film of one policy that palpates several organs: each under the probe, below it where the policy expects lesions.
 
 The truth is shown when all presses are made. The policy reads the observation alone; its belief is the Gaussian process
-over its presses that site policies read (`agents/scoring/site_agent.py`). Run it from a checkout:
+over its presses that site policies read (`surgsim_env/training/site_agent.py`). Run it from a checkout:
 
     python -m agents.organ_film --out docs/images/three_organs.webp
 """
@@ -20,17 +20,17 @@ from rich.progress import track
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from agents.scoring.results import SITES
-from agents.scoring.site_agent import SiteProcess, site_facts
 from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.scoring.results import SITES
+from surgsim_env.training.site_agent import SiteProcess, site_facts
 
 matplotlib.use("Agg")
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 with one_line_errors(__name__, "agents"):
-    from agents.evaluate import POLICIES
-    from agents.training.policy_files import load_policy
+    from surgsim_env.scoring.evaluate import policies_folder
+    from surgsim_env.training.policy_files import load_policy
 
 # Organs, and an episode of each that neither a training nor an evaluation uses.
 ORGANS: dict[str, tuple[dict[str, str], int]] = {
@@ -186,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ValueError: an --out that does not end in .webp.
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--policy", type=Path, default=POLICIES / "sites_evolved.safetensors")
+    parser.add_argument("--policy", type=Path, default=policies_folder() / "sites_evolved.safetensors")
     parser.add_argument("--organs", nargs="+", choices=list(ORGANS), default=list(ORGANS))
     parser.add_argument("--budget", type=int, default=20, help="presses of each organ")
     parser.add_argument("--out", type=Path, required=True, help="the film, NAME.webp")

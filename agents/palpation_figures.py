@@ -13,19 +13,19 @@ import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from agents.scoring.episodes import agent_generator
-from agents.scoring.leaderboard import best_raster_alone
-from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
-from agents.scoring.results import SITES, Result, family, load_results
-from agents.scoring.site_agent import site_facts
-from agents.site_search import BOUNDS
+from agents.leaderboard_tables import best_raster_alone
 from surgsim_env.palpation.scores import ERROR_LINE
+from surgsim_env.scoring.episodes import agent_generator
+from surgsim_env.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, draw_belief, episode_frames
+from surgsim_env.scoring.results import SITES, Result, family, load_results, shipped_results
+from surgsim_env.scoring.site_search import BOUNDS
+from surgsim_env.training.site_agent import site_facts
 
 matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
 with one_line_errors(__name__, "agents"):
-    from agents.evaluate import POLICIES, find_agent
+    from surgsim_env.scoring.evaluate import find_agent, policies_folder
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 # Colours of the methods in alphabetical order (Okabe & Ito 2008, with a darker yellow).
@@ -102,11 +102,11 @@ def draw_agent(path: Path) -> None:
     """Two frames of a trained policy's film: early, and after it has found the lesions."""
     from PIL import Image
 
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_lesion": True}
     env = gym.make(SITES, scene="phantom", level="standard", render_mode="rgb_array", **size)
-    frames = episode_frames(load_policy(POLICIES / SHOWN_POLICY), env, AGENT_SEED)
+    frames = episode_frames(load_policy(policies_folder() / SHOWN_POLICY), env, AGENT_SEED)
     env.close()
     Image.fromarray(np.concatenate([frames[(press - 1) * PRESS_PICTURES] for press in AGENT_PRESSES])).save(path)
 
@@ -115,7 +115,7 @@ def main() -> None:
     """Draw all figures."""
     draw_agent(IMAGES / "agent_at_work.png")
     draw_search(IMAGES / "palpation_search.png")
-    draw_errors(load_results(), IMAGES / "palpation_errors.png")
+    draw_errors(load_results(shipped_results()), IMAGES / "palpation_errors.png")
 
 
 if __name__ == "__main__":

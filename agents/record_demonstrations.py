@@ -28,8 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.command_line import named_class, one_line_errors
+from agents.command_line import one_line_errors
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
+from surgsim_env.scoring.evaluate import named_class
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
 with one_line_errors(__name__, "agents", "demonstrations"):
@@ -133,7 +134,7 @@ def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
     if by == "oracle":
         return play_oracle
     if by.endswith(POLICY_SUFFIXES):
-        from agents.training.policy_files import load_policy
+        from surgsim_env.training.policy_files import load_policy
 
         policy = load_policy(Path(by), trust_pickle=trust_pickle)
         policy.check_environment(env, f"policy {by}")

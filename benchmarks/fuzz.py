@@ -383,7 +383,7 @@ def policy_cases(folder: Path) -> Iterator[Case]:
 
 
 def read_policy(path: Path) -> None:
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     policy = load_policy(path)
     policy.reset(2)

@@ -19,23 +19,23 @@ PACKAGES = ("msdm_core", "surgsim_env", "agents", "benchmarks", "scenes")
 ORDER = {
     "surgsim_env": (
         *("reports", "scene", "instruments", "coupling", "haptics", "palpation", "tasks", "identify", "validation"),
-        *("rendering", "patient", "envs", "live", "scripting", "bench", "arm_study", "cli", "__init__"),
+        *("rendering", "patient", "envs", "live", "scripting", "training", "scoring", "bench", "arm_study", "cli"),
+        "__init__",
     ),
     "msdm_core": (
         *("errors", "numba_cache", "kernels", "mesh", "mesh_files", "material", "meshing", "organ", "lanes"),
         "__init__",
     ),
-    # Shared machinery, then one script each.
+    # One script each.
     "agents": (
-        *("__init__", "command_line", "scoring", "press_library", "training", "site_search", "raster", "keyboard"),
-        *("expert_palpate", "expert_organs", "expert_retract", "learn_palpate", "learn_palpate_organs"),
-        *("learn_palpate_recurrent", "learn_retract", "learn_retract_pixels", "learn_sites"),
-        *("record_demonstrations", "behaviour_cloning", "train", "train_rllib", "evaluate"),
+        *("__init__", "command_line", "raster", "keyboard", "make_press_library", "learn_palpate"),
+        *("learn_palpate_organs", "learn_palpate_recurrent", "learn_retract", "learn_retract_pixels", "learn_sites"),
+        *("record_demonstrations", "behaviour_cloning", "train_rllib", "leaderboard_tables", "leaderboard"),
         *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }
-MOST_ROOMS = 22
+MOST_ROOMS = 24
 
 
 def module_files() -> dict[str, Path]:

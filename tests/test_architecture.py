@@ -35,12 +35,14 @@ MUJOCO_CALLS = "surgsim_env/instruments/mujoco_kernels.py"
 NUMBA_SETTINGS = ("msdm_core/numba_cache.py",)
 
 # Rooms of surgsim_env that may import gymnasium.
-GYMNASIUM_ROOMS = {"__init__", "tasks", "envs", "live", "scripting", "bench", "arm_study", "cli"}
+GYMNASIUM_ROOMS = {"__init__", "tasks", "envs", "live", "scripting", "training", "scoring", "bench", "arm_study", "cli"}
 # Rooms that few import, and which do.
 TOPS = {
     "validation": {"bench", "cli"},
     "live": {"cli"},
-    "scripting": {"arm_study", "cli"},
+    "scripting": {"scoring", "arm_study", "cli"},
+    "training": {"scoring", "cli"},
+    "scoring": {"cli"},
     "bench": {"cli"},
     "arm_study": {"cli"},
     "cli": set(),

@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 def multiply_stiffness(
     rest, nodes, stiffness, tets, rest_volume, bulk, node_rest_volume, node_bulk, displacement, pressure, force
 ):

@@ -16,7 +16,7 @@ from msdm_core.kernels.contact_kernels import (
 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 def add_pressures(model, state, shapes, stiffness, push):
     """Contact force of every node if each were pushed along the normal: sum of w A k_p g (`add_contact_forces`).
 
@@ -57,7 +57,7 @@ def add_pressures(model, state, shapes, stiffness, push):
                 push[c] += wc * force
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 def add_gradients(rest, position, tets, gradient):
     """Deformation gradient of every tet times its rest volume, added to each of its nodes.
 
@@ -87,7 +87,7 @@ def add_gradients(rest, position, tets, gradient):
                 gradient[node, row, 2] += z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 def fill_volume_ratios(position, tets, rest_volume, ratio):
     """Volume of every tet over its volume at rest, negative where it is inside out.
 

@@ -560,7 +560,7 @@ def _(model):
 # Whether `lanes` is empty, and how many indices an array has, is known when these are compiled: one way is left.
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def entry_of(values, lane):
     """One lane's number of an array (1, n_lane), or that of an organ alone in an array (1,)."""
     if values.ndim == 2:
@@ -568,7 +568,7 @@ def entry_of(values, lane):
     return values[lane]
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def set_entry(values, lane, value):
     """Write what `entry_of` reads."""
     if values.ndim == 2:
@@ -577,7 +577,7 @@ def set_entry(values, lane, value):
         values[lane] = value
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def column_of(values, lane):
     """One lane's numbers of an array (n, n_lane), or of all lanes' array (n,)."""
     if values.ndim == 2:
@@ -585,7 +585,7 @@ def column_of(values, lane):
     return values
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def part_of(lanes, values, lane):
     """One lane's part of an array whose first index is the lane; an organ alone has the whole array."""
     if len(lanes) == 0:
@@ -593,21 +593,21 @@ def part_of(lanes, values, lane):
     return values[lane]
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _triangles_of(values, lane, count):
     if values.ndim == 3:
         return values[lane, :count]
     return values
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _numbers_of(values, lane, count):
     if values.ndim == 2:
         return values[lane, :count]
     return values
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def surface_of(lanes, model, lane):
     """One lane's surface, as contact reads it."""
     if len(lanes) == 0:
@@ -619,7 +619,7 @@ def surface_of(lanes, model, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def supports_of(lanes, model, lane):
     """One lane's supports; kernels that read them take an OrganModel as well."""
     if len(lanes) == 0:
@@ -636,28 +636,28 @@ def supports_of(lanes, model, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _places_of(values, lane):
     if values.ndim == 3:
         return values[lane]
     return values
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _blocks_of(values, lane):
     if values.ndim == 4:
         return values[lane]
     return values
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _shifts_of(values, lane):
     if values.ndim == 4:
         return values[:, :, :, lane]
     return values
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def ground_of(lanes, model, lane):
     """One lane's foundations, and how the ground moves; kernels that read them take an OrganModel as well."""
     if len(lanes) == 0:
@@ -670,7 +670,7 @@ def ground_of(lanes, model, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def touched_of(lanes, state, lane):
     """One lane's state, as contact reads and writes it."""
     if len(lanes) == 0:
@@ -687,7 +687,7 @@ def touched_of(lanes, state, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def shapes_of(lanes, shapes, lane):
     """One lane's contact shapes."""
     if len(lanes) == 0:
@@ -698,7 +698,7 @@ def shapes_of(lanes, shapes, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def response_of(lanes, response, lane):
     """The response of one lane's tools."""
     if len(lanes) == 0:
@@ -709,7 +709,7 @@ def response_of(lanes, response, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, error_model="numpy")
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def in_rows(lanes, state):
     """The state whose node arrays the tissue's kernels work on: of an organ alone with rows of four in their place."""
     if len(lanes) > 0:

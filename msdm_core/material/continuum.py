@@ -12,7 +12,6 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from msdm_core.material.tissue_law import TANGENT_CAP_LARGEST, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -277,6 +276,8 @@ def fit_springs(
     Raises:
         ValueError: a strain or ratio out of range, or a solid without equilibrium in these tests.
     """
+    from scipy.optimize import least_squares
+
     if not 0.05 <= strain <= 0.5:
         raise ValueError(f"the strain of the fit is {strain:g}; it must be from 0.05 to 0.5")
     if not 0.25 <= poisson_ratio < 0.5:

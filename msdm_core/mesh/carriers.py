@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
-from scipy.spatial import KDTree
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.geodesic import nearest_weights
@@ -111,6 +110,8 @@ def node_gradients(mesh: TetMesh, nodes: IntArray) -> csr_array:
 
 def _nearest_triangles(points: FloatArray, corners: FloatArray) -> tuple[IntArray, FloatArray]:
     """The triangle nearest to each point, and weights of its corners at its nearest point."""
+    from scipy.spatial import KDTree
+
     triangle, weights = np.zeros(len(points), dtype=np.int32), np.zeros((len(points), 3))
     gap = np.full(len(points), np.inf)
     centre = corners.mean(axis=1)

@@ -12,8 +12,6 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter
-from scipy.spatial import KDTree
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.quality import tet_angles
@@ -112,6 +110,8 @@ def stuff_graded(
         fine_depth: cells that come within this distance of such a triangle along each axis are fine [m].
         coarsest: the largest cells have an edge of 2^coarsest fine cells.
     """
+    from scipy.ndimage import maximum_filter
+
     lattice = lattice_around(body.box, cell_size, 2**coarsest)
     permitted = _permitted_levels(fine, lattice, fine_depth, coarsest)
     inside = body.signs(lattice) > 0
@@ -133,6 +133,8 @@ def stuff_graded(
 
 def _permitted_levels(corners: FloatArray, lattice: Lattice, fine_depth: float, coarsest: int) -> Int64Array:
     """0 at the cells that come within a depth [m] of triangles (n, 3, 3), the coarsest level elsewhere."""
+    from scipy.spatial import KDTree
+
     shape = np.array(lattice.shape) // 2
     size = 2 * lattice.half_cell
     cells = np.stack(np.unravel_index(np.arange(shape.prod()), shape), axis=1)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from msdm_core.errors import MeshError
 from msdm_core.material.regions import tet_samples
@@ -165,6 +164,8 @@ class SmoothedShare:
 
     def at(self, places: FloatArray) -> FloatArray:
         """Trilinear between the blocks' centres, 0 outside, at places [m] (n, 3), shape (n,)."""
+        from scipy import ndimage
+
         index = ((places - self.start) / self.step).T
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64)
 
@@ -215,6 +216,8 @@ def largest_part(image: NDArray, tags: list[int]) -> tuple[NDArray[np.bool_], ND
 
     Returns the part, cropped to its box, the corner of the box, and the sizes of the other parts.
     """
+    from scipy import ndimage
+
     mask = np.isin(image, tags) if len(tags) > 1 else image == tags[0]
     part, count = parts_of(mask)
     sizes = np.bincount(part.ravel(), minlength=count + 1)[1:]
@@ -228,6 +231,8 @@ def largest_part(image: NDArray, tags: list[int]) -> tuple[NDArray[np.bool_], ND
 
 def parts_of(mask: NDArray[np.bool_], *, corners: bool = False) -> tuple[NDArray[np.int32], int]:
     """The number of each voxel's part, from 1, 0 outside, and how many there are; joined by faces, or corners too."""
+    from scipy import ndimage
+
     labelled: Any = ndimage.label(mask, structure=np.ones((3, 3, 3)) if corners else None)
     return labelled[0], int(labelled[1])
 
@@ -250,6 +255,8 @@ def smoothed_share(
     Raises:
         MeshError: more blocks than FIELD_LIMIT.
     """
+    from scipy import ndimage
+
     smoothing = max(SMOOTHING_SPACINGS * float(step.max()), SMOOTHING_CELLS * cell_size)
     joined = np.maximum(np.floor(cell_size / (VOXELS_PER_CELL * step)), 1).astype(np.int64)
     block = joined * step

@@ -4,9 +4,9 @@ The step follows from springs, volume term, damping, supports and contact togeth
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from msdm_core.errors import OrganError
@@ -146,7 +146,7 @@ def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) 
         return 2.0 * (1.0 + math.exp(-alpha * dt)) - 2.0 * dt * rate - (omega * dt) ** 2
 
     ceiling = 2.0 / omega if omega > 0.0 else 2.0 / rate
-    return ceiling if margin(ceiling) >= 0.0 else float(brentq(margin, 0.0, ceiling, xtol=1e-12))  # pyright: ignore
+    return _root_below(ceiling, margin)
 
 
 def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
@@ -170,7 +170,17 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     def margin(dt: float) -> float:
         return limit(dt) - limit(own) * (dt / own) ** power - contact_excess(*contact_hold(model, contact, dt))
 
-    return own if margin(own) >= 0.0 else float(brentq(margin, 0.0, own, xtol=1e-12))  # pyright: ignore
+    return _root_below(own, margin)
+
+
+def _root_below(ceiling: float, margin: Callable[[float], float]) -> float:
+    """The step [s] at which a margin falls to 0, or `ceiling` where it is not negative even there."""
+    if margin(ceiling) >= 0.0:
+        return ceiling
+    # Here, because scipy.optimize takes a tenth of a second to import.
+    from scipy.optimize import brentq
+
+    return float(brentq(margin, 0.0, ceiling, xtol=1e-12))  # pyright: ignore
 
 
 def own_step(model: OrganModel) -> float:

@@ -14,6 +14,7 @@ from surgsim_env.cli.arm import Arm
 from surgsim_env.cli.arms import Arms
 from surgsim_env.cli.bench import Bench
 from surgsim_env.cli.doctor import Doctor
+from surgsim_env.cli.evaluate import Evaluate
 from surgsim_env.cli.haptics import Haptics
 from surgsim_env.cli.identify import Identify
 from surgsim_env.cli.maps import Maps
@@ -22,6 +23,7 @@ from surgsim_env.cli.organ import Organ
 from surgsim_env.cli.palpate import Palpate
 from surgsim_env.cli.retract import Retract
 from surgsim_env.cli.scenes import Scenes
+from surgsim_env.cli.train import Train
 from surgsim_env.cli.validate import Validate
 from surgsim_env.cli.view import View
 
@@ -38,6 +40,8 @@ Command = (
     | Arm
     | Arms
     | Identify
+    | Train
+    | Evaluate
     | Validate
     | Bench
     | Haptics

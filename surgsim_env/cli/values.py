@@ -1,7 +1,8 @@
 """Types of command-line options, values of options that are text, and default folders of reports."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -59,6 +60,18 @@ def command_text(words: Sequence[str], options: Mapping[str, object]) -> str:
             joined = str(one).startswith("-")
             words += [option] if one is True else [f"{option}={one}"] if joined else [option, str(one)]
     return shlex.join(words)
+
+
+@contextmanager
+def missing_packages(command: str, extra: str) -> Iterator[None]:
+    """Raise a ValueError that names the extra of pyproject.toml where a package is not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing in ("msdm_core", "surgsim_env"):
+            raise
+        raise ValueError(f"surgsim {command} needs {missing}: pip install 'surgsim[{extra}]'") from None
 
 
 def report_folder(folder: Path | None, name: str, *, quick: bool) -> Path:

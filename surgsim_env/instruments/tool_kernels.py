@@ -91,7 +91,7 @@ class ToolViews(NamedTuple):
     yielded: FloatArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 def factorise(matrix):
     """A = L D L^T in place: D on the diagonal, L below it; A (n, n) symmetric and positive definite."""
     for column in range(matrix.shape[0]):
@@ -102,7 +102,7 @@ def factorise(matrix):
             matrix[row, column] = value if row == column else value / matrix[column, column]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 def tool_mobility(factors, jacobians, tool, smooth_force, yielded, mobility, acceleration):
     """Column t of the tool mobility matrix, mobility[i, t] = J_i A^-1 J_t^T, and acceleration[t] = J_t A^-1 q.
 

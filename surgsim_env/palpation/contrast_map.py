@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from msdm_core.mesh.geodesic import SurfaceDistance
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -268,6 +267,8 @@ def score_map(
     spacing: float,
 ) -> ContrastMap:
     """Match estimates to lesions one to one by the least sum of distances along the surface, and measure the map."""
+    from scipy.optimize import linear_sum_assignment
+
     places = np.array([estimate.point for estimate in estimates]).reshape(-1, 3)
     error = np.array([surface(truth.point, places) for truth in truths]).reshape(len(truths), len(places))
     rows, columns = linear_sum_assignment(np.minimum(error, MATCHING_REACH))

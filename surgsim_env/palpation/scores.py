@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.press import scan
@@ -61,6 +60,8 @@ def matched_distances(
     truth: FloatArray, estimate: FloatArray, cutoff: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Indices of true and estimated places as OSPA matches them, one to one, and distances [m], each (min(m, k),)."""
+    from scipy.optimize import linear_sum_assignment
+
     distance = np.sqrt(((np.asarray(truth)[:, None] - np.asarray(estimate)) ** 2).sum(axis=2))
     rows, columns = linear_sum_assignment(np.minimum(distance, cutoff))
     return rows, columns, distance[rows, columns]

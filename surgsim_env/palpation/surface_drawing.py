@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from scipy.interpolate import RBFInterpolator
-from scipy.spatial import KDTree
 
 from msdm_core.mesh.carriers import surface_carriers
 from msdm_core.mesh.surface import triangle_lattice
@@ -109,6 +107,9 @@ def curved_patches(points: FloatArray, triangles: IntArray, splits_most: int = S
 
 def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
     """A continuous field near the values at the sites [m] (n, 3), at other places (m, 3): radial functions."""
+    from scipy.interpolate import RBFInterpolator
+    from scipy.spatial import KDTree
+
     if len(sites) < 8 or np.ptp(values) == 0.0:
         return values[KDTree(sites).query(places)[1]]
     # In the best-fit plane of the sites: a flat face determines nothing across it.
@@ -122,6 +123,8 @@ def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> F
 
 def nearness(sites: FloatArray, places: FloatArray, spacing: float, fade_to: float = FADE_TO) -> FloatArray:
     """Opacity of a map at each place: 1 near a site, fading to 0 beyond, shape (m,)."""
+    from scipy.spatial import KDTree
+
     distance = KDTree(sites).query(places)[0] / spacing
     return np.clip((fade_to - distance) / (fade_to - FADE_FROM), 0.0, 1.0)
 

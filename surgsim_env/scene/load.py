@@ -34,24 +34,37 @@ class _EntryError(dacite.DaciteFieldError):
 
 
 def scenes_folder(package_folder: Path = PACKAGE_FOLDER) -> Path:
-    """The folder with `organs/`, `instruments/` and `meshes/`.
+    """The folder with `organs/`, `instruments/` and `meshes/`; as `_shipped_folder`."""
+    return _shipped_folder(package_folder / "assets", package_folder.parent / "scenes", "organs", "scene files")
 
-    A wheel carries it inside the package, a checkout next to the package. Both are looked for beside this file and
+
+def agents_folder(package_folder: Path = PACKAGE_FOLDER) -> Path:
+    """The folder with `policies/`, `configs/` and `results/` of agents; as `_shipped_folder`."""
+    return _shipped_folder(
+        package_folder / "assets" / "agents", package_folder.parent / "agents", "policies", "policies of agents"
+    )
+
+
+def _shipped_folder(packed: Path, checkout: Path, inside: str, what: str) -> Path:
+    """The place of data that are shipped.
+
+    A wheel carries them inside the package, a checkout next to the package. Both are looked for beside this file and
     nowhere else: an editable install also leaves a copy in site-packages, which goes stale and is never read.
 
     Args:
-        package_folder: the folder of the package `surgsim_env`.
+        packed: the place in a wheel.
+        checkout: the place in a checkout.
+        inside: a folder that it has.
+        what: the data, for the message.
 
     Raises:
         FileNotFoundError: neither place has it; names both and the way out.
     """
-    places = (package_folder / "assets", package_folder.parent / "scenes")
-    for place in places:
-        if (place / "organs").is_dir():
+    for place in (packed, checkout):
+        if (place / inside).is_dir():
             return place
-    looked = " nor in ".join(str(place) for place in places)
     raise FileNotFoundError(
-        f"surgsim's scene files are neither in {looked} (a folder with `organs` in it is expected); "
+        f"surgsim's {what} are neither in {packed} nor in {checkout} (a folder with `{inside}` in it is expected); "
         "reinstall surgsim, or run from a complete checkout"
     )
 

@@ -6,9 +6,9 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 import gymnasium as gym
 
-from agents.scoring.site_agent import SLICES, observed_facts
-from agents.training.bell_sites import TIP, BellDraws, BellSites
 from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, PalpateSitesTask
+from surgsim_env.training.bell_sites import TIP, BellDraws, BellSites
+from surgsim_env.training.site_agent import SLICES, observed_facts
 
 pytestmark = pytest.mark.agents
 QUIET = BellDraws(background=0.0, model=(0.0, 0.0), offset=0.0, noise=(1e-6, 1.0001e-6), count_weights=(0.0, 1.0))

@@ -65,7 +65,7 @@ def missed(model, normalisation):
 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
 def test_a_known_policy_is_found(algorithm):
-    from agents.training.imitation import CloningOptions, clone, normalise_by
+    from surgsim_env.training.imitation import CloningOptions, clone, normalise_by
 
     model, normalisation = made(algorithm)
     observations, actions = demonstrations()
@@ -78,7 +78,7 @@ def test_a_known_policy_is_found(algorithm):
 
 
 def test_normalisation_is_the_data_s_own_and_goes_on():
-    from agents.training.imitation import normalise_by
+    from surgsim_env.training.imitation import normalise_by
 
     _, normalisation = made()
     observations, _ = demonstrations()
@@ -97,7 +97,7 @@ def test_normalisation_is_the_data_s_own_and_goes_on():
 
 def test_what_is_scarce_can_be_weighted():
     """Two actions for the same observation: the mean lies where the weights put it, for each number of the action."""
-    from agents.training.imitation import CloningOptions, clone
+    from surgsim_env.training.imitation import CloningOptions, clone
 
     model, _ = made(normalised=False)
     observations = np.zeros((400, 3), dtype=np.float32)
@@ -114,7 +114,7 @@ def test_what_is_scarce_can_be_weighted():
 
 
 def test_spread_is_what_the_policy_misses():
-    from agents.training.imitation import CloningOptions, clone, normalise_by
+    from surgsim_env.training.imitation import CloningOptions, clone, normalise_by
 
     model, normalisation = made()
     observations, actions = demonstrations(4000)
@@ -128,7 +128,7 @@ def test_spread_is_what_the_policy_misses():
 
 
 def test_critic_is_fitted_to_returns():
-    from agents.training.imitation import CloningOptions, clone, normalise_by
+    from surgsim_env.training.imitation import CloningOptions, clone, normalise_by
 
     model, normalisation = made()
     observations, actions = demonstrations()
@@ -143,7 +143,7 @@ def test_critic_is_fitted_to_returns():
 
 def test_recurrent_policy_remembers():
     """The action is what was seen in the episode's first step: nothing that a policy without memory could know."""
-    from agents.training.imitation import CloningOptions, clone, pad
+    from surgsim_env.training.imitation import CloningOptions, clone, pad
 
     model, _ = made("RecurrentPPO", normalised=False)
     rng = np.random.default_rng(0)
@@ -172,7 +172,7 @@ def test_reinforcement_learning_goes_on_from_the_clone(tmp_path):
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    from agents.training.imitation import CloningOptions, clone, normalise_by
+    from surgsim_env.training.imitation import CloningOptions, clone, normalise_by
 
     model, normalisation = made()
     observations, actions = demonstrations()
@@ -199,7 +199,7 @@ def test_reinforcement_learning_goes_on_from_the_clone(tmp_path):
     ],
 )
 def test_what_does_not_fit_is_refused(change, said):
-    from agents.training.imitation import clone
+    from surgsim_env.training.imitation import clone
 
     model, _ = made(normalised=False)
     given = {"observations": np.zeros((9, 3)), "actions": np.zeros((9, 2)), **change}
@@ -208,7 +208,7 @@ def test_what_does_not_fit_is_refused(change, said):
 
 
 def test_dagger_learns_from_its_own_places():
-    from agents.training.imitation import dagger
+    from surgsim_env.training.imitation import dagger
 
     envs = gym.vector.SyncVectorEnv([Steering] * 4, autoreset_mode="SameStep")
     model, normalisation = made()
@@ -231,7 +231,7 @@ def test_dagger_learns_from_its_own_places():
 
 def test_a_disturbance_is_played_and_not_learned():
     """The expert alone plays, and fails by what is added; its words are learned as ever."""
-    from agents.training.imitation import dagger
+    from surgsim_env.training.imitation import dagger
 
     envs = gym.vector.SyncVectorEnv([Steering] * 4, autoreset_mode="SameStep")
     model, normalisation = made()

@@ -1,5 +1,6 @@
 """Without the packages of an extra, every script that needs them says in one line what to install."""
 
+import importlib
 import re
 import runpy
 import sys
@@ -21,7 +22,10 @@ PACKAGES = {
     *("stable_baselines3", "tensorboard", "torch", "tqdm", "viser", "websockets", "yaml"),
 }
 # Of ours, what imports them; imported anew here.
-NEEDING = ("agents", "surgsim_env.cli.view", "surgsim_env.envs", "surgsim_env.live")
+NEEDING = (
+    *("agents", "surgsim_env.cli", "surgsim_env.envs", "surgsim_env.live", "surgsim_env.scoring"),
+    "surgsim_env.training",
+)
 SCRIPTS = {
     path.relative_to(ROOT).as_posix(): match[1]
     for folder in ("agents", "benchmarks", "docs")
@@ -61,8 +65,8 @@ def without_extras(monkeypatch) -> Iterator[None]:
 
 def test_the_scripts_that_need_extras_declare_them():
     names = {Path(name).stem for name in SCRIPTS}
-    assert names >= {"behaviour_cloning", "convert_policy", "evaluate", "learn_palpate", "learn_palpate_recurrent"}
-    assert names >= {"learn_retract", "live_browser", "palpation_figures", "record_demonstrations", "train"}
+    assert names >= {"behaviour_cloning", "convert_policy", "learn_palpate", "learn_palpate_recurrent"}
+    assert names >= {"learn_retract", "live_browser", "palpation_figures", "record_demonstrations"}
     for extras in SCRIPTS.values():
         assert all(extra.strip('"') in EXTRAS for extra in extras.split(", "))
 
@@ -78,12 +82,27 @@ def test_a_missing_extra_is_named_in_one_line(without_extras, name: str, monkeyp
     assert re.fullmatch(rf"{Path(name).stem}: error: \w+ is not installed: {re.escape(install)}", line)
 
 
-@pytest.mark.parametrize("name", ["expert_palpate", "expert_retract", "press_library", "raster"])
+@pytest.mark.parametrize("name", ["make_press_library", "raster"])
 def test_the_other_agents_need_no_extra(without_extras, name: str, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(ROOT / "agents" / f"{name}.py"), run_name="__main__")
     assert not ended.value.code and "usage" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "missing"),
+    [
+        (["train", "palpate_phantom_ppo"], "yaml"),
+        (["evaluate", "--policy", "retract_ppo"], "safetensors"),
+        (["evaluate", "--agent", "expert_organs"], "torch"),
+    ],
+)
+def test_a_command_names_the_missing_extra(without_extras, arguments: list[str], missing: str, capsys):
+    main = importlib.import_module("surgsim_env.cli.main").main
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"surgsim: error: surgsim {arguments[0]} needs {missing}: pip install 'surgsim[agents]'"
 
 
 def test_public_names_that_need_an_extra_name_it(without_extras):
@@ -96,7 +115,7 @@ def test_wrong_input_ends_a_script_in_one_line_and_is_raised_in_a_module(capsys)
     with pytest.raises(SystemExit) as ended, one_line_errors("__main__", "agents"):
         raise ValueError("two\nlines")
     assert ended.value.code == 2 and capsys.readouterr().err.endswith(": error: two lines\n")
-    with pytest.raises(ValueError, match="two"), one_line_errors("agents.evaluate", "agents"):
+    with pytest.raises(ValueError, match="two"), one_line_errors("agents.learn_sites", "agents"):
         raise ValueError("two\nlines")
     # A module of our own that is missing is our mistake.
     with pytest.raises(ModuleNotFoundError), one_line_errors("__main__", "agents"):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents.scoring.comparison import compare, describe
-from agents.scoring.leaderboard import over_training_seeds, student_interval
-from agents.scoring.results import SITES, Result
+from agents.leaderboard_tables import over_training_seeds, student_interval
 from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scoring.comparison import compare, describe
+from surgsim_env.scoring.results import SITES, Result
 
 pytestmark = pytest.mark.agents
 SEEDS = tuple(range(1_000_000, 1_000_040))

@@ -54,7 +54,7 @@ def test_an_episode_comes_back_to_the_bit(dataset):
 
 def test_a_policy_is_cloned_in_one_script(dataset, tmp_path, capsys):
     from agents.behaviour_cloning import main
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     main([NAME, "--out", str(tmp_path / "clone.safetensors"), "--epochs", "3", "--episodes", "1", "--width", "32"])
     said = capsys.readouterr().out
@@ -65,7 +65,7 @@ def test_a_policy_is_cloned_in_one_script(dataset, tmp_path, capsys):
 
 def test_a_clone_does_what_was_recorded(dataset):
     from agents.behaviour_cloning import clone_dataset
-    from agents.training.imitation import CloningOptions
+    from surgsim_env.training.imitation import CloningOptions
 
     options = CloningOptions(epochs=300, patience=300, batch_size=32, learning_rate=3e-3)
     policy, curve = clone_dataset(dataset, width=32, options=options)
@@ -80,7 +80,7 @@ def test_a_clone_does_what_was_recorded(dataset):
 
 def test_a_policy_with_a_memory_is_cloned(dataset, tmp_path):
     from agents.behaviour_cloning import clone_dataset
-    from agents.training.imitation import CloningOptions
+    from surgsim_env.training.imitation import CloningOptions
 
     options = CloningOptions(epochs=30, batch_size=1, learning_rate=3e-3)
     policy, curve = clone_dataset(dataset, recurrent=True, width=16, options=options)

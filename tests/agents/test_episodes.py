@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents.scoring.episodes import (
+from surgsim_env.palpation.scores import MapScore, press_errors
+from surgsim_env.scoring.episodes import (
     AgentActor,
     EpisodeFacts,
     agent_generator,
@@ -16,8 +17,7 @@ from agents.scoring.episodes import (
     play_sites,
     play_tasks,
 )
-from agents.site_search import Middle, OracleSites, RandomSites, TruthAgent
-from surgsim_env.palpation.scores import MapScore, press_errors
+from surgsim_env.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
 from surgsim_env.tasks.palpate import EPISODE_STEPS
 
 pytestmark = pytest.mark.agents

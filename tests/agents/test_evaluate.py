@@ -1,4 +1,4 @@
-"""python -m agents.evaluate, end to end on few presses: result files, leaderboard, films."""
+"""surgsim evaluate, end to end on few presses: result files, leaderboard, films."""
 
 import json
 import math
@@ -14,18 +14,29 @@ from matplotlib.image import imread
 from PIL import Image
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents import evaluate
-from agents.scoring import leaderboard, leaderboard_plots
-from agents.scoring.origin import file_digest
-from agents.scoring.results import SITES, Result, load_result, load_results, read_seeds, seeds_text
+from agents import leaderboard, leaderboard_tables
 from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scoring import evaluate
+from surgsim_env.scoring.evaluate import policies_folder
+from surgsim_env.scoring.origin import file_digest
+from surgsim_env.scoring.results import (
+    SITES,
+    Result,
+    load_result,
+    load_results,
+    read_seeds,
+    seeds_text,
+    shipped_results,
+)
+from tests.agents.commands import surgsim
 
 pytestmark = pytest.mark.agents
 
 
 def result(method: str, presses: float = 5.0, **changes: object) -> Result:
     figures = dict.fromkeys(
-        [name for _, name, _, _ in (*leaderboard.PLACES, *leaderboard.MAPS)], ScoreEstimate(0.5, 0.25, math.inf)
+        [name for _, name, _, _ in (*leaderboard_tables.PLACES, *leaderboard_tables.MAPS)],
+        ScoreEstimate(0.5, 0.25, math.inf),
     )
     figures |= {"hard_limit_share": ScoreEstimate(0.0, 0.0, 0.0), "fault_share": ScoreEstimate(0.01, 0.0, 0.02)}
     figures |= {
@@ -39,7 +50,7 @@ def result(method: str, presses: float = 5.0, **changes: object) -> Result:
         "seeds": (1_000_000, 1_000_001),
         "budget": 25,
         "figures": figures,
-        "command": f"python -m agents.evaluate --agent {method}",
+        "command": f"surgsim evaluate --agent {method}",
         "wall_time": 1.5,
         "date": "2026-11-22",
         "errors_mm": [[20.0, 1.0]],
@@ -62,7 +73,7 @@ def test_the_leaderboard_has_a_table_a_place_and_the_best_raster_alone(tmp_path:
         result(method, presses).save(tmp_path)
     reach = {"scene": "phantom", "level": "hard", "lesions": 8, "below": 2}
     (tmp_path / "reach_PalpateSites_phantom_hard.json").write_text(json.dumps(reach))
-    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
     text = (tmp_path / "board.md").read_text()
     assert text.count("## `SurgSim/PalpateSites-v0` phantom (hard)") == 1
     assert "2 of 8 lesions (25%)" in text
@@ -89,32 +100,34 @@ def test_the_leaderboard_shows_a_picture_a_scene(tmp_path: Path) -> None:
     made[-1].figures["seconds"] = ScoreEstimate(None, None, None)
     for one in made:
         one.save(tmp_path)
-    pictures = leaderboard_plots.draw_leaderboard(load_results(tmp_path), tmp_path)
+    pictures = leaderboard.draw_leaderboard(load_results(tmp_path), tmp_path)
     names = {"leaderboard_PalpateSites_phantom.png", "leaderboard_PalpateSites_liver.png", "leaderboard_Retract.png"}
     assert {picture.name for picture in pictures} == names
-    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
     shown = re.findall(r"!\[.*\]\(../docs/images/(.*)\)", (tmp_path / "board.md").read_text())
     assert sorted(shown) == sorted(names)
     assert imread(pictures[0]).std() > 0.05
-    kinds = {one.method: leaderboard_plots.kind(one) for one in made}
+    kinds = {one.method: leaderboard.kind(one) for one in made}
     assert kinds["sites_ppo"] == "learned" and kinds["gp_ucb"] == "searches by belief"
     assert kinds["random"] == "scripted" and kinds["oracle_retract"] == "sees the truth"
 
 
 def test_the_pictures_of_the_leaderboard_are_there() -> None:
     shown = re.findall(r"!\[.*\]\(../docs/images/(.*)\)", leaderboard.LEADERBOARD.read_text(encoding="utf-8"))
-    assert shown and all((leaderboard_plots.IMAGES / name).is_file() for name in shown)
+    assert shown and all((leaderboard.IMAGES / name).is_file() for name in shown)
 
 
 def test_results_name_policies_that_are_there() -> None:
-    for made in load_results():
+    for made in load_results(shipped_results()):
         if "--policy" in made.command:
-            policy = evaluate.POLICIES.parent.parent / made.command.split("--policy ")[1].split()[0]
+            policy = policies_folder().parents[1] / made.command.split("--policy ")[1].split()[0]
             assert policy.is_file() and policy.with_suffix(".json").is_file(), made.command
 
 
 def test_a_baseline_is_played_and_scored(tmp_path: Path) -> None:
-    evaluate.main(["--agent", "gp_ucb", "--episodes", "2", "--budget", "3", "--envs", "2", "--results", str(tmp_path)])
+    surgsim(
+        "evaluate", "--agent", "gp_ucb", "--episodes", "2", "--budget", "3", "--envs", "2", "--results", str(tmp_path)
+    )
     (made,) = load_results(tmp_path)
     assert (made.method, made.budget, made.seeds) == ("gp_ucb", 3, (1_000_000, 1_000_001))
     assert np.array(made.errors_mm).shape == (2, 3) and len(made.lesion_counts) == 2
@@ -130,7 +143,7 @@ def test_a_baseline_is_played_and_scored(tmp_path: Path) -> None:
 
 def test_who_sees_the_truth_scores_all_of_it_on_the_environment(tmp_path: Path) -> None:
     for name in ("truth", "middle"):
-        evaluate.main(["--agent", name, "--episodes", "4", "--envs", "4", "--results", str(tmp_path)])
+        surgsim("evaluate", "--agent", name, "--episodes", "4", "--envs", "4", "--results", str(tmp_path))
     figures = {made.method: made.figures for made in load_results(tmp_path)}
     for name in ("recall", "precision", "count_right", "outline_iou", "auroc", "average_precision"):
         assert figures["truth"][name].value == 1.0, name
@@ -140,15 +153,17 @@ def test_who_sees_the_truth_scores_all_of_it_on_the_environment(tmp_path: Path) 
     assert figures["middle"]["error_mm"].value > 5.0
     marks = {made.method: (made.sees_truth, made.own_estimate) for made in load_results(tmp_path)}
     assert marks == {"truth": (True, True), "middle": (False, True)}
-    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
     assert "| truth **sees truth** (own estimate) |" in (tmp_path / "board.md").read_text()
 
 
 def test_oracles_play_a_patient_who_moves(tmp_path: Path) -> None:
     """Tracked or not, a result of its own each, at a place that names the motion."""
     common = ["--scene", "phantom_small", "--motion", "calm", "--results", str(tmp_path)]
-    evaluate.main(["--agent", "oracle_palpate", "--episodes", "1", *common])
-    evaluate.main(["--agent", "oracle", "--episodes", "2", "--budget", "7", "--envs", "2", "--no-tracking", *common])
+    surgsim("evaluate", "--agent", "oracle_palpate", "--episodes", "1", *common)
+    surgsim(
+        "evaluate", "--agent", "oracle", "--episodes", "2", "--budget", "7", "--envs", "2", "--no-tracking", *common
+    )
     sites, task = sorted(load_results(tmp_path), key=lambda made: made.method)
     sites, task = (sites, task) if sites.env_id == SITES else (task, sites)
     assert task.place == "Palpate_phantom_small_standard_calm" and task.method == "oracle_palpate"
@@ -157,17 +172,21 @@ def test_oracles_play_a_patient_who_moves(tmp_path: Path) -> None:
     assert sites.command.endswith("--budget 7 --motion calm --no-tracking")
     assert sites.sees_truth and task.sees_truth and task.successes == [True]
     assert 0.0 <= sites.figures["success"].value <= 1.0
-    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
     assert "(standard, motion calm)" in (tmp_path / "board.md").read_text()
 
 
-def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_are_refused() -> None:
     for arguments, message in (
+        ([], "give one of --agent, --policy, --all, --reach, --compare, --check; given: none"),
+        (["--agent", "gp_ucb", "--all"], "given: --agent and --all"),
+        (["--agent", "gp_ucb", "--split", "tset"], "it is one of train, validation, test"),
+        (["--agent", "my:Own", "--env-arguments", "[1]"], "it must be a JSON object"),
         (["--agent", "gp_ucb", "--episodes", "101"], "there are 1 to 100 seeds"),
         (["--agent", "gp_ucb", "--seeds", "5:9", "--episodes", "6"], "there are 1 to 5 seeds"),
         (["--agent", "gp_ucb", "--seeds", "9:5"], "FIRST is at most LAST"),
         (["--agent", "gp_ucb", "--seeds", "1,x"], "the rule is FIRST:LAST, both included, or a list"),
-        (["--agent", "gp_ucb", "--envs", "0"], "at least 1 organ"),
+        (["--agent", "gp_ucb", "--envs", "0"], "--envs is 0; it must be at least 1"),
         (["--agent", "gp_ucb", "--video", "out.mp4"], "--video films a policy"),
         (["--all", "--submit", "all.json"], "--submit writes one result"),
         (
@@ -175,9 +194,8 @@ def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture
             "--env and --env-arguments are for --agent MODULE:CLASS",
         ),
     ):
-        with pytest.raises(SystemExit):
-            evaluate.main(arguments)
-        assert message in capsys.readouterr().err
+        with pytest.raises(ValueError, match=re.escape(message)):
+            surgsim("evaluate", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -185,9 +203,9 @@ def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     [
         (["--agent", "gp_ubc"], "agent 'gp_ubc' is unknown"),
         (["--agent", "nowhere_at_all:Agent"], "there is no module 'nowhere_at_all' on Python's path"),
-        (["--agent", "agents.site_search:Nobody"], "has no class 'Nobody'"),
-        (["--agent", "agents.evaluate:Player"], "missing"),
-        (["--agent", "agents.site_search:SiteFacts"], "missing"),
+        (["--agent", "surgsim_env.scoring.site_search:Nobody"], "has no class 'Nobody'"),
+        (["--agent", "surgsim_env.scoring.evaluate:Player"], "missing"),
+        (["--agent", "surgsim_env.scoring.site_search:SiteFacts"], "missing"),
         (["--agent", "expert_retract", "--level", "hard"], "argument 'level' is unknown"),
         (["--agent", "expert_retract", "--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
         (["--agent", "expert_retract", "--budget", "3"], "--budget is the number of presses"),
@@ -197,8 +215,8 @@ def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     ],
 )
 def test_what_cannot_be_played_is_refused(arguments: list[str], message: str) -> None:
-    with pytest.raises((ValueError, TypeError, OSError), match=message):
-        evaluate.main([*arguments, *(["--episodes", "1"] if "--agent" in arguments else [])])
+    with pytest.raises(ValueError, match=message):
+        surgsim("evaluate", *arguments, *(["--episodes", "1"] if "--agent" in arguments else []))
 
 
 def test_seeds_are_read_as_they_are_written() -> None:
@@ -214,18 +232,17 @@ def test_results_of_other_seeds_are_not_written_by_themselves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nor those of some evaluation seeds, or of an agent from elsewhere."""
-    monkeypatch.setattr(evaluate, "RESULTS", tmp_path / "ours")
-    monkeypatch.setattr(evaluate, "write_leaderboard", lambda: pytest.fail("the leaderboard is written"))
+    monkeypatch.setattr(evaluate, "shipped_results", lambda: tmp_path / "ours")
     common = ["--scene", "phantom_small", "--budget", "1", "--envs", "1"]
     for arguments in (
         ["--agent", "random", "--seeds", "3"],
         ["--agent", "random", "--episodes", "1"],
-        ["--agent", "agents.site_search:RandomSites", "--episodes", "1"],
+        ["--agent", "surgsim_env.scoring.site_search:RandomSites", "--episodes", "1"],
     ):
-        evaluate.main([*arguments, *common])
+        surgsim("evaluate", *arguments, *common)
         assert "not written (--results FOLDER or --submit FILE does)" in capsys.readouterr().out
     assert not (tmp_path / "ours").exists()
-    evaluate.main(["--agent", "random", "--seeds", "3,9", "--results", str(tmp_path / "mine"), *common])
+    surgsim("evaluate", "--agent", "random", "--seeds", "3,9", "--results", str(tmp_path / "mine"), *common)
     (made,) = load_results(tmp_path / "mine")
     assert made.seeds == (3, 9) and "--seeds 3,9" in made.command
 
@@ -253,13 +270,13 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_a_strangers_result_is_submitted_and_checked(module: Path, capsys: pytest.CaptureFixture[str]) -> None:
     name = ["--agent", "strangers_agent:Middle", "--scene", "phantom_small", "--seeds", "3:4", "--budget", "2"]
-    evaluate.main([*name, "--submit", "mine.json"])
+    surgsim("evaluate", *name, "--submit", "mine.json")
     made = load_result(Path("mine.json"))
     assert made.method == "strangers_agent.Middle" and made.place == "PalpateSites_phantom_small_standard"
     assert made.origin["agent"] == {"strangers_agent.py": file_digest(module)}
     assert {"surgsim", "numpy", "mujoco", "gymnasium", "python"} <= set(made.origin["versions"])
     assert str(module.parent) not in Path("mine.json").read_text()
-    evaluate.main(["--check", "mine.json"])
+    surgsim("evaluate", "--check", "mine.json")
     assert "the environment is the same" in capsys.readouterr().out
     # Each entry that says something else is named.
     environment, versions = made.origin["environment"], made.origin["versions"]
@@ -274,13 +291,13 @@ def test_a_strangers_result_is_submitted_and_checked(module: Path, capsys: pytes
     ):
         replace(made, **changed).write(Path("changed.json"))  # type: ignore[arg-type]
         with pytest.raises(ValueError, match=f"changed.json cannot be compared .*{fault}"):
-            evaluate.main(["--check", "changed.json"])
+            surgsim("evaluate", "--check", "changed.json")
     module.write_text(AGENT + "# better\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"agent: strangers_agent.py is"):
-        evaluate.main(["--check", "mine.json"])
+        surgsim("evaluate", "--check", "mine.json")
     Path("broken.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(ValueError, match=r"broken.json is no result of agents.evaluate"):
-        evaluate.main(["--check", "broken.json"])
+    with pytest.raises(ValueError, match=r"broken.json is no result of surgsim evaluate"):
+        surgsim("evaluate", "--check", "broken.json")
 
 
 def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -289,14 +306,14 @@ def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     for method, rows in (("one", errors), ("ppo_seed0", errors), ("ppo_seed1", [[1.0, 1.0], [1.0, 1.0]])):
         wins = [row[-1] <= 5.0 for row in rows]
         result(method, errors_mm=rows, successes=wins, lesion_counts=[1, 1], budget=2).save(tmp_path)
-    evaluate.main(["--compare", "one", "ppo", "--level", "hard", "--results", str(tmp_path)])
+    surgsim("evaluate", "--compare", "one", "ppo", "--level", "hard", "--results", str(tmp_path))
     printed = capsys.readouterr().out
     assert "ppo: mean over 2 training seeds" in printed and "success: one 50, ppo 75 %; difference -25" in printed
     files = [str(tmp_path / f"PalpateSites_phantom_hard_{name}.json") for name in ("one", "ppo_seed1")]
-    evaluate.main(["--compare", *files])
+    surgsim("evaluate", "--compare", *files)
     assert "success: PalpateSites_phantom_hard_one 50" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"'one' names 0 results in .* at phantom, standard; it has some at .*_hard"):
-        evaluate.main(["--compare", "one", "ppo", "--results", str(tmp_path)])
+        surgsim("evaluate", "--compare", "one", "ppo", "--results", str(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -310,21 +327,21 @@ def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_policy_does_not_play_what_it_was_not_made_for(policy: str, options: list[str], message: str) -> None:
     """Among them scenes whose observations have the same shape, which it would answer wrong without a word."""
     pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
-    path = evaluate.POLICIES / f"{policy}.safetensors"
+    path = policies_folder() / f"{policy}.safetensors"
     with pytest.raises(ValueError, match=message):
-        evaluate.main(["--policy", str(path), "--seeds", "3", *options])
+        surgsim("evaluate", "--policy", str(path), "--seeds", "3", *options)
 
 
 def test_level_and_motion_beside_a_policy_are_honoured(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
-    path = evaluate.POLICIES / "palpate_phantom_cloned.safetensors"
+    path = policies_folder() / "palpate_phantom_cloned.safetensors"
     common = ["--policy", str(path), "--seeds", "3", "--submit", str(tmp_path / "mine.json")]
-    evaluate.main([*common, "--level", "easy", "--motion", "calm", "--scene", "phantom"])
+    surgsim("evaluate", *common, "--level", "easy", "--motion", "calm", "--scene", "phantom")
     made = load_result(tmp_path / "mine.json")
     assert (made.scene, made.env_kwargs["level"], made.motion) == ("phantom", "easy", "calm")
     assert set(made.origin["agent"]) == {path.name, "palpate_phantom_cloned.json"}
     assert made.command == (
-        "python -m agents.evaluate --policy agents/policies/palpate_phantom_cloned.safetensors --level easy "
+        "surgsim evaluate --policy agents/policies/palpate_phantom_cloned.safetensors --level easy "
         "--seeds 3 --motion calm"
     )
 
@@ -353,7 +370,7 @@ def test_a_policy_is_filmed(tmp_path: Path) -> None:
         pytest.skip(f"no pictures on this machine: {error}")
     from moviepy import VideoFileClip
 
-    from agents.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, RATE, film
+    from surgsim_env.scoring.policy_video import PICTURE_SIZE, PRESS_PICTURES, RATE, film
 
     film(MiddleOfAll(), {"scene": "phantom", "budget": 2}, [5], tmp_path / "out.mp4")
     clip = VideoFileClip(str(tmp_path / "out.mp4"))

@@ -16,8 +16,8 @@ HYPERPARAMETERS = {"n_steps": 16, "batch_size": 16, "n_epochs": 1}
 
 def environments(stage: dict | None, **changes):
     """Environments with the rewards of a stage, or bare ones."""
-    from agents.training.config import EnvironmentSettings, Stage
-    from agents.training.environments import StagedRewards, make_environments
+    from surgsim_env.training.config import EnvironmentSettings, Stage
+    from surgsim_env.training.environments import StagedRewards, make_environments
 
     bare = make_environments(EnvironmentSettings(**{**PALPATION, "kwargs": SMALL, **changes}))
     return bare if stage is None else StagedRewards(bare, Stage(**stage))
@@ -95,7 +95,7 @@ def test_novelty_needs_a_touch_map():
     with pytest.raises(ValueError, match=r"pays 0.5 .* no touch map.*memory: true"):
         environments({"novelty": 0.5}, kwargs={"scene": "phantom_small", "memory": False})
     envs = environments({}, kwargs={"scene": "phantom_small", "memory": False})
-    from agents.training.config import Stage
+    from surgsim_env.training.config import Stage
 
     with pytest.raises(ValueError, match="no touch map"):
         envs.stage = Stage(novelty=0.1)
@@ -105,8 +105,8 @@ def test_novelty_needs_a_touch_map():
 
 
 def config(**changes):
-    from agents.training.config import TrainingConfig
     from surgsim_env.scene.load import fill
+    from surgsim_env.training.config import TrainingConfig
 
     table = {
         "name": "tiny",
@@ -140,9 +140,8 @@ def test_wrong_entries_are_refused(change: dict, message: str):
 
 
 def test_a_run_goes_through_its_stages_also_when_it_is_resumed(tmp_path: Path):
-    from agents.train import train
-    from agents.training.config import Stage
-    from agents.training.run import BetweenRollouts, Run
+    from surgsim_env.training.config import Stage
+    from surgsim_env.training.run import BetweenRollouts, Run, train
 
     stages = [{"failure": 0.0, "novelty": 0.1}, {"begin": 48, "failure": 0.5}, {"begin": 96}]
     settings = config(stages=stages)
@@ -161,7 +160,7 @@ def test_a_run_goes_through_its_stages_also_when_it_is_resumed(tmp_path: Path):
 
 
 def test_a_new_policy_begins_with_the_actions_of_the_configuration(tmp_path: Path):
-    from agents.training.run import Run
+    from surgsim_env.training.run import Run
 
     given = {"initial_action": [0.0, 0.1, 0.2, -0.4], "initial_spread": [0.8, 0.7, 0.4, 0.5]}
     run = Run(config(**given), tmp_path / "ppo")
@@ -180,8 +179,8 @@ def test_a_new_policy_begins_with_the_actions_of_the_configuration(tmp_path: Pat
 def test_a_sampled_policy_repeats_its_draws_and_leaves_torchs_alone(tmp_path: Path):
     import torch
 
-    from agents.training.policy_files import TrainedPolicy, load_policy, save_policy
-    from agents.training.run import Run
+    from surgsim_env.training.policy_files import TrainedPolicy, load_policy, save_policy
+    from surgsim_env.training.run import Run
 
     run = Run(config(evaluation={"every": 0, "sampled": True}), tmp_path / "run")
     seen = np.asarray(run.bare.reset())
@@ -210,7 +209,7 @@ def test_a_sampled_policy_repeats_its_draws_and_leaves_torchs_alone(tmp_path: Pa
 def test_the_touch_summary_is_what_it_says():
     import torch
 
-    from agents.training.extractors import TouchSummary
+    from surgsim_env.training.extractors import TouchSummary
 
     envs = environments(None, count=8, kind="surrogate")
     envs.seed(5)
@@ -247,7 +246,7 @@ def test_the_touch_summary_is_what_it_says():
 
 
 def test_the_touch_summary_refuses_an_observation_without_memory():
-    from agents.training.extractors import TouchSummary
+    from surgsim_env.training.extractors import TouchSummary
 
     envs = environments(None, kwargs={"scene": "phantom_small", "memory": False})
     with pytest.raises(ValueError, match="not that of Palpate-v0 with memory=True"):

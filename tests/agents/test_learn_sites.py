@@ -10,7 +10,6 @@ pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 import torch
 
 from agents import learn_sites
-from agents.evaluate import POLICIES
 from agents.learn_sites import (
     PARAMETER_STEPS,
     Evolution,
@@ -21,10 +20,11 @@ from agents.learn_sites import (
     policy_acquisition,
     presses_to_stay,
 )
-from agents.scoring.site_agent import GrowingBelief, SiteProcess, observed_facts
-from agents.training.bell_sites import BellSites
-from agents.training.policy_files import load_policy
-from agents.training.site_policy import Acquisition, belief_features, site_actions
+from surgsim_env.scoring.evaluate import policies_folder
+from surgsim_env.training.bell_sites import BellSites
+from surgsim_env.training.policy_files import load_policy
+from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
+from surgsim_env.training.site_policy import Acquisition, belief_features, site_actions
 
 pytestmark = pytest.mark.agents
 
@@ -44,11 +44,11 @@ def test_a_growing_belief_is_that_of_all_presses_at_once():
 
 
 def test_a_search_goes_on_from_a_policy():
-    start = policy_acquisition(POLICIES / "sites_evolved.safetensors")
+    start = policy_acquisition(policies_folder() / "sites_evolved.safetensors")
     evolution = Evolution(population=4, episodes=1, seed=0, start=start)
     assert evolution.best.values.tolist() == start.values.tolist() != Acquisition().values.tolist()
     with pytest.raises(ValueError, match="has no acquisition function"):
-        policy_acquisition(POLICIES / "retract_ppo.safetensors")
+        policy_acquisition(policies_folder() / "retract_ppo.safetensors")
 
 
 def test_play_presses_what_the_policy_chooses():

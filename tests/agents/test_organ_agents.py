@@ -28,7 +28,7 @@ def first():
 
 def changed(observation, **channels):
     """Observations (n, n_observation) with some channels replaced; arrays are flattened."""
-    from agents.training.face_features import FACE
+    from surgsim_env.training.face_features import FACE
 
     made = np.array(observation, dtype=np.float32)[None]
     for name, values in channels.items():
@@ -39,14 +39,14 @@ def changed(observation, **channels):
 def features(observations):
     import torch
 
-    from agents.training.face_features import face_features
+    from surgsim_env.training.face_features import face_features
 
     found = face_features(torch.as_tensor(observations))
     return {one.name: getattr(found, one.name).numpy()[0] for one in fields(found)}
 
 
 def actions(observations):
-    from agents.expert_organs import OrganExpert
+    from surgsim_env.scoring.expert_organs import OrganExpert
 
     return OrganExpert().act(observations)[0]
 
@@ -55,7 +55,7 @@ def actions(observations):
 
 
 def test_the_channels_are_the_environments(first):
-    from agents.training.face_features import FACE, OBSERVATION_SIZE
+    from surgsim_env.training.face_features import FACE, OBSERVATION_SIZE
 
     env, observation = first
     assert env.unwrapped.observation_slices == FACE and observation.shape == (OBSERVATION_SIZE,)
@@ -119,7 +119,7 @@ def test_sizes_are_relative_to_the_tip(first):
 
 
 def test_another_observation_is_refused():
-    from agents.training.face_features import FaceSummary
+    from surgsim_env.training.face_features import FaceSummary
 
     with pytest.raises(ValueError, match=r"not that of Palpate-v0 with memory=True and frame=\"face\""):
         FaceSummary(gym.spaces.Box(-1.0, 1.0, (10,)))
@@ -131,8 +131,8 @@ def test_another_observation_is_refused():
 def test_the_expert_follows_slopes_and_lifts_before_the_soft_limit(first):
     import torch
 
-    from agents.expert_organs import DEPTH, expert_actions
-    from agents.training.face_features import face_features
+    from surgsim_env.scoring.expert_organs import DEPTH, expert_actions
+    from surgsim_env.training.face_features import face_features
 
     _, observation = first
     there = face_features(torch.as_tensor(changed(observation)))
@@ -162,7 +162,7 @@ def test_the_expert_finds_the_lesion_gently_on_the_organ():
 
 def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch):
     from agents import learn_palpate_organs
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     path = tmp_path / "taught.safetensors"
     arguments = ["--out", path, "--scenes", "phantom_small", "--rounds", 2, "--imagined", 600, "--epochs", 1]
@@ -179,8 +179,8 @@ def test_a_network_on_features_acts_the_same_behind_its_extractor(first):
     import torch
 
     from agents.learn_palpate_organs import fitted, on_observations
-    from agents.training.face_features import SUMMARY_SIZE, face_features, face_summary
-    from agents.training.imitation import CloningOptions
+    from surgsim_env.training.face_features import SUMMARY_SIZE, face_features, face_summary
+    from surgsim_env.training.imitation import CloningOptions
 
     none = np.zeros((0, SUMMARY_SIZE), np.float32), np.zeros((0, 4), np.float32)
     model, _ = fitted(*none, imagined_count=300, options=CloningOptions(epochs=1))
@@ -196,7 +196,7 @@ def test_a_network_on_features_acts_the_same_behind_its_extractor(first):
 
 
 def surrogate(scene, seed=3):
-    from agents.training.face_surrogate import FaceSurrogate
+    from surgsim_env.training.face_surrogate import FaceSurrogate
 
     env = gym.make(ID, scene=scene, level="standard", scaled=True, **SETTINGS)
     return FaceSurrogate([env], np.random.default_rng(seed))
@@ -204,7 +204,7 @@ def surrogate(scene, seed=3):
 
 def test_the_surrogate_presses_as_the_organ_does():
     """On the liver, away from the lesion: the same depth, and a force of the same size along the same normal."""
-    from agents.training.face_features import FACE
+    from surgsim_env.training.face_features import FACE
 
     made = surrogate("liver")
     made.reset()
@@ -226,7 +226,7 @@ def test_the_surrogate_presses_as_the_organ_does():
 
 
 def test_the_expert_finds_the_lesion_on_the_surrogate_of_a_family():
-    from agents.expert_organs import OrganExpert
+    from surgsim_env.scoring.expert_organs import OrganExpert
 
     made, expert = surrogate("kidney_family"), OrganExpert()
     observations = made.reset()
@@ -241,7 +241,7 @@ def test_the_expert_finds_the_lesion_on_the_surrogate_of_a_family():
 
 @pytest.mark.parametrize("scene", ["phantom", "phantom_wide", "liver", "kidney_family"])
 def test_the_committed_policy_takes_any_organ(scene):
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     load_policy(POLICY).check_environment(gym.make(ID, scene=scene, **SETTINGS))
 
@@ -250,10 +250,10 @@ def test_the_committed_policy_does_as_it_was_taught(first):
     """Where the expert slides, crosses and declares, so does the network."""
     import torch
 
-    from agents.expert_organs import expert_actions
     from agents.learn_palpate_organs import imagined
-    from agents.training.face_features import face_summary
-    from agents.training.policy_files import load_policy
+    from surgsim_env.scoring.expert_organs import expert_actions
+    from surgsim_env.training.face_features import face_summary
+    from surgsim_env.training.policy_files import load_policy
 
     policy = load_policy(POLICY).networks
     made = imagined(4000, np.random.default_rng(5))

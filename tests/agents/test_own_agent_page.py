@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents import evaluate
-from agents.scoring.results import load_result
+from surgsim_env.scoring.results import load_result
+from tests.agents.commands import surgsim
 from tests.docs.test_tutorials import blocks
 
 pytestmark = pytest.mark.agents
@@ -33,8 +33,8 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
             Path(block.title).write_text(block.text, encoding="utf-8")
         for line in block.text.splitlines() if block.language == "sh" else ():
             program, *arguments = shlex.split(line)
-            assert [program, *arguments[:2]] == ["python", "-m", "agents.evaluate"]
-            evaluate.main(shorter(arguments[2:]))
+            assert [program, arguments[0]] == ["surgsim", "evaluate"]
+            surgsim("evaluate", *shorter(arguments[1:]))
             commands += 1
     sys.modules.pop("my_agent", None)
     printed = capsys.readouterr().out

@@ -18,7 +18,7 @@ ID = "SurgSim/Palpate-v0"
 
 
 def surrogate(count: int, **settings):
-    from agents.training.palpate_surrogate import PalpateSurrogate
+    from surgsim_env.training.palpate_surrogate import PalpateSurrogate
 
     return PalpateSurrogate(count, **settings)
 
@@ -47,7 +47,7 @@ def test_the_formula_presses_as_the_organ_does():
 
 def test_its_memory_is_the_environments():
     """The observation's memory, recomputed from its first ten entries by `TouchMemory` itself."""
-    from agents.expert_palpate import PalpateExpert
+    from surgsim_env.scoring.expert_palpate import PalpateExpert
 
     envs = surrogate(2)
     env = envs.envs[0]
@@ -80,7 +80,7 @@ def test_it_has_the_ranges_of_the_scene_or_of_level_standard():
 
 
 def test_its_spaces_rewards_and_ends_are_the_environments():
-    from agents.expert_palpate import PalpateExpert
+    from surgsim_env.scoring.expert_palpate import PalpateExpert
 
     envs = surrogate(16)
     assert envs.single_observation_space == gym.make(ID, level="standard", memory=True).observation_space
@@ -123,7 +123,7 @@ def test_scenes_without_a_touch_model_are_refused():
 
 
 def test_the_expert_finds_the_lesion_gently_on_the_organ():
-    from agents.expert_palpate import PalpateExpert
+    from surgsim_env.scoring.expert_palpate import PalpateExpert
 
     env = gym.make(ID, scene="phantom_small", level="standard", memory=True)
     expert = PalpateExpert(env)
@@ -138,7 +138,7 @@ def test_the_expert_finds_the_lesion_gently_on_the_organ():
 
 
 def test_the_expert_refuses_what_it_cannot_do():
-    from agents.expert_palpate import PalpateExpert
+    from surgsim_env.scoring.expert_palpate import PalpateExpert
 
     with pytest.raises(ValueError, match="make the environment with memory=True"):
         PalpateExpert(gym.make(ID))
@@ -152,7 +152,7 @@ def test_the_expert_refuses_what_it_cannot_do():
 def test_extractors_choose_what_they_say():
     import torch
 
-    from agents.training.extractors import WITH_MEMORY, MemorySummary, PlaceAndForce
+    from surgsim_env.training.extractors import WITH_MEMORY, MemorySummary, PlaceAndForce
 
     space = gym.make(ID, memory=True).observation_space
     assert space.shape is not None
@@ -188,7 +188,7 @@ def test_extractors_choose_what_they_say():
 def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch, script: str, memory: bool, more: list):
     from importlib import import_module
 
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     file = tmp_path / "taught.safetensors"
     sizes = ["--rounds", "3", "--envs", "4", "--steps", "30", "--epochs", "1"]
@@ -214,7 +214,7 @@ TAUGHT_ON_BLOCKS = [path for path in sorted(POLICIES.glob("palpate_*.json")) if 
 @pytest.mark.parametrize("path", TAUGHT_ON_BLOCKS, ids=lambda path: path.stem)
 def test_committed_policies_search_as_they_were_taught(path: Path):
     """By formula, which is quick: four of five find their lesion; who feels nothing finds nothing."""
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     policy = load_policy(path.with_suffix(".safetensors"))
     kwargs = dict(policy.description.env_kwargs)

@@ -15,12 +15,12 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import surgsim_env  # noqa: F401
-from agents import expert_retract
-from agents.expert_retract import GRIP, HOLDS, PULL, SLICES, TIP, TolerantExpert
 from agents.learn_retract_pixels import NETWORK, Player, Samples
-from agents.training.picture_features import PictureAndForce
-from agents.training.policy_files import describe, load_policy, save_policy
 from surgsim_env.rendering import gl
+from surgsim_env.scoring import expert_retract
+from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, TIP, TolerantExpert
+from surgsim_env.training.picture_features import PictureAndForce
+from surgsim_env.training.policy_files import describe, load_policy, save_policy
 
 pytestmark = pytest.mark.agents
 SHIPPED = Path(__file__).resolve().parents[2] / "agents" / "policies" / "retract_pixels.safetensors"
@@ -181,7 +181,7 @@ def test_imagined_pulls_scale_all_readings_but_the_grip_and_are_labelled():
 def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, capsys):
     """Two rounds of a few steps; each state is kept under two looks with the same force and label."""
     from agents import learn_retract_pixels
-    from agents.scoring.episodes import make_envs, play_tasks
+    from surgsim_env.scoring.episodes import make_envs, play_tasks
 
     out = tmp_path / "policy.safetensors"
     settings = {"envs": 2, "dtype": "float64", "threads": 1, "rounds": 2, "steps": 3, "looks": 2, "updates": 2}

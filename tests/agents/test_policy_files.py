@@ -20,9 +20,9 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from agents.convert_policy import convert
-from agents.training.networks import MOST_WEIGHTS
-from agents.training.policy_files import TrainedPolicy, describe, load_policy, save_policy
-from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, SitePolicy
+from surgsim_env.training.networks import MOST_WEIGHTS
+from surgsim_env.training.policy_files import TrainedPolicy, describe, load_policy, save_policy
+from surgsim_env.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, SitePolicy
 
 pytestmark = pytest.mark.agents
 OBSERVATION, ACTION = 10, 3
@@ -306,7 +306,7 @@ def test_a_flipped_bit_of_the_weights_is_noticed(shipped: Path, tmp_path: Path):
 
 
 def test_an_index_that_the_architecture_fixes_is_not_taken_from_the_file(tmp_path: Path):
-    from agents.training.extractors import PlaceAndForce
+    from surgsim_env.training.extractors import PlaceAndForce
 
     model = ppo(features_extractor_class=PlaceAndForce, **SMALL)
     path = tmp_path / "p.safetensors"

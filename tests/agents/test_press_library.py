@@ -1,5 +1,6 @@
 """The library of presses: what is looked up is what would be simulated; it goes on where it was stopped."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,12 +9,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import agents
-from agents import press_library
-from agents.press_library import FIRST_SEED, KEPT, PressLibraryEnv, load_library, make_library
 from surgsim_env.scene.levels import LEVELS
+from surgsim_env.training import press_library
+from surgsim_env.training.press_library import FIRST_SEED, KEPT, PressLibraryEnv, load_library, make_library
 
-SAMPLE = Path(agents.__file__).parent / "training" / "press_library_sample.npz"
+SAMPLE = Path(press_library.__file__).with_name("press_library_sample.npz")
 
 
 @pytest.mark.slow
@@ -40,6 +40,18 @@ def test_what_is_looked_up_is_what_would_be_simulated(tmp_path, monkeypatch):
                 assert found[2:4] == expected[2:4]
                 assert set(found[4]) <= set(expected[4])
         monkeypatch.undo()
+
+
+def test_the_script_makes_one(tmp_path, monkeypatch):
+    from agents import make_press_library
+
+    made = []
+    monkeypatch.setattr(make_press_library, "make_library", lambda *given: made.append(given))
+    monkeypatch.setattr(
+        sys, "argv", ["make_press_library", "--scene", "phantom_small", "--out", str(tmp_path / "a.npz")]
+    )
+    make_press_library.main()
+    assert made == [(tmp_path / "a.npz", "phantom_small", "standard", 400)]
 
 
 def test_it_goes_on_where_it_was_stopped_and_may_be_used_meanwhile(tmp_path, monkeypatch):

@@ -24,8 +24,8 @@ def envs(count: int, mode: str = "Disabled", **settings) -> gym.vector.VectorEnv
 
 def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
     """Three seeds on two environments: each record is that of a single environment, to the bit; all succeed."""
-    from agents.expert_retract import RetractExpert
-    from agents.scoring.episodes import play_tasks, task_figures
+    from surgsim_env.scoring.episodes import play_tasks, task_figures
+    from surgsim_env.scoring.expert_retract import RetractExpert
 
     seeds = [21, 22, 23]
     records = play_tasks(RetractExpert().act_all, envs(2), seeds)
@@ -49,7 +49,7 @@ def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
 
 def test_the_expert_follows_from_the_observation_alone():
     """Asked in another order, or again, it says the same; and it keeps still where enough is seen."""
-    from agents.expert_retract import GRIP, HOLDS, TIP, VISIBLE, RetractExpert
+    from surgsim_env.scoring.expert_retract import GRIP, HOLDS, TIP, VISIBLE, RetractExpert
 
     random = np.random.default_rng(0)
     box = gym.make(ID).observation_space
@@ -77,8 +77,8 @@ def test_forces_are_those_entries_of_the_observation():
 def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, blind: bool, monkeypatch, capsys):
     """Two rounds of a few steps; without force the policy sees zeros there, the expert does not."""
     from agents import learn_retract
-    from agents.scoring.episodes import play_tasks
-    from agents.training.policy_files import load_policy
+    from surgsim_env.scoring.episodes import play_tasks
+    from surgsim_env.training.policy_files import load_policy
 
     asked = []
     act = learn_retract.RetractExpert.act

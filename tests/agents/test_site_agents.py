@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
-from agents.evaluate import find_agent
-from agents.scoring.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts
-from agents.site_search import AGENTS, BOUNDS
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
+from surgsim_env.scoring.evaluate import find_agent
+from surgsim_env.scoring.site_search import AGENTS, BOUNDS
+from surgsim_env.training.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts
 
 pytestmark = pytest.mark.agents
 # Under a tip of 8 mm: 11 x 11 sites of the map, 4 mm apart.

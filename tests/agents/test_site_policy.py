@@ -8,8 +8,18 @@ import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
 
-from agents.evaluate import POLICIES
-from agents.scoring.site_agent import (
+from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
+from surgsim_env.palpation.lesion_estimator import (
+    BACKGROUND_SPREAD,
+    EXCESS_LENGTH,
+    EXCESS_SPREAD,
+    MODEL_SPREAD,
+    contrast_process,
+)
+from surgsim_env.scoring.evaluate import policies_folder
+from surgsim_env.scoring.site_search import UCB_BETA
+from surgsim_env.training.policy_files import describe, load_policy, save_policy
+from surgsim_env.training.site_agent import (
     LENGTH_SHARE,
     OBSERVATION_SIZE,
     SITE_COUNT,
@@ -18,9 +28,7 @@ from agents.scoring.site_agent import (
     SiteProcess,
     observed_facts,
 )
-from agents.site_search import UCB_BETA
-from agents.training.policy_files import describe, load_policy, save_policy
-from agents.training.site_policy import (
+from surgsim_env.training.site_policy import (
     CHOICE_SPACE,
     FEATURE_SPACE,
     MAPS,
@@ -30,14 +38,6 @@ from agents.training.site_policy import (
     SitePolicy,
     belief_features,
     site_actions,
-)
-from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
-from surgsim_env.palpation.lesion_estimator import (
-    BACKGROUND_SPREAD,
-    EXCESS_LENGTH,
-    EXCESS_SPREAD,
-    MODEL_SPREAD,
-    contrast_process,
 )
 
 pytestmark = pytest.mark.agents
@@ -169,7 +169,7 @@ def test_an_untrained_policy_is_an_upper_confidence_bound():
     assert chosen.tolist() == np.where(touched, -np.inf, bound).argmax(axis=1).tolist()
 
 
-@pytest.mark.parametrize("path", sorted(POLICIES.glob("sites_*.safetensors")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(policies_folder().glob("sites_*.safetensors")), ids=lambda path: path.stem)
 def test_shipped_policies_load(path):
     policy = load_policy(path)
     assert isinstance(policy.networks, SitePolicy) and policy.description.belief

@@ -41,8 +41,8 @@ def table(algorithm: str = "PPO", **changes) -> dict:
 
 
 def config(algorithm: str = "PPO", **changes):
-    from agents.training.config import TrainingConfig
     from surgsim_env.scene.load import fill
+    from surgsim_env.training.config import TrainingConfig
 
     return fill(TrainingConfig, table(algorithm, **changes), "test")
 
@@ -63,7 +63,7 @@ def config(algorithm: str = "PPO", **changes):
     ],
 )
 def test_wrong_configurations_are_refused(tmp_path: Path, change: dict, message: str):
-    from agents.training.config import read_config
+    from surgsim_env.training.config import read_config
 
     file = tmp_path / "wrong.yaml"
     file.write_text(yaml.safe_dump(table() | change))
@@ -72,9 +72,9 @@ def test_wrong_configurations_are_refused(tmp_path: Path, change: dict, message:
 
 
 def test_shipped_configurations_are_right():
-    from agents.training.config import config_text, read_config
-    from agents.training.networks import algorithm_class
-    from agents.training.run import keywords
+    from surgsim_env.training.config import config_text, read_config
+    from surgsim_env.training.networks import algorithm_class
+    from surgsim_env.training.run import keywords
 
     files = sorted((Path(__file__).parents[2] / "agents" / "configs").glob("*.yaml"))
     assert files
@@ -86,8 +86,8 @@ def test_shipped_configurations_are_right():
 
 
 def test_an_unknown_algorithm_is_answered_with_the_nearest():
-    from agents.training.networks import algorithm_class
-    from agents.training.run import keywords
+    from surgsim_env.training.networks import algorithm_class
+    from surgsim_env.training.run import keywords
 
     with pytest.raises(ValueError, match="algorithm 'RecurentPPO' is unknown; did you mean 'RecurrentPPO'"):
         algorithm_class("RecurentPPO")
@@ -100,10 +100,9 @@ def test_an_unknown_algorithm_is_answered_with_the_nearest():
 
 @pytest.mark.parametrize("algorithm", ["PPO", "RecurrentPPO", "SAC"])
 def test_a_run_leaves_checkpoints_curves_and_policies_that_play(tmp_path: Path, algorithm: str):
-    from agents.train import train
-    from agents.training.environments import make_environments
-    from agents.training.policy_files import load_policy
-    from agents.training.run import play_episodes
+    from surgsim_env.training.environments import make_environments
+    from surgsim_env.training.policy_files import load_policy
+    from surgsim_env.training.run import play_episodes, train
 
     settings = config(algorithm)
     assert train(settings, tmp_path) == 320
@@ -125,16 +124,16 @@ def test_a_run_leaves_checkpoints_curves_and_policies_that_play(tmp_path: Path, 
 
 # Dies as by SIGKILL from outside, as soon as a checkpoint is there.
 KILLED = """
-import os, signal
-from agents import train
-from agents.training.run import Run
+import os, signal, sys
+from surgsim_env.cli.main import main
+from surgsim_env.training.run import Run
 
 def save_and_die(run, save=Run.save):
     save(run)
     os.kill(os.getpid(), signal.SIGKILL)
 
 Run.save = save_and_die
-train.main()
+main(['train', *sys.argv[1:]])
 """
 
 
@@ -153,7 +152,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_number_of_steps(tmp_path: P
         assert killed.returncode == -signal.SIGKILL
     # A checkpoint that was being written when it was killed.
     (folder / "checkpoints" / "999999999999.unfinished").mkdir()
-    last = subprocess.run([sys.executable, "-m", "agents.train", *given], check=True, **settings)
+    last = subprocess.run([sys.executable, "-m", "surgsim_env.cli.main", "train", *given], check=True, **settings)
     assert "resuming from" in last.stdout
     wanted = 384 if algorithm == "PPO" else 336
     assert f"{wanted} steps" in last.stdout
@@ -162,7 +161,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_number_of_steps(tmp_path: P
 
 
 def test_a_folder_of_another_run_is_refused_and_a_longer_run_goes_on(tmp_path: Path):
-    from agents.train import train
+    from surgsim_env.training.run import train
 
     train(config(total_steps=64, evaluation={"every": 0}), tmp_path)
     with pytest.raises(ValueError, match=r"holds a run with other settings .*seed: 0.* there.*seed: 1.* here"):
@@ -171,8 +170,7 @@ def test_a_folder_of_another_run_is_refused_and_a_longer_run_goes_on(tmp_path: P
 
 
 def test_a_resumed_run_has_the_weights_normalisation_and_optimiser_it_had(tmp_path: Path):
-    from agents.train import train
-    from agents.training.run import Run
+    from surgsim_env.training.run import Run, train
 
     settings = config(evaluation={"every": 0})
     train(settings, tmp_path)
@@ -189,9 +187,8 @@ def test_a_resumed_run_has_the_weights_normalisation_and_optimiser_it_had(tmp_pa
 
 
 def test_a_warm_start_takes_weights_and_normalisation_and_the_value_learns_first(tmp_path: Path):
-    from agents.train import train
-    from agents.training.policy_files import load_policy
-    from agents.training.run import Run
+    from surgsim_env.training.policy_files import load_policy
+    from surgsim_env.training.run import Run, train
 
     train(config(evaluation={"every": 0}), tmp_path / "first")
     file = next((tmp_path / "first" / "final").iterdir()) / "policy.safetensors"
@@ -214,8 +211,7 @@ def test_a_warm_start_takes_weights_and_normalisation_and_the_value_learns_first
 
 
 def test_warm_starts_that_do_not_fit_are_refused(tmp_path: Path):
-    from agents.train import train
-    from agents.training.run import Run
+    from surgsim_env.training.run import Run, train
 
     train(config(evaluation={"every": 0}), tmp_path / "first")
     file = str(next((tmp_path / "first" / "final").iterdir()) / "policy.safetensors")
@@ -228,9 +224,8 @@ def test_warm_starts_that_do_not_fit_are_refused(tmp_path: Path):
 
 
 def test_a_warm_start_from_a_zip_needs_trust(tmp_path: Path):
-    """The zip of a checkpoint; `agents.train` names the flag in one line."""
-    from agents.train import train
-    from agents.training.run import Run
+    """The zip of a checkpoint; `surgsim train` names the flag in one line."""
+    from surgsim_env.training.run import Run, train
 
     first = config(evaluation={"every": 0}, total_steps=64)
     train(first, tmp_path / "first")
@@ -243,7 +238,7 @@ def test_a_warm_start_from_a_zip_needs_trust(tmp_path: Path):
         Run(warm, tmp_path / "second")
     with pytest.warns(UserWarning, match="is read with pickle"):
         run = Run(warm, tmp_path / "second", trust_pickle=True)
-    from agents.training.policy_files import load_policy
+    from surgsim_env.training.policy_files import load_policy
 
     weights = load_policy(policy.with_suffix(".safetensors")).networks.state_dict()
     assert all((weights[name] == one).all() for name, one in run.model.policy.state_dict().items())
@@ -287,7 +282,7 @@ class Counting:
 
 
 def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
-    from agents.training.environments import RepeatedAction
+    from surgsim_env.training.environments import RepeatedAction
 
     envs = RepeatedAction(Counting(), 4)
     envs.reset()
@@ -300,7 +295,7 @@ def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
 
 
 def test_without_force_blinds_all_that_is_observed():
-    from agents.training.environments import WithoutForce
+    from surgsim_env.training.environments import WithoutForce
 
     envs = WithoutForce(Counting(), [1])
     assert envs.reset().tolist() == [[0, 0], [0, 0]]
@@ -311,7 +306,7 @@ def test_without_force_blinds_all_that_is_observed():
 
 
 def test_the_task_says_which_entries_are_forces():
-    from agents.training.environments import force_entries, make_environments
+    from surgsim_env.training.environments import force_entries, make_environments
 
     settings = config().environment
     assert force_entries(make_environments(settings)) == [6, 7, 8]
@@ -323,8 +318,8 @@ def test_the_task_says_which_entries_are_forces():
 
 def test_a_policy_decides_as_often_as_it_was_trained_to(tmp_path: Path):
     """With a repeat of two, each environment holds its action for the second step, counted from its own begin."""
-    from agents.train import train
-    from agents.training.policy_files import TrainedPolicy, load_policy
+    from surgsim_env.training.policy_files import TrainedPolicy, load_policy
+    from surgsim_env.training.run import train
 
     train(config("RecurrentPPO", evaluation={"every": 0}, total_steps=64), tmp_path)
     loaded = load_policy(next((tmp_path / "final").iterdir()) / "policy.safetensors")
@@ -345,7 +340,7 @@ def test_a_policy_decides_as_often_as_it_was_trained_to(tmp_path: Path):
 
 
 def test_folders_are_whole_or_absent(tmp_path: Path):
-    from agents.training.run import keep_newest, whole_folders, write_folder
+    from surgsim_env.training.run import keep_newest, whole_folders, write_folder
 
     def broken(folder: Path) -> None:
         (folder / "half").write_text("half")

@@ -381,7 +381,7 @@ def test_a_target_lies_on_its_bed_that_moves():
 
 @pytest.mark.slow
 def test_oracles_that_track_succeed_on_a_calm_patient():
-    """`agents.evaluate --motion calm` has 100 episodes of each."""
+    """`surgsim evaluate --motion calm` has 100 episodes of each."""
     for env_id, scene in (("Palpate", "phantom"), ("Retract", None)):
         env = gym.make(f"SurgSim/{env_id}-v0", scene=scene, motion="calm")
         for seed in range(5):

@@ -12,7 +12,11 @@ WHERE = "from surgsim_env.scene.load import scenes_folder; print(scenes_folder()
 LIST = "import surgsim_env.scene.load; print(*surgsim_env.scene.load.list_scenes())"
 
 
-def scene_files(folder: Path) -> set[str]:
+# What a wheel carries of agents/.
+AGENTS = ("policies", "configs", "results")
+
+
+def shipped_files(folder: Path) -> set[str]:
     return {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*")
@@ -20,12 +24,13 @@ def scene_files(folder: Path) -> set[str]:
     }
 
 
-def test_wheel_holds_the_packages_the_scenes_and_nothing_else(wheel):
+def test_wheel_holds_the_packages_their_data_and_nothing_else(wheel):
     names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
     assert {Path(name).parts[0] for name in names} == {"msdm_core", "surgsim_env"}
     assets = "surgsim_env/assets/"
     shipped = {name.removeprefix(assets) for name in names if name.startswith(assets)}
-    assert shipped == scene_files(REPOSITORY / "scenes")
+    agents = {f"agents/{part}/{name}" for part in AGENTS for name in shipped_files(REPOSITORY / "agents" / part)}
+    assert shipped == shipped_files(REPOSITORY / "scenes") | agents
     assert not [name for name in names if name.endswith((".nbi", ".nbc", ".pyc"))]
 
 
@@ -50,6 +55,32 @@ def test_installed_wheel_finds_its_scenes(wheel, make_environment, tmp_path, cle
     assert (environment.folder / "bin" / "surgsim").is_file()
     known = run([environment.python, "-c", LIST], cwd=tmp_path, env=clean_environ).split()
     assert [f"{name}.toml" for name in known] == shipped
+
+
+@pytest.mark.agents
+def test_installed_wheel_trains_and_evaluates(wheel, make_environment, tmp_path, clean_environ):
+    """Policies and configurations by name, from a folder that is no checkout; results stay out of the installation."""
+    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+    environment: Environment = make_environment(tmp_path / "venv")
+    environment.install(wheel)
+    surgsim, here = environment.folder / "bin" / "surgsim", {"cwd": tmp_path, "env": clean_environ}
+    names = run([surgsim, "train", "list"], **here).split()
+    assert set(names) == {path.stem for path in (REPOSITORY / "agents" / "configs").glob("*.yaml")}
+    config = (REPOSITORY / "agents" / "configs" / "palpate_phantom_small_scratch_formula.yaml").read_text()
+    assert "kind: surrogate" in config
+    run([surgsim, "train", "palpate_phantom_small_scratch_formula", "--total-steps", "2048", "--out", "run"], **here)
+    (policy,) = tmp_path.glob("run/final/*/policy.safetensors")
+    common = ["--seeds", "3", "--results", "scores"]
+    run([surgsim, "evaluate", "--policy", policy, *common], **here)
+    run(
+        [surgsim, "evaluate", "--policy", "sites_evolved", "--scene", "phantom_small", "--budget", "2", *common], **here
+    )
+    assert len(list((tmp_path / "scores").glob("*.json"))) == 2
+    family = ["--scene", "liver_family", "--level", "standard"]
+    compared = run([surgsim, "evaluate", "--compare", "raster_5", "raster_6", *family], **here)
+    assert "PalpateSites_liver_family_standard" in compared
+    before = set((environment.site_packages / "surgsim_env" / "assets" / "agents" / "results").iterdir())
+    assert {path.name for path in before} == {path.name for path in (REPOSITORY / "agents" / "results").iterdir()}
 
 
 @pytest.mark.slow

@@ -2,18 +2,14 @@
 
 It performs the procedure of `surgsim_env.scripting.oracle`, but can act in any state that a learning agent reaches, as
 DAgger requires of an expert (Ross et al. 2011). It is written for the scene `lobe` with its own grasper, whose wrist
-turns about one hinge. Run it from a checkout:
-
-    python -m agents.expert_retract --episodes 20
+turns about one hinge.
 """
 
-import argparse
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.scoring.episodes import make_envs, play_tasks, print_episodes
 from surgsim_env.tasks.retract import RetractTask
 
 SPEED = 0.02  # [m/s] full scale of an action's velocity
@@ -169,23 +165,3 @@ def _levelling(now: NDArray[np.float64]) -> float:
     """Angular velocity of the wrist that levels the jaw [rad/s]; above 0 its pads sink."""
     _, y, z = now[POINTS_ALONG]
     return -0.6 * math.atan2(-z, -y) / CONTROL_STEP
-
-
-def main() -> None:
-    """Run episodes and print them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    envs, seeds = (
-        make_envs("SurgSim/Retract-v0", 1, dtype="float64", scaled=False),
-        range(given.seed, given.seed + given.episodes),
-    )
-    soft_force = envs.unwrapped.envs[0].unwrapped.scene.limits.soft_force  # type: ignore[attr-defined]
-    records = play_tasks(RetractExpert().act_all, envs, seeds)
-    names = ("success", "torn", "hard_limit", "sim_fault", "pull_force_peak", "slips", "visible")
-    print_episodes(records, seeds, soft_force, *names)
-
-
-if __name__ == "__main__":
-    main()

@@ -12,14 +12,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.scoring.results import SITES, Result
 from surgsim_env.palpation.job import package_version
 from surgsim_env.palpation.scores import ERROR_LINE, presses_to_line
 from surgsim_env.scene.digest import content_digest
+from surgsim_env.scoring.results import SITES, Result
+from surgsim_env.training import site_agent
 
 PACKAGES = ("numpy", "mujoco", "gymnasium", "numba")
 # Code that plays episodes and computes scores.
-SCORING = tuple(Path(__file__).with_name(name) for name in ("episodes.py", "site_agent.py"))
+SCORING = (Path(__file__).with_name("episodes.py"), Path(site_agent.__file__))
 FILE_DIGEST_SIZE = 32
 # Of the errors in a file, half of their last digit [m].
 ROUNDING = 5e-6
@@ -91,9 +92,8 @@ def _against_itself(result: Result) -> Iterator[str]:
     if result.env_id == SITES and any(result.lesion_counts):
         errors = 0.001 * np.array(result.errors_mm)[np.array(result.lesion_counts) > 0]
         # Errors are written rounded.
-        told["presses_to_median"] = tuple(
-            presses_to_line(errors, 50.0, ERROR_LINE + slack) for slack in (ROUNDING, -ROUNDING)
-        )
+        low, high = (presses_to_line(errors, 50.0, ERROR_LINE + slack) for slack in (ROUNDING, -ROUNDING))
+        told["presses_to_median"] = (low, high)
     for name, (low, high) in told.items():
         figure = result.figures[name].value
         if figure is None or not low - 1e-4 <= figure <= high + 1e-4:

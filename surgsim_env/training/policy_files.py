@@ -1,9 +1,9 @@
 """Policies as files: NAME.safetensors holds the weights, NAME.json the networks, environment and preprocessing.
 
-Reading them runs no code of theirs: networks are built from names of fixed tables (`agents.training.networks`), weights
-are checked before they are used. A zip of stable-baselines3 is a set of pickles, which run any code that their author
-put there: it is read only where `trust_pickle` says so, and `python -m agents.convert_policy` makes files without
-pickles from it.
+Reading them runs no code of theirs: networks are built from names of fixed tables
+(`surgsim_env.training.networks`), weights are checked before they are used. A zip of stable-baselines3 is a set of
+pickles, which run any code that their author put there: it is read only where `trust_pickle` says so, and
+`python -m agents.convert_policy` makes files without pickles from it.
 """
 
 import argparse
@@ -25,9 +25,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.scoring.site_agent import OBSERVATION_SIZE
-from agents.training.environments import blinded
-from agents.training.networks import (
+from surgsim_env.envs.ids import TASKS
+from surgsim_env.scene.load import fill
+from surgsim_env.tasks.task import Task
+from surgsim_env.training.environments import blinded
+from surgsim_env.training.networks import (
     NetworkDescription,
     algorithm_class,
     build_networks,
@@ -35,10 +37,8 @@ from agents.training.networks import (
     load_weights,
     shortened,
 )
-from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, PLACE_SPACE, belief_features, site_actions
-from surgsim_env.envs.ids import TASKS
-from surgsim_env.scene.load import fill
-from surgsim_env.tasks.task import Task
+from surgsim_env.training.site_agent import OBSERVATION_SIZE
+from surgsim_env.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, PLACE_SPACE, belief_features, site_actions
 
 # Defaults of VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8

@@ -9,8 +9,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-import surgsim_env  # noqa: F401  (registers the ids)
-from agents.scoring.results import SITES
+from surgsim_env.scoring.results import SITES
 
 matplotlib.use("Agg")
 from matplotlib.backends.backend_agg import FigureCanvasAgg

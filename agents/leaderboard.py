@@ -1,4 +1,7 @@
-"""The leaderboard as a picture for each scene, docs/images/leaderboard_*.png, from the same result files."""
+"""Write agents/LEADERBOARD.md and a picture for each scene, docs/images/leaderboard_*.png, from agents/results/*.json.
+
+python -m agents.leaderboard
+"""
 
 import math
 from collections.abc import Sequence
@@ -7,14 +10,15 @@ from typing import Any, NamedTuple
 
 import matplotlib
 
-from agents.scoring.leaderboard import ranked, shown_name
-from agents.scoring.results import SITES, Result, picture_name
+from agents.leaderboard_tables import ranked, shown_name, write_leaderboard
 from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scoring.results import SITES, Result, load_results, picture_name, shipped_results
 
 matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
-IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+LEADERBOARD = Path(__file__).resolve().with_name("LEADERBOARD.md")
+IMAGES = LEADERBOARD.parents[1] / "docs" / "images"
 WIDTH, DPI = 8.4, 110  # [in], [1/in]
 # Heights of a method, of a panel's title, and of what surrounds all panels [in].
 ROW, HEADING, MARGINS = 0.23, 0.35, 1.1
@@ -144,3 +148,13 @@ def _scaled(
         for one in (figure.value, figure.low, figure.high)
     )
     return value, low, high
+
+
+def main() -> None:
+    """Write tables and pictures."""
+    write_leaderboard(shipped_results(), LEADERBOARD)
+    draw_leaderboard(load_results(shipped_results()), IMAGES)
+
+
+if __name__ == "__main__":
+    main()

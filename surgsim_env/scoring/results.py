@@ -1,4 +1,4 @@
-"""Result files agents/results/*.json: one method on one environment, with what it takes to compare it with others."""
+"""Result files: one method on one environment, with what it takes to compare it with others."""
 
 import json
 import math
@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scene.load import agents_folder
 from surgsim_env.scene.motions import STILL
 
-RESULTS = Path(__file__).resolve().parents[1] / "results"
 # JSON has no infinity.
 NEVER = "never"
 SITES = "SurgSim/PalpateSites-v0"
@@ -37,7 +37,7 @@ class Result:
         lesion_counts: lesions of each episode (PalpateSites only)
         sees_truth: whether the method is declared to see what is hidden
         own_estimate: whether its own estimate is scored in place of the common estimator's
-        origin: versions and digests (`agents.scoring.origin`); empty in files of earlier versions
+        origin: versions and digests (`surgsim_env.scoring.origin`); empty in files of earlier versions
     """
 
     method: str
@@ -75,7 +75,7 @@ class Result:
         motion = self.env_kwargs.get("motion") or STILL
         return "" if motion == STILL else motion
 
-    def save(self, folder: Path = RESULTS) -> Path:
+    def save(self, folder: Path) -> Path:
         """Write it into a folder; replaces an older result of the same method and place."""
         path = folder / f"{self.place}_{self.method}.json"
         self.write(path)
@@ -93,6 +93,11 @@ class Result:
         path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
 
+def shipped_results() -> Path:
+    """The folder of results of the project's own methods."""
+    return agents_folder() / "results"
+
+
 def load_result(path: Path) -> Result:
     """Read a file of `Result.write`.
 
@@ -108,10 +113,10 @@ def load_result(path: Path) -> Result:
         return Result(**{**table, "seeds": read_seeds(table["seeds"])})
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         said = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} is no result of agents.evaluate: {type(error).__name__}: {said}") from None
+        raise ValueError(f"{path} is no result of surgsim evaluate: {type(error).__name__}: {said}") from None
 
 
-def load_results(folder: Path = RESULTS) -> list[Result]:
+def load_results(folder: Path) -> list[Result]:
     """All results of a folder, by file name, without `reach_*.json`."""
     return [load_result(path) for path in sorted(folder.glob("*.json")) if not path.name.startswith("reach_")]
 

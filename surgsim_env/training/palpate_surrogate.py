@@ -20,7 +20,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.palpation.chart import MAP_SIDE
 from surgsim_env.palpation.touches import stiffest_spots
 from surgsim_env.tasks.palpate import (

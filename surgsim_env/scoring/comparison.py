@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.scoring.results import SITES, Result, seeds_text
 from surgsim_env.palpation.scores import RESAMPLES, ScoreEstimate, figure_with_interval, presses_to_line
+from surgsim_env.scoring.results import SITES, Result, seeds_text
 
 
 @dataclass(frozen=True)

@@ -3,17 +3,14 @@
 It has no state: each action is a function of one observation, so that a network can learn it
 (`agents/learn_palpate.py`). The tip slides along rows at a constant depth, less where the force nears the soft limit;
 the observation holds the measured contrast. After the rows it returns to the stiffest place and declares it.
-
-    python -m agents.expert_palpate --scene phantom --episodes 48
 """
 
-import argparse
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.scoring.episodes import make_envs, play_tasks, print_episodes
 from surgsim_env.palpation.chart import MAP_SIDE
 
 ROWS_FEWEST = 5
@@ -47,12 +44,13 @@ class PalpateExpert:
         Raises:
             ValueError: a scene that is not a block, or an environment without memory.
         """
-        scene, task = env.unwrapped.scene, env.unwrapped.task
+        single: Any = env.unwrapped
+        scene, task = single.scene, single.task
         if scene.mesh.block is None:
             raise ValueError(f"this expert slides on a block's flat top; {scene.name!r} is not a block: use phantom")
         if task.memory is None:
             raise ValueError("this expert reads the memory of the observation: make the environment with memory=True")
-        self.env, self.slices = env.unwrapped, task.observation_slices
+        self.env, self.slices = single, task.observation_slices
         self.chart = task.memory.chart
         self.surface = scene.mesh.block.size[2] + scene.instrument.tip_radius
         self.force_most = force_share * scene.limits.soft_force
@@ -98,24 +96,3 @@ class PalpateExpert:
         x = way * np.clip(short / NEAR, -1.0, 1.0)
         y = np.where(at_end, 1.0, (self.rows[row] - tip[:, 1]) / NEAR)
         return np.column_stack([x, y])
-
-
-def main() -> None:
-    """Print one line per episode, and the figures of all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", default="phantom")
-    parser.add_argument("--level", default=None)
-    parser.add_argument("--episodes", type=int, default=16)
-    parser.add_argument("--envs", type=int, default=16, help="organs side by side")
-    parser.add_argument("--seed", type=int, default=700_000)
-    given = parser.parse_args()
-    envs = make_envs("SurgSim/Palpate-v0", given.envs, scene=given.scene, level=given.level, memory=True)
-    first, seeds = envs.unwrapped.envs[0], range(given.seed, given.seed + given.episodes)  # type: ignore[attr-defined]
-    records = play_tasks(PalpateExpert(first).act, envs, seeds)
-    print_episodes(
-        records, seeds, first.unwrapped.scene.limits.soft_force, "success", "declared", "error_mm", "sim_fault"
-    )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,23 +1,17 @@
 """A scripted expert for SurgSim/Palpate-v0 on any organ, with memory=True and frame="face".
 
-It has no state: each action is a function of `agents.training.face_features`, which an observation alone gives, so that
-a network can learn it (`agents/learn_palpate_organs.py`). The tip slides at a constant depth along rows of the face,
-less deep where the force nears the soft limit. Where it has passed a place that is clearly stiffer than most of what it
-felt, or the rows are done, it searches across the row there, goes to the stiffest place and declares it. Lengths are in
-tip radii and forces over the soft limit: what works on one organ works on another.
-
-    python -m agents.expert_organs --scene liver --episodes 16
-    python -m agents.expert_organs --scene liver --blind        # declares in the middle of the face
+It has no state: each action is a function of `surgsim_env.training.face_features`, which an observation alone gives,
+so that a network can learn it (`agents/learn_palpate_organs.py`). The tip slides at a constant depth along rows of the
+face, less deep where the force nears the soft limit. Where it has passed a place that is clearly stiffer than most of
+what it felt, or the rows are done, it searches across the row there, goes to the stiffest place and declares it.
+Lengths are in tip radii and forces over the soft limit: what works on one organ works on another.
 """
-
-import argparse
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from agents.scoring.episodes import make_envs, play_tasks, print_episodes
-from agents.training.face_features import FACE, UPRIGHT, FaceFeatures, face_features
+from surgsim_env.training.face_features import FACE, UPRIGHT, FaceFeatures, face_features
 
 DEPTH = 0.42  # [tip radii] of the sliding ball
 GAP = 0.15  # [tip radii] between tip and surface on the way to the first row
@@ -76,26 +70,3 @@ class OrganExpert:
             seen = face_features(read)
             actions = blind_actions(seen, read[:, FACE["tip_place"]][:, :2]) if self.blind else expert_actions(seen)
             return actions.numpy().astype(np.float32)
-
-
-def main() -> None:
-    """Print one line per episode, and the figures of all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", default="liver")
-    parser.add_argument("--level", default=None)
-    parser.add_argument("--episodes", type=int, default=16)
-    parser.add_argument("--envs", type=int, default=16, help="organs side by side")
-    parser.add_argument("--seed", type=int, default=700_000)
-    parser.add_argument("--blind", action="store_true", help="declare in the middle of the face")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    envs = make_envs("SurgSim/Palpate-v0", given.envs, scene=given.scene, level=given.level, memory=True, frame="face")
-    first, seeds = envs.unwrapped.envs[0], range(given.seed, given.seed + given.episodes)  # type: ignore[attr-defined]
-    records = play_tasks(OrganExpert(blind=given.blind).act, envs, seeds)
-    print_episodes(
-        records, seeds, first.unwrapped.scene.limits.soft_force, "success", "declared", "error_mm", "sim_fault"
-    )
-
-
-if __name__ == "__main__":
-    main()

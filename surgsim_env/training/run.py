@@ -19,10 +19,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from agents.training.config import TrainingConfig, config_text
-from agents.training.environments import StagedRewards, force_entries, make_environments
-from agents.training.networks import POLICIES, algorithm_class, describe_networks, with_classes
-from agents.training.policy_files import PolicyDescription, TrainedPolicy, describe, load_policy, save_policy
+from surgsim_env.training.config import TrainingConfig, config_text
+from surgsim_env.training.environments import StagedRewards, force_entries, make_environments
+from surgsim_env.training.networks import POLICIES, algorithm_class, describe_networks, with_classes
+from surgsim_env.training.policy_files import PolicyDescription, TrainedPolicy, describe, load_policy, save_policy
 
 # First seeds of training and of its periodic evaluation; scores use others
 # (`surgsim_env.palpation.scores.EVALUATION_SEEDS`, from 1,000,000 to 1,000,099).
@@ -267,6 +267,21 @@ class BetweenRollouts(BaseCallback):
                 parameter.requires_grad_(learns)
                 if not learns:
                     parameter.grad = None
+
+
+def train(config: TrainingConfig, folder: Path, *, progress: bool = False, trust_pickle: bool = False) -> int:
+    """Train up to the configuration's number of steps; returns the number reached."""
+    run = Run(config, folder, trust_pickle=trust_pickle)
+    model, start = run.model, run.model.num_timesteps
+    if run.resumed_from is not None:
+        print(f"resuming from {run.resumed_from} ({start} of {config.total_steps} steps)", flush=True)
+    if start >= config.total_steps:
+        return start
+    # A resumed run trains for the remaining steps.
+    left = config.total_steps - start
+    model.learn(left, BetweenRollouts(run), reset_num_timesteps=start == 0, progress_bar=progress)
+    run.finish()
+    return model.num_timesteps
 
 
 def set_initial(model: BaseAlgorithm, entry: str, values: Sequence[float]) -> None:

@@ -1,4 +1,4 @@
-"""agents/LEADERBOARD.md from the result files agents/results/*.json."""
+"""The tables of agents/LEADERBOARD.md from the result files agents/results/*.json."""
 
 import json
 import math
@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
-from agents.scoring.results import RESULTS, SITES, Result, family, load_results, picture_name, seeds_text
 from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scoring.results import SITES, Result, family, load_results, picture_name, seeds_text
 
-LEADERBOARD = RESULTS.with_name("LEADERBOARD.md")
 # Coverage of the intervals over training seeds.
 COVERAGE = 0.95
 
@@ -58,8 +57,8 @@ TASKS: tuple[Column, ...] = (
 )
 
 
-def write_leaderboard(folder: Path = RESULTS, path: Path = LEADERBOARD) -> None:
-    """Write the tables of all results of a folder, a scene's under its picture (`agents.scoring.leaderboard_plots`)."""
+def write_leaderboard(folder: Path, path: Path) -> None:
+    """Write the tables of all results of a folder, a scene's under its picture (`agents.leaderboard`)."""
     results = load_results(folder)
     places = sorted({result.place for result in results}, key=_order)
     parts, shown = [HEADER], set[str]()
@@ -78,7 +77,7 @@ def write_leaderboard(folder: Path = RESULTS, path: Path = LEADERBOARD) -> None:
 
 HEADER = """# Leaderboard
 
-Written by `python -m agents.evaluate --leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
+Written by `python -m agents.leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
 Each figure is a mean over the episodes of its seeds, in brackets the 95 % bootstrap interval over them; "never" is a
 line that was not reached within the presses of an episode. Baselines and policies play the same organs. The rasters
 shown are the best of those tried, by presses to 5 mm, then by the error over all presses. Where policies of one
@@ -88,7 +87,7 @@ Student's t over training seeds (which may pass 100 %); "never" where one of the
 and oracles go with the surface that markers show; a method whose name ends in `untracked` goes where places are at
 rest.
 How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
-`python -m agents.evaluate --compare A B`.
+`surgsim evaluate --compare A B`.
 """
 
 

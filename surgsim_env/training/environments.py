@@ -7,10 +7,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-import surgsim_env  # noqa: F401  (registers the ids)
-from agents.training.config import EnvironmentSettings, Stage
-from agents.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, belief_features, site_actions
 from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+from surgsim_env.training.config import EnvironmentSettings, Stage
+from surgsim_env.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, belief_features, site_actions
 
 
 def make_environments(settings: EnvironmentSettings, count: int | None = None) -> VecEnv:
@@ -53,15 +52,15 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
         )
         return VectorEnvForStableBaselines(envs)
     if settings.kind == "library":
-        from agents.press_library import PressLibraryEnv
+        from surgsim_env.training.press_library import PressLibraryEnv
 
         return DummyVecEnv([lambda: PressLibraryEnv(settings.library, **settings.kwargs)] * count)
     if settings.kind == "bells":
-        from agents.training.bell_sites import BellSites
+        from surgsim_env.training.bell_sites import BellSites
 
         return DummyVecEnv([BellSites] * count)
     if settings.kind == "surrogate":
-        from agents.training.palpate_surrogate import PalpateSurrogate
+        from surgsim_env.training.palpate_surrogate import PalpateSurrogate
 
         # As gym.make: no level unless one is given.
         return VectorEnvForStableBaselines(PalpateSurrogate(count, **{"level": None, **settings.kwargs}))

@@ -17,7 +17,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.palpation.touches import Indenter
 
 # Ranges that an episode draws: s, A, w over the lesion's radius, amplitude of g, and wavelength over the tip's radius.

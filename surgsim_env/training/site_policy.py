@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from agents.scoring.site_agent import SITE_COUNT, SLICES, SiteProcess, observed_facts
 from surgsim_env.palpation.chart import MAP_SIDE
 from surgsim_env.palpation.lesion_estimator import EXCESS_SPREAD
+from surgsim_env.training.site_agent import SITE_COUNT, SLICES, SiteProcess, observed_facts
 
 # Bound of a feature; expected excess is some 3 spreads at most.
 FEATURE_BOUND = 10.0
@@ -44,10 +44,11 @@ VALUE_SIZE = 2 * WIDTH + NUMBERS
 def belief_features(observations: NDArray[np.floating]) -> NDArray[np.float32]:
     """What a policy reads of observations of SurgSim/PalpateSites-v0 with memory, (m, n_observation).
 
-    Maps of the expected excess and its deviation over the prior's, as the searches gp_* of agents/site_search.py have
-    them, of the sites that were pressed and of those that may be chosen; then the share of presses left, the area of
-    the sites that may be chosen over AREA_SCALE, the map's cell and the lesions' radius over the tip's, and the least
-    excess of a lesion over the prior's deviation: (m, 4 n n + 5). They follow from the observation alone, on any organ.
+    Maps of the expected excess and its deviation over the prior's, as the searches gp_* of
+    surgsim_env/scoring/site_search.py have them, of the sites that were pressed and of those that may be chosen; then
+    the share of presses left, the area of the sites that may be chosen over AREA_SCALE, the map's cell and the lesions'
+    radius over the tip's, and the least excess of a lesion over the prior's deviation: (m, 4 n n + 5). They follow from
+    the observation alone, on any organ.
     """
     return np.stack([_features(observation) for observation in np.asarray(observations, dtype=np.float64)])
 
@@ -139,7 +140,7 @@ class SiteScores(nn.Module):
     """Scores of all sites, and features for the value.
 
     Channels are the maps and numbers of `belief_features`. Only candidates that were not pressed are chosen, as by the
-    searches gp_* of agents/site_search.py.
+    searches gp_* of surgsim_env/scoring/site_search.py.
     """
 
     def __init__(self) -> None:

@@ -18,11 +18,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.scoring.site_agent import OBSERVATION_SIZE, SLICES
 from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimator
 from surgsim_env.palpation.scores import ospa, ospa_cutoff
 from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, FOUND_DISTANCE, SUCCESS_ERROR, WIDE, PalpateSitesTask
+from surgsim_env.training.site_agent import OBSERVATION_SIZE, SLICES
 
 # Tip radius of the estimator's own lengths: an error in tip radii over it is one in metres of the benchmark.
 TIP = 0.008

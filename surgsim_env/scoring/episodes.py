@@ -14,12 +14,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-import surgsim_env  # noqa: F401  (registers the ids)
-from agents.scoring.site_agent import site_facts
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
 from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, with_intervals
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.training.site_agent import site_facts
 
 # Of the seeds that belong to agents, among those that follow from an episode's (`SeedSequence.spawn_key`).
 AGENT_STREAM = 0x41_67_65_6E_74
@@ -62,7 +61,7 @@ def play(
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
     begin: Callable[[int, int], R],
-    progress: Callable[[], object] = lambda: None,
+    progress: Callable[[int], object] = lambda ended: None,
 ) -> list[R]:
     """Play an episode of each seed and return its record; where one ends the next seed begins.
 
@@ -73,7 +72,7 @@ def play(
         envs: with autoreset_mode="Disabled", so that each reset has its seed.
         seeds: of the episodes.
         begin: makes the record of an episode from the index of its environment and its seed.
-        progress: called after each step.
+        progress: called after each step with the number of episodes that ended.
 
     Raises:
         ValueError: another autoreset mode, or several environments that cannot be paused.
@@ -116,7 +115,7 @@ def play(
             if index is not None:
                 info = {name: values[env] for name, values in infos.items() if not name.startswith("_")}
                 records[index].note(float(rewards[env]), info, bool(begins[env]))
-        progress()
+        progress(int(begins.sum()))
 
 
 # ---- agents, one for each episode ------------------------------------------------------------------------------------
@@ -148,7 +147,7 @@ class EpisodeFacts:
 class EpisodeAgent(Protocol):
     """Plays one episode of an environment whose steps are control steps; each episode has an agent of its own.
 
-    For SurgSim/PalpateSites-v0, whose step is a press: `agents.scoring.site_agent.SiteAgent`.
+    For SurgSim/PalpateSites-v0, whose step is a press: `surgsim_env.training.site_agent.SiteAgent`.
     """
 
     def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
@@ -249,14 +248,14 @@ def play_tasks(
     actor: Actor | AgentActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
-    progress: Callable[[], object] = lambda: None,
+    progress: Callable[[int], object] = lambda ended: None,
 ) -> list[TaskRecord]:
     """`play` for the records of these environments."""
     return play(actor, envs, seeds, lambda env, seed: TaskRecord(), progress)
 
 
 def play_scripts(
-    env: gym.Env, seeds: Sequence[int], *, tracks: bool, progress: Callable[[], object] = lambda: None
+    env: gym.Env, seeds: Sequence[int], *, tracks: bool, progress: Callable[[int], object] = lambda ended: None
 ) -> list[TaskRecord]:
     """Episodes of the oracle's script, one after the other; a script that fails ends its episode without success.
 
@@ -264,7 +263,7 @@ def play_scripts(
         env: one environment.
         seeds: of the episodes.
         tracks: the script follows a surface that moves.
-        progress: called after each episode.
+        progress: called with 1 after each episode.
     """
     records = []
     for seed in seeds:
@@ -275,7 +274,7 @@ def play_scripts(
             trace = failed.trace
         peaks = [float(info["force_peak"]) for info in trace.infos]
         records.append(TaskRecord(len(trace.reward), float(trace.reward.sum()), peaks, trace.infos[-1]))
-        progress()
+        progress(1)
     return records
 
 
@@ -312,20 +311,6 @@ def task_figures(
     return with_intervals({name: np.array(values, dtype=np.float64) for name, values in columns.items()}, rng)
 
 
-def print_episodes(records: Sequence[TaskRecord], seeds: Sequence[int], soft_force: float, *names: str) -> None:
-    """Print a line per episode with some entries of its last info, and a line of figures."""
-    for seed, one in zip(seeds, records, strict=True):
-        shown = " ".join(f"{name}={one.last[name]}" for name in names)
-        print(f"seed={seed} steps={one.steps} return={one.total:.2f} peak={max(one.force_peaks):.2f} N {shown}")
-    won = np.mean([bool(one.last["success"]) for one in records])
-    gentle = np.mean([max(one.force_peaks) <= soft_force for one in records])
-    steps = np.median([one.steps for one in records])
-    print(
-        f"{len(records)} episodes: success {won:.0%}, median {steps:.0f} control steps, "
-        f"under the soft limit {gentle:.0%}"
-    )
-
-
 # ---- SurgSim/PalpateSites-v0 ----------------------------------------------------------------------------------------
 
 
@@ -333,12 +318,12 @@ def play_sites(
     actor: Actor | AgentActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
-    progress: Callable[[], object] = lambda: None,
+    progress: Callable[[int], object] = lambda ended: None,
 ) -> list[PalpationRecord]:
     """`play` for agents, or for one policy in all environments.
 
-    An agent with methods `estimate` and `estimate_map`, as `agents.site_search.TruthAgent` has them, replaces the
-    estimator.
+    An agent with methods `estimate` and `estimate_map`, as `surgsim_env.scoring.site_search.TruthAgent` has them,
+    replaces the estimator.
     """
     singles = envs.unwrapped.envs  # type: ignore[attr-defined]
 
@@ -419,6 +404,6 @@ def _over_lesion(task: PalpateSitesTask, points: NDArray[np.float64]) -> NDArray
     over = np.zeros(points.shape[:-1], dtype=bool)
     chart = task.charted.chart
     for lesion in task.lesions:
-        centre = 0.5 * (chart.place(lesion.centre) + 1.0) * chart.extent
+        centre = 0.5 * (chart.place(lesion.centre) + 1.0) * chart.extent  # type: ignore[arg-type]
         over |= ((points - centre) ** 2).sum(axis=-1) <= lesion.radius**2  # type: ignore[operator]
     return over

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from agents.training.extractors import MemorySummary, PlaceAndForce, TouchSummary
-from agents.training.face_features import FaceSummary
-from agents.training.picture_features import PictureAndForce
-from agents.training.site_policy import SitePolicy
 from surgsim_env.scene.load import nearest
+from surgsim_env.training.extractors import MemorySummary, PlaceAndForce, TouchSummary
+from surgsim_env.training.face_features import FaceSummary
+from surgsim_env.training.picture_features import PictureAndForce
+from surgsim_env.training.site_policy import SitePolicy
 
 # Classes that a configuration and a policy's file name, beside the policies of stable-baselines3's algorithms.
 EXTRACTORS = {
@@ -234,7 +234,7 @@ def describe_networks(model: BaseAlgorithm) -> NetworkDescription:
     if not names:
         raise ValueError(
             f"the policy {type(model.policy).__name__} has no name in a policy's file; known are {', '.join(known)}: "
-            "add it to POLICIES in agents/training/networks.py"
+            "add it to POLICIES in surgsim_env/training/networks.py"
         )
     arguments: dict[str, Any] = {"use_sde": True} if getattr(model, "use_sde", False) else {}
     for entry, value in model.policy_kwargs.items():
@@ -245,7 +245,7 @@ def describe_networks(model: BaseAlgorithm) -> NetworkDescription:
             if not named:
                 raise ValueError(
                     f"policy_kwargs.{entry} is {shortened(value)}, which has no name in a policy's file; known are "
-                    f"{', '.join(CLASSES[entry])}: add it to agents/training/networks.py"
+                    f"{', '.join(CLASSES[entry])}: add it to surgsim_env/training/networks.py"
                 )
             value = named[0]
         arguments[entry] = value

@@ -1,43 +1,32 @@
-"""Score methods on the evaluation seeds, write the leaderboard, film a policy; run from a checkout.
+"""Play a method on seeds, score it, and write the result: baselines, trained policies, agents of others.
 
-    python -m agents.evaluate --agent gp_ucb --scene phantom --level standard
-    python -m agents.evaluate --all --scene phantom --level standard     # every baseline and every policy for it
-    python -m agents.evaluate --agent oracle_retract --motion calm       # a patient who breathes
-    python -m agents.evaluate --policy agents/policies/NAME.safetensors --episodes 20 --video out.mp4
-    python -m agents.evaluate --agent my_agent:MyAgent --submit mine.json # an agent of your own: docs/own_agent.md
-    python -m agents.evaluate --check mine.json
-    python -m agents.evaluate --compare gp_ucb raster_3 --scene phantom --level standard
-    python -m agents.evaluate --reach --scene phantom --level hard       # lesions below the sensor's reach
-    python -m agents.evaluate --leaderboard
-
-Results of the project's own methods on all evaluation seeds go to agents/results/, one file per method, scene and
-level; the leaderboard is written from all of them. Other results are printed, and written where --results or --submit
-says.
-Reading NAME.safetensors runs no code of its author; a zip of stable-baselines3 is read with --trust-pickle only.
+Results of the project's own methods on all evaluation seeds go to agents/results of a checkout, one file per method,
+scene and level. Other results are printed, and written where the options `results` or `submit` say.
 """
 
-import argparse
 import datetime
+import importlib
 import inspect
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from rich.console import Console
 
-import surgsim_env  # noqa: F401  (registers the ids)
-from agents import site_search
-from agents.command_line import named_class, one_line_errors
-from agents.expert_palpate import PalpateExpert
-from agents.expert_retract import RetractExpert
-from agents.scoring.comparison import compare, describe
-from agents.scoring.episodes import (
+from surgsim_env.palpation.scores import PalpationRecord, press_errors, score, with_intervals
+from surgsim_env.reports.step_progress import StepProgress
+from surgsim_env.scene.load import agents_folder, make_scene
+from surgsim_env.scoring import site_search
+from surgsim_env.scoring.comparison import compare, describe
+from surgsim_env.scoring.episodes import (
     Actor,
     AgentActor,
+    TaskRecord,
     episode_facts,
     estimates_itself,
     make_envs,
@@ -47,25 +36,18 @@ from agents.scoring.episodes import (
     sees_truth,
     task_figures,
 )
-from agents.scoring.leaderboard import write_leaderboard
-from agents.scoring.leaderboard_plots import IMAGES, draw_leaderboard
-from agents.scoring.origin import check_origin, describe_origin
-from agents.scoring.results import RESULTS, SITES, Result, family, load_result, load_results, read_seeds, seeds_text
-from agents.scoring.site_agent import SiteAgent, site_facts
-from agents.site_search import AGENTS, RASTER_SIDES, REFERENCES
-from surgsim_env.palpation.scores import EVALUATION_SEEDS, press_errors, score, with_intervals
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import SPLITS
-from surgsim_env.scene.motions import list_motions
+from surgsim_env.scoring.expert_palpate import PalpateExpert
+from surgsim_env.scoring.expert_retract import RetractExpert
+from surgsim_env.scoring.options import ScoringOptions
+from surgsim_env.scoring.origin import check_origin, describe_origin
+from surgsim_env.scoring.results import SITES, Result, family, load_result, load_results, seeds_text, shipped_results
+from surgsim_env.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_env.scripting import oracle
 from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR
+from surgsim_env.training.site_agent import SiteAgent, site_facts
 
-with one_line_errors(__name__, "agents"):
-    from tqdm import tqdm
-
-# Seed of the bootstrap; time between two messages of progress [s].
-BOOTSTRAP_SEED, PROGRESS_EVERY = 0, 60.0
-POLICIES = Path(__file__).resolve().parent / "policies"
+# Seed of the bootstrap.
+BOOTSTRAP_SEED = 0
 # Where a method plays unless options say otherwise.
 PLACES = {"scene": "phantom", "level": "standard"}
 # Arguments of SurgSim/Palpate-v0 with which organs of any size and pose are alike.
@@ -125,7 +107,7 @@ def _organ_expert(*, blind: bool) -> Callable[[dict[str, Any]], Actor]:
     """Makes the expert for any organ, which needs torch."""
 
     def make(kwargs: dict[str, Any]) -> Actor:
-        from agents.expert_organs import OrganExpert
+        from surgsim_env.scoring.expert_organs import OrganExpert
 
         return OrganExpert(blind=blind).act
 
@@ -160,6 +142,40 @@ ORACLES = {
 }
 
 
+def policies_folder() -> Path:
+    """The folder of the policies that are shipped."""
+    return agents_folder() / "policies"
+
+
+def named_class(text: str, option: str) -> Any:
+    """The class (or any function that makes an agent) of MODULE:CLASS.
+
+    Importing the module runs its code.
+
+    Args:
+        text: MODULE:CLASS.
+        option: where it was given, for messages.
+
+    Raises:
+        ValueError: another text, or no such module or class.
+    """
+    module, _, name = text.partition(":")
+    if not (module and name):
+        raise ValueError(f"{option} is {text!r}; the rule is MODULE:CLASS")
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise
+        raise ValueError(
+            f"{option} {text}: there is no module {error.name!r} on Python's path: run from its folder, or add that to "
+            "PYTHONPATH"
+        ) from None
+    if not callable(getattr(found, name, None)):
+        raise ValueError(f"{option} {text}: {found.__file__ or module} has no class {name!r}")
+    return getattr(found, name)
+
+
 def find_agent(name: str) -> Callable[[], SiteAgent]:
     """The factory of the site search with a name.
 
@@ -171,106 +187,30 @@ def find_agent(name: str) -> Callable[[], SiteAgent]:
     return AGENTS[name]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--all", action="store_true", help="every baseline, and every policy for this scene")
-    what.add_argument("--agent", help=f"MODULE:CLASS, or one of {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
-    what.add_argument("--policy", type=Path, help="NAME.safetensors, with NAME.json beside it")
-    what.add_argument("--reach", action="store_true", help="count the lesions below the sensor's reach")
-    what.add_argument("--leaderboard", action="store_true", help="write the leaderboard and its pictures only")
-    what.add_argument(
-        "--compare", nargs=2, metavar=("A", "B"), help="two methods of --results on this scene and level, or two files"
-    )
-    what.add_argument(
-        "--check", type=Path, metavar="FILE", help="whether a result can be compared with those made here"
-    )
-    parser.add_argument("--env", help=f"the environment of MODULE:CLASS, {SITES} by default")
-    parser.add_argument(
-        "--env-arguments", type=json.loads, default={}, help="of the environment of MODULE:CLASS, as JSON"
-    )
-    parser.add_argument(
-        "--trust-pickle", action="store_true", help="let --policy be a zip, which runs any code of its author"
-    )
-    parser.add_argument("--scene", help="phantom by default; for a policy, that of its training")
-    parser.add_argument("--level", help="standard by default; for a policy, that of its training")
-    parser.add_argument("--split", choices=SPLITS, help=f"of a family of organs, {SCORED_SPLIT!r} by default")
-    parser.add_argument("--motion", choices=list_motions(), help="how the patient moves; as the scene says by default")
-    parser.add_argument(
-        "--no-tracking", action="store_true", help="presses and oracles go where the surface is at rest, as it moves"
-    )
-    parser.add_argument(
-        "--seeds",
-        type=_seeds,
-        default=tuple(EVALUATION_SEEDS),
-        help="FIRST:LAST or A,B,C; the evaluation seeds by default",
-    )
-    parser.add_argument("--episodes", type=int, help="play the first of the seeds, so many")
-    parser.add_argument("--budget", type=int, help="presses of an episode, in place of the environment's own")
-    parser.add_argument("--envs", type=int, default=16, help="organs side by side")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--dtype", default="float32", choices=("float64", "float32"), help="of the lanes")
-    parser.add_argument("--results", type=Path, help="folder of the result files; agents/results by default")
-    parser.add_argument("--submit", type=Path, metavar="FILE", help="write the result into one file, and nowhere else")
-    parser.add_argument("--video", type=Path, help="film the first episodes into this mp4 file")
-    parser.add_argument("--video-episodes", type=int, default=3)
-    options = parser.parse_args(arguments)
-    if options.episodes is not None:
-        if not 1 <= options.episodes <= len(options.seeds):
-            parser.error(f"--episodes is {options.episodes}; there are 1 to {len(options.seeds)} seeds")
-        options.seeds = options.seeds[: options.episodes]
-    if options.envs < 1:
-        parser.error(f"--envs is {options.envs}; at least 1 organ is played")
-    if options.video is not None and options.policy is None:
-        parser.error("--video films a policy: give --policy as well")
-    if options.submit is not None and options.agent is None and options.policy is None:
-        parser.error("--submit writes one result: give --agent or --policy as well")
-    if (options.env or options.env_arguments) and ":" not in (options.agent or ""):
-        parser.error(
-            "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"
-        )
-    if options.reach:
-        write_reach(options)
-    elif options.agent is not None:
-        evaluate(find_player(options.agent, options), options)
-    elif options.policy is not None:
-        evaluate(policy_player(options.policy, options), options)
-    elif options.all:
-        evaluate_all(options)
-    elif options.compare:
-        print_comparison(*options.compare, options)
-    elif options.check is not None:
-        check(options.check, options)
-    if options.leaderboard:
-        write_leaderboard()
-        draw_leaderboard(load_results(), IMAGES)
-
-
-def evaluate_all(options: argparse.Namespace) -> None:
+def evaluate_all(options: ScoringOptions, console: Console) -> None:
     """Every baseline on the scene and level of the options, then every policy trained on that scene."""
-    from agents.training.policy_files import home_scene
+    from surgsim_env.training.policy_files import home_scene
 
-    options.scene = options.scene or PLACES["scene"]
-    options.level = options.level or PLACES["level"]
-    widest = 7 if "wide" in options.scene else 5
+    scene, level = options.scene or PLACES["scene"], options.level or PLACES["level"]
+    options = replace(options, scene=scene, level=level)
+    widest = 7 if "wide" in scene else 5
     skipped = {f"raster_{side}" for side in RASTER_SIDES if not widest - 3 <= side <= widest}
     for name in AGENTS:
         if name not in skipped:
-            evaluate(find_player(name, options), options)
-    for path in sorted(POLICIES.glob("*.json")):
+            evaluate(find_player(name, options), options, console)
+    for path in sorted(policies_folder().glob("*.json")):
         described = json.loads(path.read_text(encoding="utf-8"))
-        if home_scene(described["env_id"], described["env_kwargs"]) == options.scene:
-            evaluate(policy_player(path.with_suffix(".safetensors"), options), options)
+        if home_scene(described["env_id"], described["env_kwargs"]) == scene:
+            evaluate(policy_player(path.with_suffix(".safetensors"), options), options, console)
 
 
-def find_player(name: str, options: argparse.Namespace) -> Player:
+def find_player(name: str, options: ScoringOptions) -> Player:
     """The player of a name: a site search, a script of another environment, an oracle, or MODULE:CLASS.
 
     Raises:
         ValueError: an unknown name, or a class that is not there.
     """
-    command, ours = f"python -m agents.evaluate --agent {name}", Path(__file__).resolve().parent
+    command, ours = f"surgsim evaluate --agent {name}", Path(__file__).resolve().parent
     if ":" in name:
         return _strangers_player(name, options)
     if name in ORACLES:
@@ -291,16 +231,19 @@ def find_player(name: str, options: argparse.Namespace) -> Player:
         # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
     files = (Path(site_search.__file__),)
-    return Player(name, AgentActor(make), SITES, kwargs, command, files, **_declared(make()))
+    return Player(name, AgentActor(make), SITES, kwargs, command, files, *_declared(make()))
 
 
-def _strangers_player(name: str, options: argparse.Namespace) -> Player:
+def _strangers_player(name: str, options: ScoringOptions) -> Player:
     make, env_id = named_class(name, "--agent"), options.env or SITES
-    kwargs = {**_places(options, PLACES if env_id == SITES else {}), **options.env_arguments}
-    command = f"python -m agents.evaluate --agent {name}" + f" --env {env_id}" * (env_id != SITES)
-    command += f" --env-arguments '{json.dumps(options.env_arguments)}'" * bool(options.env_arguments)
+    kwargs = {**_places(options, PLACES if env_id == SITES else {}), **options.env_kwargs}
+    command = f"surgsim evaluate --agent {name}" + f" --env {env_id}" * (env_id != SITES)
+    command += f" --env-arguments '{json.dumps(options.env_kwargs)}'" * bool(options.env_kwargs)
     command += _place_options(_places(options, {}))
-    agent = make()
+    try:
+        agent = make()
+    except TypeError as error:
+        raise ValueError(f"--agent {name}: it is made without arguments, and that failed: {error}") from None
     for method in ("reset", "act"):
         if not callable(getattr(agent, method, None)):
             raise ValueError(f"--agent {name}: it has no method {method}; docs/own_agent.md says what an agent has")
@@ -308,14 +251,15 @@ def _strangers_player(name: str, options: argparse.Namespace) -> Player:
     file = inspect.getsourcefile(type(agent))
     files = () if file is None else (Path(file),)
     actor = AgentActor(make, facts)
-    return Player(name.replace(":", "."), actor, env_id, kwargs, command, files, ours=False, **_declared(agent))
+    return Player(name.replace(":", "."), actor, env_id, kwargs, command, files, *_declared(agent), ours=False)
 
 
-def _declared(agent: Any) -> dict[str, bool]:
-    return {"sees_truth": sees_truth(agent), "own_estimate": estimates_itself(agent)}
+def _declared(agent: Any) -> tuple[bool, bool]:
+    """`sees_truth` and `own_estimate` of a `Player`."""
+    return sees_truth(agent), estimates_itself(agent)
 
 
-def _places(options: argparse.Namespace, defaults: dict[str, str]) -> dict[str, Any]:
+def _places(options: ScoringOptions, defaults: dict[str, str]) -> dict[str, Any]:
     """Scene, level and split as the options or else the defaults have them; else they are the environment's own.
 
     A family of organs is scored on its test split.
@@ -332,9 +276,21 @@ def _place_options(kwargs: dict[str, Any]) -> str:
     return "".join(f" --{name} {told[name]}" for name in (*PLACES, "split") if name in told)
 
 
-def policy_player(path: Path, options: argparse.Namespace) -> Player:
-    """A trained policy on its own environment, or on the scene and level of the options where it can play them."""
-    from agents.training.policy_files import load_policy
+def policy_player(path: Path, options: ScoringOptions) -> Player:
+    """A trained policy on its own environment, or on the scene and level of the options where it can play them.
+
+    Args:
+        path: of its file, or the name of a shipped policy.
+        options: of the evaluation.
+
+    Raises:
+        ValueError: no such policy, or one that cannot play there.
+    """
+    from surgsim_env.training.policy_files import load_policy
+
+    shipped = policies_folder() / f"{path}.safetensors"
+    if not path.exists() and shipped.is_file():
+        path = shipped
 
     policy = load_policy(path, trust_pickle=options.trust_pickle)
     env_id = policy.description.env_id
@@ -346,18 +302,18 @@ def policy_player(path: Path, options: argparse.Namespace) -> Player:
         )
     own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
     kwargs = {**own, **_places(options, {})}
-    command = f"python -m agents.evaluate --policy {_from_here(path)}"
+    command = f"surgsim evaluate --policy {_from_here(path)}"
     # The level always, the scene where it is another than that of the training.
     told = {name: value for name, value in kwargs.items() if name == "level" or value != own.get(name)}
-    policy.reset(min(options.envs, len(options.seeds)))
+    policy.reset(min(options.envs, len(options.played_seeds)))
 
     def check(env: gym.Env) -> None:
         policy.check_environment(env, f"policy {path}")
         if options.video is not None:
-            from agents.scoring.policy_video import film
+            from surgsim_env.scoring.policy_video import film
 
-            film(policy, _arguments(player, options), options.seeds[: options.video_episodes], options.video)
-            policy.reset(min(options.envs, len(options.seeds)))
+            film(policy, _arguments(player, options), options.played_seeds[: options.video_episodes], options.video)
+            policy.reset(min(options.envs, len(options.played_seeds)))
 
     files = (path, path.with_suffix(".json"))
     player = Player(
@@ -369,10 +325,10 @@ def policy_player(path: Path, options: argparse.Namespace) -> Player:
 
 
 def _is_ours(path: Path) -> bool:
-    return path.resolve().parent == POLICIES
+    return path.resolve().parent == policies_folder()
 
 
-def _arguments(player: Player, options: argparse.Namespace) -> dict[str, Any]:
+def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
     """The environment's arguments, with those that options add.
 
     Raises:
@@ -395,9 +351,9 @@ def _arguments(player: Player, options: argparse.Namespace) -> dict[str, Any]:
     return kwargs
 
 
-def evaluate(player: Player, options: argparse.Namespace) -> Result:
+def evaluate(player: Player, options: ScoringOptions, console: Console) -> Result:
     """Play the seeds of the options; print the result and write it where it belongs."""
-    kwargs, seeds, env_id, actor = _arguments(player, options), options.seeds, player.env_id, player.actor
+    kwargs, seeds, env_id, actor = _arguments(player, options), options.played_seeds, player.env_id, player.actor
     name = player.name + "_untracked" * options.no_tracking
     rng = np.random.default_rng(BOOTSTRAP_SEED)
     count = 1 if actor is None else min(options.envs, len(seeds))
@@ -408,33 +364,17 @@ def evaluate(player: Player, options: argparse.Namespace) -> Result:
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
     player.check(first)
     origin = describe_origin(first, player.files, "float64" if actor is None else options.dtype)
-    start, bar = time.perf_counter(), tqdm(desc=name, unit=" steps", mininterval=PROGRESS_EVERY)
-    scored: dict[str, Any]
-    if actor is not None and env_id == SITES:
-        presses, budget = play_sites(actor, envs, seeds, bar.update), first.task.budget
-        line = SUCCESS_ERROR * first.task.tip_scale
-        succeeded = [bool(press_errors(record, budget)[-1] <= line) for record in presses]
-        share = {"success": np.array(succeeded, dtype=np.float64)}
-        scored = {
-            "budget": budget,
-            "figures": {**score(presses, budget, rng), **with_intervals(share, rng)},
-            "errors_mm": [np.round(1000.0 * press_errors(record, budget), 2).tolist() for record in presses],
-            "lesion_counts": [len(record.truth) for record in presses],
-        }
-    else:
-        control_step, soft_force = first.scene.timing.control_step, first.scene.limits.soft_force
-        if actor is None:
-            single = gym.make(env_id, **kwargs)
-            records = play_scripts(single, seeds, tracks=not options.no_tracking, progress=bar.update)
+    start = time.perf_counter()
+    with StepProgress(console) as shown, shown.step(f"{name}, {len(seeds)} episodes", total=len(seeds)) as ended:
+        if actor is not None and env_id == SITES:
+            succeeded, scored = _site_scores(play_sites(actor, envs, seeds, ended), first.task, rng)
+        elif actor is not None:
+            succeeded, scored = _task_scores(play_tasks(actor, envs, seeds, ended), first, rng)
         else:
-            records = play_tasks(actor, envs, seeds, bar.update)
-        succeeded = [bool(record.last["success"]) for record in records]
-        scored = {
-            "budget": first.task.episode_steps or 0,
-            "figures": task_figures(records, control_step, soft_force, rng),
-        }
+            single = gym.make(env_id, **kwargs)
+            records = play_scripts(single, seeds, tracks=not options.no_tracking, progress=ended)
+            succeeded, scored = _task_scores(records, first, rng)
     taken = time.perf_counter() - start
-    bar.close()
     envs.close()
     result = Result(
         method=name,
@@ -451,49 +391,72 @@ def evaluate(player: Player, options: argparse.Namespace) -> Result:
         **scored,
     )
     path = _write(result, player, options)
-    shown = {name: figure.value for name, figure in result.figures.items()}
+    values = {name: figure.value for name, figure in result.figures.items()}
     printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
-    figures = ", ".join(f"{name} {shown[name]:.3g}" for name in printed if shown.get(name) is not None)
+    figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
     where = "not written (--results FOLDER or --submit FILE does)" if path is None else f"-> {path}"
-    print(f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}", flush=True)
+    _say(console, f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}")
     return result
 
 
-def _write(result: Result, player: Player, options: argparse.Namespace) -> Path | None:
+def _site_scores(presses: list[PalpationRecord], task: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
+    """Whether each episode of presses succeeded, and the entries of a `Result` that follow from them."""
+    line = SUCCESS_ERROR * task.tip_scale
+    succeeded = [bool(press_errors(record, task.budget)[-1] <= line) for record in presses]
+    share = {"success": np.array(succeeded, dtype=np.float64)}
+    return succeeded, {
+        "budget": task.budget,
+        "figures": {**score(presses, task.budget, rng), **with_intervals(share, rng)},
+        "errors_mm": [np.round(1000.0 * press_errors(record, task.budget), 2).tolist() for record in presses],
+        "lesion_counts": [len(record.truth) for record in presses],
+    }
+
+
+def _task_scores(records: list[TaskRecord], env: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
+    """Whether each episode of control steps succeeded, and the entries of a `Result` that follow from them."""
+    return [bool(record.last["success"]) for record in records], {
+        "budget": env.task.episode_steps or 0,
+        "figures": task_figures(records, env.scene.timing.control_step, env.scene.limits.soft_force, rng),
+    }
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+def _write(result: Result, player: Player, options: ScoringOptions) -> Path | None:
     """Write a result where it belongs; agents/results holds the project's own methods on all evaluation seeds alone."""
     if options.submit is not None:
         result.write(options.submit)
         return options.submit
     if options.results is not None:
-        path = result.save(options.results)
-    elif player.ours and result.seeds == tuple(EVALUATION_SEEDS):
-        path = result.save(RESULTS)
-    else:
-        return None
-    if path.parent.resolve() == RESULTS:
-        write_leaderboard()
-        draw_leaderboard(load_results(), IMAGES)
-    return path
+        return result.save(options.results)
+    if player.ours and options.all_seeds and _checkout() is not None:
+        return result.save(shipped_results())
+    return None
 
 
-def print_comparison(one: str, other: str, options: argparse.Namespace) -> None:
+def print_comparison(one: str, other: str, options: ScoringOptions, console: Console) -> None:
     """Print the differences of two methods, each a file, a method's name, or a name that training seeds share."""
     groups = [_group(name, options) for name in (one, other)]
     names = [Path(name).stem if name.endswith(".json") else name for name in (one, other)]
-    first, differences = groups[0][0], compare(*groups, np.random.default_rng(BOOTSTRAP_SEED))
-    print(f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap")
+    first, differences = groups[0][0], compare(groups[0], groups[1], np.random.default_rng(BOOTSTRAP_SEED))
+    _say(
+        console,
+        f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap",
+    )
     for name, group in zip(names, groups, strict=True):
         if len(group) > 1:
-            print(f"{name}: mean over {len(group)} training seeds")
+            _say(console, f"{name}: mean over {len(group)} training seeds")
     for difference in differences:
-        print(describe(difference, *names))
+        _say(console, describe(difference, *names))
 
 
-def _group(name: str, options: argparse.Namespace) -> list[Result]:
+def _group(name: str, options: ScoringOptions) -> list[Result]:
     """The results of a file or of a name: one, or one for each seed of a training."""
     if name.endswith(".json"):
         return [load_result(Path(name))]
-    folder = options.results or RESULTS
+    folder = options.results or shipped_results()
     wanted = _places(options, PLACES)
     named = [one for one in load_results(folder) if name in (one.method, family(one.method))]
     # An environment without a choice of scene or level has neither.
@@ -514,7 +477,7 @@ def _group(name: str, options: argparse.Namespace) -> list[Result]:
     return found
 
 
-def check(path: Path, options: argparse.Namespace) -> None:
+def check(path: Path, console: Console) -> None:
     """Say whether a result can be compared with those made here.
 
     Raises:
@@ -524,13 +487,16 @@ def check(path: Path, options: argparse.Namespace) -> None:
     faults = list(check_origin(result, _files_here(result)))
     if faults:
         raise ValueError(f"{path} cannot be compared with results made here: {'; '.join(faults)}")
-    print(f"{path}: {result.method} on {result.place}, seeds {seeds_text(result.seeds)}: the environment is the same")
+    _say(
+        console,
+        f"{path}: {result.method} on {result.place}, seeds {seeds_text(result.seeds)}: the environment is the same",
+    )
 
 
 def _files_here(result: Result) -> list[Path]:
     """The agent's files that are in the working folder or in the project, for digests to be compared."""
     ours = Path(__file__).resolve().parent
-    folders = (Path(), ours, POLICIES, Path(oracle.__file__).parent)
+    folders = (Path(), ours, policies_folder(), Path(oracle.__file__).parent)
     return [
         next(folder / name for folder in folders if (folder / name).is_file())
         for name in map(str, result.origin.get("agent", {}))
@@ -538,16 +504,18 @@ def _files_here(result: Result) -> list[Path]:
     ]
 
 
-def write_reach(options: argparse.Namespace) -> None:
+def write_reach(options: ScoringOptions, console: Console) -> None:
     """Press over each lesion of the evaluation seeds, with and without it, and count those below the sensor's reach."""
     from surgsim_env.palpation.scores import lesion_reaches
 
     kwargs = _places(options, PLACES)
     env = gym.make(SITES, **kwargs).unwrapped
     reaches = []
-    for seed in tqdm(options.seeds, desc="reach", mininterval=PROGRESS_EVERY):
-        env.reset(seed=seed)
-        reaches += lesion_reaches(env.task.anatomy, env.task.drawn)  # type: ignore[attr-defined]
+    with StepProgress(console) as shown, shown.step("reach", total=len(options.played_seeds)) as ended:
+        for seed in options.played_seeds:
+            env.reset(seed=seed)
+            reaches += lesion_reaches(env.task.anatomy, env.task.drawn)  # type: ignore[attr-defined]
+            ended(1)
     table = {
         **kwargs,
         "lesions": len(reaches),
@@ -555,25 +523,17 @@ def write_reach(options: argparse.Namespace) -> None:
         "noise": reaches[0].noise,
         "differences": [round(reach.force - reach.force_without, 5) for reach in reaches],
     }
-    print(f"{table['below']} of {table['lesions']} lesions below reach", flush=True)
-    folder = options.results or (RESULTS if options.seeds == tuple(EVALUATION_SEEDS) else None)
+    _say(console, f"{table['below']} of {table['lesions']} lesions below reach")
+    folder = options.results or (shipped_results() if options.all_seeds and _checkout() is not None else None)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"reach_PalpateSites_{kwargs['scene']}_{kwargs['level']}.json"
         path.write_text(json.dumps(table) + "\n", encoding="utf-8")
-        print(f"-> {path}")
+        _say(console, f"-> {path}")
 
 
-def _seeds(text: str) -> tuple[int, ...]:
-    try:
-        return read_seeds(text)
-    except ValueError as error:
-        # Of a ValueError argparse would not show the text.
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _with_options(command: str, options: argparse.Namespace) -> str:
-    command += "" if options.seeds == tuple(EVALUATION_SEEDS) else f" --seeds {seeds_text(options.seeds)}"
+def _with_options(command: str, options: ScoringOptions) -> str:
+    command += "" if options.all_seeds else f" --seeds {seeds_text(options.played_seeds)}"
     command += "" if options.budget is None else f" --budget {options.budget}"
     command += "" if options.motion is None else f" --motion {options.motion}"
     command += " --no-tracking" * options.no_tracking
@@ -590,10 +550,12 @@ def _without_folders(kwargs: dict[str, Any]) -> dict[str, Any]:
 
 def _from_here(path: Path) -> str:
     """The path relative to the checkout, so that no machine's folders are written."""
-    absolute, checkout = path.resolve(), POLICIES.parent.parent
-    return absolute.relative_to(checkout).as_posix() if absolute.is_relative_to(checkout) else path.name
+    absolute, checkout = path.resolve(), _checkout()
+    inside = checkout is not None and absolute.is_relative_to(checkout)
+    return absolute.relative_to(checkout).as_posix() if inside else path.name  # type: ignore[arg-type]
 
 
-if __name__ == "__main__":
-    with one_line_errors(__name__, "agents"):
-        main()
+def _checkout() -> Path | None:
+    """The folder of the checkout that this package belongs to; None where it is installed."""
+    folder = agents_folder().parent
+    return folder if (folder / "pyproject.toml").is_file() else None

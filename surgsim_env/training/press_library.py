@@ -1,14 +1,11 @@
 """A library of presses: organs drawn as SurgSim/PalpateSites-v0 draws them, each pressed at every site of a grid.
 
-    python -m agents.press_library --scene phantom --level standard --organs 400 --out runs/phantom_standard.npz
-
-Hours of simulation, done once; training then looks presses up (`PressLibraryEnv`): task, sensor, estimator and rewards
-are the environment's own code. A stopped run continues where it ended, and a library can be used while it grows;
-agents/training/press_library_sample.npz is a small one. Scores are computed on the environment itself, never on the
-library.
+Hours of simulation, done once (`agents/make_press_library.py`); training then looks presses up (`PressLibraryEnv`):
+task, sensor, estimator and rewards are the environment's own code. A stopped run continues where it ended, and a
+library can be used while it grows; press_library_sample.npz beside this file is a small one. Scores are computed on the
+environment itself, never on the library.
 """
 
-import argparse
 import os
 import time
 from dataclasses import dataclass
@@ -77,7 +74,7 @@ def load_library(path: str | Path) -> PressLibrary:
             return PressLibrary(str(file["scene"]), str(file["level"]), organs, presses)
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(
-            f"{path} is not a library of presses ({error}): make one with python -m agents.press_library"
+            f"{path} is not a library of presses ({error}): make one with python -m agents.make_press_library"
         ) from None
 
 
@@ -222,18 +219,3 @@ class PressLibraryEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             **measures,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }
-
-
-def main() -> None:
-    """Make a library, or continue one."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", default="phantom")
-    parser.add_argument("--level", default="standard")
-    parser.add_argument("--organs", type=int, default=400)
-    parser.add_argument("--out", type=Path, default=Path("runs/library.npz"))
-    arguments = parser.parse_args()
-    make_library(arguments.out, arguments.scene, arguments.level, arguments.organs)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,69 @@
+"""`surgsim evaluate`: score a method on fixed seeds, or compare two results."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+
+from surgsim_env.cli.values import MaybePath, MaybeText, missing_packages
+from surgsim_env.scoring.options import ScoringOptions
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score a method on fixed seeds: a search or a script by name, a trained policy, or an agent of your own.
+
+    Give one of --agent, --policy, --all, --reach, --compare and --check. Results, the agents' interface and what makes
+    a score comparable: docs/own_agent.md. Reading NAME.safetensors runs no code of its author; a zip of
+    stable-baselines3 is read with --trust-pickle only.
+    """
+
+    agent: MaybeText = None
+    """MODULE:CLASS, or a name such as gp_ucb, raster_4, sobol, random, oracle (an unknown one lists all)."""
+    policy: MaybePath = None
+    """A shipped policy by name, or NAME.safetensors with NAME.json beside it."""
+    all: bool = False
+    """Every search, and every shipped policy for this scene."""
+    reach: bool = False
+    """Count the lesions below the sensor's reach."""
+    compare: tuple[str, str] | None = None
+    """Two methods of --results on this scene and level, or two files."""
+    check: MaybePath = None
+    """Whether this result can be compared with those made here."""
+    options: ScoringOptions = field(default_factory=ScoringOptions)
+
+    def run(self, console: Console) -> int:
+        """Play, print and write; returns 0.
+
+        Raises:
+            ValueError: not one of the six, options that do not go with it, a missing package, an unknown method.
+        """
+        asked = [name for name in ("agent", "policy", "all", "reach", "compare", "check") if getattr(self, name)]
+        if len(asked) != 1:
+            told = " and ".join(f"--{name}" for name in asked) or "none"
+            raise ValueError(f"give one of --agent, --policy, --all, --reach, --compare, --check; given: {told}")
+        options = self.options
+        if options.video is not None and self.policy is None:
+            raise ValueError("--video films a policy: give --policy as well")
+        if options.submit is not None and self.agent is None and self.policy is None:
+            raise ValueError("--submit writes one result: give --agent or --policy as well")
+        if (options.env or options.env_kwargs) and ":" not in (self.agent or ""):
+            raise ValueError(
+                "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"
+            )
+        from surgsim_env.scoring import evaluate
+
+        with missing_packages("evaluate", "agents"):
+            if self.agent is not None:
+                evaluate.evaluate(evaluate.find_player(self.agent, options), options, console)
+            elif self.policy is not None:
+                evaluate.evaluate(evaluate.policy_player(Path(self.policy), options), options, console)
+            elif self.all:
+                evaluate.evaluate_all(options, console)
+            elif self.reach:
+                evaluate.write_reach(options, console)
+            elif self.compare is not None:
+                evaluate.print_comparison(*self.compare, options, console)
+            elif self.check is not None:
+                evaluate.check(self.check, console)
+        return 0

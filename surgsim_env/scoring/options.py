@@ -1,0 +1,88 @@
+"""Where and how `surgsim evaluate` plays a method, as its options say."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from surgsim_env.palpation.scores import EVALUATION_SEEDS
+from surgsim_env.scene.model import SPLITS
+from surgsim_env.scoring.results import read_seeds
+
+
+@dataclass(frozen=True)
+class ScoringOptions:
+    """Options of an evaluation; None is the method's own choice."""
+
+    scene: str | None = None
+    """Default: phantom; for a policy, that of its training."""
+    level: str | None = None
+    """Default: standard; for a policy, that of its training."""
+    split: str | None = None
+    """Of a family of organs: train, validation or test (the default)."""
+    motion: str | None = None
+    """How the patient moves; default: as the scene says."""
+    no_tracking: bool = False
+    """Presses and oracles go where the surface is at rest, as it moves."""
+    seeds: str | None = None
+    """FIRST:LAST or A,B,C; default: the evaluation seeds."""
+    episodes: int | None = None
+    """Play the first of the seeds, so many."""
+    budget: int | None = None
+    """Presses of an episode, in place of the environment's own."""
+    envs: int = 16
+    """Organs side by side."""
+    threads: int = 1
+    """Threads that share them."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Of the lanes."""
+    env: str | None = None
+    """The environment of --agent MODULE:CLASS; default: SurgSim/PalpateSites-v0."""
+    env_arguments: str = "{}"
+    """Of the environment of --agent MODULE:CLASS, as a JSON object."""
+    trust_pickle: bool = False
+    """Let --policy be a zip, which runs any code of its author."""
+    results: Path | None = None
+    """Folder of result files; default: agents/results of a checkout."""
+    submit: Path | None = None
+    """Write the result into this file, and nowhere else."""
+    video: Path | None = None
+    """Film the first episodes of a policy into this mp4 file."""
+    video_episodes: int = 3
+    """Episodes in the film."""
+
+    def __post_init__(self) -> None:
+        if self.split is not None and self.split not in SPLITS:
+            raise ValueError(f"--split is {self.split!r}; it is one of {', '.join(SPLITS)}")
+        for name in ("envs", "threads", "video_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+        given = EVALUATION_SEEDS if self.seeds is None else read_seeds(self.seeds)
+        if self.episodes is not None and not 1 <= self.episodes <= len(given):
+            raise ValueError(f"--episodes is {self.episodes}; there are 1 to {len(given)} seeds")
+        if not isinstance(self.env_arguments, str) or not isinstance(_json(self.env_arguments), dict):
+            raise ValueError(f"--env-arguments is {self.env_arguments!r}; it must be a JSON object")
+
+    @cached_property
+    def played_seeds(self) -> tuple[int, ...]:
+        """Seeds of the episodes."""
+        given = EVALUATION_SEEDS if self.seeds is None else read_seeds(self.seeds)
+        return tuple(given)[: self.episodes]
+
+    @property
+    def all_seeds(self) -> bool:
+        """Whether all evaluation seeds are played, and no others."""
+        return self.played_seeds == tuple(EVALUATION_SEEDS)
+
+    @cached_property
+    def env_kwargs(self) -> dict[str, Any]:
+        """`env_arguments` as a dictionary."""
+        return _json(self.env_arguments)
+
+
+def _json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return None

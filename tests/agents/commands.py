@@ -1,0 +1,15 @@
+"""`surgsim` commands of agents, in this process."""
+
+import contextlib
+import io
+
+from surgsim_env.cli.main import main
+
+
+def surgsim(*arguments: str) -> None:
+    """Run a command; what it says as an error is raised as a ValueError."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said):
+        status = main(arguments)
+    if status:
+        raise ValueError(said.getvalue())

@@ -16,6 +16,7 @@ import atexit
 import functools
 import hashlib
 import io
+import logging
 import os
 import shutil
 import stat
@@ -33,6 +34,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.target_extension import dispatcher_registry, target_registry
 from numba.misc.appdirs import AppDirs
 
+LOGGER = logging.getLogger("msdm_core")
 KERNEL_FILES = "*kernels.py"
 FOLDER_PREFIX = "surgsim-kernels-"
 STALE_AGE = 7 * 24 * 3600.0  # [s]
@@ -241,7 +243,21 @@ class HealingCache(FunctionCache):
             _warn_of_no_room(str(Path(self._cache_path).parents[1]), error.strerror or str(error))
 
 
-class HealingDispatcher(CPUDispatcher):
+class KernelDispatcher(CPUDispatcher):
+    """A compiled function that says when compiling takes long, and refuses calls from Python if it has no wrapper."""
+
+    def __init__(self, py_func: Any, *given: Any, **options: Any) -> None:
+        super().__init__(py_func, *given, **options)
+        if self.targetoptions.get("no_cpython_wrapper"):
+            self.__class__ = {HealingDispatcher: InnerHealing, UncachedDispatcher: InnerUncached}[type(self)]
+
+    def compile(self, sig: Any) -> Any:
+        """Load or compile the function for a signature."""
+        with COMPILING.one():
+            return super().compile(sig)
+
+
+class HealingDispatcher(KernelDispatcher):
     """A compiled function with a `HealingCache`."""
 
     def enable_caching(self) -> None:
@@ -254,11 +270,54 @@ class HealingDispatcher(CPUDispatcher):
             _warn_of_no_room(str(Path(config.CACHE_DIR).parent), str(error))  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class UncachedDispatcher(CPUDispatcher):
+class UncachedDispatcher(KernelDispatcher):
     """A compiled function that is not kept, although it was declared with `cache=True`."""
 
     def enable_caching(self) -> None:
         """Keep nothing."""
+
+
+class _Inner:
+    """A compiled function without a wrapper for Python: numba's own call would jump to address 0."""
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        raise TypeError(
+            f"{self.__name__} is called by compiled code alone (no_cpython_wrapper): decorate it with KERNEL or "  # type: ignore[attr-defined]
+            "INLINED_KERNEL of msdm_core/kernels/option_kernels.py to call it from Python"
+        )
+
+
+class InnerHealing(_Inner, HealingDispatcher):
+    """`HealingDispatcher` of a function that compiled code alone calls."""
+
+
+class InnerUncached(_Inner, UncachedDispatcher):
+    """`UncachedDispatcher` of a function that compiled code alone calls."""
+
+
+class CompilingMessage:
+    """Logs once that functions are compiled, when that has taken longer than `patience` [s], and when it is over."""
+
+    def __init__(self, patience: float) -> None:
+        self._patience = patience
+        self._depth, self._begin, self._said = 0, 0.0, False
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Around the compiling of one function, with all that it calls."""
+        if self._depth == 0:
+            self._begin, self._said = time.monotonic(), False
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            spent = time.monotonic() - self._begin
+            if spent > self._patience and not self._said:
+                self._said = True
+                LOGGER.warning("surgsim: compiling for this processor, once: up to a minute ...")
+            if self._said and self._depth == 0:
+                LOGGER.warning("surgsim: compiled in %.0f s", spent)
 
 
 def _verify(path: str) -> None:
@@ -338,4 +397,6 @@ def _remove(folder: Path, maker: int) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+# Anything that takes more than 2 s says so.
+COMPILING = CompilingMessage(2.0)
 CACHE_FOLDER = provide_cache_folder(Path(__file__).resolve().parent)

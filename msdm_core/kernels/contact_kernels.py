@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
+from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, KERNEL
+
 # Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
 CANDIDATE_MARGIN = 1e-3
 
@@ -36,7 +38,7 @@ PLACE_WIDTH = 5
 SWEEPS = (1.0, 2.0, 2.0)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def find_candidates(model, state, shapes, duration):
     """Broad phase of one call: the triangles that a shape may touch within a duration, by bounding boxes and spheres.
 
@@ -88,7 +90,7 @@ def find_candidates(model, state, shapes, duration):
     return most
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz):
     """Stretch of a spring across a normal that sticks to a surface: u + dt v, without its part along n.
 
@@ -102,14 +104,14 @@ def stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz):
     return ux - along * nx, uy - along * ny, uz - along * nz
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def slipped(ux, uy, uz, longest):
     """Factor on a stretch u [m] that slips where it is longer than `longest` = mu p / k_t [m] (Coulomb); at most 1."""
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
     return longest / length if length > longest else 1.0
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
     """`stretched`, then shortened to `longest` [m] where it slips."""
     ux, uy, uz = stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz)
@@ -117,7 +119,7 @@ def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
     return kept * ux, kept * uy, kept * uz
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
     """Contact forces of every shape on its candidate triangles as they are now, and the reaction on the tools.
 
@@ -264,7 +266,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
     return count
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wrench):
     """Make contact implicit: pressure and friction of each quadrature point at the END of the substep.
 
@@ -406,7 +408,7 @@ def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wre
                 hold[node] = 0.0
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _extent(ends, spans, shape, axis, around):
     """Lowest and highest coordinate of the core of a shape, widened by `around` [m]."""
     first, second = ends[shape, 0, axis], ends[shape, 1, axis]
@@ -414,20 +416,20 @@ def _extent(ends, spans, shape, axis, around):
     return min(first, second) - around, max(first, second) + around
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _overlap(position, axis, a, b, c, low, high):
     """Whether a triangle reaches into an interval of one coordinate."""
     first, second, third = position[a, axis], position[b, axis], position[c, axis]
     return max(first, second, third) >= low and min(first, second, third) <= high
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _span(position, a, b):
     """From one node to another [m]."""
     return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _mean(values, a, b, c, wa, wb, wc):
     """Three nodes' values by their weights."""
     x = wa * values[a, 0] + wb * values[b, 0] + wc * values[c, 0]
@@ -436,7 +438,7 @@ def _mean(values, a, b, c, wa, wb, wc):
     return x, y, z
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _tool_velocity(twist, centre, tool, x, y, z):
     """Velocity of a tool at a point [m/s]."""
     ox = x - centre[tool, 0]
@@ -448,7 +450,7 @@ def _tool_velocity(twist, centre, tool, x, y, z):
     return vx, vy, vz
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _middle(position, a, b, c):
     """Centroid of a triangle [m], and the square of the radius around it that holds its corners [m^2]."""
     x = (position[a, 0] + position[b, 0] + position[c, 0]) / 3.0
@@ -460,7 +462,7 @@ def _middle(position, a, b, c):
     return x, y, z, max(to_a, to_b, to_c)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _is_held(engaged, shape, triangle):
     """Whether a shape holds any point of a triangle."""
     first = triangle * QUADRATURE_COUNT
@@ -470,7 +472,7 @@ def _is_held(engaged, shape, triangle):
     return False
 
 
-@njit(forceinline=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED_KERNEL)
 def closest_on_axis(ends, shape, x, y, z):
     """The point of the axis of a shape that is nearest to a point.
 
@@ -490,7 +492,7 @@ def closest_on_axis(ends, shape, x, y, z):
     return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def closest_on_core(ends, spans, shape, x, y, z):
     """The point of the core of a shape that is nearest to a point: on its axis, and across it in a rounded box.
 
@@ -510,7 +512,7 @@ def closest_on_core(ends, spans, shape, x, y, z):
     return px, py, pz
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _release(engaged, stretch_memory, shape, item):
     """Forget the contact of one quadrature point with one shape."""
     engaged[shape, item] = 0
@@ -519,7 +521,7 @@ def _release(engaged, stretch_memory, shape, item):
     stretch_memory[shape, item, 2] = 0.0
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _put_slope(rows, number, corner, weight, along_n, gx, gy, gz, nx, ny, nz):
     """Write the slope of a point's penetration with one corner into its row, weight g + along_n n."""
     rows[number, ROW_SLOPE + 3 * corner] = weight * gx + along_n * nx
@@ -527,7 +529,7 @@ def _put_slope(rows, number, corner, weight, along_n, gx, gy, gz, nx, ny, nz):
     rows[number, ROW_SLOPE + 3 * corner + 2] = weight * gz + along_n * nz
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _push_corner(position, force, reference, wrench, tool, node, rows, number, corner, push, weight, ux, uy, uz):
     """One corner's share of a point's force, -push dg/dx - weight u [N], and the reaction to it."""
     fx = -push * rows[number, ROW_SLOPE + 3 * corner] - weight * ux
@@ -547,7 +549,7 @@ def _push_corner(position, force, reference, wrench, tool, node, rows, number, c
     wrench[tool, 5] -= ax * fy - ay * fx
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
     """Drop the part along a shape's core in which the nearest point (px, py, pz) lies strictly between its borders."""
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
@@ -576,7 +578,7 @@ def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
     return gx, gy, gz
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def stretch_by_lag(model, state, shapes, response, candidate_count):
     """Shift the stretch of sticking friction by each tool's lag, to where MuJoCo puts the tool at the end of the step.
 

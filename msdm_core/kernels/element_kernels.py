@@ -6,6 +6,7 @@ agree to the bit where they add in the same order.
 
 from numba import njit
 
+from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL
 from msdm_core.kernels.vector_kernels import any_below, below_zero, root
 
 # Below this volume ratio s a tet also bears the share K' of its volume term that is averaged at nodes, by a pressure
@@ -20,13 +21,13 @@ STEEP_EXCESS = 0.1
 STRAIN_LEAST = 1e-30
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def spring_length(dx, dy, dz):
     """Length of a spring [m]; d: from one end to the other [m]."""
     return root(dx * dx + dy * dy + dz * dz)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def spring_scale(share, stiffness):
     """Force over length of a linear spring, k (1 - l0 / l) (Sala 2011, eq. 1).
 
@@ -36,14 +37,14 @@ def spring_scale(share, stiffness):
     return stiffness * (1.0 - share)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def spring_energy(length, rest_length, stiffness):
     """Twice the energy of a linear spring, k (l - l0)^2 [J]."""
     change = length - rest_length
     return stiffness * change * change
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def strain_square(energy, softness):
     """Square of the equivalent strain of a node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs (`Stiffening`).
 
@@ -52,7 +53,7 @@ def strain_square(energy, softness):
     return energy * softness
 
 
-@njit(forceinline=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED_KERNEL)
 def node_law(square, onset, growth, excess):
     """Half the factor w'(s) / s of a node's springs on their linear tension, and what their tangent w'' is above 1.
 
@@ -69,7 +70,7 @@ def node_law(square, onset, growth, excess):
     return 0.5 + 0.5 * (excess * size / (strain + STRAIN_LEAST)), excess * growth * ramp * ramp
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def faded_share(duration, time):
     """Share of its tension that a Maxwell arm loses, 1 - exp(-x), x = duration / time, by exp's series to x^4.
 
@@ -80,7 +81,7 @@ def faded_share(duration, time):
     return 1.0 - 1.0 / (1.0 + x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0)))))
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def spring_drag(dx, dy, dz, vx, vy, vz, stiffness, beta):
     """Force over length that Rayleigh's beta adds to a spring, k beta (dl/dt) / l.
 
@@ -90,7 +91,7 @@ def spring_drag(dx, dy, dz, vx, vy, vz, stiffness, beta):
     return stiffness * beta * (dx * vx + dy * vy + dz * vz) / (dx * dx + dy * dy + dz * dz)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz):
     """Six times the gradients dV/dx of the volume of a tet at its corners b, c and d: cross products of its edges.
 
@@ -109,7 +110,7 @@ def tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz):
     return gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def six_volumes(bx, by, bz, gbx, gby, gbz):
     """Six times the volume of a tet: one edge times six times its gradient.
 
@@ -119,7 +120,7 @@ def six_volumes(bx, by, bz, gbx, gby, gbz):
     return bx * gbx + by * gby + bz * gbz
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def tet_shape(b, c, d):
     """Six times the gradients and six times the volume of a tet.
 
@@ -130,7 +131,7 @@ def tet_shape(b, c, d):
     return gradients, six_volumes(b[0], b[1], b[2], gradients[0], gradients[1], gradients[2])
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def six_rates(b, c, d, g):
     """Rate of six times the volume of a tet.
 
@@ -144,7 +145,7 @@ def six_rates(b, c, d, g):
     )
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     """Factor from `tet_gradients` to the forces of a tet on its corners: minus a sixth of its tension.
 
@@ -161,7 +162,7 @@ def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     return tension * (-1.0 / 6.0)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def volume_ratio(six_volume, inverse_volume):
     """Volume of a tet over its rest volume, V / V0.
 
@@ -170,7 +171,7 @@ def volume_ratio(six_volume, inverse_volume):
     return six_volume * (inverse_volume * (1.0 / 6.0))
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def node_tension(sum_of_six_volumes, inverse_volume, bulk):
     """Tension of the volume averaged at a node, K_a (J_a - 1) (averaged volumes: Bonet and Burton 1998).
 

@@ -22,6 +22,7 @@ from msdm_core.kernels.element_kernels import (
     volume_ratio,
 )
 from msdm_core.kernels.layout_kernels import add_to_corners, corner_mean
+from msdm_core.kernels.option_kernels import INLINED, KERNEL
 from msdm_core.kernels.vector_kernels import (
     any_below,
     define_extract,
@@ -56,7 +57,7 @@ _row_3 = define_shuffle([6, 7, 14, 15])
 _at_0, _at_1, _at_2, _at_3, _at_4, _at_5, _at_6, _at_7 = (define_extract(place) for place in range(GROUP))
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _columns(r0, r1, r2, r3, r4, r5, r6, r7):
     """Eight rows (x, y, z, -) as three vectors of eight."""
     r01, r23, r45, r67 = _join(r0, r1), _join(r2, r3), _join(r4, r5), _join(r6, r7)
@@ -64,7 +65,7 @@ def _columns(r0, r1, r2, r3, r4, r5, r6, r7):
     return _low_halves(low, high), _high_halves(low, high), _low_halves(_pick_z(r01, r23), _pick_z(r45, r67))
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _rows(x, y, z):
     """Three vectors of eight as eight rows (x, y, z, 0)."""
     nothing = z * 0.0
@@ -75,13 +76,13 @@ def _rows(x, y, z):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _edge(values, items, item, corner):
     """Row from corner 0 of an item to another of its corners."""
     return load_row(values, items[item, corner]) - load_row(values, items[item, 0])
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _edges(values, items, first, corner):
     """The same of eight items, as three vectors."""
     return _columns(
@@ -92,7 +93,7 @@ def _edges(values, items, first, corner):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _pull(force, items, item, pull):
     """Add a row to the first end of a spring and take it from the other."""
     i, j = items[item, 0], items[item, 1]
@@ -100,7 +101,7 @@ def _pull(force, items, item, pull):
     store_row(force, j, load_row(force, j) - pull)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _push(force, items, item, a, b, c, d):
     """Take a row from corner a of a tet and add one to each of the others."""
     at_a, at_b, at_c, at_d = items[item, 0], items[item, 1], items[item, 2], items[item, 3]
@@ -110,7 +111,7 @@ def _push(force, items, item, a, b, c, d):
     store_row(force, at_d, load_row(force, at_d) + d)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _give_way(arm_tension, arm, elastic, fade):
     """Let one arm of eight springs give way to their elastic tension over l0 [N/m]; returns its tension lost."""
     before = load_full(arm_tension, arm)
@@ -119,7 +120,7 @@ def _give_way(arm_tension, arm, elastic, fade):
     return after
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
     """`tissue_kernels.fade_arms` of eight springs."""
     second, third = springs + first, 2 * springs + first
@@ -129,13 +130,13 @@ def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
     store_full(relief, first, total)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _end_sum(pairs, items, item):
     """Sum of the second numbers of the pairs of a spring's two ends."""
     return pairs[items[item, 0], 1] + pairs[items[item, 1], 1]
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _end_sums(pairs, items, first):
     """The same of eight springs."""
     return pack(
@@ -146,14 +147,14 @@ def _end_sums(pairs, items, first):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _corner_sums(pairs, tets, tet):
     """Sum of the pairs of a tet's first two corners, the ends of its spring, and of all four."""
     ends = load_pair(pairs, tets[tet, 0]) + load_pair(pairs, tets[tet, 1])
     return ends, ends + load_pair(pairs, tets[tet, 2]) + load_pair(pairs, tets[tet, 3])
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _corner_means(tension, tets, first):
     """`corner_mean` of eight tets."""
     return pack(
@@ -164,7 +165,7 @@ def _corner_means(tension, tets, first):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _means_and_end_sums(pairs, tets, first):
     """Of eight tets the mean of the first numbers of the pairs at their corners, and `_end_sums` of their springs."""
     ends_0, all_0 = _corner_sums(pairs, tets, first)
@@ -185,14 +186,14 @@ def _means_and_end_sums(pairs, tets, first):
     return 0.25 * totals, ends
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _add_to_ends(pairs, items, item, value):
     """Add to the second numbers of the pairs of a spring's ends."""
     pairs[items[item, 0], 1] += value
     pairs[items[item, 1], 1] += value
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _add_energies(pairs, items, first, value):
     """Add the numbers of eight springs to their ends."""
     _add_to_ends(pairs, items, first, _at_0(value))
@@ -205,7 +206,7 @@ def _add_energies(pairs, items, first, value):
     _add_to_ends(pairs, items, first + 7, _at_7(value))
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _add_pairs(pairs, tets, tet, at_ends, elsewhere):
     """Add one pair to the first two corners of a tet and another to the other two."""
     a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
@@ -215,7 +216,7 @@ def _add_pairs(pairs, tets, tet, at_ends, elsewhere):
     store_pair(pairs, d, load_pair(pairs, d) + elsewhere)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _add_volumes_and_energies(pairs, tets, first, six, energy):
     """Add six times the volumes of eight tets at their corners, and twice the energies of their springs at the ends."""
     nothing = spread_like(pairs, 0.0)
@@ -231,7 +232,7 @@ def _add_volumes_and_energies(pairs, tets, first, six, energy):
     _add_pairs(pairs, tets, first + 7, _pair_3(high, high), _pair_3(high_six, high_six))
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """Energies of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_energies`.
 
@@ -248,7 +249,7 @@ def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, b
     return whole
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
     """`tissue_kernels.set_node_laws` of whole groups of nodes.
 
@@ -274,7 +275,7 @@ def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, ex
     return whole, stiffens, steepens
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count):
     """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
 
@@ -320,7 +321,7 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
     return whole, steep_count
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """Sums at nodes over whole groups of tets; arguments as in `tissue_kernels.sum_at_nodes`.
 
@@ -350,7 +351,7 @@ def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length
     return whole
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_tet_groups(
     position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed, law,
     steep_count,
@@ -421,7 +422,7 @@ def add_tet_groups(
     return whole, count, steep_count
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _keep(low, ratio):
     """Remember a volume ratio where it is the smallest yet."""
     if not ratio >= low[0]:

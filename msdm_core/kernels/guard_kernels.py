@@ -6,6 +6,7 @@ from typing import NamedTuple
 from numba import njit
 
 from msdm_core.kernels.contact_kernels import closest_on_axis
+from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER, KERNEL
 
 # The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
 GUARD_SHARE = 0.6
@@ -35,7 +36,7 @@ class _NearPoint(NamedTuple):
     stiffness: float
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def guard_axes(model, state, shapes, law, response, dt, candidate_count, reference, wrench):
     """Keep the surface off the axes of the shapes, which the quadrature points alone may let pass.
 
@@ -116,7 +117,7 @@ def guard_axes(model, state, shapes, law, response, dt, candidate_count, referen
     return kept
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near):
     """The guard's push on a point of a triangle, with the speed and mobility that it has in this substep.
 
@@ -173,7 +174,7 @@ def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
     wrench[tool, 5] -= x * fy - y * fx
 
 
-@njit(cache=True, nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _passed(shapes, shape, position, velocity, dt, a, b, c):
     """Whether an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
     ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]
@@ -201,7 +202,7 @@ def _passed(shapes, shape, position, velocity, dt, a, b, c):
     return highest > 0.0 > lowest and _is_inside(highest, highest_b, highest_c, lowest, lowest_b, lowest_c)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _foot(x, y, z, position, velocity, dt, a, b, c):
     """Of a point over a triangle as it was dt ago: height [m], and its foot's weights of the corners b and c."""
     ax = position[a, 0] - dt * velocity[a, 0]
@@ -225,7 +226,7 @@ def _foot(x, y, z, position, velocity, dt, a, b, c):
     return (px * nx + py * ny + pz * nz) / math.sqrt(squared), wb, wc
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _is_inside(high, high_b, high_c, low, low_b, low_c):
     """Whether the way from a height above a triangle to one below it leads through it, its edges included."""
     share = high / (high - low)
@@ -234,7 +235,7 @@ def _is_inside(high, high_b, high_c, low, low_b, low_c):
     return wb >= -EDGE_WIDTH and wc >= -EDGE_WIDTH and wb + wc <= 1.0 + EDGE_WIDTH
 
 
-@njit(forceinline=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED_KERNEL)
 def closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
     """The point of a triangle that is nearest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
 

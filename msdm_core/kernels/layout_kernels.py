@@ -10,6 +10,7 @@ known when a function is compiled, which drops the other branch of each `if len(
 import numpy as np
 from numba import njit
 
+from msdm_core.kernels.option_kernels import INLINED, KERNEL
 from msdm_core.kernels.vector_kernels import (
     define_extract,
     keep_lower,
@@ -23,7 +24,7 @@ from msdm_core.kernels.vector_kernels import (
 _at_0, _at_1, _at_2 = define_extract(0), define_extract(1), define_extract(2)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def load_item(lanes, values, item):
     """An item's number, or the vector of all organs' numbers of it."""
     if len(lanes) == 0:
@@ -31,7 +32,7 @@ def load_item(lanes, values, item):
     return load_lanes(lanes, values, item)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def store_item(lanes, values, item, value):
     """Write what `load_item` reads."""
     if len(lanes) == 0:
@@ -40,7 +41,7 @@ def store_item(lanes, values, item, value):
         store_lanes(values, item, value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def load_shared(lanes, like, values, item):
     """`load_item` of an array that organs may share: then (n_item,) for all of them; of the type of `like`."""
     if len(lanes) == 0:
@@ -48,7 +49,7 @@ def load_shared(lanes, like, values, item):
     return load_or_spread(lanes, like, values, item)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def load_half(lanes, pairs, node, half):
     """The first (0) or the second (1) of a node's two numbers, in an array (n_node, 2) or (2, n_node, n_lane).
 
@@ -60,7 +61,7 @@ def load_half(lanes, pairs, node, half):
     return load_lanes(lanes, pairs, half * pairs.shape[1] + np.intp(node))
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def store_half(lanes, pairs, node, half, value):
     """Write what `load_half` reads."""
     if len(lanes) == 0:
@@ -69,13 +70,13 @@ def store_half(lanes, pairs, node, half, value):
         store_lanes(pairs, half * pairs.shape[1] + np.intp(node), value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def add_half(lanes, pairs, node, half, value):
     """Add to what `load_half` reads."""
     store_half(lanes, pairs, node, half, load_half(lanes, pairs, node, half) + value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def load_column(lanes, values, width, item, column):
     """One number of an item's row, or the vector of all organs' numbers, of an array (n_item, width, n_lane).
 
@@ -86,7 +87,7 @@ def load_column(lanes, values, width, item, column):
     return load_lanes(lanes, values, width * np.intp(item) + column)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def store_column(lanes, values, width, item, column, value):
     """Write what `load_column` reads."""
     if len(lanes) == 0:
@@ -95,13 +96,13 @@ def store_column(lanes, values, width, item, column, value):
         store_lanes(values, width * np.intp(item) + column, value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def add_to_column(lanes, values, width, item, column, value):
     """Add to what `load_column` reads."""
     store_column(lanes, values, width, item, column, load_column(lanes, values, width, item, column) + value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def parts_of(lanes):
     """How many registers hold a node's x, y and z."""
     if len(lanes) == 0:
@@ -109,7 +110,7 @@ def parts_of(lanes):
     return 3
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def load_part(lanes, values, part):
     """A register of an array of nodes; those of node i are i * parts_of(lanes) and on."""
     if len(lanes) == 0:
@@ -117,7 +118,7 @@ def load_part(lanes, values, part):
     return load_lanes(lanes, values, part)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def store_part(lanes, values, part, value):
     """Write what `load_part` reads."""
     if len(lanes) == 0:
@@ -126,7 +127,7 @@ def store_part(lanes, values, part, value):
         store_lanes(values, part, value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def store_sum(lanes, total, value):
     """Write a sum over `load_part` into an array (1,) or (1, n_lane); of a row its three numbers added up."""
     if len(lanes) == 0:
@@ -135,7 +136,7 @@ def store_sum(lanes, total, value):
         store_lanes(total, 0, value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def where_moving(lanes, moving, after, before):
     """For each organ the value `after` where it moves (1 in `moving`), else `before`."""
     if len(lanes) == 0:
@@ -144,7 +145,7 @@ def where_moving(lanes, moving, after, before):
     return keep_lower(moves, moves * 0.0 + 1.0, before, after)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def difference(lanes, values, items, item, corner):
     """From corner 0 of an item to another of its corners, of an array of nodes: x, y and z."""
     if len(lanes) == 0:
@@ -158,7 +159,7 @@ def difference(lanes, values, items, item, corner):
     )
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def three_edges(lanes, values, tets, tet):
     """From corner 0 of a tet to its other three."""
     return (
@@ -168,7 +169,7 @@ def three_edges(lanes, values, tets, tet):
     )
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def add_to_node(lanes, force, node, x, y, z):
     """Add x, y and z to a node's force."""
     if len(lanes) == 0:
@@ -182,7 +183,7 @@ def add_to_node(lanes, force, node, x, y, z):
         store_lanes(force, part + 2, load_lanes(lanes, force, part + 2) + z)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def take_from_node(lanes, force, node, x, y, z):
     """Take x, y and z from a node's force."""
     if len(lanes) == 0:
@@ -196,7 +197,7 @@ def take_from_node(lanes, force, node, x, y, z):
         store_lanes(force, part + 2, load_lanes(lanes, force, part + 2) - z)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def add_to_corners(lanes, total, tets, tet, value):
     """Add a number to each corner of a tet."""
     for corner in range(4):
@@ -204,7 +205,7 @@ def add_to_corners(lanes, total, tets, tet, value):
         store_item(lanes, total, node, load_item(lanes, total, node) + value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def add_volume_and_energy(lanes, pairs, tets, tet, volume, energy):
     """Add to the first numbers of the pairs at a tet's corners, and to the second ones at the ends of its spring.
 
@@ -222,7 +223,7 @@ def add_volume_and_energy(lanes, pairs, tets, tet, volume, energy):
     store_half(lanes, pairs, b, 1, energy_b)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def corner_mean_of_pairs(lanes, pairs, tets, tet):
     """Mean of the first numbers of pairs at the corners of a tet."""
     return 0.25 * (
@@ -231,7 +232,7 @@ def corner_mean_of_pairs(lanes, pairs, tets, tet):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def corner_mean(lanes, values, tets, tet):
     """Mean of the numbers at the corners of a tet."""
     return 0.25 * (
@@ -240,7 +241,7 @@ def corner_mean(lanes, values, tets, tet):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def spread_order(items, base, gap, waiting, last, order):
     """The base order, changed so that items that share a node stand apart.
 

@@ -3,8 +3,10 @@
 import numpy as np
 from numba import njit
 
+from msdm_core.kernels.option_kernels import KERNEL
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+
+@njit(**KERNEL)
 def multiply_stiffness(
     rest, nodes, stiffness, tets, rest_volume, bulk, node_rest_volume, node_bulk, displacement, pressure, force
 ):

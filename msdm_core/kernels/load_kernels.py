@@ -14,9 +14,10 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_WEIGHT,
     closest_on_core,
 )
+from msdm_core.kernels.option_kernels import KERNEL
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_pressures(model, state, shapes, stiffness, push):
     """Contact force of every node if each were pushed along the normal: sum of w A k_p g (`add_contact_forces`).
 
@@ -57,7 +58,7 @@ def add_pressures(model, state, shapes, stiffness, push):
                 push[c] += wc * force
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_gradients(rest, position, tets, gradient):
     """Deformation gradient of every tet times its rest volume, added to each of its nodes.
 
@@ -87,7 +88,7 @@ def add_gradients(rest, position, tets, gradient):
                 gradient[node, row, 2] += z
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def fill_volume_ratios(position, tets, rest_volume, ratio):
     """Volume of every tet over its volume at rest, negative where it is inside out.
 

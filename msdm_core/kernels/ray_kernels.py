@@ -7,8 +7,10 @@ passes once per edge, so that no line slips between two triangles.
 import numpy as np
 from numba import njit
 
+from msdm_core.kernels.option_kernels import INLINED, KERNEL
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+
+@njit(**INLINED)
 def ray_hit(ox, oy, oz, dx, dy, dz, bx, by, bz, cx, cy, cz):
     """Where a ray meets a triangle, in multiples of d from its origin; not a number where it passes beside it.
 
@@ -24,7 +26,7 @@ def ray_hit(ox, oy, oz, dx, dy, dz, bx, by, bz, cx, cy, cz):
     return np.nan
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def nearest_hits(origins, directions, corners, least, distance):
     """The nearest triangle that each of some rays meets.
 
@@ -41,7 +43,7 @@ def nearest_hits(origins, directions, corners, least, distance):
         distance[ray] = nearest
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def pierces(origins, directions, corners, pierced):
     """Whether each of some segments passes through the triangle of the same number.
 
@@ -52,7 +54,7 @@ def pierces(origins, directions, corners, pierced):
         pierced[ray] = 0.0 < _hit_of(origins, directions, ray, corners, ray) < 1.0
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _hit_of(origins, directions, ray, corners, triangle):
     """`ray_hit` of one ray and one triangle of arrays."""
     ax, ay, az = corners[triangle, 0, 0], corners[triangle, 0, 1], corners[triangle, 0, 2]

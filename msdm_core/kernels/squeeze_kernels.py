@@ -18,6 +18,7 @@ from msdm_core.kernels.layout_kernels import (
     store_column,
     take_from_node,
 )
+from msdm_core.kernels.option_kernels import INLINED, KERNEL
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 # Implicit stiffness of a steep spring over what stiffening adds to its tangent: with a larger one fewer sweeps hold the
@@ -35,7 +36,7 @@ SWEEPS_PER_TANGENT = 1.0 / 3.0
 SWEEPS_LEAST = 4
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def hold_squeezed(
     position, velocity, force, inverse_mass, tets, inverse_volume, averaged_bulk, squeezed, count, width, dt
 ):  # fmt: skip
@@ -85,7 +86,7 @@ def hold_squeezed(
                     force[node, axis] -= more * (1.0 / 6.0) * gradients[corner][axis]
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _change_speeds(lanes, speed, inverse_mass, dt, i, j, along, pull):
     """Change the speeds of a spring's ends by its pull [N] for one substep.
 
@@ -96,7 +97,7 @@ def _change_speeds(lanes, speed, inverse_mass, dt, i, j, along, pull):
     take_from_node(lanes, speed, j, for_j * along[0], for_j * along[1], for_j * along[2])
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _direction(lanes, rows, row):
     """The direction of the spring of a row."""
     return (
@@ -105,14 +106,14 @@ def _direction(lanes, rows, row):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _set_axis(lanes, speed, velocity, force, rate, node, axis):
     """One axis of `_set_speed`."""
     after = load_column(lanes, velocity, 3, node, axis) + rate * load_column(lanes, force, 3, node, axis)
     store_column(lanes, speed, 3, node, axis, after)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
     """The speed that a node gets to by all forces so far."""
     rate = dt * load_item(lanes, inverse_mass, node)
@@ -121,7 +122,7 @@ def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
     _set_axis(lanes, speed, velocity, force, rate, node, 2)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def hold_steep(
     lanes, position, velocity, force, inverse_mass, nodes, stiffness, steepness, gain, relaxes, tet_count, steep, count,
     width, sweeps_least, sweeps_most, places, rows, speed, dt,
@@ -201,7 +202,7 @@ def hold_steep(
         take_from_node(lanes, force, j, x, y, z)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _edge(position, a, b):
     """From one node to another."""
     return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]

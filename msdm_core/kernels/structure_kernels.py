@@ -12,6 +12,8 @@ from numba import njit
 from numba.extending import overload
 from numpy.typing import NDArray
 
+from msdm_core.kernels.option_kernels import INLINED
+
 FloatArray = NDArray[np.float64]
 # float64 or float32, eight or sixteen lanes.
 LaneArray = NDArray[Any]
@@ -560,7 +562,7 @@ def _(model):
 # Whether `lanes` is empty, and how many indices an array has, is known when these are compiled: one way is left.
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def entry_of(values, lane):
     """One lane's number of an array (1, n_lane), or that of an organ alone in an array (1,)."""
     if values.ndim == 2:
@@ -568,7 +570,7 @@ def entry_of(values, lane):
     return values[lane]
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def set_entry(values, lane, value):
     """Write what `entry_of` reads."""
     if values.ndim == 2:
@@ -577,7 +579,7 @@ def set_entry(values, lane, value):
         values[lane] = value
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def column_of(values, lane):
     """One lane's numbers of an array (n, n_lane), or of all lanes' array (n,)."""
     if values.ndim == 2:
@@ -585,7 +587,7 @@ def column_of(values, lane):
     return values
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def part_of(lanes, values, lane):
     """One lane's part of an array whose first index is the lane; an organ alone has the whole array."""
     if len(lanes) == 0:
@@ -593,21 +595,21 @@ def part_of(lanes, values, lane):
     return values[lane]
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _triangles_of(values, lane, count):
     if values.ndim == 3:
         return values[lane, :count]
     return values
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _numbers_of(values, lane, count):
     if values.ndim == 2:
         return values[lane, :count]
     return values
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def surface_of(lanes, model, lane):
     """One lane's surface, as contact reads it."""
     if len(lanes) == 0:
@@ -619,7 +621,7 @@ def surface_of(lanes, model, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def supports_of(lanes, model, lane):
     """One lane's supports; kernels that read them take an OrganModel as well."""
     if len(lanes) == 0:
@@ -636,28 +638,28 @@ def supports_of(lanes, model, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _places_of(values, lane):
     if values.ndim == 3:
         return values[lane]
     return values
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _blocks_of(values, lane):
     if values.ndim == 4:
         return values[lane]
     return values
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _shifts_of(values, lane):
     if values.ndim == 4:
         return values[:, :, :, lane]
     return values
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def ground_of(lanes, model, lane):
     """One lane's foundations, and how the ground moves; kernels that read them take an OrganModel as well."""
     if len(lanes) == 0:
@@ -670,7 +672,7 @@ def ground_of(lanes, model, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def touched_of(lanes, state, lane):
     """One lane's state, as contact reads and writes it."""
     if len(lanes) == 0:
@@ -687,7 +689,7 @@ def touched_of(lanes, state, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def shapes_of(lanes, shapes, lane):
     """One lane's contact shapes."""
     if len(lanes) == 0:
@@ -698,7 +700,7 @@ def shapes_of(lanes, shapes, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def response_of(lanes, response, lane):
     """The response of one lane's tools."""
     if len(lanes) == 0:
@@ -709,7 +711,7 @@ def response_of(lanes, response, lane):
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def in_rows(lanes, state):
     """The state whose node arrays the tissue's kernels work on: of an organ alone with rows of four in their place."""
     if len(lanes) > 0:

@@ -13,6 +13,7 @@ from numba import njit
 from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
+from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
@@ -61,7 +62,7 @@ from msdm_core.kernels.tissue_kernels import (
 FADE_INTERVAL = 1e-3
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def move_shapes(shapes, dt):
     """Carry the shapes along the twist of their tool for one substep: x <- x + dt (v + w x (x - c)).
 
@@ -89,7 +90,7 @@ def move_shapes(shapes, dt):
             shapes.tool_centre[tool, axis] += dt * twist[tool, axis]
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def push_tools(shapes, response, dt, substep, wrench):
     """Change the tools' twists by the wrench of a substep, before the shapes move along them: twist += dt (a + B w).
 
@@ -111,7 +112,7 @@ def push_tools(shapes, response, dt, substep, wrench):
             before[tool, row] = wrench[tool, row]
 
 
-@njit(cache=True, nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _copy_rows(source, target):
     """The first three columns of an array."""
     for node in range(source.shape[0]):
@@ -119,7 +120,7 @@ def _copy_rows(source, target):
             target[node, axis] = source[node, axis]
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _load_rows(lanes, state):
     """Positions and velocities of an organ alone into its rows of four."""
     if len(lanes) == 0:
@@ -127,7 +128,7 @@ def _load_rows(lanes, state):
         _copy_rows(state.node_velocity, state.row_velocity)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _averages(lanes, averages_volume):
     """Whether any lane has a volume term that is averaged at nodes."""
     if len(lanes) == 0:
@@ -135,7 +136,7 @@ def _averages(lanes, averages_volume):
     return averages_volume.any()
 
 
-@njit(cache=True, nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _evaluate(model, state, fades, fade_duration):
     """Gravity, springs and volume term into the force of all lanes.
 
@@ -197,7 +198,7 @@ def _evaluate(model, state, fades, fade_duration):
     return squeezed_count, steep_count
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _lane_count(lanes):
     """How many organs there are."""
     if len(lanes) == 0:
@@ -205,28 +206,28 @@ def _lane_count(lanes):
     return len(lanes)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _wake(lanes, state):
     """Clear the fault of an organ alone at the start of a call; a lane keeps its fault until `put_lane`."""
     if len(lanes) == 0:
         state.lane_fault[0] = FAULT_NONE
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _keep_forces(lanes, state):
     """Keep the forces of lanes that do not move: the tissue's kernels overwrite them."""
     if len(lanes) > 0:
         state.kept_force[:, :, :] = state.node_force
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _put_back_forces(lanes, state):
     """Restore the forces of lanes that do not move."""
     if len(lanes) > 0:
         put_back(lanes, state.node_force, state.kept_force, state.moving)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _store_motion(lanes, state):
     """Positions and velocities of an organ alone out of its rows of four."""
     if len(lanes) == 0:
@@ -234,14 +235,14 @@ def _store_motion(lanes, state):
         _copy_rows(state.row_velocity, state.node_velocity)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _store_force(lanes, state):
     """Forces of an organ alone out of its rows of four."""
     if len(lanes) == 0:
         _copy_rows(state.row_force, state.node_force)
 
 
-@njit(cache=True, nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _keep_force(state, lane):
     """Keep one lane's forces as they are."""
     force, kept = state.node_force, state.kept_force
@@ -250,7 +251,7 @@ def _keep_force(state, lane):
             kept[node, axis, lane] = force[node, axis, lane]
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _stop(lanes, state, lane, fault):
     """Stop one lane in its present state."""
     state.lane_fault[lane] = fault
@@ -259,7 +260,7 @@ def _stop(lanes, state, lane, fault):
         _keep_force(state, lane)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _begin(lanes, model, state, shapes, response, duration):
     """Note which lanes move and look for the triangles in reach of their shapes."""
     stands = False
@@ -291,7 +292,7 @@ def _begin(lanes, model, state, shapes, response, duration):
         _keep_forces(lanes, state)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrench, lane):
     """Contact and guard of one lane; notes the points in contact."""
     surface, touched = surface_of(lanes, model, lane), touched_of(lanes, state, lane)
@@ -303,7 +304,7 @@ def _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrenc
         state.contact_kept[lane] = 0
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane):
     """What contact and squeezed tets of one lane hold with at the end of the substep."""
     surface, touched = surface_of(lanes, model, lane), touched_of(lanes, state, lane)
@@ -318,7 +319,7 @@ def _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference
     )  # fmt: skip
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench):
     """What holds an organ, contact, guard, steep springs, squeezed tets, lane by lane; returns how many lanes move.
 
@@ -364,7 +365,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
     return moving
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _move_ground(lanes, model, state, dt, decay):
     """Move what holds the organs that move: anchored nodes by the integration that follows, the others at once."""
     if model.motion_node_shift.shape[0] == 0:
@@ -383,7 +384,7 @@ def _move_ground(lanes, model, state, dt, decay):
         place_ground(ground, motion, foundation, part_of(lanes, state.ground_support, lane))
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _move_tools(lanes, state, shapes, response, dt, substep, wrench):
     """Advance the tools, lane by lane; stop lanes with a fault; returns how many lanes still move."""
     moving = 0
@@ -402,7 +403,7 @@ def _move_tools(lanes, state, shapes, response, dt, substep, wrench):
     return moving
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
     """Mean wrenches and the lag of friction for lanes that move; restore the forces of those that do not."""
     stands = False
@@ -423,7 +424,7 @@ def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
         _put_back_forces(lanes, state)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def advance_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
     """Advance organs by some substeps against moving shapes; the kernel behind `organ.advance` and `advance_lanes`.
 
@@ -466,7 +467,7 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
     return state.lane_fault[0]
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def evaluate_forces(model, state):
     """Internal forces and gravity of a state, without contact, supports and foundations.
 

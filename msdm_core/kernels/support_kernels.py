@@ -6,12 +6,13 @@ from numba import njit
 
 from msdm_core.kernels.contact_kernels import stick_or_slip
 from msdm_core.kernels.layout_kernels import load_item, load_part, parts_of, store_part, where_moving
+from msdm_core.kernels.option_kernels import INLINED, KERNEL
 from msdm_core.kernels.vector_kernels import load_row
 
 PLANE, SPHERE, CAPSULE, BOX = 0, 1, 2, 3
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_support_forces(model, ground, position, velocity, force, stretch, load, dt):
     """Push every surface node out of the supports that it is in; two supports both push.
 
@@ -77,7 +78,7 @@ def add_support_forces(model, ground, position, velocity, force, stretch, load, 
             load[support, 2] += z
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_foundation_forces(nodes, ground, stiffness, position, force):
     """Hold nodes elastically where they are without force: f = -K (x - x0).
 
@@ -95,7 +96,7 @@ def add_foundation_forces(nodes, ground, stiffness, position, force):
             )
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def place_ground(model, motion, foundation, support):
     """Where the ground is now: x0 + sum of s_m d_m, at the speed sum of ds_m/dt d_m, over the motions m.
 
@@ -119,7 +120,7 @@ def place_ground(model, motion, foundation, support):
             support[item, 1, axis] = speed
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def carry_anchors(model, motion, velocity):
     """Give anchored nodes the speed of the ground, v = sum of ds_m/dt d_m.
 
@@ -136,7 +137,7 @@ def carry_anchors(model, motion, velocity):
             velocity[node, axis] = speed
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _ground_shift(lanes, shift, number, node, part):
     """What of a motion's shift belongs to a part of a node, see `layout_kernels.load_part`."""
     if len(lanes) == 0:
@@ -144,7 +145,7 @@ def _ground_shift(lanes, shift, number, node, part):
     return _lanes_shift(lanes, shift, number, node, part)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _lanes_shift(lanes, shift, number, node, part):
     """The number that all lanes share, or the vector of each lane's own."""
     if shift.ndim == 4:
@@ -152,7 +153,7 @@ def _lanes_shift(lanes, shift, number, node, part):
     return shift[number, node, part]
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def drag_along(lanes, shift, rate, moving, decay, velocity):
     """Let the integration that follows, v' = decay v + ..., damp velocities relative to the ground's.
 
@@ -176,7 +177,7 @@ def drag_along(lanes, shift, rate, moving, decay, velocity):
             store_part(lanes, velocity, parts * node + part, where_moving(lanes, moving, after, before))
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def move_ground(model, position, force, foundation, load, motion, dt):
     """Count the work of the ground on the organ, and advance the signals by a step.
 
@@ -216,7 +217,7 @@ def move_ground(model, position, force, foundation, load, motion, dt):
         motion[number, 0] += motion[number, 1] * dt
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def depth_inside(kind, first, second, third, x, y, z):
     """Depth of a point in a solid, and the outward normal there, in the frame of the solid.
 

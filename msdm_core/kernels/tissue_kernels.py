@@ -51,10 +51,11 @@ from msdm_core.kernels.layout_kernels import (
     three_edges,
     where_moving,
 )
+from msdm_core.kernels.option_kernels import INLINED, KERNEL
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def group_width(lanes):
     """How many tets in a row an entry of `squeezed_tets` stands for."""
     if len(lanes) == 0:
@@ -62,7 +63,7 @@ def group_width(lanes):
     return 1
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def set_gravity(lanes, force, mass, gravity):
     """F = m g.
 
@@ -79,7 +80,7 @@ def set_gravity(lanes, force, mass, gravity):
                 store_item(lanes, force, 3 * node + axis, load_item(lanes, mass, node) * gravity[axis])
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving, finite_sum):
     """Symplectic Euler of the organs that move: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt).
 
@@ -100,7 +101,7 @@ def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving,
     store_sum(lanes, finite_sum, check)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def put_back(lanes, values, kept, moving):
     """Restore the kept values of organs that do not move.
 
@@ -112,7 +113,7 @@ def put_back(lanes, values, kept, moving):
         store_part(lanes, values, part, value)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
     """Pull the ends of a spring together with `scale` times the way from the one to the other."""
     x, y, z = x * scale, y * scale, z * scale
@@ -120,13 +121,13 @@ def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
     take_from_node(lanes, force, nodes[spring, 1], x, y, z)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _end_sum(lanes, pairs, items, item):
     """Sum of the second numbers of the pairs of a spring's two ends."""
     return load_half(lanes, pairs, items[item, 0], 1) + load_half(lanes, pairs, items[item, 1], 1)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """`add_energy_groups` for an organ alone; returns the first spring that is left over."""
     if len(lanes) == 0:
@@ -134,7 +135,7 @@ def _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, r
     return begin
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _keep_length(lanes, lengths, spring, length):
     """Note the length of a spring of an organ alone.
 
@@ -144,7 +145,7 @@ def _keep_length(lanes, lengths, spring, length):
         lengths[spring] = length
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _kept_length(lanes, lengths, spring, x, y, z):
     """What `_keep_length` noted; measured where it notes nothing."""
     if len(lanes) == 0:
@@ -152,7 +153,7 @@ def _kept_length(lanes, lengths, spring, x, y, z):
     return spring_length(x, y, z)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
     """Note the length of a spring along an edge; returns its `spring_energy`."""
     length = spring_length(edge[0], edge[1], edge[2])
@@ -160,7 +161,7 @@ def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
     return spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """Twice the energy of linear springs from number `begin` on, k (l - l0)^2, at both ends of each.
 
@@ -177,7 +178,7 @@ def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length,
         add_half(lanes, pairs, nodes[spring, 1], 1, twice)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
     """`set_node_law_groups` for an organ alone; returns the first node left over, and what `set_node_laws` does."""
     if len(lanes) == 0:
@@ -185,7 +186,7 @@ def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset
     return 0, False, False
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
     """From the sums of volumes and energies around nodes to the tension of the averaged volumes and to `node_law`.
 
@@ -219,7 +220,7 @@ def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, e
     return stiffens, steepens
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, steep_count):
     """`add_spring_groups` for an organ alone; returns the first spring that is left over and the entries of `steep`."""
     if len(lanes) == 0:
@@ -227,7 +228,7 @@ def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length
     return begin, steep_count
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
     """Let one arm give way to the elastic tension over l0 of its spring [N/m]; returns what it has given way to."""
     before = load_item(lanes, arm_tension, arm)
@@ -236,7 +237,7 @@ def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
     return after
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic, fade, moving):
     """Let the Maxwell arms of a spring give way to its elastic tension for some time: z_i <- z_i + fade_i (T_e - z_i).
 
@@ -259,7 +260,7 @@ def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic,
     store_item(lanes, relief, spring, where_moving(lanes, moving, total, load_item(lanes, relief, spring)))
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, begin, law, moving):
     """Springs from number `begin` on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their law.
 
@@ -302,7 +303,7 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
     return steep_count
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta):
     """Rayleigh's beta along all springs: f = k beta dl/dt.
 
@@ -316,7 +317,7 @@ def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta)
         _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """`sum_tet_groups` for an organ alone; returns the first tet that is left over."""
     if len(lanes) == 0:
@@ -324,7 +325,7 @@ def _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness,
     return 0
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """Six times the volume of each tet added up at its corners; where springs stiffen, with twice its spring's energy.
 
@@ -345,7 +346,7 @@ def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_l
             add_to_corners(lanes, total, tets, tet, six)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
     """From the sums of six times the volumes around nodes to the tension of the averaged volumes.
 
@@ -358,7 +359,7 @@ def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
         store_item(lanes, tension, node, node_tension(load_item(lanes, tension, node), inverse, bulk))
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffens):
     """Beta's share of the averaged volume term: beta times the rates of volumes, to what `sum_at_nodes` adds up.
 
@@ -375,7 +376,7 @@ def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffe
             add_to_corners(lanes, total, tets, tet, six)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _push_corners(lanes, force, tets, tet, scale, g, pull, edge):
     """Forces of a tet on its corners, and of the spring along its first edge."""
     bx, by, bz = scale * g[0] - pull * edge[0], scale * g[1] - pull * edge[1], scale * g[2] - pull * edge[2]
@@ -387,7 +388,7 @@ def _push_corners(lanes, force, tets, tet, scale, g, pull, edge):
     add_to_node(lanes, force, tets[tet, 3], dx, dy, dz)
 
 
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED)
 def _add_groups_of_tets(
     lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed,
     law, steep_count,
@@ -401,7 +402,7 @@ def _add_groups_of_tets(
     return 0, 0, steep_count
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_tet_forces(
     lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving,
     squeezed, law, steep_count,
@@ -465,7 +466,7 @@ def add_tet_forces(
     return count, steep_count
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def add_volume_damping(lanes, position, velocity, force, tets, inverse_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt.
 

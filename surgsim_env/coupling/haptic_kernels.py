@@ -13,6 +13,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from msdm_core.kernels.option_kernels import KERNEL
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LANE_EMPTY, response_of, shapes_of
 from msdm_core.kernels.substep_kernels import advance_substeps
 from surgsim_env.coupling.motion_kernels import steer_motion
@@ -88,7 +89,7 @@ def begin_step(tools, drive, shapes, response, motion, reference):
     reference[:, :] = shapes.tool_centre
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def check_wrench(wrench):
     """The FAULT_ code of the tissue's mean wrench on each tool, (n_tool, 6)."""
     fault = FAULT_NONE
@@ -102,7 +103,7 @@ def check_wrench(wrench):
     return fault
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def total_force(wrench):
     """Size of the sum of the forces on all tools [N]; wrench (n_tool, 6) [N, N m]."""
     x, y, z = 0.0, 0.0, 0.0
@@ -113,7 +114,7 @@ def total_force(wrench):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def pull_force(jaws, wrench):
     """Largest size of the sum of the forces on the two fingers of a jaw [N], over all jaws (n_jaw, 2)."""
     largest = 0.0
@@ -166,7 +167,7 @@ def end_step(tools, fault, plan, outcome, lane):
         outcome.stopped[lane] = LANE_EMPTY
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def advance_haptic_steps(model, state, law, shapes, response, tools, drive, plan, outcome):
     """Advance an organ and its tools by `plan.step_count` haptic steps, fewer at a fault or beyond a limit.
 
@@ -186,7 +187,7 @@ def advance_haptic_steps(model, state, law, shapes, response, tools, drive, plan
             return
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def advance_lane_haptic_steps(model, state, law, shapes, response, tools, drives, plan, outcome):
     """Advance organs side by side and their tools by `plan.step_count` haptic steps; a lane that ends early stops.
 

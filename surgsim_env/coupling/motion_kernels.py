@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from msdm_core.kernels.option_kernels import INLINED_KERNEL, KERNEL
+
 FloatArray = NDArray[np.float64]
 
 
@@ -35,13 +37,13 @@ class MotionDrive(NamedTuple):
     step_count: NDArray[np.int64]
 
 
-@njit(forceinline=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INLINED_KERNEL)
 def smooth_rise(x):
     """From 0 at 0 to 1 at 1, rate and acceleration 0 at both."""
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def signal_at(drive, number, time):
     """Signal of one motion at a time since the reset [s]."""
     start = drive.cycle_start[number]
@@ -62,7 +64,7 @@ def signal_at(drive, number, time):
     return 0.0
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def steer_motion(drive, motion):
     """Let the signals of an organ change evenly over the next haptic step to their values at its end.
 

@@ -11,6 +11,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from msdm_core.kernels.option_kernels import KERNEL
 from surgsim_env.instruments.mujoco_kernels import (
     OBJECT_BODY,
     mj_fullM,
@@ -91,7 +92,7 @@ class ToolViews(NamedTuple):
     yielded: FloatArray
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def factorise(matrix):
     """A = L D L^T in place: D on the diagonal, L below it; A (n, n) symmetric and positive definite."""
     for column in range(matrix.shape[0]):
@@ -102,7 +103,7 @@ def factorise(matrix):
             matrix[row, column] = value if row == column else value / matrix[column, column]
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def tool_mobility(factors, jacobians, tool, smooth_force, yielded, mobility, acceleration):
     """Column t of the tool mobility matrix, mobility[i, t] = J_i A^-1 J_t^T, and acceleration[t] = J_t A^-1 q.
 

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from msdm_core.kernels.option_kernels import INNER, KERNEL
 from msdm_core.kernels.ray_kernels import ray_hit
 
 FloatArray = NDArray[np.float64]
@@ -25,7 +26,7 @@ def _near_cone(x, y, z, radius, eye, axis, cosine, sine, reach):
     return across * cosine - along * sine <= radius
 
 
-@njit(cache=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def hide_behind_triangles(eye, points, axis, cosine, sine, reach, position, triangles, hidden):
     """Mark the points whose straight way from the eye meets a triangle.
 
@@ -51,7 +52,7 @@ def hide_behind_triangles(eye, points, axis, cosine, sine, reach, position, tria
                 hidden[point] = 1
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _meets_ball(x, y, z, dx, dy, dz):
     """Whether the segment from (x, y, z) by (dx, dy, dz) meets the unit ball."""
     a = dx * dx + dy * dy + dz * dz
@@ -63,7 +64,7 @@ def _meets_ball(x, y, z, dx, dy, dz):
     return -b - root < a and -b + root > 0.0
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _meets_slabs(x, y, z, dx, dy, dz, size, first, low, high):
     """Whether the part from `low` to `high` of a segment meets the slabs |coordinate| < size, from axis `first` on."""
     for axis in range(first, 3):
@@ -78,7 +79,7 @@ def _meets_slabs(x, y, z, dx, dy, dz, size, first, low, high):
     return low < high
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _meets_cylinder(x, y, z, dx, dy, dz, radius, half_length, limits):
     """Whether a segment meets the cylinder about z; `limits` (3,) is scratch."""
     a = dx * dx + dy * dy
@@ -98,7 +99,7 @@ def _meets_cylinder(x, y, z, dx, dy, dz, radius, half_length, limits):
     return _meets_slabs(x, y, z, dx, dy, dz, limits, 2, low, high)
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**INNER)
 def _meets_shape(kind, size, x, y, z, dx, dy, dz, limits):
     """Whether a segment, in the shape's own frame, meets one of MuJoCo's shapes."""
     if kind == PLANE:
@@ -120,7 +121,7 @@ def _meets_shape(kind, size, x, y, z, dx, dy, dz, limits):
     )
 
 
-@njit(cache=True, no_cfunc_wrapper=True, error_model="numpy")
+@njit(**KERNEL)
 def hide_behind_shapes(
     eye, points, axis, cosine, sine, reach, geoms, kind, size, ball, position, rotation, limits, hidden
 ):

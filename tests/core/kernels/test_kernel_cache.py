@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import pytest
 from numba.core.registry import CPUDispatcher
 from numba.core.target_extension import dispatcher_registry, target_registry
@@ -20,6 +21,7 @@ from numba.core.target_extension import dispatcher_registry, target_registry
 import msdm_core
 import surgsim_env
 from msdm_core import numba_cache
+from msdm_core.kernels import guard_kernels
 from msdm_core.kernels.tissue_kernels import set_node_tension
 
 USE = """
@@ -283,3 +285,23 @@ def test_a_cache_that_another_process_removes_meanwhile_is_no_error(source: Path
     monkeypatch.setattr(numba_cache, "_verify", overtaken)
     hit, (said,) = started(source)
     assert not hit and "it is dropped" in said
+
+
+def test_a_function_without_a_wrapper_refuses_python():
+    """numba would jump to address 0."""
+    assert type(guard_kernels._foot) is numba_cache.InnerHealing
+    with pytest.raises(TypeError, match=r"_foot is called by compiled code alone .* decorate it with KERNEL"):
+        guard_kernels._foot(np.zeros(3))
+
+
+def test_compiling_that_takes_long_says_so_once(caplog):
+    for patience, lines in ((0.0, ["once: up to a minute", "compiled in 0 s"]), (60.0, [])):
+        message = numba_cache.CompilingMessage(patience)
+        caplog.clear()
+        # A function that calls two others, of which the first takes long.
+        with message.one():
+            for pause in (0.002, 0.0):
+                with message.one():
+                    time.sleep(pause)
+        assert len(caplog.messages) == len(lines)
+        assert all(text in said for text, said in zip(lines, caplog.messages, strict=True))

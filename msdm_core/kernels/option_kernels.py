@@ -1,0 +1,18 @@
+"""How kernels are compiled: the options of `@njit(**...)`.
+
+Division by zero gives infinity and nan, as in numpy, and no function is wrapped for C. A wrapper for Python takes as
+long to compile as a small function: those that compiled code alone calls have none. Calling one of them from Python
+ends the process.
+"""
+
+from typing import Any
+
+_ALL: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+# Called from Python, kept on disk, and runs without the interpreter's lock.
+KERNEL: dict[str, Any] = {**_ALL, "cache": True, "nogil": True}
+# A kernel that kernels call.
+INNER: dict[str, Any] = {**KERNEL, "no_cpython_wrapper": True}
+# Becomes part of each function that calls it.
+INLINED: dict[str, Any] = {**_ALL, "forceinline": True, "no_cpython_wrapper": True}
+# The same, and called from Python too.
+INLINED_KERNEL: dict[str, Any] = {**_ALL, "forceinline": True}

@@ -15,7 +15,7 @@ WITH_RAY := --editable=.[dev,distributed]
 # A file's tests run in one worker, which makes what they share once.
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: help demo test test-all test-agents test-distributed with-ray bench soak docs lint clean distclean
+.PHONY: help demo test test-all test-agents test-distributed with-ray bench soak docs lint dist test-dist release clean distclean
 .NOTPARALLEL:
 
 help:
@@ -28,6 +28,9 @@ help:
 	@echo "make soak         play all environments for an hour with random, corner and adversarial actions"
 	@echo "make docs         the documentation site, in site/; warnings are errors"
 	@echo "make lint         ruff and pyright"
+	@echo "make dist         the source archive and the wheel, in dist/"
+	@echo "make test-dist    installs the wheel, nothing else, for each Python from 3.11 that is here, and tries it"
+	@echo "make release      all tests, dist, test-dist, and a local tag of the version"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
 	@echo "PYTHON=/path/to/python picks the interpreter (3.11 or newer) that $(VENV) is made from"
 
@@ -71,6 +74,37 @@ lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pyright --pythonpath $(PY)
+
+VERSION = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+# Where Pythons are looked for; of each minor version the first is taken.
+PYTHONS ?= python3.11 python3.12 python3.13 python3.14 $${PYENV_ROOT:-$$HOME/.pyenv}/versions/*/bin/python3
+# ALONE=--all steps every environment; by default the README's code and `surgsim doctor` run.
+ALONE ?=
+
+dist: $(VENV)/.ready-dev
+	rm -rf dist
+	$(PY) -m build --no-isolation --outdir dist . >dist.log 2>&1 || { cat dist.log >&2; exit 1; }
+	@rm -f dist.log
+	@ls -sh dist
+
+# In folders of their own under dist/, each with an empty numba cache.
+test-dist: dist
+	@tried=" "; for python in $(PYTHONS); do \
+	    found=$$("$$python" -c 'import sys; ($(SUITABLE)) and print("python%d.%d" % sys.version_info[:2])' 2>/dev/null); \
+	    case " $$tried " in *" $$found "*) continue;; esac; tried="$$tried $$found"; \
+	    folder=$(CURDIR)/dist/$$found; \
+	    echo "surgsim: the wheel alone, in $$folder"; \
+	    mkdir -p $$folder/work && "$$python" -m venv $$folder/env \
+	        && $$folder/env/bin/python -m pip install -qq --disable-pip-version-check dist/*.whl \
+	        && (cd $$folder/work && NUMBA_CACHE_DIR=$$folder/cache \
+	            $$folder/env/bin/python $(CURDIR)/tests/packaging/alone.py $(CURDIR)/README.md $(ALONE)) || exit 1; \
+	done
+
+release: ALONE = --all
+release: lint docs test-all test-dist
+	git diff --quiet HEAD || { echo "surgsim: there are changes that are not committed" >&2; exit 1; }
+	git tag -a v$(VERSION) -m "surgsim $(VERSION)"
+	@echo "surgsim: tagged v$(VERSION); its notes are in CHANGELOG.md; publish dist/ and the tag by hand"
 
 clean:
 	rm -rf runs build dist site .pytest_cache .ruff_cache .hypothesis .numba_cache

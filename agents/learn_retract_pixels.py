@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
 from surgsim_env.rendering.looks import draw_look, find_look_ranges
-from surgsim_env.scoring.expert_retract import HOLDS, PULL, SLICES, TolerantExpert
+from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, TolerantExpert
 
 with one_line_errors(__name__, "agents"):
     import torch
@@ -52,7 +52,8 @@ TAUGHT = ("tip_position", "opening", "holds", "edge_points", "visible")
 TAUGHT_WEIGHT = 0.1
 # Share of states with a pull above PULL_LEAST [N] that are kept a second time, with an imagined pull [N]. States in
 # which the jaw pushes without holding anything are rare: all of them are kept, with UNHELD_PULLS imagined pulls each.
-IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL, UNHELD_PULLS = 0.2, 0.05, (0.6, 1.3), 4
+# Of the others SLIPPED_SHARE are imagined without a grip, as if the edge had just slipped out.
+IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL, UNHELD_PULLS, SLIPPED_SHARE = 0.2, 0.05, (0.6, 1.3), 4, 0.3
 # Of the first rounds, the share of steps that the expert plays.
 EXPERT_SHARES = (1.0, 0.5, 0.2)
 
@@ -137,6 +138,9 @@ class Player:
             factor = self._rng.uniform(*IMAGINED_PULL) / observation[PULL]
             observation[PULL] *= factor
             forces[row, self._pulled] *= factor
+            if observation[HOLDS] > 0.5 and self._rng.random() < SLIPPED_SHARE:
+                observation[[HOLDS, GRIP]] = 0.0
+                forces[row, ~self._pulled] = 0.0
             wanted[row] = self._expert.act(observation)
         return self._seen["picture"][chosen].copy(), forces, wanted, taught[chosen]
 

@@ -30,7 +30,7 @@ class Evaluate:
     """Two methods of --results on this scene and level, or two files."""
     check: MaybePath = None
     """Whether this result can be compared with those made here."""
-    options: ScoringOptions = field(default_factory=ScoringOptions)
+    played: ScoringOptions = field(default_factory=ScoringOptions)
 
     def run(self, console: Console) -> int:
         """Play, print and write; returns 0.
@@ -42,7 +42,7 @@ class Evaluate:
         if len(asked) != 1:
             told = " and ".join(f"--{name}" for name in asked) or "none"
             raise ValueError(f"give one of --agent, --policy, --all, --reach, --compare, --check; given: {told}")
-        options = self.options
+        options = self.played
         if options.video is not None and self.policy is None:
             raise ValueError("--video films a policy: give --policy as well")
         if options.submit is not None and self.agent is None and self.policy is None:

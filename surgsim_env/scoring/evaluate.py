@@ -8,6 +8,7 @@ import datetime
 import importlib
 import inspect
 import json
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -148,7 +149,7 @@ def policies_folder() -> Path:
 
 
 def named_class(text: str, option: str) -> Any:
-    """The class (or any function that makes an agent) of MODULE:CLASS.
+    """The class (or any function that makes an agent) of MODULE:CLASS; modules of the working folder are found too.
 
     Importing the module runs its code.
 
@@ -162,6 +163,9 @@ def named_class(text: str, option: str) -> Any:
     module, _, name = text.partition(":")
     if not (module and name):
         raise ValueError(f"{option} is {text!r}; the rule is MODULE:CLASS")
+    # `surgsim` is a script of an environment: Python looks for modules beside it, not in the working folder.
+    if not {"", str(Path.cwd())} & set(sys.path):
+        sys.path.insert(0, str(Path.cwd()))
     try:
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:

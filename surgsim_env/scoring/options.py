@@ -13,7 +13,7 @@ from surgsim_env.scoring.results import read_seeds
 
 @dataclass(frozen=True)
 class ScoringOptions:
-    """Options of an evaluation; None is the method's own choice."""
+    """Where and how a method is played; what is not given is the method's own."""
 
     scene: str | None = None
     """Default: phantom; for a policy, that of its training."""

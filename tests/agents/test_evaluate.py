@@ -263,7 +263,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A stranger's file in the working folder, from which modules are imported."""
     (tmp_path / "strangers_agent.py").write_text(AGENT, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
     yield tmp_path / "strangers_agent.py"
     sys.modules.pop("strangers_agent", None)
 

@@ -11,11 +11,17 @@ SUITABLE := $(if $(PYTHON),sys.version_info >= (3, 11),(3, 11) <= sys.version_in
 TORCH := torch==2.13.0
 WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
 WITH_RAY := --editable=.[dev,distributed]
+# LeRobot 0.3 is the last that reads data sets of format v2.1. It asks for older Gymnasium and torch, and for cameras and
+# motors: beside it is what its loader imports. torchvision 0.15.2 (Python 3.11) is the last that a torch without CUDA of
+# any version lets in; the loader decodes videos with it.
+LEROBOT := lerobot==0.3.3 torchvision==0.15.2
+WITH_LEROBOT := --editable=.[dev,demonstrations] huggingface_hub~=0.34 datasets==3.6.0 draccus==0.10.0 tqdm av jsonlines \
+    einops pandas termcolor
 
 # A file's tests run in one worker, which makes what they share once.
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: help demo test test-all test-agents test-distributed with-ray bench soak docs lint dist test-dist release clean distclean
+.PHONY: help demo test test-all test-agents test-distributed with-ray test-lerobot with-lerobot bench soak docs lint dist test-dist release clean distclean
 .NOTPARALLEL:
 
 help:
@@ -24,6 +30,7 @@ help:
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
 	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
+	@echo "make test-lerobot  those that read data sets with LeRobot, in $(VENV)-lerobot (Python 3.11; installs 2.2 GB)"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
 	@echo "make soak         play all environments for an hour with random, corner and adversarial actions"
 	@echo "make docs         the documentation site, in site/; warnings are errors"
@@ -58,6 +65,13 @@ test-distributed:
 
 with-ray: $(VENV)/.ready-distributed
 	$(PY) -m pytest tests/agents -m "distributed and not slow"
+
+# LeRobot likewise.
+test-lerobot:
+	@$(MAKE) --no-print-directory VENV=$(VENV)-lerobot with-lerobot
+
+with-lerobot: $(VENV)/.ready-lerobot
+	$(PY) -m pytest tests/agents/test_lerobot.py -m lerobot
 
 bench: $(VENV)/.ready-bench
 	$(VENV)/bin/surgsim bench --out docs
@@ -112,6 +126,7 @@ clean:
 
 distclean: clean
 	rm -rf $(VENV) $(VENV)-virtualenv $(VENV)-distributed $(VENV)-distributed-virtualenv
+	rm -rf $(VENV)-lerobot $(VENV)-lerobot-virtualenv
 
 # ---- set-up -------------------------------------------------------------------------------------------------------
 # Stamp files, not the folder, say what is done. `.made` holds the folder that .venv was made for; `.installing` lies
@@ -138,6 +153,12 @@ $(VENV)/.ready-agents: pyproject.toml $(VENV)/.made
 
 $(VENV)/.ready-distributed: pyproject.toml $(VENV)/.made
 	$(call install,$(TORCH) $(WITH_RAY))
+
+$(VENV)/.ready-lerobot: pyproject.toml $(VENV)/.made
+	$(call install,$(TORCH) $(WITH_LEROBOT))
+	@rm $@
+	$(PY) -m pip install -qq --disable-pip-version-check --no-deps $(LEROBOT)
+	@touch $@
 
 $(VENV)/.ready-bench: pyproject.toml $(VENV)/.made
 	$(call install,--editable=.[bench])

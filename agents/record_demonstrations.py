@@ -1,12 +1,17 @@
-"""Record episodes of an oracle, an agent, a trained policy or a person as a Minari dataset.
+"""Record episodes of an oracle, an agent, a trained policy or a person as a Minari or LeRobot data set.
 
     python -m agents.record_demonstrations SurgSim/Retract-v0 --episodes 100 --dataset surgsim/retract/oracle-v0
     python -m agents.record_demonstrations SurgSim/Palpate-v0 --by agents.raster:RasterAgent \
         --dataset surgsim/palpate/raster-v0
+    python -m agents.record_demonstrations SurgSim/Palpate-v0 --format lerobot --dataset runs/palpate --hours 5 \
+        --images endoscope --keep-failures
 
-Datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored with its
-seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations to the
-bit. A person plays with `agents/keyboard.py`. `Recorder` records any other code that steps an environment:
+With `--format lerobot` the data set is the folder `--dataset` (`agents/lerobot_format.py`, docs/datasets.md). Its
+episodes are written one by one, and the same command goes on where it was stopped.
+
+Minari's datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored
+with its seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations
+to the bit. A person plays with `agents/keyboard.py`. `Recorder` records any other code that steps an environment:
 
     env = Recorder(gym.make("SurgSim/Palpate-v0"))
     ...  # reset and step it
@@ -15,9 +20,11 @@ bit. A person plays with `agents/keyboard.py`. `Recorder` records any other code
 
 import argparse
 import copy
+import inspect
 import json
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +36,10 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
+from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
+from surgsim_env.rendering.gl import NoGLError
+from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.scoring.evaluate import named_class
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
@@ -37,6 +47,9 @@ with one_line_errors(__name__, "agents", "demonstrations"):
     import minari
     from minari.data_collector.episode_buffer import EpisodeBuffer
     from tqdm import tqdm
+
+    from agents.lerobot_format import LeRobotFolder
+    from agents.recorded_features import PICTURES, Reading, features, readings
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".safetensors", ".zip")
@@ -47,13 +60,14 @@ Player = Callable[[gym.Env, int], None]
 
 @dataclass
 class RecordedEpisode:
-    """A recorded episode, with one observation and one info more than actions."""
+    """A recorded episode, with one observation, one info and one of each reading more than actions."""
 
     seed: int | None
     observations: list[NDArray] = field(default_factory=list)
     infos: list[dict[str, float]] = field(default_factory=list)
     actions: list[NDArray] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
+    readings: dict[str, list[NDArray]] = field(default_factory=dict)
     terminated: bool = False
     truncated: bool = False
 
@@ -61,6 +75,18 @@ class RecordedEpisode:
     def success(self) -> bool:
         """Success according to the last info."""
         return bool(self.infos[-1].get("success", False))
+
+    def frames(self) -> dict[str, NDArray]:
+        """The episode in LeRobot's form: for each action what was observed before it, and what came of it."""
+        ends = np.zeros(len(self.actions), dtype=np.bool_)
+        ends[-1] = True
+        return {
+            "action": np.array(self.actions),
+            **{name: np.array(values[:-1]) for name, values in self.readings.items()},
+            "next.reward": np.array(self.rewards, dtype=np.float32),
+            "next.done": ends,
+            "next.success": np.array([bool(info.get("success", False)) for info in self.infos[1:]]),
+        }
 
     def buffer(self, index: int) -> EpisodeBuffer:
         """The episode in Minari's form; an unfinished episode counts as truncated."""
@@ -79,10 +105,16 @@ class RecordedEpisode:
 
 
 class Recorder(gym.Wrapper):
-    """Records every episode that is played in an environment."""
+    """Records every episode that is played in an environment.
 
-    def __init__(self, env: gym.Env) -> None:
+    Args:
+        env: the environment.
+        readings: functions of it that are read with each observation, by name.
+    """
+
+    def __init__(self, env: gym.Env, readings: "Mapping[str, Reading] | None" = None) -> None:
         super().__init__(env)
+        self._readings = readings or {}
         self.all_episodes: list[RecordedEpisode] = []
 
     @property
@@ -111,6 +143,8 @@ class Recorder(gym.Wrapper):
         """Record observation and info; Minari stores infos as typed arrays, so only numbers and booleans are kept."""
         episode = self.all_episodes[-1]
         episode.observations.append(np.array(observation))
+        for name, read in self._readings.items():
+            episode.readings.setdefault(name, []).append(np.array(read(self.env)))
         episode.infos.append({name: value for name, value in info.items() if isinstance(value, bool | int | float)})
 
 
@@ -162,15 +196,70 @@ def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: b
     Raises:
         ValueError: seeds that are reserved for scores.
     """
-    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
-    if kept is not None:
-        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
+    check_seeds(seeds)
     recorder = Recorder(env)
     progress = tqdm(seeds, unit="episode")
     for seed in progress:
         play(recorder, seed)
         progress.set_postfix(success=f"{np.mean([episode.success for episode in recorder.episodes]):.0%}")
     return [episode for episode in recorder.episodes if keep_failures or episode.success]
+
+
+def check_seeds(seeds: Iterable[int]) -> None:
+    """Refuse seeds that are reserved for scores.
+
+    Raises:
+        ValueError: names the first.
+    """
+    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
+    if kept is not None:
+        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
+
+
+def record_into(
+    folder: LeRobotFolder,
+    env: gym.Env,
+    play: Player,
+    *,
+    last_seed: int | None = None,
+    hours: float | None = None,
+    keep_failures: bool = False,
+) -> None:
+    """Play an episode for each seed from the folder's next on, write each at once, and append the failures at the end.
+
+    Args:
+        folder: whose features are those of the environment.
+        env: where it is played.
+        play: plays.
+        last_seed: the last to be played; None without such a limit.
+        hours: simulated time of the whole data set from which on no episode is played [h]; None likewise.
+        keep_failures: write them too.
+
+    Raises:
+        ValueError: the next seed is reserved for scores.
+    """
+    known = readings([name.removeprefix(PICTURES) for name in folder.feature_names if name.startswith(PICTURES)])
+    recorder = Recorder(env, known)
+    first, most = folder.next_seed, math.inf if last_seed is None else last_seed
+    progress = tqdm(unit="episode", total=None if last_seed is None else max(last_seed + 1 - first, 0))
+    try:
+        while folder.next_seed <= most and (hours is None or folder.duration < 3600.0 * hours):
+            seed = folder.next_seed
+            check_seeds([seed])
+            recorder.all_episodes.clear()
+            play(recorder, seed)
+            episode = recorder.all_episodes[0]
+            if episode.actions and (episode.success or keep_failures):
+                folder.add(seed, episode.frames(), success=episode.success)
+            else:
+                folder.skip(seed)
+            progress.update()
+            progress.set_postfix(hours=f"{folder.duration / 3600.0:.3f}", failures=len(folder.waiting))
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on")
+    finally:
+        progress.close()
+    folder.finish()
 
 
 def write_dataset(
@@ -214,26 +303,88 @@ def write_dataset(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Play episodes and write the dataset."""
+    """Play episodes and write the data set."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
     parser.add_argument("--by", default="oracle", help="oracle, a policy's NAME.safetensors, or MODULE:CLASS")
     parser.add_argument("--trust-pickle", action="store_true", help="let --by be a zip, which runs code of its author")
-    parser.add_argument("--episodes", type=int, default=10, help="number of episodes to play")
+    parser.add_argument("--episodes", type=int, help="number of episodes to play; 10 by default")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
-    parser.add_argument("--dataset", required=True, help="the dataset's name, such as surgsim/retract/oracle-v0")
+    parser.add_argument(
+        "--dataset", required=True, help="minari: a name, such as surgsim/retract/oracle-v0; else a folder"
+    )
+    parser.add_argument("--format", choices=("minari", "lerobot"), default="minari")
+    lerobot = parser.add_argument_group("with --format lerobot")
+    lerobot.add_argument("--hours", type=float, help="play until so much simulated time is recorded [h]")
+    lerobot.add_argument("--images", nargs="+", choices=CAMERAS, default=[], help="cameras whose pictures are recorded")
+    lerobot.add_argument("--image-size", nargs=2, type=int, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
     given = parser.parse_args(arguments)
+    who = Path(given.by).stem if given.by.endswith(POLICY_SUFFIXES) else given.by
+    if given.format == "lerobot":
+        _record_lerobot(given, who)
+        return
+    if given.hours is not None or given.images:
+        raise ValueError("--hours and --images are for --format lerobot: add it, or leave them out")
     env = gym.make(given.env, **given.env_arguments)
-    seeds = range(given.first_seed, given.first_seed + given.episodes)
+    seeds = range(given.first_seed, given.first_seed + (10 if given.episodes is None else given.episodes))
     episodes = record(
         env, player(given.by, env, trust_pickle=given.trust_pickle), seeds, keep_failures=given.keep_failures
     )
-    who = Path(given.by).stem if given.by.endswith(POLICY_SUFFIXES) else given.by
     dataset = write_dataset(episodes, env, given.dataset, algorithm_name=who)
     print(
         f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps, in {dataset.spec.data_path}"
+    )
+
+
+def _record_lerobot(given: argparse.Namespace, who: str) -> None:
+    """Record as the command line says."""
+    width, height = given.image_size
+    if given.images and (width % 2 or height % 2 or min(width, height) < 16):
+        raise ValueError(f"--image-size is {width} {height}; H.264 takes even numbers of pixels from 16 on")
+    if given.hours is not None and not 0.0 < given.hours < math.inf:
+        raise ValueError(f"--hours is {given.hours:g}; it must be above 0")
+    sight = {"show_force": False, "width": width, "height": height} if given.images else {}
+    env = gym.make(given.env, **sight, **given.env_arguments)
+    inner = env.unwrapped
+    if not isinstance(inner, SurgicalEnv):
+        raise ValueError(f"{given.env} is a {type(inner).__name__}; frames are read from environments of this project")
+    count = 10 if given.episodes is None and given.hours is None else given.episodes
+    folder = LeRobotFolder(
+        Path(given.dataset),
+        features(env, given.images, width=width, height=height),
+        frame_rate=round(1.0 / inner.scene.timing.control_step),
+        robot=Path(inner.scene.instrument.model).stem,
+        task=(inspect.getdoc(type(inner.task)) or type(inner.task).__name__).splitlines()[0],
+        recorded={
+            "env_id": given.env,
+            "env_arguments": given.env_arguments,
+            "scene": inner.scene.name,
+            "recorded_by": who,
+            "first_seed": given.first_seed,
+            "failures_kept": given.keep_failures,
+            "digests": inner.digests(),
+        },
+        first_seed=given.first_seed,
+    )
+    try:
+        record_into(
+            folder,
+            env,
+            player(given.by, env, trust_pickle=given.trust_pickle),
+            last_seed=None if count is None else given.first_seed + count - 1,
+            hours=given.hours,
+            keep_failures=given.keep_failures,
+        )
+    except NoGLError as error:
+        raise ValueError(f"--images: {error}; or leave --images out") from None
+    finally:
+        folder.close()
+        env.close()
+    print(
+        f"{folder.path}: {folder.episode_count} episodes, {folder.frame_count} frames, "
+        f"{folder.duration / 3600.0:.3f} h of simulated time"
     )
 
 

@@ -30,7 +30,15 @@ ORDER = {
     "agents": (
         *("__init__", "command_line", "raster", "keyboard", "make_press_library", "learn_palpate"),
         *("learn_palpate_organs", "learn_palpate_recurrent", "learn_retract", "learn_retract_pixels", "learn_sites"),
-        *("record_demonstrations", "behaviour_cloning", "train_rllib", "leaderboard_tables", "leaderboard"),
+        *(
+            "lerobot_format",
+            "recorded_features",
+            "record_demonstrations",
+            "behaviour_cloning",
+            "train_rllib",
+            "leaderboard_tables",
+            "leaderboard",
+        ),
         *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),

@@ -28,7 +28,7 @@ def film(policy: Any, env_kwargs: dict[str, Any], seeds: Sequence[int], path: Pa
         ValueError: moviepy is missing.
     """
     try:
-        from moviepy import ImageSequenceClip
+        from moviepy import ImageSequenceClip  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError("films need moviepy: pip install 'surgsim[video]'") from None
     size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE, "show_lesion": True}

@@ -15,10 +15,10 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import surgsim_env  # noqa: F401
-from agents.learn_retract_pixels import NETWORK, Player, Samples
+from agents.learn_retract_pixels import NETWORK, UNHELD_PULLS, Player, Samples
 from surgsim_env.rendering import gl
 from surgsim_env.scoring import expert_retract
-from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, TIP, TolerantExpert
+from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, PULL_MOST, SLICES, TIP, TolerantExpert
 from surgsim_env.training.picture_features import PictureAndForce
 from surgsim_env.training.policy_files import describe, load_policy, save_policy
 
@@ -134,7 +134,7 @@ def held_lobe(pull: float) -> np.ndarray:
 
 def test_the_teacher_gives_way_to_a_hard_pull():
     """Back towards the place between lifting and folding, the jaw closed; below the limit it goes on folding."""
-    teacher, limit = TolerantExpert(grasp_along=0.04), expert_retract.PULL_MOST
+    teacher, limit = TolerantExpert(grasp_along=0.04), PULL_MOST
     goes_on, gives_way = (teacher.act(held_lobe(limit + change)) for change in (-0.01, 0.01))
     back, on = (np.array(goal) - [0.030, 0.045] for goal in (expert_retract.RISEN, expert_retract.FOLDED))
     for action, way in ((gives_way, back), (goes_on, on)):
@@ -152,28 +152,48 @@ def test_the_teacher_gives_way_to_a_hard_pull():
     )
 
 
-def test_imagined_pulls_scale_all_readings_but_the_grip_and_are_labelled():
-    """Of states that pull some come again, with forces of a harder pull and the teacher's answer to it."""
-    count = 400
-    player = Player.__new__(Player)
-    pulls = np.where(np.arange(count) % 2 == 0, 0.4, 0.0)
+def imagined(pulls: list[float], *, holds: bool) -> tuple[Player, np.ndarray, np.ndarray, np.ndarray]:
+    """A player of states with these pulls; forces, labels and numbers of the states that it imagines from them."""
+    player, count = Player.__new__(Player), len(pulls)
     player._singles = [SimpleNamespace(task_observation=held_lobe(pull)) for pull in pulls]
+    for single in player._singles:
+        single.task_observation[[HOLDS, GRIP]] *= holds
     player._envs = SimpleNamespace(single_action_space=gym.spaces.Box(-1.0, 1.0, (5,)))  # type: ignore[assignment]
     player._rng, player._expert = np.random.default_rng(0), TolerantExpert(grasp_along=0.04)
     player._pulled = np.arange(8) != 6
-    taught = np.arange(count, dtype=np.float32)[:, None]
     force = np.full((count, 8), 0.4, dtype=np.float32)
     player._seen = {"picture": np.zeros((count, 2, 2, 3), np.uint8), "force": force}
-    pictures, forces, actions, kept = player._imagined(taught)
-    assert 0.1 * count / 2 < len(kept) < 0.3 * count / 2 and (kept % 2 == 0).all()
+    pictures, forces, actions, kept = player._imagined(np.arange(count, dtype=np.float32)[:, None])
     assert len(pictures) == len(forces) == len(actions) == len(kept)
-    made = forces[:, 7]
-    np.testing.assert_allclose(forces, np.where(player._pulled, made[:, None], 0.4), rtol=1e-6)
-    assert made.min() >= 0.6 and made.max() <= 1.3 and np.ptp(made) > 0.5
-    for pull, action in zip(made, actions, strict=True):
-        np.testing.assert_array_equal(action, player._expert.act(held_lobe(float(pull))))
     # The states themselves stay as they are.
-    assert (force == np.float32(0.4)).all() and all(s.task_observation[PULL] in (0.0, 0.4) for s in player._singles)
+    assert (force == np.float32(0.4)).all()
+    assert [single.task_observation[PULL] for single in player._singles] == pulls
+    return player, forces, actions, kept[:, 0]
+
+
+def test_imagined_pulls_scale_all_readings_but_the_grip_and_are_labelled():
+    """Of states that pull some come again, with forces of a harder pull and the teacher's answer to it."""
+    count = 800
+    player, forces, actions, kept = imagined([0.4, 0.0] * (count // 2), holds=True)
+    assert 0.1 * count / 2 < len(kept) < 0.3 * count / 2 and (kept % 2 == 0).all()
+    made, slipped = forces[:, 7], forces[:, 6] == 0.0
+    assert 0.2 < slipped.mean() < 0.4
+    np.testing.assert_allclose(forces[:, :6], np.repeat(made[:, None], 6, axis=1), rtol=1e-6)
+    assert (forces[~slipped, 6] == np.float32(0.4)).all()
+    assert made.min() >= 0.6 and made.max() <= 1.3 and np.ptp(made) > 0.5
+    for pull, gone, action in zip(made, slipped, actions, strict=True):
+        state = held_lobe(float(pull))
+        state[[HOLDS, GRIP]] *= not gone
+        np.testing.assert_array_equal(action, player._expert.act(state))
+    # Where the edge has slipped out, the teacher goes back with an open jaw.
+    back = actions[slipped & (made > PULL_MOST)]
+    assert len(back) and (back == np.float32([0.0, 0.75, 0.0, 0.0, 1.0])).all()
+
+
+def test_all_pulls_that_hold_nothing_are_imagined_several_times():
+    _, forces, _, kept = imagined([0.4, 0.0, 0.04, 0.4], holds=False)
+    assert kept.tolist() == [0] * UNHELD_PULLS + [3] * UNHELD_PULLS
+    assert len(np.unique(forces[:, 7])) == len(kept)
 
 
 @pytest.mark.slow

@@ -57,6 +57,7 @@ def test_installed_wheel_finds_its_scenes(wheel, make_environment, tmp_path, cle
     assert [f"{name}.toml" for name in known] == shipped
 
 
+@pytest.mark.slow
 @pytest.mark.agents
 def test_installed_wheel_trains_and_evaluates(wheel, make_environment, tmp_path, clean_environ):
     """Policies and configurations by name, from a folder that is no checkout; results stay out of the installation."""

@@ -394,7 +394,7 @@ class LeRobotFolder:
             "",
             f"Task: {task} LeRobot data set {VERSION}, {self.frame_rate} frames per second of simulated time.",
             "",
-            "A frame holds what was observed, the action that followed, and under `next.` what came of it. All values",
+            "A frame holds an observation, the action that followed, and under `next.` its results. All values",
             "of a frame are of one moment of the simulation: they are synchronous by construction, and `timestamp` is",
             "frame_index / fps without jitter.",
             "",

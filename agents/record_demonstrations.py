@@ -77,7 +77,7 @@ class RecordedEpisode:
         return bool(self.infos[-1].get("success", False))
 
     def frames(self) -> dict[str, NDArray]:
-        """The episode in LeRobot's form: for each action what was observed before it, and what came of it."""
+        """The episode in LeRobot's form: for each action the observation before it and the reward after it."""
         ends = np.zeros(len(self.actions), dtype=np.bool_)
         ends[-1] = True
         return {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from surgsim_env.cli.values import MaybeText
+from surgsim_env.cli.values import MaybeText, missing_packages
 from surgsim_env.haptics.pacing import Timeliness, timeliness
 from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.motions import with_motion
@@ -64,10 +64,8 @@ class View:
             ValueError: a scene, an instrument or an address that is not to be had; viser is not installed.
             LiveError: the physics died, or viser cannot be guarded.
         """
-        try:
+        with missing_packages("view", "live"):
             import viser  # noqa: F401
-        except ImportError:
-            raise ValueError("surgsim view needs viser: pip install 'surgsim[live]'") from None
         from surgsim_env.live.exchange_records import Replay
         from surgsim_env.live.page import Page
         from surgsim_env.live.recording import read_recording

@@ -176,7 +176,7 @@ PLAYED = [(False, 3), (True, 2), (True, 4), (False, 1), (True, 3), (False, 2)]
 
 
 def play_into(folder, count, pictures=False):
-    """Record the first so many of PLAYED, from where the folder is; seed 5 is played and not kept."""
+    """Record the seeds below `count` that the folder does not hold yet; seed 5 is played and not kept."""
     from agents.lerobot_format import Feature, LeRobotFolder
 
     features = [Feature("action", "float32", (2,), ("along", "across"))]

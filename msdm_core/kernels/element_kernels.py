@@ -92,62 +92,48 @@ def spring_drag(dx, dy, dz, vx, vy, vz, stiffness, beta):
 
 
 @njit(**INLINED)
-def tet_gradients(bx, by, bz, cx, cy, cz, dx, dy, dz):
-    """Six times the gradients dV/dx of the volume of a tet at its corners b, c and d: cross products of its edges.
+def corner_gradient(c, d):
+    """Six times the gradient dV/dx of the volume of a tet at one corner, c x d [m^2].
 
-    In: b, c, d: edges from the corner a [m]
-    Returns nine numbers [m^2], x, y and z of each corner.
+    In: c, d: edges from the corner a to the next two corners, in the order b, c, d, b, c [m]
     """
-    gbx = cy * dz - cz * dy
-    gby = cz * dx - cx * dz
-    gbz = cx * dy - cy * dx
-    gcx = dy * bz - dz * by
-    gcy = dz * bx - dx * bz
-    gcz = dx * by - dy * bx
-    gdx = by * cz - bz * cy
-    gdy = bz * cx - bx * cz
-    gdz = bx * cy - by * cx
-    return gbx, gby, gbz, gcx, gcy, gcz, gdx, gdy, gdz
+    return c[1] * d[2] - c[2] * d[1], c[2] * d[0] - c[0] * d[2], c[0] * d[1] - c[1] * d[0]
 
 
 @njit(**INLINED)
-def six_volumes(bx, by, bz, gbx, gby, gbz):
+def six_volumes(b, gradient):
     """Six times the volume of a tet: one edge times six times its gradient.
 
-    In: b: edge from the corner a [m], gb: six times the gradient at b [m^2]
+    In: b: edge from the corner a [m], gradient: `corner_gradient` at b [m^2]
     Returns [m^3].
     """
-    return bx * gbx + by * gby + bz * gbz
+    return b[0] * gradient[0] + b[1] * gradient[1] + b[2] * gradient[2]
 
 
 @njit(**INLINED)
 def tet_shape(b, c, d):
-    """Six times the gradients and six times the volume of a tet.
-
-    In: b, c, d: edges from the corner a, three numbers each [m]
-    Returns the nine numbers of `tet_gradients` [m^2], and six times the volume [m^3].
-    """
-    gradients = tet_gradients(b[0], b[1], b[2], c[0], c[1], c[2], d[0], d[1], d[2])
-    return gradients, six_volumes(b[0], b[1], b[2], gradients[0], gradients[1], gradients[2])
+    """`corner_gradient` at b [m^2] and six times the volume of a tet [m^3]; b, c, d: edges from the corner a [m]."""
+    gradient = corner_gradient(c, d)
+    return gradient, six_volumes(b, gradient)
 
 
 @njit(**INLINED)
-def six_rates(b, c, d, g):
+def six_rates(b, c, d, b_rate, c_rate, d_rate):
     """Rate of six times the volume of a tet.
 
-    In: b, c, d: velocities of these corners less that of a, three numbers each [m/s], g: `tet_gradients` [m^2]
+    In: b, c, d: edges from the corner a, three numbers each [m], their rates [m/s]
     Returns [m^3/s].
     """
     return (
-        six_volumes(b[0], b[1], b[2], g[0], g[1], g[2])
-        + six_volumes(c[0], c[1], c[2], g[3], g[4], g[5])
-        + six_volumes(d[0], d[1], d[2], g[6], g[7], g[8])
+        six_volumes(b_rate, corner_gradient(c, d))
+        + six_volumes(c_rate, corner_gradient(d, b))
+        + six_volumes(d_rate, corner_gradient(b, c))
     )
 
 
 @njit(**INLINED)
 def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
-    """Factor from `tet_gradients` to the forces of a tet on its corners: minus a sixth of its tension.
+    """Factor from `corner_gradient` to the forces of a tet on its corners: minus a sixth of its tension.
 
     The tension is K (J - 1), plus the mean tension of the volumes averaged at its corners, plus, where J is below
     s = SQUEEZED_RATIO, K' (J - s) s / J.

@@ -5,6 +5,7 @@ from numba import njit
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     STEEP_EXCESS,
+    corner_gradient,
     spring_length,
     tet_shape,
     volume_ratio,
@@ -54,18 +55,16 @@ def hold_squeezed(
     for entry in range(count):
         for tet in range(squeezed[entry], min(squeezed[entry] + width, tets.shape[0])):
             corners = (tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3])
-            g, six = tet_shape(
-                _edge(position, corners[0], corners[1]),
-                _edge(position, corners[0], corners[2]),
-                _edge(position, corners[0], corners[3]),
-            )
+            b = _edge(position, corners[0], corners[1])
+            c = _edge(position, corners[0], corners[2])
+            d = _edge(position, corners[0], corners[3])
+            gb, six = tet_shape(b, c, d)
             ratio = volume_ratio(six, inverse_volume[tet])
             if not ratio < SQUEEZED_RATIO:
                 continue
-            gradients = (
-                (-(g[0] + g[3] + g[6]), -(g[1] + g[4] + g[7]), -(g[2] + g[5] + g[8])),
-                (g[0], g[1], g[2]), (g[3], g[4], g[5]), (g[6], g[7], g[8]),
-            )  # fmt: skip
+            gc, gd = corner_gradient(d, b), corner_gradient(b, c)
+            ga = (-(gb[0] + gc[0] + gd[0]), -(gb[1] + gc[1] + gd[1]), -(gb[2] + gc[2] + gd[2]))
+            gradients = (ga, gb, gc, gd)
             # Six times the rate of the volume that follows from all forces so far, and its change for a tension of 6.
             six_rate = 0.0
             give = 0.0

@@ -1,7 +1,7 @@
 """Springs, volume term and integration of an organ alone, or of organs of the same tets side by side.
 
 The equations are those of `element_kernels`, the places in memory those of `layout_kernels`. For an organ alone
-`group_kernels` does the bulk of springs and tets, eight at a time; the plain loops here do what is left over, and all
+`group_kernels` does the bulk of springs and tets, GROUP at a time; the plain loops here do what is left over, and all
 of it for organs side by side. The sums have the same order in every case: an organ moves to the bit as it would alone.
 """
 
@@ -10,6 +10,7 @@ from numba import njit
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     STEEP_EXCESS,
+    corner_gradient,
     node_law,
     node_tension,
     six_rates,
@@ -23,7 +24,6 @@ from msdm_core.kernels.element_kernels import (
     volume_ratio,
 )
 from msdm_core.kernels.group_kernels import (
-    GROUP,
     add_energy_groups,
     add_spring_groups,
     add_tet_groups,
@@ -52,7 +52,7 @@ from msdm_core.kernels.layout_kernels import (
     where_moving,
 )
 from msdm_core.kernels.option_kernels import INLINED, KERNEL
-from msdm_core.kernels.vector_kernels import any_below, keep_lower
+from msdm_core.kernels.vector_kernels import GROUP, any_below, keep_lower
 
 
 @njit(**INLINED)
@@ -337,10 +337,10 @@ def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_l
         _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens),
         tets.shape[0],
     ):
-        edge, third, fourth = three_edges(lanes, position, tets, tet)
-        _, six = tet_shape(edge, third, fourth)
+        b, c, d = three_edges(lanes, position, tets, tet)
+        _, six = tet_shape(b, c, d)
         if stiffens:
-            twice = _measure(lanes, position, lengths, tet, stiffness, rest_length, edge)
+            twice = _measure(lanes, position, lengths, tet, stiffness, rest_length, b)
             add_volume_and_energy(lanes, pairs, tets, tet, six, twice)
         else:
             add_to_corners(lanes, total, tets, tet, six)
@@ -367,8 +367,8 @@ def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffe
     Out: total or the first numbers of pairs [m^3], as in `sum_at_nodes`
     """
     for tet in range(tets.shape[0]):
-        gradients, _ = tet_shape(*three_edges(lanes, position, tets, tet))
-        six = beta * six_rates(*three_edges(lanes, velocity, tets, tet), gradients)
+        b, c, d = three_edges(lanes, position, tets, tet)
+        six = beta * six_rates(b, c, d, *three_edges(lanes, velocity, tets, tet))
         if stiffens:
             for corner in range(4):
                 add_half(lanes, pairs, tets[tet, corner], 0, six)
@@ -377,15 +377,21 @@ def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffe
 
 
 @njit(**INLINED)
-def _push_corners(lanes, force, tets, tet, scale, g, pull, edge):
-    """Forces of a tet on its corners, and of the spring along its first edge."""
-    bx, by, bz = scale * g[0] - pull * edge[0], scale * g[1] - pull * edge[1], scale * g[2] - pull * edge[2]
-    cx, cy, cz = scale * g[3], scale * g[4], scale * g[5]
-    dx, dy, dz = scale * g[6], scale * g[7], scale * g[8]
-    take_from_node(lanes, force, tets[tet, 0], bx + cx + dx, by + cy + dy, bz + cz + dz)
-    add_to_node(lanes, force, tets[tet, 1], bx, by, bz)
-    add_to_node(lanes, force, tets[tet, 2], cx, cy, cz)
-    add_to_node(lanes, force, tets[tet, 3], dx, dy, dz)
+def _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b):
+    """Add the forces of a tet on its corners: `scale` times `corner_gradient`, and `at_b` in place of that at b.
+
+    One corner after the other: all gradients at once do not fit into 16 registers.
+    """
+    x, y, z = at_b
+    add_to_node(lanes, force, tets[tet, 1], x, y, z)
+    g = corner_gradient(d, b)
+    gx, gy, gz = scale * g[0], scale * g[1], scale * g[2]
+    add_to_node(lanes, force, tets[tet, 2], gx, gy, gz)
+    x, y, z = x + gx, y + gy, z + gz
+    g = corner_gradient(b, c)
+    gx, gy, gz = scale * g[0], scale * g[1], scale * g[2]
+    add_to_node(lanes, force, tets[tet, 3], gx, gy, gz)
+    take_from_node(lanes, force, tets[tet, 0], x + gx, y + gy, z + gz)
 
 
 @njit(**INLINED)
@@ -431,8 +437,8 @@ def add_tet_forces(
     width = group_width(lanes)
     lowest = load_item(lanes, low, 0)
     for tet in range(first, tets.shape[0]):
-        edge, third, fourth = three_edges(lanes, position, tets, tet)
-        gradients, six = tet_shape(edge, third, fourth)
+        b, c, d = three_edges(lanes, position, tets, tet)
+        gradient, six = tet_shape(b, c, d)
         ratio = volume_ratio(six, load_shared(lanes, position, inverse_volume, tet))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         if any_below(ratio, SQUEEZED_RATIO):
@@ -442,9 +448,9 @@ def add_tet_forces(
                 count += 1
         if measured:
             averaged = corner_mean_of_pairs(lanes, pairs, tets, tet)
-            length = _kept_length(lanes, lengths, tet, edge[0], edge[1], edge[2])
+            length = _kept_length(lanes, lengths, tet, b[0], b[1], b[2])
         else:
-            averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(edge[0], edge[1], edge[2])
+            averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(b[0], b[1], b[2])
         scale = tet_scale(ratio, load_item(lanes, bulk, tet), load_item(lanes, averaged_bulk, tet), averaged)
         share = load_shared(lanes, position, rest_length, tet) / length
         rigidity = load_item(lanes, stiffness, tet)
@@ -461,7 +467,10 @@ def add_tet_forces(
             if fades:
                 fade_arms(lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], tet, pull / share, fade, moving)
             pull = pull * load_shared(lanes, position, gain, tet) - load_item(lanes, relief, tet) * share
-        _push_corners(lanes, force, tets, tet, scale, gradients, pull, edge)
+        at_b = (
+            scale * gradient[0] - pull * b[0], scale * gradient[1] - pull * b[1], scale * gradient[2] - pull * b[2]
+        )  # fmt: skip
+        _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b)
     store_item(lanes, low, 0, where_moving(lanes, moving, lowest, load_item(lanes, low, 0)))
     return count, steep_count
 
@@ -474,8 +483,9 @@ def add_volume_damping(lanes, position, velocity, force, tets, inverse_volume, b
     Out: force, added to [N] (n_node, 4)
     """
     for tet in range(tets.shape[0]):
-        gradients, _ = tet_shape(*three_edges(lanes, position, tets, tet))
-        six_rate = six_rates(*three_edges(lanes, velocity, tets, tet), gradients)
+        b, c, d = three_edges(lanes, position, tets, tet)
+        six_rate = six_rates(b, c, d, *three_edges(lanes, velocity, tets, tet))
         rate = beta * volume_ratio(six_rate, load_shared(lanes, position, inverse_volume, tet))
         scale = load_item(lanes, bulk, tet) * rate * (-1.0 / 6.0)
-        _push_corners(lanes, force, tets, tet, scale, gradients, rate * 0.0, gradients)
+        g = corner_gradient(c, d)
+        _push_corners(lanes, force, tets, tet, scale, b, c, d, (scale * g[0], scale * g[1], scale * g[2]))

@@ -8,12 +8,18 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
+from numba.core.registry import cpu_target
+
+from msdm_core.kernels.vector_kernels import GROUP, lane_counts
 from surgsim_env.reports.output_folder import OutputFolder
 
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
 REPORT_NAME = "benchmarks.md"
 # Written by hand; kept in the folder of the report, and appended to it.
 NOTES_NAME = "benchmarks_notes.md"
+# Width of vector registers [bits] by a feature of the processor, the widest first; without one of them it is 128.
+REGISTERS = {"avx512f": 512, "avx2": 256, "avx": 256}
 INTRODUCTION = """# Benchmarks
 
 Written by `surgsim bench{quick}`; text after the figures, if any, is from `{notes}`, written by hand. Times hold for
@@ -40,6 +46,20 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
+def registers() -> str:
+    """The widest vector registers that compiled code uses here, and what it works on at a time.
+
+    NUMBA_CPU_NAME and NUMBA_CPU_FEATURES change the registers; the numbers at a time are the same everywhere.
+    """
+    features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+    bits = next((bits for name, bits in REGISTERS.items() if f"+{name}" in features), 128)
+    doubles, singles = (" or ".join(map(str, lane_counts(dtype))) for dtype in (np.float64, np.float32))
+    return (
+        f"vector registers of {bits} bits; {GROUP} springs or tets of an organ alone at a time, or one of {doubles} "
+        f"organs in float64, {singles} in float32"
+    )
+
+
 def version(package: str) -> str:
     """A package's version, or "absent"."""
     try:
@@ -57,6 +77,7 @@ def describe(load_before: str) -> str:
     """Machine, versions and date, as a list in Markdown."""
     lines = [
         f"machine: {core_count()} cores of {processor()}, {platform.system()} {platform.machine()}",
+        registers(),
         f"load average (1 min): {load_before} at the start, {load()} at the end; this run makes about 1 itself",
         f"Python {platform.python_version()}; " + ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         f"date: {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",

@@ -10,14 +10,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-import llvmlite.binding
 import numpy as np
 from packaging.requirements import Requirement
 from rich.console import Console
 
 from msdm_core.kernels.substep_kernels import advance_substeps
 from msdm_core.numba_cache import FOLDER_PREFIX
-from surgsim_env.bench.report import core_count, processor
+from surgsim_env.bench.report import core_count, processor, registers
 from surgsim_env.coupling import mujoco_library
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import SitePress, press_alone, press_phases
@@ -38,8 +37,6 @@ FEATURES = {
     "tetwild": "surgsim organ --mesher tetwild",
     "video": "films of episodes",
 }
-# Width of vector registers [bits] by a feature of the processor, the widest first; without one of them it is 128.
-REGISTERS = {"avx512f": 512, "avx2": 256, "avx": 256}
 # The self-test presses the middle of the top of this scene's healthy organ: the force on the tip [N], and the relative
 # difference that rounding in libraries of other versions may make.
 SCENE = "phantom_small"
@@ -97,9 +94,7 @@ def interpreter() -> Finding:
 
 def cores() -> Finding:
     """Cores and vector registers."""
-    features = llvmlite.binding.get_host_cpu_features()
-    bits = next((bits for name, bits in REGISTERS.items() if features.get(name)), 128)
-    return Finding("processor", "ok", f"{core_count()} cores of {processor()}, vector registers of {bits} bits")
+    return Finding("processor", "ok", f"{core_count()} cores of {processor()}; {registers()}")
 
 
 def opengl() -> Finding:

@@ -10,7 +10,7 @@ known when a function is compiled, which drops the other branch of each `if len(
 import numpy as np
 from numba import njit
 
-from msdm_core.kernels.option_kernels import INLINED, KERNEL
+from msdm_core.kernels.option_kernels import ALLOCATING_KERNEL, INLINED
 from msdm_core.kernels.vector_kernels import (
     define_extract,
     keep_lower,
@@ -241,7 +241,7 @@ def corner_mean(lanes, values, tets, tet):
     )  # fmt: skip
 
 
-@njit(**KERNEL)
+@njit(**ALLOCATING_KERNEL)
 def spread_order(items, base, gap, waiting, last, order):
     """The base order, changed so that items that share a node stand apart.
 

@@ -12,7 +12,7 @@ from numba import njit
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from msdm_core.kernels.option_kernels import INLINED
+from msdm_core.kernels.option_kernels import INLINED, INLINED_VIEW
 
 FloatArray = NDArray[np.float64]
 # float64 or float32, eight or sixteen lanes.
@@ -579,7 +579,7 @@ def set_entry(values, lane, value):
         values[lane] = value
 
 
-@njit(**INLINED)
+@njit(**INLINED_VIEW)
 def column_of(values, lane):
     """One lane's numbers of an array (n, n_lane), or of all lanes' array (n,)."""
     if values.ndim == 2:
@@ -587,7 +587,7 @@ def column_of(values, lane):
     return values
 
 
-@njit(**INLINED)
+@njit(**INLINED_VIEW)
 def part_of(lanes, values, lane):
     """One lane's part of an array whose first index is the lane; an organ alone has the whole array."""
     if len(lanes) == 0:
@@ -595,14 +595,14 @@ def part_of(lanes, values, lane):
     return values[lane]
 
 
-@njit(**INLINED)
+@njit(**INLINED_VIEW)
 def _triangles_of(values, lane, count):
     if values.ndim == 3:
         return values[lane, :count]
     return values
 
 
-@njit(**INLINED)
+@njit(**INLINED_VIEW)
 def _numbers_of(values, lane, count):
     if values.ndim == 2:
         return values[lane, :count]
@@ -638,21 +638,21 @@ def supports_of(lanes, model, lane):
     )  # fmt: skip
 
 
-@njit(**INLINED)
+@njit(**INLINED_VIEW)
 def _places_of(values, lane):
     if values.ndim == 3:
         return values[lane]
     return values
 
 
-@njit(**INLINED)
+@njit(**INLINED_VIEW)
 def _blocks_of(values, lane):
     if values.ndim == 4:
         return values[lane]
     return values
 
 
-@njit(**INLINED)
+@njit(**INLINED_VIEW)
 def _shifts_of(values, lane):
     if values.ndim == 4:
         return values[:, :, :, lane]

@@ -13,6 +13,7 @@ from numba import njit
 from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
+from msdm_core.kernels.layout_kernels import load_part, store_part
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
@@ -217,7 +218,8 @@ def _wake(lanes, state):
 def _keep_forces(lanes, state):
     """Keep the forces of lanes that do not move: the tissue's kernels overwrite them."""
     if len(lanes) > 0:
-        state.kept_force[:, :, :] = state.node_force
+        for part in range(3 * state.node_force.shape[0]):
+            store_part(lanes, state.kept_force, part, load_part(lanes, state.node_force, part))
 
 
 @njit(**INLINED)

@@ -18,6 +18,7 @@ from llvmlite import ir
 from numba import extending, types
 from numba.core import cgutils
 from numba.core.datamodel.models import PrimitiveModel
+from numba.core.registry import cpu_target
 from numba.extending import overload, register_model
 from numpy.typing import NDArray
 
@@ -30,6 +31,8 @@ REGISTER_SIZE = 64
 # into vectors and back by the fewest shuffles; eight took 20 % longer with AVX2, whose 16 registers they overflow, and
 # 9 % longer with AVX-512.
 GROUP = 4
+# By a feature of the processor, the widest first; without one of them it is 128.
+_REGISTER_BITS = {"avx512f": 512, "avx2": 256, "avx": 256}
 # No fusing of products and sums: the same bits on every machine, for numbers and for vectors of any width.
 FLAGS = ()
 
@@ -55,6 +58,15 @@ class VectorModel(PrimitiveModel):
 def lane_counts(dtype: Any) -> tuple[int, ...]:
     """Possible numbers of lanes of a numpy type: a full register first, then half a register."""
     return (8,) if np.dtype(dtype) == np.float64 else (16, 8)
+
+
+def register_bits() -> int:
+    """Width of the widest vector registers that compiled code may use [bits].
+
+    NUMBA_CPU_NAME and NUMBA_CPU_FEATURES decide; without them, the processor.
+    """
+    features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+    return next((bits for name, bits in _REGISTER_BITS.items() if f"+{name}" in features), 128)
 
 
 def aligned_zeros(shape: tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:

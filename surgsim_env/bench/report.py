@@ -9,17 +9,14 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-from numba.core.registry import cpu_target
 
-from msdm_core.kernels.vector_kernels import GROUP, lane_counts
+from msdm_core.kernels.vector_kernels import GROUP, lane_counts, register_bits
 from surgsim_env.reports.output_folder import OutputFolder
 
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
 REPORT_NAME = "benchmarks.md"
 # Written by hand; kept in the folder of the report, and appended to it.
 NOTES_NAME = "benchmarks_notes.md"
-# Width of vector registers [bits] by a feature of the processor, the widest first; without one of them it is 128.
-REGISTERS = {"avx512f": 512, "avx2": 256, "avx": 256}
 INTRODUCTION = """# Benchmarks
 
 Written by `surgsim bench{quick}`; text after the figures, if any, is from `{notes}`, written by hand. Times hold for
@@ -47,15 +44,10 @@ def processor() -> str:
 
 
 def registers() -> str:
-    """The widest vector registers that compiled code uses here, and what it works on at a time.
-
-    NUMBA_CPU_NAME and NUMBA_CPU_FEATURES change the registers; the numbers at a time are the same everywhere.
-    """
-    features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
-    bits = next((bits for name, bits in REGISTERS.items() if f"+{name}" in features), 128)
+    """The vector registers that compiled code uses here, and what it works on at a time."""
     doubles, singles = (" or ".join(map(str, lane_counts(dtype))) for dtype in (np.float64, np.float32))
     return (
-        f"vector registers of {bits} bits; {GROUP} springs or tets of an organ alone at a time, or one of {doubles} "
+        f"vector registers of {register_bits()} bits; {GROUP} springs or tets of an organ alone at a time, or one of {doubles} "
         f"organs in float64, {singles} in float32"
     )
 

@@ -86,7 +86,9 @@ def begin_step(tools, drive, shapes, response, motion, reference):
     drive_servo(tools)
     read_shapes(tools, shapes)
     read_response(tools, response)
-    reference[:, :] = shapes.tool_centre
+    for tool in range(reference.shape[0]):
+        for axis in range(3):
+            reference[tool, axis] = shapes.tool_centre[tool, axis]
 
 
 @njit(**KERNEL)

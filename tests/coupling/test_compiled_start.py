@@ -11,7 +11,6 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from numba.core.runtime import _nrt_python, rtsys
 
 from msdm_core.kernels.structure_kernels import FAULT_NONE
 from surgsim_env.coupling import mujoco_library
@@ -19,6 +18,7 @@ from surgsim_env.coupling.exchange import haptic_steps, step_outcome
 from surgsim_env.coupling.haptic_kernels import StepPlan, advance_haptic_steps
 from surgsim_env.instruments.mujoco_kernels import MUJOCO_FUNCTIONS
 from surgsim_env.instruments.tool_bodies import ToolBodies
+from tests.allocations import allocations
 from tests.coupling.test_compiled_step import DOWN, on_phantom, pair
 from tests.coupling.test_exchange import LAW, free_ball, free_organ
 
@@ -40,20 +40,9 @@ def steps_of(env, count):
 
 
 def test_nothing_is_allocated_within_the_loop():
-    """What the call itself takes (a reference to each array handed in) does not grow with the number of steps."""
-    env = on_phantom(gap=-0.001)[0]
-    if not _nrt_python.memsys_stats_enabled():
-        _nrt_python.memsys_enable_stats()
-    counts = []
-    for count in (1, 3, 30):
-        call = steps_of(env, count)
-        before = rtsys.get_allocation_stats()
-        result = call()
-        after = rtsys.get_allocation_stats()
-        assert result == (count, FAULT_NONE)
-        counts.append((after.alloc - before.alloc, after.mi_alloc - before.mi_alloc))
-    assert counts[0][1] > 0, "the counters do not count"
-    assert counts[0] == counts[1] == counts[2]
+    call, results = steps_of(on_phantom(gap=-0.001)[0], 30), []
+    assert allocations(lambda: results.append(call())) == 0
+    assert results == [(30, FAULT_NONE)]
 
 
 def test_other_threads_run_meanwhile():

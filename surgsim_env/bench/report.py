@@ -47,8 +47,8 @@ def registers() -> str:
     """The vector registers that compiled code uses here, and what it works on at a time."""
     doubles, singles = (" or ".join(map(str, lane_counts(dtype))) for dtype in (np.float64, np.float32))
     return (
-        f"vector registers of {register_bits()} bits; {GROUP} springs or tets of an organ alone at a time, or one of {doubles} "
-        f"organs in float64, {singles} in float32"
+        f"vector registers of {register_bits()} bits; {GROUP} springs or tets of an organ alone at a time, or one of "
+        f"{doubles} organs in float64, {singles} in float32"
     )
 
 

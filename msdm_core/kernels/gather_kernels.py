@@ -55,9 +55,7 @@ class _Numbers:
 
     def load(self, item: int, corner: int, kind: Any, column: int = 0) -> Any:
         """Numbers of a node from a column on."""
-        loaded = self._builder.load(self._place(item, corner, column, kind))
-        loaded.align = _ALIGNMENT
-        return loaded
+        return self._builder.load(self._place(item, corner, column, kind), align=_ALIGNMENT)
 
     def add(self, item: int, corner: int, value: Any, column: int = 0) -> None:
         """Add to what `load` reads."""
@@ -70,8 +68,9 @@ class _Numbers:
         self._builder.store(less, self._place(item, corner, 0, value.type), align=_ALIGNMENT)
 
 
-def _shuffle(builder: ir.IRBuilder, a: Any, b: Any, places: Sequence[int]) -> Any:
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT32, len(places)), list(places)))
+def _shuffle(builder: ir.IRBuilder, pair: Sequence[Any], places: Sequence[int]) -> Any:
+    """Entries of two vectors, one after the other, by place."""
+    return builder.shuffle_vector(pair[0], pair[1], ir.Constant(ir.VectorType(_INT32, len(places)), list(places)))
 
 
 def _pack(builder: ir.IRBuilder, numbers: Sequence[Any]) -> Any:
@@ -88,9 +87,9 @@ def _entry(builder: ir.IRBuilder, vector: Any, place: int) -> Any:
 def _columns(builder: ir.IRBuilder, rows: Sequence[Any]) -> list[Any]:
     """Rows (x, y, z, -), one an item, as vectors of x, y and z."""
     pairs = ((rows[0], rows[1]), (rows[2], rows[3]))
-    even = [_shuffle(builder, *pair, _EVEN) for pair in pairs]
-    odd = [_shuffle(builder, *pair, _ODD) for pair in pairs]
-    return [_shuffle(builder, *even, _LOW), _shuffle(builder, *odd, _LOW), _shuffle(builder, *even, _HIGH)]
+    even = [_shuffle(builder, pair, _EVEN) for pair in pairs]
+    odd = [_shuffle(builder, pair, _ODD) for pair in pairs]
+    return [_shuffle(builder, even, _LOW), _shuffle(builder, odd, _LOW), _shuffle(builder, even, _HIGH)]
 
 
 def _rows(builder: ir.IRBuilder, columns: Sequence[Any]) -> list[Any]:
@@ -98,8 +97,8 @@ def _rows(builder: ir.IRBuilder, columns: Sequence[Any]) -> list[Any]:
     x, y, z = columns
     nothing = ir.Constant(_VECTOR, [0.0] * GROUP)
     # x0, y0, x2, y2 and z0, 0, z2, 0; then those of items 1 and 3.
-    even, odd = ([_shuffle(builder, *pair, places) for pair in ((x, y), (z, nothing))] for places in (_EVEN, _ODD))
-    return [_shuffle(builder, *pairs, half) for half in (_LOW, _HIGH) for pairs in (even, odd)]
+    even, odd = ([_shuffle(builder, pair, places) for pair in ((x, y), (z, nothing))] for places in (_EVEN, _ODD))
+    return [_shuffle(builder, pairs, half) for half in (_LOW, _HIGH) for pairs in (even, odd)]
 
 
 def _define_read(corners: int, width: int, result: Any, write: Callable[..., Any]) -> Any:
@@ -125,7 +124,8 @@ def _define_add(corners: int, width: int, write: Callable[..., None]) -> Any:
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, given: Any) -> Any:
             group = _Group(context, builder, signature.args[1], given[1], given[2], corners)
             numbers = _Numbers(group, context, signature.args[0], given[0], width)
-            write(builder, numbers, _entries(builder, signature.args[3], given[3]))
+            several = isinstance(vectors, types.BaseTuple)
+            write(builder, numbers, _entries(builder, signature.args[3], given[3]) if several else given[3])
             return context.get_dummy_value()
 
         return types.none(values, items, types.intp, vectors), generate
@@ -142,11 +142,12 @@ def _tuple(context: Any, builder: ir.IRBuilder, kind: Any, values: Sequence[Any]
     return context.make_tuple(builder, kind, parts)
 
 
-def _entries(builder: ir.IRBuilder, kind: Any, value: Any) -> Any:
+def _entries(builder: ir.IRBuilder, kind: Any, value: Any) -> list[Any]:
     """Tuples of tuples of values as lists of lists."""
-    if not isinstance(kind, types.BaseTuple):
-        return value
-    return [_entries(builder, part, cgutils.unpack_tuple(builder, value)[place]) for place, part in enumerate(kind)]
+    return [
+        _entries(builder, part, entry) if isinstance(part, types.BaseTuple) else entry
+        for part, entry in zip(kind, cgutils.unpack_tuple(builder, value), strict=True)
+    ]
 
 
 # ---- springs ------------------------------------------------------------------------------------------------------
@@ -170,7 +171,7 @@ def _end_sums(builder: ir.IRBuilder, pairs: _Numbers) -> Any:
 def _pull_ends(builder: ir.IRBuilder, force: _Numbers, vectors: Any) -> None:
     rows, scale = vectors
     for item in range(GROUP):
-        pull = builder.fmul(rows[item], _shuffle(builder, scale, scale, [item] * 4))
+        pull = builder.fmul(rows[item], _shuffle(builder, (scale, scale), [item] * 4))
         force.add(item, 0, pull)
         force.take(item, 1, pull)
 
@@ -245,11 +246,10 @@ def _add_at_corners(builder: ir.IRBuilder, total: _Numbers, six: Any) -> None:
 
 
 def _add_pairs(builder: ir.IRBuilder, pairs: _Numbers, vectors: Any) -> None:
-    six, energy = vectors
     nothing = ir.Constant(_VECTOR, [0.0] * GROUP)
     for item in range(GROUP):
         places = (item, item + GROUP)
-        at_ends, elsewhere = _shuffle(builder, six, energy, places), _shuffle(builder, six, nothing, places)
+        at_ends, elsewhere = _shuffle(builder, vectors, places), _shuffle(builder, (vectors[0], nothing), places)
         for corner, value in enumerate((at_ends, at_ends, elsewhere, elsewhere)):
             pairs.add(item, corner, value)
 

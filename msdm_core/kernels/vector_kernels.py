@@ -65,7 +65,8 @@ def register_bits() -> int:
 
     NUMBA_CPU_NAME and NUMBA_CPU_FEATURES decide; without them, the processor.
     """
-    features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+    context: Any = cpu_target.target_context
+    features = context.codegen().magic_tuple()[2].split(",")
     return next((bits for name, bits in _REGISTER_BITS.items() if f"+{name}" in features), 128)
 
 

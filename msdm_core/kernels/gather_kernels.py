@@ -102,10 +102,16 @@ def _rows(builder: ir.IRBuilder, columns: Sequence[Any]) -> list[Any]:
 
 
 def _define_read(corners: int, width: int, result: Any, write: Callable[..., Any]) -> Any:
-    """A function of an array, of items and of a group's first item that returns vectors."""
+    """A function of an array, of items and of a group's first item that returns vectors.
+
+    `write` writes its code. Arrays have `width` numbers a node and `corners` nodes an item, one after the other.
+    """
 
     @intrinsic
     def read(_typing: Any, values: Any, items: Any, first: Any) -> Any:
+        if not values.layout == items.layout == "C":
+            return None
+
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, given: Any) -> Any:
             group = _Group(context, builder, signature.args[1], given[1], given[2], corners)
             written = write(builder, _Numbers(group, context, signature.args[0], given[0], width))
@@ -117,10 +123,16 @@ def _define_read(corners: int, width: int, result: Any, write: Callable[..., Any
 
 
 def _define_add(corners: int, width: int, write: Callable[..., None]) -> Any:
-    """A function of an array, of items, of a group's first item and of vectors that adds these up in the array."""
+    """A function of an array, of items, of a group's first item and of vectors that adds these up in the array.
+
+    Otherwise as `_define_read`.
+    """
 
     @intrinsic
     def add(_typing: Any, values: Any, items: Any, first: Any, vectors: Any) -> Any:
+        if not values.layout == items.layout == "C":
+            return None
+
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, given: Any) -> Any:
             group = _Group(context, builder, signature.args[1], given[1], given[2], corners)
             numbers = _Numbers(group, context, signature.args[0], given[0], width)

@@ -259,9 +259,12 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 ux *= drag
                 uy *= drag
                 uz *= drag
-                _push_corner(position, force, reference, wrench, tool, a, rows, count, 0, push, wa, ux, uy, uz)
-                _push_corner(position, force, reference, wrench, tool, b, rows, count, 1, push, wb, ux, uy, uz)
-                _push_corner(position, force, reference, wrench, tool, c, rows, count, 2, push, wc, ux, uy, uz)
+                # A loop: written out, each constant number of a corner would be compiled for itself.
+                for corner in range(3):
+                    node, weight = places[count, 2 + corner], QUADRATURE_BARYCENTRIC[point, corner]
+                    _push_corner(
+                        position, force, reference, wrench, tool, node, rows, count, corner, push, weight, ux, uy, uz
+                    )
                 count += 1
     return count
 

@@ -58,7 +58,7 @@ def swept(points: FloatArray, items: NDArray[np.integer]) -> NDArray[np.intp]:
     along, across, within = np.argsort(-np.ptp(points, axis=0), kind="stable")
     base = np.lexsort((cells[:, within], cells[:, across], cells[:, along]))
     order, last = np.empty(len(items), dtype=np.intp), np.full(len(points), -GAP)
-    spread_order(np.ascontiguousarray(items), base, GAP, np.empty(WINDOW, dtype=np.intp), last, order)
+    spread_order(np.ascontiguousarray(items, dtype=np.intp), base, GAP, np.empty(WINDOW, dtype=np.intp), last, order)
     return order
 
 

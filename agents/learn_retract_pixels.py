@@ -53,7 +53,7 @@ TAUGHT_WEIGHT = 0.1
 # Share of states with a pull above PULL_LEAST [N] that are kept a second time, with an imagined pull [N]. States in
 # which the jaw pushes without holding anything are rare: all of them are kept, with UNHELD_PULLS imagined pulls each.
 # Of the others SLIPPED_SHARE are imagined without a grip, as if the edge had just slipped out.
-IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL, UNHELD_PULLS, SLIPPED_SHARE = 0.2, 0.05, (0.6, 1.3), 4, 0.3
+IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL, UNHELD_PULLS, SLIPPED_SHARE = 0.2, 0.05, (0.4, 1.3), 4, 0.3
 # Of the first rounds, the share of steps that the expert plays.
 EXPERT_SHARES = (1.0, 0.5, 0.2)
 

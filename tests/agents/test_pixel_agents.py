@@ -15,10 +15,10 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import surgsim_env  # noqa: F401
-from agents.learn_retract_pixels import NETWORK, UNHELD_PULLS, Player, Samples
+from agents.learn_retract_pixels import IMAGINED_PULL, NETWORK, UNHELD_PULLS, Player, Samples
 from surgsim_env.rendering import gl
 from surgsim_env.scoring import expert_retract
-from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, PULL_MOST, SLICES, TIP, TolerantExpert
+from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, PULL_MOST, PUSH_MOST, SLICES, TIP, TolerantExpert
 from surgsim_env.training.picture_features import PictureAndForce
 from surgsim_env.training.policy_files import describe, load_policy, save_policy
 
@@ -141,10 +141,12 @@ def test_the_teacher_gives_way_to_a_hard_pull():
         assert action[1:3] @ way > 0.99 * np.linalg.norm(action[1:3]) * np.linalg.norm(way) > 0.0
         assert action[3] == 0.0 and action[4] == -1.0
     # Where the edge has slipped out of the jaw, the pads still push: outwards, and the jaw opens.
-    slipped = held_lobe(limit + 0.01)
-    slipped[HOLDS] = 0.0
-    away = teacher.act(slipped)
+    slipped = [held_lobe(PUSH_MOST + change) for change in (-0.01, 0.01)]
+    for observation in slipped:
+        observation[HOLDS] = 0.0
+    still_in, away = (teacher.act(observation) for observation in slipped)
     assert away[1] > 0.0 and away[0] == away[2] == 0.0 and away[4] == 1.0
+    assert not np.array_equal(still_in, away)
     # The plain expert pulls on.
     np.testing.assert_array_equal(
         expert_retract.RetractExpert().act(held_lobe(limit + 0.01))[:3],
@@ -180,13 +182,14 @@ def test_imagined_pulls_scale_all_readings_but_the_grip_and_are_labelled():
     assert 0.2 < slipped.mean() < 0.4
     np.testing.assert_allclose(forces[:, :6], np.repeat(made[:, None], 6, axis=1), rtol=1e-6)
     assert (forces[~slipped, 6] == np.float32(0.4)).all()
-    assert made.min() >= 0.6 and made.max() <= 1.3 and np.ptp(made) > 0.5
+    assert made.min() >= IMAGINED_PULL[0] and made.max() <= IMAGINED_PULL[1]
+    assert np.ptp(made) > 0.8 * np.ptp(IMAGINED_PULL)
     for pull, gone, action in zip(made, slipped, actions, strict=True):
         state = held_lobe(float(pull))
         state[[HOLDS, GRIP]] *= not gone
         np.testing.assert_array_equal(action, player._expert.act(state))
     # Where the edge has slipped out, the teacher goes back with an open jaw.
-    back = actions[slipped & (made > PULL_MOST)]
+    back = actions[slipped & (made > PUSH_MOST)]
     assert len(back) and (back == np.float32([0.0, 0.75, 0.0, 0.0, 1.0])).all()
 
 

@@ -387,7 +387,8 @@ def read_policy(path: Path) -> None:
 
     policy = load_policy(path)
     policy.reset(2)
-    policy.act(np.zeros((2, *policy.observation_shape), dtype=np.float32))
+    # Not zeros: a policy of sites refuses lengths of 0.
+    policy.act(np.full((2, *policy.observation_shape), 0.5, dtype=np.float32))
 
 
 KINDS = {

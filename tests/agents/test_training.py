@@ -80,8 +80,8 @@ def test_a_run_of_each_shipped_configuration_begins(tmp_path: Path, monkeypatch,
     monkeypatch.chdir(CONFIGS.parents[1])
     read = read_config(file, seed=3)
     assert read.seed == 3 and f"name: {read.name}" in config_text(read)
-    if read.warm_start is not None and not Path(read.warm_start).exists():
-        # What an earlier run leaves.
+    if read.warm_start is not None and read.warm_start.startswith("runs/"):
+        # An earlier run leaves it.
         read = replace(read, warm_start=None, warm_spread=None)
     run = Run(replace(read, environment=replace(read.environment, count=4)), tmp_path / "run")
     assert run.model.num_timesteps == 0

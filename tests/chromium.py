@@ -36,6 +36,8 @@ COUNT_PICTURES = """(() => {
 
 # How long anything may take before a test gives up [s]. Nothing that passes depends on it.
 PATIENCE = 600.0
+# A press is repeated where the server has not heard of it after this time [s], this often.
+GRAB_TIMEOUT, PRESSES = 5.0, 10
 
 
 class Chromium:
@@ -146,11 +148,12 @@ class Browser(Link):
         """Until the page that was opened last is whole, its pictures and style sheets with it."""
         self.wait_for("location.href !== 'about:blank' && document.readyState === 'complete'")
 
-    def wait_until(self, condition: Callable[[], Any]) -> None:
-        """Until something is true on the server's side, while the page goes on."""
+    def wait_until(self, condition: Callable[[], Any], state: Callable[[], Any] = lambda: "not told") -> None:
+        """Until something is true on the server's side, while the page goes on; a failure shows the state."""
         deadline = time.monotonic() + PATIENCE
         while not condition():
-            assert time.monotonic() < deadline, f"the condition stays false; console: {self.complaints()}"
+            complaints = self.complaints()
+            assert time.monotonic() < deadline, f"the condition stays false; state: {state()}; console: {complaints}"
             self.run("new Promise(done => setTimeout(done, 50))")
 
     def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
@@ -158,19 +161,47 @@ class Browser(Link):
         self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=buttons, clickCount=1, **pressed)
 
     def drag(
-        self, start: tuple[float, float], end: tuple[float, float], arrived: Callable[[], Any], *, steps: int = 12
+        self,
+        start: tuple[float, float],
+        end: tuple[float, float],
+        arrived: Callable[[], Any],
+        *,
+        grabbed: Callable[[], Any] | None = None,
+        state: Callable[[], Any] = lambda: "not told",
+        steps: int = 12,
     ) -> None:
-        """Press at a place, move to another one, a frame of the page for each step, and let go once it has arrived."""
+        """Press at a place, move to another one, a frame of the page for each step, and let go once it has arrived.
+
+        `grabbed` tells whether the server knows of the press. A slow page may be pressed before it has drawn what is
+        there: then press again.
+        """
         (x, y), (to_x, to_y) = start, end
         self.mouse("mouseMoved", x, y)
         self.next_frame()
         self.mouse("mousePressed", x, y, 1)
+        for _ in range(PRESSES):
+            if grabbed is None or self._soon(grabbed):
+                break
+            self.mouse("mouseReleased", x, y)
+            self.next_frame()
+            self.mouse("mousePressed", x, y, 1)
+        else:
+            raise AssertionError(f"nothing is grabbed at {start}; state: {state()}; console: {self.complaints()}")
         for step in range(1, steps + 1):
             share = step / steps
             self.mouse("mouseMoved", x + share * (to_x - x), y + share * (to_y - y), 1)
             self.next_frame()
-        self.wait_until(arrived)
+        self.wait_until(arrived, state)
         self.mouse("mouseReleased", to_x, to_y)
+
+    def _soon(self, condition: Callable[[], Any]) -> bool:
+        """Whether something becomes true on the server's side within a few seconds."""
+        deadline = time.monotonic() + GRAB_TIMEOUT
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self.run("new Promise(done => setTimeout(done, 50))")
+        return True
 
     def next_frame(self) -> None:
         """Until the page has drawn what it knows by now."""

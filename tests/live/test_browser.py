@@ -195,13 +195,16 @@ def test_both_arms_are_dragged_and_both_forces_shown(two_arms, chromium):
         # Down by the arrow of each handle: a pad of the open jaw is 4 mm above the lobe, the ball 15 mm.
         for arm, way in enumerate((0.008, 0.018)):
             tip, start = session.frame()["tip"].copy(), session.targets.copy()
-            grip = start[arm] + 0.06 * two_arms._handles[arm].scale * out
+            # In the arrow's cone, away from the jaw's upper pad, which can be dragged, too.
+            grip = start[arm] + 0.088 * two_arms._handles[arm].scale * out
             browser.drag(
                 seen_at(browser, two_arms, grip),
                 seen_at(browser, two_arms, grip - way * out),
                 lambda arm=arm, place=start[arm] - way * out, way=way: np.allclose(
                     session.targets[arm], place, rtol=0.0, atol=0.15 * way
                 ),
+                grabbed=lambda arm=arm: two_arms._held == {arm},
+                state=lambda start=start: (start, session.targets, two_arms._held, two_arms._grabs),
             )
             browser.wait_until(lambda: not two_arms._held)
             np.testing.assert_allclose(session.targets[arm] - start[arm], -way * out, atol=0.15 * way)

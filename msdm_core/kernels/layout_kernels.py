@@ -253,7 +253,9 @@ def spread_order(items, base, gap, waiting, last, order):
          order (n_item,)
     """
     count, held = base.shape[0], min(waiting.shape[0], base.shape[0])
-    waiting[:held] = base[:held]
+    # Entry by entry: for slices numba compiles a message that states both shapes, which takes a second.
+    for entry in range(held):
+        waiting[entry] = base[entry]
     for place in range(count):
         chosen, widest = 0, -1
         for entry in range(held):

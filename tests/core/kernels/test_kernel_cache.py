@@ -1,5 +1,6 @@
 """Compiled code is taken from disk, and made anew when a compiled file has changed or one of the cache is damaged."""
 
+import gc
 import importlib.util
 import os
 import pickle
@@ -296,7 +297,7 @@ def test_a_function_without_a_wrapper_refuses_python():
 
 def test_compiling_that_takes_long_says_so_once(caplog):
     for patience, lines in ((0.0, ["once: up to a minute", "compiled in 0 s"]), (60.0, [])):
-        message = numba_cache.CompilingMessage(patience)
+        message = numba_cache.Compiling(patience)
         caplog.clear()
         # A function that calls two others, of which the first takes long.
         with message.one():
@@ -305,3 +306,11 @@ def test_compiling_that_takes_long_says_so_once(caplog):
                     time.sleep(pause)
         assert len(caplog.messages) == len(lines)
         assert all(text in said for text, said in zip(lines, caplog.messages, strict=True))
+
+
+def test_the_oldest_garbage_is_left_while_functions_compile():
+    compiling, before = numba_cache.Compiling(60.0), gc.get_threshold()
+    with pytest.raises(ValueError, match="no such type"), compiling.one(), compiling.one():
+        assert gc.get_threshold() == (*before[:2], numba_cache.NEVER)
+        raise ValueError("no such type")
+    assert gc.get_threshold() == before

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from rich.console import Console
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup
@@ -349,7 +348,7 @@ def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
     with contextlib.suppress(OSError, ValueError, EOFError):
         if path is not None:
             return HealthyMap(np.load(path, allow_pickle=False))
-    with StepProgress(Console(stderr=True)) as progress:
+    with StepProgress.on_stderr() as progress:
         grid = _pressed_quickly(anatomy, progress) if beside.is_file() else _pressed(anatomy, progress, dtype)
     if path is not None:
         keep_map(path, grid)

@@ -13,7 +13,6 @@ from pathlib import Path
 from threading import Lock
 
 import numpy as np
-from rich.console import Console
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.chart import (
@@ -87,7 +86,7 @@ def _read_or_press(member: Anatomy, progress: StepProgress | None) -> HealthyMap
     if progress is not None:
         grid = _corrected(base_map, member, progress)
     else:
-        with StepProgress(Console(stderr=True)) as own:
+        with StepProgress.on_stderr() as own:
             grid = _corrected(base_map, member, own)
     if path is not None:
         keep_map(path, grid)

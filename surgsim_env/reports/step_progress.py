@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+# rich is imported where it is used: environments import this module, and rich takes a tenth of a second.
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 class StepProgress:
@@ -13,7 +15,10 @@ class StepProgress:
     On a terminal each step has a line with its time, which moves from its begin on; elsewhere its name is printed.
     """
 
-    def __init__(self, console: Console | None = None) -> None:
+    def __init__(self, console: "Console | None" = None) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
         self._console = console
         self._lines = Progress(
             SpinnerColumn(finished_text=" "),
@@ -24,6 +29,13 @@ class StepProgress:
             console=console or Console(quiet=True),
         )
         self._shown = ExitStack()
+
+    @classmethod
+    def on_stderr(cls) -> "StepProgress":
+        """Progress that leaves what a program prints alone."""
+        from rich.console import Console
+
+        return cls(Console(stderr=True))
 
     def __enter__(self) -> "StepProgress":
         if self._console is not None and self._console.is_terminal:

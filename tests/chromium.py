@@ -150,11 +150,18 @@ class Browser(Link):
 
     def wait_until(self, condition: Callable[[], Any], state: Callable[[], Any] = lambda: "not told") -> None:
         """Until something is true on the server's side, while the page goes on; a failure shows the state."""
-        deadline = time.monotonic() + PATIENCE
+        assert self._becomes(condition, PATIENCE), (
+            f"the condition stays false; state: {state()}; console: {self.complaints()}"
+        )
+
+    def _becomes(self, condition: Callable[[], Any], timeout: float) -> bool:
+        """Whether something becomes true on the server's side within some time [s], while the page goes on."""
+        deadline = time.monotonic() + timeout
         while not condition():
-            complaints = self.complaints()
-            assert time.monotonic() < deadline, f"the condition stays false; state: {state()}; console: {complaints}"
+            if time.monotonic() > deadline:
+                return False
             self.run("new Promise(done => setTimeout(done, 50))")
+        return True
 
     def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
         pressed = {"button": "left"} if kind != "mouseMoved" or buttons else {}
@@ -178,13 +185,12 @@ class Browser(Link):
         (x, y), (to_x, to_y) = start, end
         self.mouse("mouseMoved", x, y)
         self.next_frame()
-        self.mouse("mousePressed", x, y, 1)
         for _ in range(PRESSES):
-            if grabbed is None or self._soon(grabbed):
+            self.mouse("mousePressed", x, y, 1)
+            if grabbed is None or self._becomes(grabbed, GRAB_TIMEOUT):
                 break
             self.mouse("mouseReleased", x, y)
             self.next_frame()
-            self.mouse("mousePressed", x, y, 1)
         else:
             raise AssertionError(f"nothing is grabbed at {start}; state: {state()}; console: {self.complaints()}")
         for step in range(1, steps + 1):
@@ -193,15 +199,6 @@ class Browser(Link):
             self.next_frame()
         self.wait_until(arrived, state)
         self.mouse("mouseReleased", to_x, to_y)
-
-    def _soon(self, condition: Callable[[], Any]) -> bool:
-        """Whether something becomes true on the server's side within a few seconds."""
-        deadline = time.monotonic() + GRAB_TIMEOUT
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            self.run("new Promise(done => setTimeout(done, 50))")
-        return True
 
     def next_frame(self) -> None:
         """Until the page has drawn what it knows by now."""

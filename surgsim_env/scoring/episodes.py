@@ -1,13 +1,13 @@
 """Play episodes of given seeds side by side, record them, and the figures of a policy.
 
-An agent draws from `agent_generator(seed)`, which no environment uses. One that declares `sees_truth = True` is given
-the task with the truth by its method `see`; no other is given it.
+An agent draws from `agent_generator(seed)`, which no environment uses. One whose class declares `sees_truth = True` is
+given the task with the truth by its method `see`; no other is given it.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -15,15 +15,32 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
-from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, with_intervals
+from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, press_errors, with_intervals
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
-from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR, PalpateSitesTask
 from surgsim_env.training.site_agent import site_facts
 
 # Of the seeds that belong to agents, among those that follow from an episode's (`SeedSequence.spawn_key`).
 AGENT_STREAM = 0x41_67_65_6E_74
 # Actions (n, n_action) for observations (n, n_observation); where the second (n,) is true an episode begins.
 Actor = Callable[[NDArray[Any], NDArray[np.bool_]], NDArray[Any]]
+
+
+@runtime_checkable
+class EpisodeActor(Protocol):
+    """An `Actor` that is told where an episode begins and ends, as one with random numbers or a memory has to be."""
+
+    def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
+        """Begin an episode in environment `index`, with random numbers that follow from its seed."""
+        ...
+
+    def end(self, index: int) -> None:
+        """The episode of environment `index` is over, if there was one."""
+        ...
+
+    def __call__(self, observations: NDArray[Any], begins: NDArray[np.bool_]) -> NDArray[Any]:
+        """Actions, as an `Actor` gives them."""
+        ...
 
 
 class EpisodeRecord(Protocol):
@@ -57,7 +74,7 @@ def agent_generator(seed: int) -> np.random.Generator:
 
 
 def play(
-    actor: "Actor | AgentActor",
+    actor: Actor | EpisodeActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
     begin: Callable[[int, int], R],
@@ -68,7 +85,8 @@ def play(
     Environments for which no seed is left are paused (`LaneVectorEnv.pause`).
 
     Args:
-        actor: what plays.
+        actor: what plays. An episode's record does not depend on the others where the actor's actions do not: those
+            of an `EpisodeActor` may draw from the random numbers of each episode.
         envs: with autoreset_mode="Disabled", so that each reset has its seed.
         seeds: of the episodes.
         begin: makes the record of an episode from the index of its environment and its seed.
@@ -101,11 +119,11 @@ def play(
             observations, _ = envs.reset(seed=starts, options={"reset_mask": resets})  # type: ignore[arg-type]
         for env in np.flatnonzero(begins):
             index = playing[env]
-            if isinstance(actor, AgentActor):
+            if isinstance(actor, EpisodeActor):
                 actor.end(int(env))
             if index is not None:
-                if isinstance(actor, AgentActor):
-                    actor.begin(int(env), lanes.envs[env], int(seeds[index]))  # type: ignore[attr-defined]
+                if isinstance(actor, EpisodeActor):
+                    actor.begin(int(env), lanes.envs[env], agent_generator(int(seeds[index])))  # type: ignore[attr-defined]
                 records[index] = begin(int(env), int(seeds[index]))
         if begins.any() and idle.any():
             lanes.pause(idle)  # type: ignore[attr-defined]
@@ -175,8 +193,33 @@ def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeF
 
 
 def sees_truth(agent: object) -> bool:
-    """Whether an agent, or its class, declares that it may see the truth."""
-    return bool(getattr(agent, "sees_truth", False))
+    """Whether an agent's class declares that it may see the truth."""
+    return bool(getattr(type(agent), "sees_truth", False))
+
+
+def check_agent(agent: object, name: str) -> None:
+    """Check that an agent has the methods that an episode calls; messages call it `name`.
+
+    Raises:
+        ValueError: a method is missing, or `see` is there and its class does not declare that it sees the truth.
+    """
+    has = {
+        method: callable(getattr(type(agent), method, None))
+        for method in ("reset", "act", "see", "estimate", "estimate_map")
+    }
+    for method, why in (
+        ("reset", "begins an episode"),
+        ("act", "chooses an action"),
+        *((("see", "takes the task with the truth, as its class declares sees_truth = True"),) * sees_truth(agent)),
+        *((("estimate_map", "gives the map beside the places of its method estimate"),) * has["estimate"]),
+    ):
+        if not has[method]:
+            raise ValueError(f"{name} has no method {method}, which {why}: docs/own_agent.md says what an agent has")
+    if has["see"] and not sees_truth(agent):
+        raise ValueError(
+            f"{name} has a method see, which takes the task with the truth, and its class does not declare "
+            "sees_truth = True: declare it, or call the method otherwise"
+        )
 
 
 class AgentActor:
@@ -193,23 +236,18 @@ class AgentActor:
         self.agents: dict[int, Any] = {}
         self._idle = np.zeros(0, dtype=np.float32)
 
-    def begin(self, index: int, env: Any, seed: int) -> Any:
+    def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
         """Make the agent of an episode in environment `index`.
 
         Raises:
-            ValueError: it has a method `see` and does not declare that it sees the truth.
+            ValueError: it is refused by `check_agent`.
         """
         agent = self.agents[index] = self.make()
+        check_agent(agent, f"agent {type(agent).__name__}")
         self._idle = np.zeros(env.action_space.shape, dtype=np.float32)
-        agent.reset(agent_generator(seed), self.facts(env))
+        agent.reset(rng, self.facts(env))
         if sees_truth(agent):
             agent.see(env.unwrapped.task)
-        elif hasattr(agent, "see"):
-            raise ValueError(
-                f"agent {type(agent).__name__} has a method see, which takes the task with the truth, and does not "
-                "declare sees_truth = True: declare it, or call the method otherwise"
-            )
-        return agent
 
     def end(self, index: int) -> None:
         """Forget the agent of environment `index`, if there is one."""
@@ -245,7 +283,7 @@ class TaskRecord:
 
 
 def play_tasks(
-    actor: Actor | AgentActor,
+    actor: Actor | EpisodeActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
     progress: Callable[[int], object] = lambda ended: None,
@@ -315,7 +353,7 @@ def task_figures(
 
 
 def play_sites(
-    actor: Actor | AgentActor,
+    actor: Actor | EpisodeActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
     progress: Callable[[int], object] = lambda ended: None,
@@ -335,8 +373,14 @@ def play_sites(
 
 
 def estimates_itself(agent: object) -> bool:
-    """Whether an agent's own estimate is scored in place of the common estimator's."""
-    return hasattr(agent, "estimate")
+    """Whether an agent's own estimate is scored in place of the common estimator's: its class has the method."""
+    return callable(getattr(type(agent), "estimate", None))
+
+
+def site_success(record: PalpationRecord, task: PalpateSitesTask) -> bool:
+    """Whether an episode ended in success, by the estimate that is scored: no harm, and the last error small enough."""
+    harmed = record.hard_limit or bool(record.fault)
+    return not harmed and bool(press_errors(record, task.budget)[-1] <= SUCCESS_ERROR * task.tip_scale)
 
 
 class SiteRecord:
@@ -350,7 +394,7 @@ class SiteRecord:
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
         """Add a press; the last one completes the record."""
         reference = self.reference
-        said = self.task.estimated if reference is None else reference.estimate(self.task.charted.surface)
+        said = self.task.estimated if reference is None else self._own_places()
         self.estimates.append(np.array(said))
         self.forces.append((float(info["force"]), float(info["force_peak"]), float(info["depth"])))
         if over:
@@ -374,6 +418,18 @@ class SiteRecord:
             fault=str(info["sim_fault"]),
             map=made if self.reference is None else self._own_map(made),
         )
+
+    def _own_places(self) -> NDArray[np.float64]:
+        """The agent's own estimate; a ValueError where it is no list of places."""
+        said = np.asarray(self.reference.estimate(self.task.charted.surface), dtype=np.float64)
+        if said.size == 0:
+            return np.zeros((0, 3))
+        if said.ndim != 2 or said.shape[1] != 3 or not np.isfinite(said).all():
+            raise ValueError(
+                f"agent {type(self.reference).__name__}: estimate gives {said.tolist()!r:.60}, shape {said.shape}; "
+                "the rule is places on the face [m], finite, shape (k, 3)"
+            )
+        return said
 
     def _own_map(self, made: MapScore) -> MapScore:
         """The agent's own map beside the truth, which only one that declares it sees."""

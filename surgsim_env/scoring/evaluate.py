@@ -27,7 +27,9 @@ from surgsim_env.scoring.comparison import compare, describe
 from surgsim_env.scoring.episodes import (
     Actor,
     AgentActor,
+    EpisodeActor,
     TaskRecord,
+    check_agent,
     episode_facts,
     estimates_itself,
     make_envs,
@@ -35,6 +37,7 @@ from surgsim_env.scoring.episodes import (
     play_sites,
     play_tasks,
     sees_truth,
+    site_success,
     task_figures,
 )
 from surgsim_env.scoring.expert_palpate import PalpateExpert
@@ -44,7 +47,6 @@ from surgsim_env.scoring.origin import check_origin, describe_origin
 from surgsim_env.scoring.results import SITES, Result, family, load_result, load_results, seeds_text, shipped_results
 from surgsim_env.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_env.scripting import oracle
-from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR
 from surgsim_env.training.site_agent import SiteAgent, site_facts
 
 # Seed of the bootstrap.
@@ -74,7 +76,7 @@ class Player:
     """
 
     name: str
-    actor: Actor | AgentActor | None
+    actor: Actor | EpisodeActor | None
     env_id: str
     kwargs: dict[str, Any]
     command: str
@@ -248,9 +250,7 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
         agent = make()
     except TypeError as error:
         raise ValueError(f"--agent {name}: it is made without arguments, and that failed: {error}") from None
-    for method in ("reset", "act"):
-        if not callable(getattr(agent, method, None)):
-            raise ValueError(f"--agent {name}: it has no method {method}; docs/own_agent.md says what an agent has")
+    check_agent(agent, f"--agent {name}: it")
     facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, kwargs)
     file = inspect.getsourcefile(type(agent))
     files = () if file is None else (Path(file),)
@@ -321,7 +321,7 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
 
     files = (path, path.with_suffix(".json"))
     player = Player(
-        *(path.stem, policy.act, env_id, kwargs, command + _place_options(told), files),
+        *(path.stem, policy, env_id, kwargs, command + _place_options(told), files),
         ours=_is_ours(path),
         check=check,
     )
@@ -405,8 +405,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
 
 def _site_scores(presses: list[PalpationRecord], task: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
     """Whether each episode of presses succeeded, and the entries of a `Result` that follow from them."""
-    line = SUCCESS_ERROR * task.tip_scale
-    succeeded = [bool(press_errors(record, task.budget)[-1] <= line) for record in presses]
+    succeeded = [site_success(record, task) for record in presses]
     share = {"success": np.array(succeeded, dtype=np.float64)}
     return succeeded, {
         "budget": task.budget,

@@ -45,7 +45,7 @@ VARIANCE_SLACK = 1e-8
 CUT = 10.0
 # Most control steps of a decision; the longest episode has fewer.
 REPEAT_MOST = 10_000
-# First random number of sampled actions.
+# Seed of sampled actions, with the environment's index, where no episode gives them random numbers.
 SAMPLING_SEED = 0
 # Of a normalisation.
 LARGEST = 1e30
@@ -130,6 +130,9 @@ class TrainedPolicy:
     policy = load_policy(Path("agents/policies/NAME.safetensors"))
     policy.reset(env_count)
     actions = policy.act(observations, begins)
+
+    It is an `EpisodeActor` of `surgsim_env.scoring.episodes`: where `begin` is called, sampled actions follow from the
+    episode's own random numbers, whatever is played beside it.
     """
 
     def __init__(self, networks: BasePolicy, description: PolicyDescription) -> None:
@@ -188,14 +191,26 @@ class TrainedPolicy:
     def reset(self, count: int) -> None:
         """Begin episodes in `count` environments."""
         self._state: Any = None
-        self._random = torch.Generator().manual_seed(SAMPLING_SEED).get_state()
+        self._random = [_random_state(np.random.default_rng((SAMPLING_SEED, index))) for index in range(count)]
         self._since = np.zeros(count, dtype=np.int64)
         self._actions = np.zeros((count, *self.action_space.shape), dtype=self.action_space.dtype)
+
+    def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
+        """Begin an episode in environment `index`, whose sampled actions are drawn by `rng`."""
+        self._random[index] = _random_state(rng)
+
+    def end(self, index: int) -> None:
+        """Nothing to do: the next observation of this environment begins an episode."""
+
+    def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray:
+        """As `act`."""
+        return self.act(observations, begins)
 
     def act(self, observations: Any, begins: NDArray[np.bool_] | None = None) -> NDArray:
         """Actions (n, n_action) for raw observations (n, n_observation), or a dictionary of arrays (n, ...).
 
-        They are deterministic, or drawn by random numbers of the policy's own that `reset` begins anew.
+        They are deterministic, or drawn by random numbers that each environment has for itself: those of the episode
+        where `begin` was called, else of the environment's index.
 
         An episode begins where `begins` (n,) is true; without it at the first call after `reset` alone.
         """
@@ -219,11 +234,22 @@ class TrainedPolicy:
     def _predicted(self, seen: Any, begins: NDArray[np.bool_] | None) -> tuple[NDArray, Any]:
         if not self.description.sampled:
             return self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=True)  # type: ignore[return-value]
+        made = [self._sampled(seen, begins, index) for index in range(len(self._random))]
+        states = [state for _, state in made if state is not None]
+        joined = tuple(np.concatenate(parts, axis=1) for parts in zip(*states, strict=True)) if states else None
+        return np.concatenate([actions for actions, _ in made]), joined
+
+    def _sampled(self, seen: Any, begins: NDArray[np.bool_] | None, index: int) -> tuple[NDArray, Any]:
+        """Action (1, n_action) and recurrent state of one environment."""
+        one = [index]
+        alone = {name: part[one] for name, part in seen.items()} if isinstance(seen, dict) else seen[one]
+        state = None if self._state is None else tuple(part[:, one] for part in self._state)
+        begin = None if begins is None else begins[one]
         # Torch's random state, which a training run goes on with, is kept.
         with torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(self._random)
-            made = self.networks.predict(seen, state=self._state, episode_start=begins, deterministic=False)
-            self._random = torch.get_rng_state()
+            torch.set_rng_state(self._random[index])
+            made = self.networks.predict(alone, state=state, episode_start=begin, deterministic=False)
+            self._random[index] = torch.get_rng_state()
         return made  # type: ignore[return-value]
 
     def seen(self, observations: Any) -> Any:
@@ -236,6 +262,11 @@ class TrainedPolicy:
             return values
         scale = np.sqrt(np.asarray(one.observation_variance) + VARIANCE_SLACK)
         return np.clip((values - np.asarray(one.observation_mean)) / scale, -CUT, CUT).astype(np.float32)
+
+
+def _random_state(rng: np.random.Generator) -> torch.Tensor:
+    """The state of torch's random numbers for a number that `rng` draws."""
+    return torch.Generator().manual_seed(int(rng.integers(2**63))).get_state()
 
 
 def raw_shape(space: gym.Space) -> tuple[int, ...] | dict[str, tuple[int, ...]]:

@@ -1,5 +1,7 @@
 """How episodes are played for scores: agents' random numbers, lanes without a seed, and who sees the truth."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -16,6 +18,7 @@ from surgsim_env.scoring.episodes import (
     make_envs,
     play_sites,
     play_tasks,
+    site_success,
 )
 from surgsim_env.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
 from surgsim_env.tasks.palpate import EPISODE_STEPS
@@ -118,11 +121,39 @@ def test_the_truth_is_for_those_that_declare_it():
     env = gym.make(SITES, **SMALL)
     env.reset(seed=5)
     with pytest.raises(ValueError, match=r"agent Peeking has a method see, .* does not declare sees_truth = True"):
-        AgentActor(Peeking).begin(0, env, 5)
-    oracle = AgentActor(OracleSites).begin(0, env, 5)
-    assert len(oracle.places) == len(env.unwrapped.task.truth)  # type: ignore[attr-defined]
-    truth = AgentActor(TruthAgent).begin(0, env, 5)
-    np.testing.assert_array_equal(truth.truth, env.unwrapped.task.truth)  # type: ignore[attr-defined]
+        begun(Peeking, env)
+    with pytest.raises(ValueError, match=r"agent Late has a method see"):
+        begun(Late, env)
+    assert len(begun(OracleSites, env).places) == len(env.unwrapped.task.truth)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(begun(TruthAgent, env).truth, env.unwrapped.task.truth)  # type: ignore[attr-defined]
+
+
+def begun(make: Callable[[], Any], env: gym.Env) -> Any:
+    """An agent that has begun an episode."""
+    actor = AgentActor(make)
+    actor.begin(0, env, agent_generator(5))
+    return actor.agents[0]
+
+
+@pytest.mark.parametrize(
+    ("entries", "missing"),
+    [
+        ({"act": print}, "reset"),
+        ({"reset": print}, "act"),
+        ({"reset": print, "act": print, "sees_truth": True}, "see"),
+        ({"reset": print, "act": print, "estimate": print}, "estimate_map"),
+    ],
+)
+def test_an_agent_without_a_method_is_refused_before_its_episode(entries: dict[str, Any], missing: str):
+    with pytest.raises(ValueError, match=f"agent Partial has no method {missing},"):
+        begun(type("Partial", (), entries), gym.make(SITES, **SMALL))
+
+
+class Late(Peeking):
+    """Declares it once it has begun, when its results are no longer marked."""
+
+    def reset(self, rng: np.random.Generator, facts: Any) -> None:
+        self.sees_truth = True
 
 
 class Prying(Middle):
@@ -143,6 +174,34 @@ def test_an_estimate_of_ones_own_is_made_without_the_truth():
     assert not shown.lesion.any() and not shown.outline_true.any()
     charted = envs.unwrapped.envs[0].unwrapped.task.charted  # type: ignore[attr-defined]
     np.testing.assert_array_equal(record.estimates[-1], charted.surface(np.zeros((1, 2))))
+
+
+@pytest.mark.parametrize("said", [np.zeros(3), np.zeros((1, 2)), np.full((1, 3), np.nan)])
+def test_an_estimate_that_is_no_list_of_places_is_refused(said: np.ndarray):
+    class Wrong(Middle):
+        def estimate(self, surface: object) -> np.ndarray:
+            return said
+
+    with pytest.raises(ValueError, match=r"agent Wrong: estimate gives .*, shape \(.*shape \(k, 3\)"):
+        play_sites(AgentActor(Wrong), make_envs(SITES, 1, **SMALL), [5])
+
+
+def test_an_attribute_named_estimate_is_no_estimate():
+    class Keeps(RandomSites):
+        def reset(self, rng: np.random.Generator, facts: Any) -> None:
+            super().reset(rng, facts)
+            self.estimate = np.zeros(2)
+
+    (record,) = play_sites(AgentActor(Keeps), make_envs(SITES, 1, **SMALL), [5])
+    assert len(record.force) == 2
+
+
+def test_an_episode_that_ends_in_harm_is_no_success():
+    (record,) = play_sites(AgentActor(TruthAgent), (envs := make_envs(SITES, 1, **SMALL)), [5])
+    task = envs.unwrapped.envs[0].unwrapped.task  # type: ignore[attr-defined]
+    assert site_success(record, task)
+    for harm in ({"hard_limit": True}, {"fault": "inverted"}):
+        assert not site_success(replace(record, **harm), task)
 
 
 # ---- other environments ----------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ import json
 import pickle
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from agents.convert_policy import convert
+from surgsim_env.scoring.episodes import agent_generator
 from surgsim_env.training.networks import MOST_WEIGHTS
 from surgsim_env.training.policy_files import TrainedPolicy, describe, load_policy, save_policy
 from surgsim_env.training.site_policy import CHOICE_SPACE, FEATURE_SPACE, SitePolicy
@@ -126,6 +128,24 @@ def test_a_policy_comes_back_with_every_bit(tmp_path: Path, name: str, monkeypat
         seen = rng.uniform(0.1, 2.0, (4, *before.observation_shape)).astype(np.float32)
         begins = np.full(4, step == 0)
         assert before.act(seen, begins).tobytes() == after.act(seen, begins).tobytes()
+
+
+# DQN has no distribution, and state-dependent exploration ("separate") draws its noise once for many steps.
+@pytest.mark.parametrize("name", ["PPO", "RecurrentPPO", "SAC", "SitePolicy"])
+def test_sampled_actions_of_an_episode_do_not_depend_on_those_beside_it(name: str):
+    before = made(name)
+    policy = TrainedPolicy(before.networks, replace(before.description, sampled=True))
+    rng = np.random.default_rng(0)
+    seen = rng.uniform(0.1, 2.0, (5, *policy.observation_shape)).astype(np.float32)
+
+    def played(count: int, at: int, episode: int) -> list[bytes]:
+        policy.reset(count)
+        for index in range(count):
+            policy.begin(index, None, agent_generator(episode if index == at else 100 + index))
+        begins = np.ones(count, dtype=bool)
+        return [policy(np.repeat(one[None], count, axis=0), begins & (one is seen[0]))[at].tobytes() for one in seen]
+
+    assert played(1, 0, 7) == played(3, 2, 7) != played(3, 2, 8)
 
 
 def test_networks_without_a_name_are_refused_before_training_ends():

@@ -11,6 +11,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +46,18 @@ def convert(path: Path, *, trust_pickle: bool = False) -> Path:
     model = load_model(path, description)
     described = replace(description, network=describe_networks(model))
     target = path.with_suffix(".safetensors")
-    save_policy(model.policy, described, target)
-    before, after = TrainedPolicy(model.policy, description), load_policy(target)
+    with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
+        unchecked = Path(folder) / target.name
+        save_policy(model.policy, described, unchecked)
+        _check_actions(TrainedPolicy(model.policy, description), load_policy(unchecked), path)
+        for suffix in (".safetensors", ".json"):
+            unchecked.with_suffix(suffix).replace(path.with_suffix(suffix))
+    return target
+
+
+def _check_actions(before: TrainedPolicy, after: TrainedPolicy, path: Path) -> None:
+    """Raise ValueError where two policies act differently on random observations."""
+    description = before.description
     rng = np.random.default_rng(0)
     # In the range of the normalisation, so that few entries are clipped.
     middle, spread = 0.0, 1.0
@@ -61,15 +72,19 @@ def convert(path: Path, *, trust_pickle: bool = False) -> Path:
         begins = np.full(COUNT, step == 0) | (rng.random(COUNT) < 0.1)
         old, new = before.act(observations, begins), after.act(observations, begins)
         if old.tobytes() != new.tobytes():
-            raise ValueError(f"policy {target} does not act as {path.name} does: {new[0]} instead of {old[0]}")
-    return target
+            raise ValueError(
+                f"policy {path} is not converted: as a file without pickles it acts differently, {new[0]} instead of "
+                f"{old[0]}"
+            )
 
 
 def _plausible(observations: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """Observations of SurgSim/PalpateSites-v0 with a few pressed sites on a face that fills the map."""
     made = observations.copy()
     made[:, SLICES["pressed_map"]] = rng.random((len(made), SITE_COUNT)) < 0.01
-    for name, value in {"face_map": 1.0, "map_cell": 0.5, "chart_share": 1.0, "contrast_noise": 0.05}.items():
+    facts = {"face_map": 1.0, "map_cell": 0.5, "chart_share": 1.0}
+    facts |= {"contrast_noise": 0.05, "excess_least": 0.1, "lesion_radius": 1.0}
+    for name, value in facts.items():
         made[:, SLICES[name]] = value
     return made
 

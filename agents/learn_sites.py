@@ -11,7 +11,7 @@ bound of `gp_ucb` or at a policy. All candidates of a generation play the same e
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
 
 with the lines 5 mm and 3.3 mm, as a score is in presses to a line. The result is a policy of stable-baselines3's PPO,
-whose convolutional part is 0; `surgsim train` can go on from it (`warm_start`). A generation takes about a minute of
+whose convolutional part is 0; `surgsim train` can go on from it (`warm_start`). A generation takes half a minute of
 processor time. The policy of the generation that costs least on other episodes is kept.
 """
 

@@ -3,7 +3,7 @@
 It uses the observation (tip position, force) and the scene file (height of the phantom, force limits) only, so a
 learning agent should beat its score. Run it from a checkout:
 
-    python agents/raster.py --episodes 5
+    python -m agents.raster --episodes 5
 """
 
 import argparse
@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from agents.command_line import one_line_errors
 
 PRESS_DEPTH = 0.0035  # [m] below the resting surface
 TRAVEL_GAP = 0.0006  # [m] between tip and surface while moving sideways
@@ -109,4 +110,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors(__name__):
+        main()

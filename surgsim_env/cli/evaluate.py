@@ -47,6 +47,12 @@ class Evaluate:
             raise ValueError("--video films a policy: give --policy as well")
         if options.submit is not None and self.agent is None and self.policy is None:
             raise ValueError("--submit writes one result: give --agent or --policy as well")
+        ignored = [name for name in ("motion", "budget", "no_tracking") if getattr(options, name)]
+        if self.reach and ignored:
+            raise ValueError(
+                f"--reach presses an organ that holds still, with and without each lesion: leave out "
+                f"--{ignored[0].replace('_', '-')}"
+            )
         if (options.env or options.env_kwargs) and ":" not in (self.agent or ""):
             raise ValueError(
                 "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"

@@ -10,18 +10,17 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.press import scan
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.levels import DrawnOrgan
+from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan
 
 # Episodes that every method is scored on; no training and no tuning uses them.
 EVALUATION_SEEDS = range(1_000_000, 1_000_100)
-# OSPA's cutoff [m] for a tip of 8 mm: a lesion missed, or one too many, counts as one at this distance. It scales with
-# the tip's radius, as the lesions that a scene hides do.
+# OSPA's cutoff [m] for a tip of REFERENCE_TIP: a lesion missed, or one too many, counts as one at this distance. It
+# scales with the tip's radius, as the lesions that a scene hides do.
 CUTOFF = 0.020
-CUTOFF_TIP_RADIUS = 0.008
+# A lesion is found where an estimate is within this share of the cutoff: 10 mm for a tip of REFERENCE_TIP.
+FOUND_SHARE = 0.5
 # The line that a method's median error must cross [m].
 ERROR_LINE = 0.005
-# A lesion is found where an estimate is matched to it within this [m], that of `SurgSim/Palpate-v0`.
-FOUND_DISTANCE = 0.010
 # Draws of the bootstrap and the percentiles of its interval [%].
 RESAMPLES = 2000
 INTERVAL = (2.5, 97.5)
@@ -31,7 +30,7 @@ NOISES_LEAST = 2.0
 
 def ospa_cutoff(tip_radius: float) -> float:
     """The benchmark's cutoff for a tip's radius [m]."""
-    return CUTOFF * tip_radius / CUTOFF_TIP_RADIUS
+    return CUTOFF * tip_radius / REFERENCE_TIP
 
 
 def ospa(truth: FloatArray, estimate: FloatArray, cutoff: float) -> float:
@@ -214,7 +213,7 @@ def figure_with_interval(value: float, draws: FloatArray) -> ScoreEstimate:
 def _matched(record: PalpationRecord) -> FloatArray:
     """Distances [m] between lesions and the last estimates that found them."""
     distance = matched_distances(record.truth, record.estimates[-1], record.cutoff)[2]
-    return distance[distance <= FOUND_DISTANCE]
+    return distance[distance <= FOUND_SHARE * record.cutoff]
 
 
 def _outline_iou(record: PalpationRecord) -> float:

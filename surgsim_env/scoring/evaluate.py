@@ -8,6 +8,7 @@ import datetime
 import importlib
 import inspect
 import json
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from rich.console import Console
 
 from surgsim_env.palpation.scores import PalpationRecord, press_errors, score, with_intervals
 from surgsim_env.reports.step_progress import StepProgress
-from surgsim_env.scene.load import agents_folder, make_scene
+from surgsim_env.scene.load import agents_folder, list_scenes, make_scene
 from surgsim_env.scoring import site_search
 from surgsim_env.scoring.comparison import compare, describe
 from surgsim_env.scoring.episodes import (
@@ -44,7 +45,16 @@ from surgsim_env.scoring.expert_palpate import PalpateExpert
 from surgsim_env.scoring.expert_retract import RetractExpert
 from surgsim_env.scoring.options import ScoringOptions
 from surgsim_env.scoring.origin import check_origin, describe_origin
-from surgsim_env.scoring.results import SITES, Result, family, load_result, load_results, seeds_text, shipped_results
+from surgsim_env.scoring.results import (
+    SITES,
+    Result,
+    family,
+    load_result,
+    load_results,
+    place_name,
+    seeds_text,
+    shipped_results,
+)
 from surgsim_env.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_env.scripting import oracle
 from surgsim_env.training.site_agent import SiteAgent, site_facts
@@ -194,19 +204,21 @@ def find_agent(name: str) -> Callable[[], SiteAgent]:
 
 
 def evaluate_all(options: ScoringOptions, console: Console) -> None:
-    """Every baseline on the scene and level of the options, then every policy trained on that scene."""
-    from surgsim_env.training.policy_files import home_scene
+    """Every baseline on the scene and level of the options, then every shipped policy that can play there."""
+    from surgsim_env.training.policy_files import home_scene, read_description
 
-    scene, level = options.scene or PLACES["scene"], options.level or PLACES["level"]
-    options = replace(options, scene=scene, level=level)
-    widest = 7 if "wide" in scene else 5
+    places = _places(options, PLACES)
+    options = replace(options, **places)
+    # The widest raster that the presses of an episode complete, and the three next.
+    widest = math.isqrt(options.budget or gym.make(SITES, **places).unwrapped.task.budget)  # type: ignore[attr-defined]
     skipped = {f"raster_{side}" for side in RASTER_SIDES if not widest - 3 <= side <= widest}
     for name in AGENTS:
         if name not in skipped:
             evaluate(find_player(name, options), options, console)
     for path in sorted(policies_folder().glob("*.json")):
-        described = json.loads(path.read_text(encoding="utf-8"))
-        if home_scene(described["env_id"], described["env_kwargs"]) == scene:
+        described = read_description(path)
+        home = home_scene(described.env_id, described.env_kwargs)
+        if described.plays_every_scene or home == Path(places["scene"]).stem:
             evaluate(policy_player(path.with_suffix(".safetensors"), options), options, console)
 
 
@@ -242,7 +254,12 @@ def find_player(name: str, options: ScoringOptions) -> Player:
 
 def _strangers_player(name: str, options: ScoringOptions) -> Player:
     make, env_id = named_class(name, "--agent"), options.env or SITES
-    kwargs = {**_places(options, PLACES if env_id == SITES else {}), **options.env_kwargs}
+    for argument in (*PLACES, "split", "motion", "budget"):
+        if argument in options.env_kwargs and getattr(options, argument) is not None:
+            raise ValueError(f"{argument} is given by --{argument} and in --env-arguments: leave one out")
+    own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
+    # A split that --env-arguments name is meant.
+    kwargs = {**_places(options, own), **options.env_kwargs}
     command = f"surgsim evaluate --agent {name}" + f" --env {env_id}" * (env_id != SITES)
     command += f" --env-arguments '{json.dumps(options.env_kwargs)}'" * bool(options.env_kwargs)
     command += _place_options(_places(options, {}))
@@ -251,11 +268,12 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     except TypeError as error:
         raise ValueError(f"--agent {name}: it is made without arguments, and that failed: {error}") from None
     check_agent(agent, f"--agent {name}: it")
-    facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, kwargs)
+    facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, _arguments(player, options))
     file = inspect.getsourcefile(type(agent))
     files = () if file is None else (Path(file),)
     actor = AgentActor(make, facts)
-    return Player(name.replace(":", "."), actor, env_id, kwargs, command, files, *_declared(agent), ours=False)
+    player = Player(name.replace(":", "."), actor, env_id, kwargs, command, files, *_declared(agent), ours=False)
+    return player
 
 
 def _declared(agent: Any) -> tuple[bool, bool]:
@@ -266,12 +284,14 @@ def _declared(agent: Any) -> tuple[bool, bool]:
 def _places(options: ScoringOptions, defaults: dict[str, str]) -> dict[str, Any]:
     """Scene, level and split as the options or else the defaults have them; else they are the environment's own.
 
-    A family of organs is scored on its test split.
+    A family of organs is scored on its test split unless the options name another, also where a method was trained on
+    the family's training split.
     """
-    given = {name: getattr(options, name) for name in (*PLACES, "split") if getattr(options, name) is not None}
-    places = {**defaults, **given}
-    if "scene" in places and make_scene(places["scene"]).family is not None:
-        places.setdefault("split", SCORED_SPLIT)
+    given = {name: getattr(options, name) for name in PLACES if getattr(options, name) is not None}
+    places = {name: value for name, value in {**defaults, **given}.items() if name in PLACES}
+    is_family = places.get("scene") is not None and make_scene(places["scene"]).family is not None
+    if options.split is not None or is_family:
+        places["split"] = options.split or SCORED_SPLIT
     return places
 
 
@@ -305,7 +325,7 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
             "if you trust the policy's author"
         )
     own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
-    kwargs = {**own, **_places(options, {})}
+    kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
     command = f"surgsim evaluate --policy {_from_here(path)}"
     # The level always, the scene where it is another than that of the training.
     told = {name: value for name, value in kwargs.items() if name == "level" or value != own.get(name)}
@@ -428,13 +448,17 @@ def _say(console: Console, text: str) -> None:
 
 
 def _write(result: Result, player: Player, options: ScoringOptions) -> Path | None:
-    """Write a result where it belongs; agents/results holds the project's own methods on all evaluation seeds alone."""
+    """Write a result where it belongs.
+
+    agents/results holds the project's own methods on the project's own scenes alone, as `ScoringOptions.standard` says.
+    """
     if options.submit is not None:
         result.write(options.submit)
         return options.submit
     if options.results is not None:
         return result.save(options.results)
-    if player.ours and options.all_seeds and _checkout() is not None:
+    own_place = result.env_kwargs.get("scene") in (None, *list_scenes())
+    if player.ours and options.standard and own_place and _checkout() is not None:
         return result.save(shipped_results())
     return None
 
@@ -512,25 +536,26 @@ def write_reach(options: ScoringOptions, console: Console) -> None:
     from surgsim_env.palpation.scores import lesion_reaches
 
     kwargs = _places(options, PLACES)
-    env = gym.make(SITES, **kwargs).unwrapped
+    env: Any = gym.make(SITES, **kwargs).unwrapped
     reaches = []
     with StepProgress(console) as shown, shown.step("reach", total=len(options.played_seeds)) as ended:
         for seed in options.played_seeds:
             env.reset(seed=seed)
-            reaches += lesion_reaches(env.task.anatomy, env.task.drawn)  # type: ignore[attr-defined]
+            reaches += lesion_reaches(env.task.anatomy, env.task.drawn)
             ended(1)
     table = {
-        **kwargs,
+        **_without_folders(kwargs),
         "lesions": len(reaches),
         "below": sum(reach.below for reach in reaches),
-        "noise": reaches[0].noise,
+        "noise": env.task.anatomy.scene.sensor.noise,
         "differences": [round(reach.force - reach.force_without, 5) for reach in reaches],
     }
     _say(console, f"{table['below']} of {table['lesions']} lesions below reach")
-    folder = options.results or (shipped_results() if options.all_seeds and _checkout() is not None else None)
+    ours = options.standard and kwargs["scene"] in list_scenes() and _checkout() is not None
+    folder = options.results or (shipped_results() if ours else None)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"reach_PalpateSites_{kwargs['scene']}_{kwargs['level']}.json"
+        path = folder / f"reach_{place_name(SITES, kwargs)}.json"
         path.write_text(json.dumps(table) + "\n", encoding="utf-8")
         _say(console, f"-> {path}")
 

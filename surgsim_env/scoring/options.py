@@ -75,6 +75,11 @@ class ScoringOptions:
         """Whether all evaluation seeds are played, and no others."""
         return self.played_seeds == tuple(EVALUATION_SEEDS)
 
+    @property
+    def standard(self) -> bool:
+        """Whether results are those that are shipped: of all evaluation seeds, presses and lanes as by default."""
+        return self.all_seeds and self.budget is None and self.dtype == type(self).dtype
+
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:
         """`env_arguments` as a dictionary."""

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
+from surgsim_env.scoring.episodes import agent_generator
 from surgsim_env.scoring.results import SITES
 
 matplotlib.use("Agg")
@@ -44,6 +45,7 @@ def episode_frames(policy: Any, env: gym.Env, seed: int) -> list[NDArray[np.uint
     presses = policy.description.env_id == SITES
     observation, _ = env.reset(seed=int(seed))
     policy.reset(1)
+    policy.begin(0, env, agent_generator(int(seed)))
     over, steps = False, 0
     forces: list[float] = []
     tips: list[NDArray[np.float64]] = []
@@ -90,7 +92,7 @@ def _draw_forces(axes: Any, env: Any, forces: Sequence[float], presses: bool) ->
     axes.axhline(limits.soft_force, color="tab:orange", linewidth=1)
     axes.axhline(limits.hard_force, color="tab:red", linewidth=1)
     axes.set_ylim(0.0, 1.1 * limits.hard_force)
-    axes.set_xlim(0.0, max(env.task.budget if presses else 30.0, 1.0))
+    axes.set_xlim(0.0, max(env.task.budget if presses else 30.0, len(forces) * step))
     axes.set_xlabel("press" if presses else "time [s]", fontsize=8)
     axes.set_ylabel("peak force [N]", fontsize=8)
     axes.tick_params(labelsize=7)
@@ -119,22 +121,31 @@ def draw_belief(axes: Any, task: Any) -> None:
 
 
 def _draw_way(axes: Any, env: Any, tips: Sequence[NDArray[np.float64]]) -> None:
-    """The tip's path from above, over the remembered contrast if the observation has a memory."""
+    """The tip's path: on the face, over the remembered contrast, if the observation has a memory; else from above."""
     memory = getattr(env.task, "memory", None)
-    if memory is not None:
-        chart = memory.chart
-        contrast = np.where(memory.visited > 0.0, memory.contrast, np.nan).reshape(chart.side_count, -1)
-        edges = [1000.0 * np.linspace(chart.lower[i], chart.upper[i], chart.side_count) for i in range(2)]
-        shown = axes.pcolormesh(*edges, contrast, shading="nearest", cmap="viridis", vmin=0.5, vmax=2.5)
+    if memory is None:
+        way = 1000.0 * np.array(tips)[:, :2]
+        lesions = [1000.0 * lesion.centre[:2] for lesion in env.task.lesions]
+        seen = np.concatenate([1000.0 * env.simulation.anatomy.mesh.points[:, :2], way])
+        lower, upper = seen.min(axis=0) - 5.0, seen.max(axis=0) + 5.0
+    else:
+        chart, touched = memory.chart, memory.map
+        extent = 1000.0 * chart.extent
+        way = 0.5 * (chart.place(np.array(tips)) + 1.0) * extent
+        lesions = [0.5 * (chart.place(lesion.centre) + 1.0) * extent for lesion in env.task.lesions]
+        contrast = np.where(memory.visited > 0.0, memory.contrast, np.nan)
+        columns, rows = (1000.0 * axis for axis in touched.axes)
+        cells = contrast.reshape(len(rows), len(columns))
+        shown = axes.pcolormesh(columns, rows, cells, shading="nearest", cmap="viridis", vmin=0.5, vmax=2.5)
         axes.figure.colorbar(shown, ax=axes, label="contrast felt")
-    way = 1000.0 * np.array(tips)
+        lower, upper = np.minimum(way.min(axis=0), 0.0) - 5.0, np.maximum(way.max(axis=0), extent) + 5.0
     axes.plot(way[:, 0], way[:, 1], "-", color="tab:gray", linewidth=1)
-    axes.plot(*way[-1, :2], "o", color="tab:blue")
-    for lesion in env.task.lesions:
-        axes.plot(1000.0 * lesion.centre[0], 1000.0 * lesion.centre[1], "x", color="red")
-    seen = np.concatenate([1000.0 * env.simulation.anatomy.mesh.points[:, :2], way[:, :2]])
-    axes.set_xlim(seen[:, 0].min() - 5.0, seen[:, 0].max() + 5.0)
-    axes.set_ylim(seen[:, 1].min() - 5.0, seen[:, 1].max() + 5.0)
+    axes.plot(*way[-1], "o", color="tab:blue")
+    for place in lesions:
+        axes.plot(*place, "x", color="red")
+    axes.set_xlim(lower[0], upper[0])
+    axes.set_ylim(lower[1], upper[1])
     axes.set_aspect("equal")
-    axes.set_xlabel("the tip's way, from above [mm]", fontsize=8)
+    where = "from above" if memory is None else "on the face"
+    axes.set_xlabel(f"the tip's path, {where} [mm]", fontsize=8)
     axes.tick_params(labelsize=7)

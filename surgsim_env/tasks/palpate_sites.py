@@ -17,7 +17,7 @@ from surgsim_env.palpation.chart import MAP_SIDE, HealthyMap, Site, charted_face
 from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimate, LesionEstimator
 from surgsim_env.palpation.member_map import member_map, still_template
 from surgsim_env.palpation.press import PressResult
-from surgsim_env.palpation.scores import ospa, ospa_cutoff
+from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
 from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, SiteTouches, Touch, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.family import family_of
@@ -29,9 +29,7 @@ from surgsim_env.tasks.task import InfoValue, Start, Task, check_count, check_sh
 
 # Presses of an episode; BUDGET_WIDE where the chart's longer side exceeds WIDE tip radii.
 BUDGET, BUDGET_WIDE, WIDE = 25, 60, 10.0
-# Distance of an estimate at which a lesion is found [m], and OSPA at which an episode succeeds [m], under a tip of
-# 8 mm; in proportion under others.
-FOUND_DISTANCE = 0.010
+# OSPA at which an episode succeeds [m], under a tip of REFERENCE_TIP; in proportion under others.
 SUCCESS_ERROR = 0.005
 # Bound of the observed depth over the scene's press depth.
 DEPTH_BOUND = 2.0
@@ -374,7 +372,7 @@ class PalpateSitesTask(Task):
         if len(self.truth) == 0:
             return float(len(self.estimated) == 0)
         distance = np.sqrt(((self.truth[:, None] - self.estimated) ** 2).sum(axis=2))
-        return float((distance <= FOUND_DISTANCE * self.tip_scale).any(axis=1).mean())
+        return float((distance <= FOUND_SHARE * self.cutoff).any(axis=1).mean())
 
     # ---- judgement --------------------------------------------------------------------------------------------------
 

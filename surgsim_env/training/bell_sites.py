@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimator
-from surgsim_env.palpation.scores import ospa, ospa_cutoff
-from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, FOUND_DISTANCE, SUCCESS_ERROR, WIDE, PalpateSitesTask
+from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
+from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask
 from surgsim_env.training.site_agent import OBSERVATION_SIZE, SLICES
 
 # Tip radius of the estimator's own lengths: an error in tip radii over it is one in metres of the benchmark.
@@ -184,4 +184,4 @@ class BellSites(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if len(self.truth) == 0:
             return error, float(len(points) == 0)
         distance = np.linalg.norm(self.truth[:, None] - points, axis=2)
-        return error, float((distance <= FOUND_DISTANCE).any(axis=1).mean())
+        return error, float((distance <= FOUND_SHARE * self.cutoff).any(axis=1).mean())

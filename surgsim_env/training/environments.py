@@ -24,6 +24,13 @@ def make_environments(settings: EnvironmentSettings, count: int | None = None) -
     return EpisodeMonitor(envs)
 
 
+def observed_environment(settings: EnvironmentSettings, envs: VecEnv) -> gym.Env:
+    """An environment whose observation a policy of these reads: one of them, or the one that a surrogate stands for."""
+    if settings.kind == "bells":
+        return gym.make(settings.id, **settings.kwargs).unwrapped
+    return envs.get_attr("unwrapped", indices=[0])[0]
+
+
 def force_entries(envs: VecEnv) -> list[int]:
     """Entries of the observation that depend on force sensing, by the task's `force_entries`.
 
@@ -154,14 +161,14 @@ class StagedRewards(VecEnvWrapper):
     def reset(self) -> VecEnvObs:
         """Start an episode everywhere."""
         observation = self.venv.reset()
-        self._felt = self._count(np.asarray(observation))
+        self._felt = self._count(observation)
         return observation
 
     def step_wait(self) -> VecEnvStepReturn:
         """One step of all."""
         observation, reward, done, infos = self.venv.step_wait()
         paid = np.array(reward, dtype=np.float32)
-        felt = self._count(np.asarray(observation))
+        felt = self._count(observation)
         # The observation of an environment that is done is the first of its next episode.
         paid += self._stage.novelty * np.where(done, 0.0, felt - self._felt)
         self._felt = felt
@@ -172,10 +179,10 @@ class StagedRewards(VecEnvWrapper):
             paid[index] += self.found - cost if close else -(1.0 - self._stage.failure) * cost
         return observation, paid, done, infos
 
-    def _count(self, observation: np.ndarray) -> np.ndarray:
+    def _count(self, observation: VecEnvObs) -> np.ndarray:
         if self.visited is None:
             return np.zeros(self.num_envs)
-        return observation[:, self.visited].sum(axis=1)
+        return np.asarray(observation)[:, self.visited].sum(axis=1)
 
 
 class Observed(VecEnvWrapper):

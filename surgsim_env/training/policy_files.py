@@ -87,6 +87,11 @@ class PolicyDescription:
     network: NetworkDescription | None = None
     sha256: str | None = None
 
+    @property
+    def plays_every_scene(self) -> bool:
+        """Whether its observation does not depend on a scene's size: belief maps and the frame of the face do not."""
+        return self.belief or self.env_kwargs.get("frame") == "face"
+
 
 def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
     """Size and scale of each channel that an environment observes, by name; None for one without a task of ours.
@@ -176,10 +181,8 @@ class TrainedPolicy:
                     f"{name} has {what} of shape {shape}, {self.description.env_id} with "
                     f"{shortened(self.description.env_kwargs)} those of {given_shape}: env_id or env_kwargs are wrong"
                 )
-        in_face = self.description.env_kwargs.get("frame") == "face"
-        if self.description.belief or in_face or given is None:
-            # Belief maps and the frame of the face are relative to the tip and the face; of an environment that is not
-            # ours nothing is known.
+        if self.description.plays_every_scene or given is None:
+            # Of an environment that is not ours nothing is known.
             return
         home, scene = home_scene(self.description.env_id, self.description.env_kwargs), env.unwrapped.scene.name  # type: ignore[attr-defined]
         if scene != home:

@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from surgsim_env.training.config import TrainingConfig, config_text
-from surgsim_env.training.environments import StagedRewards, force_entries, make_environments
+from surgsim_env.training.config import TrainingConfig, config_text, read_config
+from surgsim_env.training.environments import (
+    StagedRewards,
+    force_entries,
+    make_environments,
+    observed_environment,
+)
 from surgsim_env.training.networks import POLICIES, algorithm_class, describe_networks, with_classes
 from surgsim_env.training.policy_files import PolicyDescription, TrainedPolicy, describe, load_policy, save_policy
 
@@ -59,6 +64,7 @@ class Run:
         saved = whole_folders(folder / "checkpoints")
         self.resumed_from = saved[-1] if saved else None
         self.bare = make_environments(config.environment)
+        self._observed = observed_environment(config.environment, self.bare)
         self.staged = StagedRewards(self.bare, config.stages[0]) if config.stages else None
         self.blind_entries = force_entries(self.bare) if config.environment.without_force else []
         self.model = self._begin() if self.resumed_from is None else self._resume(self.resumed_from)
@@ -88,7 +94,7 @@ class Run:
         return describe(
             self.model,
             self.normalization,
-            self.bare.get_attr("unwrapped", indices=[0])[0],
+            self._observed,
             env_id=settings.id,
             env_kwargs=settings.kwargs,
             action_repeat=settings.action_repeat,
@@ -169,19 +175,19 @@ class Run:
 
     def _claim_folder(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        file, text = self.folder / "config.yaml", config_text(self.config)
+        file = self.folder / "config.yaml"
         if file.exists():
             # A run may be extended.
             old, new = (
-                {line for line in one.splitlines() if not line.startswith("total_steps")}
-                for one in (file.read_text(encoding="utf-8"), text)
+                {name: json.dumps(value, sort_keys=True) for name, value in asdict(one).items()}
+                for one in (read_config(file, total_steps=self.config.total_steps), self.config)
             )
-            if old != new:
+            if differ := [name for name in new if old[name] != new[name]]:
+                shown = "; ".join(f"{name}: {old[name]} there, {name}: {new[name]} here" for name in differ)
                 raise ValueError(
-                    f"{self.folder} holds a run with other settings ({'; '.join(sorted(old - new))} there, "
-                    f"{'; '.join(sorted(new - old))} here): name another folder with --out"
+                    f"{self.folder} holds a run with other settings ({shown}): name another folder with --out"
                 )
-        write_file(file, text)
+        write_file(file, config_text(self.config))
 
     def _begin(self) -> BaseAlgorithm:
         config, envs = self.config, self.staged or self.bare
@@ -345,7 +351,7 @@ def play_episodes(policy: TrainedPolicy, envs: VecEnv, episodes: int, seed: int 
     policy.reset(envs.num_envs)
     records: list[list[dict]] = [[] for _ in wanted]
     while any(len(done) < count for done, count in zip(records, wanted, strict=True)):
-        observations, _, begins, infos = envs.step(policy.act(np.asarray(observations), begins))
+        observations, _, begins, infos = envs.step(policy.act(observations, begins))
         for index in np.flatnonzero(begins):
             if len(records[index]) < wanted[index]:
                 records[index].append(infos[index])

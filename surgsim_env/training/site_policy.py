@@ -195,7 +195,7 @@ def open_sites(maps: torch.Tensor) -> torch.Tensor:
 
 
 class SitePolicy(ActorCriticPolicy):
-    """A policy of stable-baselines3 on `SiteBelief` features: the scores are the logits of the sites."""
+    """A policy of stable-baselines3 on the maps of `belief_features`: the scores are the logits of the sites."""
 
     def _build_mlp_extractor(self) -> None:
         self.mlp_extractor = SiteScores()  # type: ignore[assignment]

@@ -32,6 +32,7 @@ def result(method: str, errors: np.ndarray, **changes: object) -> Result:
         errors_mm=errors.tolist(),
         lesion_counts=[1] * len(errors),
         successes=(errors[:, -1] <= 5.0).tolist(),
+        origin={"environment": {"source": "a"}},
     )
     return replace(made, **changes)  # type: ignore[arg-type]
 
@@ -107,6 +108,7 @@ def test_episodes_without_lesions_do_not_count_for_presses():
         ({"budget": 25}, "with 10 steps and PalpateSites_phantom_standard with 25"),
         ({"successes": []}, "the result of other does not list its episodes"),
         ({"origin": {"environment": {"scene": "b"}}}, "the digests of their environments differ"),
+        ({"origin": {}}, "the result of other has no digests of its environment"),
     ],
 )
 def test_results_of_other_episodes_are_refused(changes: dict[str, object], message: str):

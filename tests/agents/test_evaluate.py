@@ -3,11 +3,15 @@
 import json
 import math
 import re
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -16,8 +20,10 @@ from PIL import Image
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents import leaderboard, leaderboard_tables
 from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scene.load import scenes_folder
 from surgsim_env.scoring import evaluate
 from surgsim_env.scoring.evaluate import policies_folder
+from surgsim_env.scoring.options import ScoringOptions
 from surgsim_env.scoring.origin import file_digest
 from surgsim_env.scoring.results import (
     SITES,
@@ -57,7 +63,7 @@ def result(method: str, presses: float = 5.0, **changes: object) -> Result:
         "lesion_counts": [1, 0],
         "successes": [True, False],
         "sees_truth": method == "truth",
-        "origin": {"versions": {"numpy": "2"}},
+        "origin": {"versions": {"numpy": "2"}, "environment": {"source": "a"}},
     }
     return Result(**{**settings, **changes})  # type: ignore[arg-type]
 
@@ -242,9 +248,70 @@ def test_results_of_other_seeds_are_not_written_by_themselves(
         surgsim("evaluate", *arguments, *common)
         assert "not written (--results FOLDER or --submit FILE does)" in capsys.readouterr().out
     assert not (tmp_path / "ours").exists()
+    monkeypatch.setattr("surgsim_env.scoring.options.EVALUATION_SEEDS", range(1_000_000, 1_000_001))
+    own_scene = shutil.copy(scenes_folder() / "organs" / "phantom_small.toml", tmp_path)
+    for arguments in (
+        ["--scene", "phantom_small", "--budget", "1"],
+        ["--scene", "phantom_small", "--dtype", "float64"],
+        ["--scene", own_scene],
+    ):
+        surgsim("evaluate", "--agent", "middle", "--envs", "1", *arguments)
+        assert "not written" in capsys.readouterr().out
+    surgsim("evaluate", "--agent", "middle", "--envs", "1", "--scene", "phantom_small")
+    (made,) = load_results(tmp_path / "ours")
+    assert made.place == "PalpateSites_phantom_small_standard"
     surgsim("evaluate", "--agent", "random", "--seeds", "3,9", "--results", str(tmp_path / "mine"), *common)
     (made,) = load_results(tmp_path / "mine")
     assert made.seeds == (3, 9) and "--seeds 3,9" in made.command
+
+
+def test_a_family_is_scored_on_its_test_split(tmp_path: Path) -> None:
+    """Wherever its name comes from, unless a split is named."""
+    described = SimpleNamespace(env_id=SITES, env_kwargs={"scene": "liver_family", "split": "train"})
+    policy = SimpleNamespace(description=described, reset=lambda count: None)
+    mine = "surgsim_env.scoring.site_search:RandomSites"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("surgsim_env.training.policy_files.load_policy", lambda path, **more: policy)
+
+        def split(method: str, **given: Any) -> str | None:
+            made = ScoringOptions(**given)
+            player = (
+                evaluate.policy_player(Path("p"), made) if method == "policy" else evaluate.find_player(method, made)
+            )
+            return player.kwargs.get("split")
+
+        assert split("gp_ucb", scene="liver_family") == "test"
+        assert split("policy") == "test" and split("policy", split="train") == "train"
+        assert split("policy", scene="phantom") is None
+        named = json.dumps({"scene": "liver_family"})
+        assert split(mine, env_arguments=named) == "test"
+        assert split(mine, env_arguments=json.dumps({"scene": "liver_family", "split": "validation"})) == "validation"
+        with pytest.raises(ValueError, match=r"scene is given by --scene and in --env-arguments: leave one out"):
+            split(mine, scene="phantom", env_arguments=named)
+
+
+def test_reach_counts_no_lesion_where_there_is_none(tmp_path: Path) -> None:
+    env = gym.make(SITES, scene="phantom_small", level="standard").unwrapped
+    env.reset(seed=(seed := next(seed for seed in range(100) if not drawn_lesions(env, seed))))
+    scene = shutil.copy(scenes_folder() / "organs" / "phantom_small.toml", tmp_path / "own.toml")
+    surgsim("evaluate", "--reach", "--scene", str(scene), "--seeds", str(seed), "--results", str(tmp_path / "out"))
+    table = json.loads((tmp_path / "out" / "reach_PalpateSites_own_standard.json").read_text())
+    assert (table["lesions"], table["below"], table["scene"]) == (0, 0, "own.toml")
+    with pytest.raises(ValueError, match="leave out --motion"):
+        surgsim("evaluate", "--reach", "--motion", "calm")
+
+
+def drawn_lesions(env: Any, seed: int) -> int:
+    env.reset(seed=seed)
+    return len(env.task.truth)
+
+
+def test_all_methods_are_those_that_the_place_suits(monkeypatch: pytest.MonkeyPatch) -> None:
+    played: list[str] = []
+    monkeypatch.setattr(evaluate, "evaluate", lambda player, options, console: played.append(player.name))
+    surgsim("evaluate", "--all", "--scene", "phantom_wide", "--episodes", "1")
+    assert {"raster_4", "raster_7", "sites_evolved", "palpate_organs", "gp_ucb"} <= set(played)
+    assert not {"raster_3", "palpate_phantom_cloned", "retract_dagger"} & set(played)
 
 
 AGENT = """
@@ -355,6 +422,9 @@ class MiddleOfAll:
     def reset(self, count: int) -> None:
         """Nothing to forget."""
 
+    def begin(self, index: int, env: object, rng: object) -> None:
+        """Nothing is drawn."""
+
     def act(self, observations: np.ndarray) -> np.ndarray:
         return np.zeros((len(observations), 2), dtype=np.float32)
 
@@ -381,6 +451,30 @@ def test_a_policy_is_filmed(tmp_path: Path) -> None:
     assert first[:, left].std() > 10.0, "an organ is seen"
     assert np.abs(first[:, right].astype(float) - last[:, right]).max() > 100.0, "the second press was drawn"
     clip.close()
+
+
+def test_an_episode_with_a_touch_map_is_filmed() -> None:
+    """The tip's path on the face over the contrast felt, on an organ whose face is not level."""
+    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+    from surgsim_env.rendering import gl
+
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    from surgsim_env.scoring.policy_video import PICTURE_SIZE, episode_frames
+    from surgsim_env.training.policy_files import load_policy
+
+    policy = load_policy(policies_folder() / "palpate_organs.safetensors")
+    size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE, "max_episode_steps": 80}
+    kwargs = {**policy.description.env_kwargs, "scene": "liver"}
+    env = gym.make("SurgSim/Palpate-v0", render_mode="rgb_array", **size, **kwargs)
+    first, *_, last = episode_frames(policy, env, 3)
+    assert first.shape == (PICTURE_SIZE, 2 * PICTURE_SIZE, 3)
+    # The map, without the bar of colours on its right.
+    maps = [one[PICTURE_SIZE * 2 // 5 :, PICTURE_SIZE : PICTURE_SIZE + 380].astype(int) for one in (first, last)]
+    coloured = [int((one.max(axis=-1) - one.min(axis=-1) > 60).sum()) for one in maps]
+    assert coloured[1] > coloured[0] + 500, "what was felt is painted"
 
 
 def test_organs_are_filmed_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

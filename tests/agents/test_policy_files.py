@@ -20,6 +20,7 @@ import stable_baselines3
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from agents import convert_policy
 from agents.convert_policy import convert
 from surgsim_env.scoring.episodes import agent_generator
 from surgsim_env.training.networks import MOST_WEIGHTS
@@ -401,6 +402,28 @@ def test_a_zip_is_converted_with_every_bit(zipped: Path):
     for policy in (before, after):
         policy.reset(50)
     assert before.act(seen).tobytes() == after.act(seen).tobytes()
+
+
+def test_a_zip_of_a_policy_on_belief_maps_is_converted(tmp_path: Path):
+    policy, model = made("SitePolicy"), MODELS["SitePolicy"]()
+    save_policy(policy.networks, policy.description, tmp_path / "p.safetensors")
+    (tmp_path / "p.safetensors").unlink()
+    model.save(tmp_path / "p.zip")
+    with pytest.warns(UserWarning, match="is read with pickle"):
+        assert load_policy(convert(tmp_path / "p.zip", trust_pickle=True)).description.belief
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["p.json", "p.safetensors", "p.zip"]
+
+
+def test_a_policy_that_acts_otherwise_is_not_kept(zipped: Path, monkeypatch: pytest.MonkeyPatch):
+    described = zipped.with_suffix(".json").read_bytes()
+    monkeypatch.setattr(convert_policy, "load_policy", lambda path: made("SAC"))
+    with (
+        pytest.warns(UserWarning, match="is read with pickle"),
+        pytest.raises(ValueError, match=r"p\.zip is not converted: .* it acts differently"),
+    ):
+        convert(zipped, trust_pickle=True)
+    assert zipped.with_suffix(".json").read_bytes() == described
+    assert not zipped.with_suffix(".safetensors").exists()
 
 
 def test_a_damaged_zip_is_refused_in_one_line(zipped: Path):

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -170,6 +171,59 @@ def test_a_folder_of_another_run_is_refused_and_a_longer_run_goes_on(tmp_path: P
     with pytest.raises(ValueError, match=r"holds a run with other settings .*seed: 0.* there.*seed: 1.* here"):
         train(config(total_steps=64, evaluation={"every": 0}, seed=1), tmp_path)
     assert train(config(total_steps=192, evaluation={"every": 0}), tmp_path) == 192
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"hyperparameters": {"policy_kwargs": {"net_arch": [16, 8]}}},
+        {"evaluation": {"every": 4096}, "checkpoint": {"every": 8192}},
+        {"hyperparameters": {"use_sde": 1}},
+    ],
+)
+def test_settings_that_hold_the_same_lines_of_yaml_are_told_apart(tmp_path: Path, change: dict):
+    """The same lines in another order, one of them twice, and a number for a truth value."""
+    from surgsim_env.training.run import Run
+
+    before = {
+        "hyperparameters": {"policy_kwargs": {"net_arch": [8, 16]}, "use_sde": True},
+        "evaluation": {"every": 8192},
+        "checkpoint": {"every": 4096},
+    }
+    Run(config(**before), tmp_path)
+    Run(config(**before), tmp_path)
+    with pytest.raises(ValueError, match=f"other settings .*{next(iter(change))}: "):
+        Run(config(**{**before, **change}), tmp_path)
+
+
+def test_episodes_of_dictionaries_are_evaluated():
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+    from surgsim_env.training.run import mean_figures, play_episodes
+
+    class Parts(gym.Env):
+        observation_space = gym.spaces.Dict({"a": gym.spaces.Box(0.0, 9.0, (2,)), "b": gym.spaces.Box(0.0, 9.0, (3,))})
+        action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+        def reset(self, **given):
+            super().reset(**given)
+            self.count = 0
+            return {"a": np.zeros(2, np.float32), "b": np.ones(3, np.float32)}, {}
+
+        def step(self, action):
+            self.count += 1
+            return {"a": np.zeros(2, np.float32), "b": np.ones(3, np.float32)}, 1.0, self.count == 3, False, {}
+
+    class Still:
+        def reset(self, count):
+            self.count = count
+
+        def act(self, observations, begins):
+            assert observations["b"].shape == (self.count, 3)
+            return np.zeros((self.count, 1))
+
+    figures = mean_figures(play_episodes(Still(), VecMonitor(DummyVecEnv([Parts] * 2)), 4))
+    assert figures["return"] == figures["length"] == 3.0
 
 
 def test_a_resumed_run_has_the_weights_normalisation_and_optimiser_it_had(tmp_path: Path):

@@ -16,7 +16,7 @@ def test_noise_hides_a_small_difference() -> None:
 
 @pytest.mark.slow
 def test_deep_lesions_are_below_reach() -> None:
-    """Sensor noise of `hard` is 20 mN: 40 mN of a press of some 0.2 N must come from the lesion."""
+    """Sensor noise of `hard` is 15 mN: 30 mN of a press of some 0.2 N must come from the lesion."""
     anatomy = load_anatomy(find_level("hard").scene(make_scene("phantom")))
     shallow = anatomy.lesion_below([0.018, 0.018, 0.03], 0.008, 0.003, 8.0, "shallow")
     deep = anatomy.lesion_below([0.042, 0.042, 0.03], 0.006, 0.014, 2.5, "deep")

@@ -9,7 +9,7 @@ import pytest
 from surgsim_env.palpation.scores import (
     ERROR_LINE,
     EVALUATION_SEEDS,
-    FOUND_DISTANCE,
+    FOUND_SHARE,
     MapScore,
     PalpationRecord,
     press_errors,
@@ -19,7 +19,7 @@ from surgsim_env.palpation.scores import (
 
 SIDE = 0.04  # of the square that lesions are drawn in [m]
 BUDGET = 5
-CUTOFF = 0.05  # beyond the square's half diagonal
+CUTOFF = 0.04  # beyond the square's half diagonal
 NONE = np.zeros((0, 3))
 
 
@@ -83,7 +83,7 @@ def test_who_guesses_the_middle_has_what_chance_predicts() -> None:
     figures = score(records, BUDGET, rng)
     by_chance = 1000.0 * SIDE * (math.sqrt(2.0) + math.asinh(1.0)) / 6.0
     assert figures["error_mm"].value == pytest.approx(by_chance, abs=4.0 * distance.std() / math.sqrt(600))
-    within = math.pi * FOUND_DISTANCE**2 / SIDE**2
+    within = math.pi * (FOUND_SHARE * CUTOFF) ** 2 / SIDE**2
     for name in ("recall", "precision"):
         assert figures[name].value == pytest.approx(within, abs=4.0 * math.sqrt(within * (1.0 - within) / 600)), name
     # A map that knows nothing orders a site of a lesion before another one half of the time.

@@ -92,7 +92,7 @@ How to score an agent of your own: `docs/own_agent.md`. Differences between two 
 
 
 def _order(place: str) -> tuple[int, str]:
-    levels = ("standard", "easy", "hard")
+    levels = ("standard", "easy", "hard", "clinical")
     found = [index for index, level in enumerate(levels) if place.endswith(level)]
     return (0 if place.startswith("PalpateSites") else 1, f"{place.rsplit('_', 1)[0]}{found[0] if found else 9}")
 
@@ -112,7 +112,8 @@ def _sites(place: str, rows: list[Result], folder: Path) -> str:
         f"{len(lesions)} organs (seeds {seeds_text(first.seeds)}), {sum(lesions)} lesions, "
         f"{lesions.count(0)} organs without one; {first.budget} presses.{_reach(place, folder)}\n"
     )
-    return "\n".join([f"\n## {_title(first)}\n", organs, _table(rows, PLACES), "", _table(rows, MAPS)])
+    parts = [f"\n## {_title(first)}\n", organs + _versions(rows), _table(rows, PLACES), "", _table(rows, MAPS)]
+    return "\n".join(parts)
 
 
 def _tasks(place: str, rows: list[Result]) -> str:
@@ -122,7 +123,18 @@ def _tasks(place: str, rows: list[Result]) -> str:
     most = max(counts.values())
     fewer = "".join(f", {count} of {method}" for method, count in counts.items() if count < most)
     seeds = f"{most} episodes{fewer} (seeds from {rows[0].seeds[0]}), at most {rows[0].budget} control steps.\n"
-    return "\n".join([f"\n## {_title(rows[0])}\n", seeds, _table(rows, used)])
+    return "\n".join([f"\n## {_title(rows[0])}\n", seeds + _versions(rows), _table(rows, used)])
+
+
+def _versions(rows: Sequence[Result]) -> str:
+    """Which methods were played with different versions of the environment's source; "" where all with one."""
+    groups: dict[str, list[str]] = {}
+    for row in rows:
+        groups.setdefault(json.dumps(row.origin.get("environment"), sort_keys=True), []).append(shown_name(row))
+    if len(groups) == 1:
+        return ""
+    listed = "; ".join(", ".join(names) for names in groups.values())
+    return f"Played with {len(groups)} versions of the source, which `--compare` does not mix: {listed}.\n"
 
 
 def _title(result: Result) -> str:
@@ -178,7 +190,8 @@ def _reach(place: str, folder: Path) -> str:
         return ""
     table = json.loads(path.read_text(encoding="utf-8"))
     below, lesions = table["below"], table["lesions"]
-    return f" Below the sensor's reach: {below} of {lesions} lesions ({below / lesions:.0%})."
+    share = f" ({below / lesions:.0%})" if lesions else ""
+    return f" Below the sensor's reach: {below} of {lesions} lesions{share}."
 
 
 def _figures(result: Result) -> dict[str, ScoreEstimate]:

@@ -94,6 +94,19 @@ def test_the_leaderboard_has_a_table_a_place_and_the_best_raster_alone(tmp_path:
     assert "--agent raster_4`" in text
 
 
+def test_methods_played_with_other_versions_of_the_source_are_listed(tmp_path: Path) -> None:
+    board = tmp_path / "board.md"
+    for method in ("gp_ucb", "sobol"):
+        result(method).save(tmp_path)
+    leaderboard_tables.write_leaderboard(tmp_path, board)
+    assert "versions of the source" not in board.read_text().split("##", 1)[1]
+    result("random", origin={"environment": {"source": "b"}}).save(tmp_path)
+    leaderboard_tables.write_leaderboard(tmp_path, board)
+    assert "Played with 2 versions of the source, which `--compare` does not mix: gp_ucb, sobol; random." in (
+        board.read_text()
+    )
+
+
 def test_the_leaderboard_shows_a_picture_a_scene(tmp_path: Path) -> None:
     """All levels of a scene in one; what never comes, what none has and who estimates by itself can be drawn too."""
     made = [

@@ -89,6 +89,31 @@ def test_a_run_of_each_shipped_configuration_begins(tmp_path: Path, monkeypatch,
     run.bare.close()
 
 
+def test_a_policy_that_was_trained_on_bell_curves_plays_the_environment(tmp_path: Path):
+    """Its file declares the observation of the environment that the bell curves stand for."""
+    from surgsim_env.training.config import read_config
+    from surgsim_env.training.policy_files import load_policy
+    from surgsim_env.training.run import train
+
+    read = read_config(CONFIGS / "sites_ppo.yaml")
+    small = {"n_steps": 5, "batch_size": 10, "n_epochs": 1}
+    environment = replace(read.environment, count=2)
+    train(
+        replace(
+            read,
+            total_steps=10,
+            environment=environment,
+            evaluation=replace(read.evaluation, every=0),
+            hyperparameters={**read.hyperparameters, **small},
+        ),
+        tmp_path,
+    )
+    (final,) = (tmp_path / "final").iterdir()
+    policy, env = load_policy(final / "policy.safetensors"), gym.make(environment.id, scene="phantom_small")
+    policy.check_environment(env)
+    assert policy.act(env.reset(seed=0)[0][None])[0] in env.action_space
+
+
 def test_an_unknown_algorithm_is_answered_with_the_nearest():
     from surgsim_env.training.networks import algorithm_class
     from surgsim_env.training.run import keywords

@@ -83,11 +83,11 @@ line that was not reached within the presses of an episode. Baselines and polici
 shown are the best of those tried, by presses to 5 mm, then by the error over all presses. Where policies of one
 configuration were trained with several seeds, their row is the mean over them, in brackets the 95 % interval of
 Student's t over training seeds (which may pass 100 %); "never" where one of them never does. Methods marked
-**sees truth** are told what is hidden: their rows bound what an environment allows. Where the patient moves, presses
-and oracles go with the surface that markers show; a method whose name ends in `untracked` goes where places are at
-rest.
+**sees truth** know what is hidden: `truth` reports it, the oracles press with that knowledge. Where the patient moves,
+presses and oracles track the surface by markers; methods whose name ends in `untracked` press at the rest position.
 How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
-`surgsim evaluate --compare A B`.
+`surgsim evaluate --compare A B`, for results with equal digests. Tables without the references `truth` and `middle`
+are drawn in the pictures.
 """
 
 

@@ -285,7 +285,7 @@ def bounces(falls: tuple[tuple[float, float], ...], duration: float = 10.0) -> I
         yield compare(
             f"largest energy of a bouncing ball, {name}", "passivity: never above its start", expected=1.0,
             measured=float(energy.max() / energy[0]), tolerance=0.01,
-            note=f"{duration:g} s; at the end {(energy[-1] - energy[0]) * 1e6:+.3g} uJ of {energy[0] * 1e6:.3g} uJ",
+            note=f"in {duration:g} s the energy changes by {(energy[-1] - energy[0]) * 1e6:+.3g} uJ from {energy[0] * 1e6:.3g} uJ",
         )  # fmt: skip
         yield compare(
             f"largest rise of its mean over 0.1 s, {name}", "passivity: what is lost stays lost", expected=0.0,

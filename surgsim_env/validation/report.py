@@ -1,6 +1,8 @@
 """The table on the terminal, `validation.md` and its plots, all from one run."""
 
 import math
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 
 from rich.console import Console
@@ -12,13 +14,14 @@ from surgsim_env.validation.suite import Validation
 
 REPORT_NAME = "validation.md"
 HEADINGS = ("case", "source", "expected", "measured", "error", "tolerance", "verdict")
+PACKAGES = ("numpy", "numba", "mujoco", "scikit-fem")
 # Labels of dashed lines begin with these.
 REFERENCES = ("reference", "Eshelby")
 ERROR_TICKS = (0.03, 0.05, 0.1, 0.2, 0.5)
 COLOURS = {"met": "green", "not met": "red", "known": "yellow", "skipped": "dim"}
 INTRODUCTION = """# Validation
 
-Written by `surgsim validate{quick}`; the plots are from the same run. References are closed forms, or solutions by
+Written by `surgsim validate{quick}` on {date} with {versions}; the plots are from the same run. References are closed forms, or solutions by
 scikit-fem on quadratic elements; none comes from the code under test. `known` marks a row that is not met and listed,
 with its reason, in `surgsim_env/validation/known_shortfalls.toml`. Organs are those of formula (6) of Sala et al. 2011
 with the volume term where nu is above 1/4, unless a row says otherwise.
@@ -85,7 +88,12 @@ def print_report(validation: Validation, console: Console) -> None:
 
 def write_report(validation: Validation, folder: OutputFolder) -> None:
     """Write `validation.md` and images/validation_*.png into a folder."""
-    lines = [INTRODUCTION.format(quick=" --quick" if validation.quick else ""), summary(validation) + ".\n"]
+    introduction = INTRODUCTION.format(
+        quick=" --quick" if validation.quick else "",
+        date=datetime.now(UTC).date().isoformat(),
+        versions=", ".join(f"{package} {version(package)}" for package in PACKAGES),
+    )
+    lines = [introduction, summary(validation) + ".\n"]
     lines += ["| " + " | ".join((*HEADINGS, "note")) + " |", "|" + "---|" * (len(HEADINGS) + 1)]
     for row in validation.rows:
         texts = (*cells(validation, row), validation.reason(row))
@@ -122,6 +130,7 @@ def write_plot(curves: list[Curve], path: Path) -> None:
         axes.minorticks_off()
     axes.set_xlabel(curves[0].x_label)
     axes.set_ylabel(curves[0].y_label)
+    axes.set_title(curves[0].figure.replace("_", " "))
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside lower center", ncols=2)
     figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -281,11 +281,12 @@ def bounces(falls: tuple[tuple[float, float], ...], duration: float = 10.0) -> I
         coupled = Coupled(model, free_ball(mass, RADIUS, height, joint=UPRIGHT if mass > 0.05 else FREE))
         energy = coupled.followed(duration)
         name = f"{mass * 1e3:.0f} g from {height * 1e3:.1f} mm"
+        change = f"{(energy[-1] - energy[0]) * 1e6:+.3g} uJ from {energy[0] * 1e6:.3g} uJ"
         window = energy[: len(energy) // WINDOW * WINDOW].reshape(-1, WINDOW).mean(axis=1)
         yield compare(
             f"largest energy of a bouncing ball, {name}", "passivity: never above its start", expected=1.0,
             measured=float(energy.max() / energy[0]), tolerance=0.01,
-            note=f"in {duration:g} s the energy changes by {(energy[-1] - energy[0]) * 1e6:+.3g} uJ from {energy[0] * 1e6:.3g} uJ",
+            note=f"in {duration:g} s the energy changes by {change}",
         )  # fmt: skip
         yield compare(
             f"largest rise of its mean over 0.1 s, {name}", "passivity: what is lost stays lost", expected=0.0,

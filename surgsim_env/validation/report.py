@@ -23,7 +23,7 @@ INTRODUCTION = """# Validation
 
 Written by `surgsim validate{quick}` on {date} with {versions}; the plots are from the same
 run. References are closed forms, or solutions by scikit-fem on quadratic elements; none comes from the code under
-test. `known` marks a row that is not met and listed, with its reason, in `surgsim_env/validation/known_shortfalls.toml`.
+test. `known` marks a row that is not met and listed with its reason in `surgsim_env/validation/known_shortfalls.toml`.
 Organs are those of formula (6) of Sala et al. 2011 with the volume term where nu is above 1/4, unless a row says
 otherwise.
 """

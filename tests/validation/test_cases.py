@@ -1,6 +1,7 @@
 """The cases of `surgsim validate`: every row is met, or listed with its reason among the known shortfalls."""
 
 import math
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -9,6 +10,7 @@ from surgsim_env.validation import suite
 from surgsim_env.validation.elements import has_fem
 from surgsim_env.validation.row import Case, Row, bounded, compare
 
+PAGE = (Path(__file__).parents[2] / "docs" / "validation.md").read_text(encoding="utf-8")
 # Cases of a quick run that take more than a second each.
 LONG = {
     *("passivity, bounces", "fitted springs, torsion", "cosine load", "capsule, pulled", "on supports", "deep presses"),
@@ -33,6 +35,8 @@ def test_case(case: Case):
     said = [f"{row.case}: expected {row.expected:.6g}, measured {row.measured:.6g}" for row in found.unexplained]
     assert not said, "not met, and not a known shortfall or worse than known"
     assert not found.outdated, "no longer a shortfall"
+    missing = [row.case for row in found.rows if f"| {row.case} |" not in PAGE]
+    assert not missing, "docs/validation.md is older than these rows: run surgsim validate"
 
 
 def row(name: str, measured: float) -> Row:

@@ -37,7 +37,7 @@ def write_views(path: Path) -> None:
     point, outward = anatomy.face.project(pressed.centre)
     simulation.reset(anatomy.organ(lesions), point + outward * (anatomy.scene.instrument.tip_radius + 0.001))
     simulation.instrument.command_velocity(-0.02 * outward)
-    simulation.control_step(450)
+    simulation.control_step(330)
     simulation.end_control_step()
     pictures = []
     for options, camera in VIEWS:

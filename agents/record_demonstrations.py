@@ -40,6 +40,7 @@ from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
+from surgsim_env.scoring.episodes import agent_generator
 from surgsim_env.scoring.evaluate import named_class
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
@@ -53,6 +54,8 @@ with one_line_errors(__name__, "agents", "demonstrations"):
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".safetensors", ".zip")
+# Least frames a second of a LeRobot data set.
+LEAST_RATE = 20
 
 # Plays one episode in an environment, reset with a seed.
 Player = Callable[[gym.Env, int], None]
@@ -172,8 +175,16 @@ def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
 
         policy = load_policy(Path(by), trust_pickle=trust_pickle)
         policy.check_environment(env, f"policy {by}")
-        alone = SimpleNamespace(reset=lambda: policy.reset(1), act=lambda seen: policy.act(seen[None])[0])
-        return lambda env, seed: play_agent(env, seed, alone)
+
+        def play_policy(env: gym.Env, seed: int) -> None:
+            def begin() -> None:
+                policy.reset(1)
+                # Sampled actions are those of the episode of this seed, as it is scored.
+                policy.begin(0, env, agent_generator(seed))
+
+            play_agent(env, seed, SimpleNamespace(reset=begin, act=lambda seen: policy.act(seen[None])[0]))
+
+        return play_policy
     if ":" not in by:
         raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.safetensors or MODULE:CLASS")
     agent = named_class(by, "--by")(env)
@@ -247,7 +258,11 @@ def record_into(
             seed = folder.next_seed
             check_seeds([seed])
             recorder.all_episodes.clear()
-            play(recorder, seed)
+            try:
+                play(recorder, seed)
+            except KeyboardInterrupt:
+                print("stopped; the same command goes on")
+                break
             episode = recorder.all_episodes[0]
             if episode.actions and (episode.success or keep_failures):
                 folder.add(seed, episode.frames(), success=episode.success)
@@ -255,11 +270,12 @@ def record_into(
                 folder.skip(seed)
             progress.update()
             progress.set_postfix(hours=f"{folder.duration / 3600.0:.3f}", failures=len(folder.waiting))
+        folder.finish()
     except KeyboardInterrupt:
-        print("stopped; the same command goes on")
+        # A half-written episode is removed when the folder is opened again, and by nothing before.
+        raise SystemExit("stopped while an episode was written; the same command goes on") from None
     finally:
         progress.close()
-    folder.finish()
 
 
 def write_dataset(
@@ -351,10 +367,16 @@ def _record_lerobot(given: argparse.Namespace, who: str) -> None:
     if not isinstance(inner, SurgicalEnv):
         raise ValueError(f"{given.env} is a {type(inner).__name__}; frames are read from environments of this project")
     count = 10 if given.episodes is None and given.hours is None else given.episodes
+    rate, step = round(1.0 / inner.scene.timing.control_step), inner.scene.timing.control_step
+    if rate < LEAST_RATE or abs(rate * step - 1.0) > 1e-9:
+        raise ValueError(
+            f"the control step of {inner.scene.name} is {step:g} s; a data set has a whole number of frames a second, "
+            f"at least {LEAST_RATE}: set timing.haptic_steps_per_control of the scene, as to 50 for 20 frames a second"
+        )
     folder = LeRobotFolder(
         Path(given.dataset),
         features(env, given.images, width=width, height=height),
-        frame_rate=round(1.0 / inner.scene.timing.control_step),
+        frame_rate=rate,
         robot=Path(inner.scene.instrument.model).stem,
         task=(inspect.getdoc(type(inner.task)) or type(inner.task).__name__).splitlines()[0],
         recorded={

@@ -11,6 +11,7 @@ import pytest
 
 import surgsim_env  # noqa: F401
 from surgsim_env.rendering import gl
+from surgsim_env.scene.load import scenes_folder
 
 pytestmark = pytest.mark.agents
 pytest.importorskip("tqdm", reason="needs the `agents` extra")
@@ -202,14 +203,14 @@ class Killed(Exception):
     """Stands for a process that was killed."""
 
 
-def kill_at(patch, count):
-    """Let the recording end where it is about to put a file in its place for the `count`-th time."""
+def kill_at(patch, count, how=Killed):
+    """Let the recording end, by raising `how`, where it is about to put a file in its place for the `count`-th time."""
     real, made = Path.replace, [0]
 
     def replace(self, target):
         made[0] += 1
         if made[0] == count:
-            raise Killed
+            raise how
         return real(self, target)
 
     patch.setattr(Path, "replace", replace)
@@ -267,6 +268,42 @@ def test_a_simulation_that_was_stopped_goes_on(dataset, tmp_path):
     for count in ("1", "4"):
         record(folder, "--episodes", count, "--keep-failures")
     assert contents(folder) == contents(dataset)
+
+
+def test_a_recording_that_is_interrupted_while_it_writes_goes_on(dataset, tmp_path, monkeypatch):
+    folder = tmp_path / "interrupted"
+    with monkeypatch.context() as patch:
+        kill_at(patch, 7, KeyboardInterrupt)
+        with pytest.raises(SystemExit, match="stopped while an episode was written"):
+            record(folder, "--episodes", "4", "--keep-failures")
+    record(folder, "--episodes", "4", "--keep-failures")
+    assert contents(folder) == contents(dataset)
+
+
+def test_episodes_of_a_sampled_policy_are_those_of_their_seeds():
+    from agents.record_demonstrations import Recorder, player
+    from surgsim_env.scoring.evaluate import policies_folder
+
+    env = gym.make("SurgSim/Retract-v0", max_episode_steps=6)
+    recorder = Recorder(env)
+    play = player(str(policies_folder() / "retract_scratch.safetensors"), env)
+    for seed in (3, 4, 3):
+        play(recorder, seed)
+    first, other, again = (np.array(one.actions) for one in recorder.all_episodes)
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other)[0].max() > 0.01
+
+
+def test_a_control_step_without_a_whole_rate_is_refused(tmp_path):
+    text = (scenes_folder() / "organs" / "phantom_small.toml").read_text(encoding="utf-8")
+    assert "haptic_steps_per_control = 50" in text
+    for steps in (30, 100):
+        scene = tmp_path / f"steps_{steps}.toml"
+        scene.write_text(text.replace("haptic_steps_per_control = 50", f"haptic_steps_per_control = {steps}"))
+        with pytest.raises(
+            ValueError, match=r"a whole number of frames a second, at least 20: set timing.haptic_steps"
+        ):
+            record(tmp_path / "never", arguments={"scene": str(scene)})
 
 
 def test_hours_are_of_simulated_time(tmp_path):

@@ -40,8 +40,10 @@ from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
+from surgsim_env.scene.digest import content_digest, source_files
 from surgsim_env.scoring.episodes import agent_generator
 from surgsim_env.scoring.evaluate import named_class
+from surgsim_env.scoring.origin import file_digest
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 
 with one_line_errors(__name__, "agents", "demonstrations"):
@@ -189,6 +191,18 @@ def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
         raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.safetensors or MODULE:CLASS")
     agent = named_class(by, "--by")(env)
     return lambda env, seed: play_agent(env, seed, agent)
+
+
+def player_digests(by: str) -> dict[str, str]:
+    """Digests of what a player (`player`) consists of, by the name of each file, or of the oracle's code."""
+    if by == "oracle":
+        return {"scripting": content_digest(*source_files("scripting"))}
+    if by.endswith(POLICY_SUFFIXES):
+        files = [Path(by), Path(by).with_suffix(".json")]
+    else:
+        source = inspect.getsourcefile(named_class(by, "--by"))
+        files = [] if source is None else [Path(source)]
+    return {path.name: file_digest(path) for path in files}
 
 
 def play_agent(env: gym.Env, seed: int, agent: Any) -> None:
@@ -386,7 +400,7 @@ def _record_lerobot(given: argparse.Namespace, who: str) -> None:
             "recorded_by": who,
             "first_seed": given.first_seed,
             "failures_kept": given.keep_failures,
-            "digests": inner.digests(),
+            "digests": {**inner.digests(), **player_digests(given.by)},
         },
         first_seed=given.first_seed,
     )

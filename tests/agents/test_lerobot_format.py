@@ -282,16 +282,43 @@ def test_a_recording_that_is_interrupted_while_it_writes_goes_on(dataset, tmp_pa
 
 def test_episodes_of_a_sampled_policy_are_those_of_their_seeds():
     from agents.record_demonstrations import Recorder, player
+    from surgsim_env.scoring.episodes import agent_generator
     from surgsim_env.scoring.evaluate import policies_folder
+    from surgsim_env.training.policy_files import load_policy
 
     env = gym.make("SurgSim/Retract-v0", max_episode_steps=6)
     recorder = Recorder(env)
-    play = player(str(policies_folder() / "retract_scratch.safetensors"), env)
+    path = policies_folder() / "retract_scratch.safetensors"
+    play, policy = player(str(path), env), load_policy(path)
     for seed in (3, 4, 3):
         play(recorder, seed)
-    first, other, again = (np.array(one.actions) for one in recorder.all_episodes)
+        # As `surgsim evaluate` plays it.
+        policy.reset(1)
+        policy.begin(0, env, agent_generator(seed))
+        recorded = recorder.all_episodes[-1]
+        np.testing.assert_array_equal(policy.act(recorded.observations[0][None])[0], recorded.actions[0])
+    first, _, again = (np.array(one.actions) for one in recorder.all_episodes)
     np.testing.assert_array_equal(first, again)
-    assert np.abs(first - other)[0].max() > 0.01
+
+
+def test_a_recording_does_not_go_on_with_another_policy_of_the_same_name(tmp_path):
+    from agents.lerobot_format import Feature, LeRobotFolder
+    from agents.record_demonstrations import player_digests
+    from surgsim_env.scoring.evaluate import policies_folder
+
+    named = []
+    for name in ("retract_scratch", "retract_dagger"):
+        folder = tmp_path / name
+        folder.mkdir()
+        for suffix in (".safetensors", ".json"):
+            shutil.copy(policies_folder() / f"{name}{suffix}", folder / f"policy{suffix}")
+        named.append(player_digests(str(folder / "policy.safetensors")))
+    assert set(named[0]) == set(named[1]) == {"policy.safetensors", "policy.json"} and named[0] != named[1]
+    writer = {"frame_rate": 20, "robot": "probe", "task": "Wait.", "first_seed": 0}
+    features = [Feature("action", "float32", (2,), ("along", "across"))]
+    LeRobotFolder(tmp_path / "set", features, recorded={"digests": named[0]}, **writer).close()
+    with pytest.raises(ValueError, match=r"policy\.safetensors"):
+        LeRobotFolder(tmp_path / "set", features, recorded={"digests": named[1]}, **writer)
 
 
 def test_a_control_step_without_a_whole_rate_is_refused(tmp_path):

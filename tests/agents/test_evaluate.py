@@ -280,6 +280,7 @@ def test_results_of_other_seeds_are_not_written_by_themselves(
 
 def test_a_family_is_scored_on_its_test_split(tmp_path: Path) -> None:
     """Wherever its name comes from, unless a split is named."""
+    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
     described = SimpleNamespace(env_id=SITES, env_kwargs={"scene": "liver_family", "split": "train"})
     policy = SimpleNamespace(description=described, reset=lambda count: None)
     mine = "surgsim_env.scoring.site_search:RandomSites"
@@ -320,6 +321,7 @@ def drawn_lesions(env: Any, seed: int) -> int:
 
 
 def test_all_methods_are_those_that_the_place_suits(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
     played: list[str] = []
     monkeypatch.setattr(evaluate, "evaluate", lambda player, options, console: played.append(player.name))
     surgsim("evaluate", "--all", "--scene", "phantom_wide", "--episodes", "1")

@@ -281,6 +281,7 @@ def test_a_recording_that_is_interrupted_while_it_writes_goes_on(dataset, tmp_pa
 
 
 def test_episodes_of_a_sampled_policy_are_those_of_their_seeds():
+    pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
     from agents.record_demonstrations import Recorder, player
     from surgsim_env.scoring.episodes import agent_generator
     from surgsim_env.scoring.evaluate import policies_folder

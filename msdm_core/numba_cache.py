@@ -32,6 +32,7 @@ from typing import Any
 from numba.core import config
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
 from numba.core.target_extension import dispatcher_registry, target_registry
 from numba.misc.appdirs import AppDirs
 
@@ -161,6 +162,19 @@ class CheckedCacheFile(IndexDataCacheFile):
         # Files that could not be removed: the index is read once more before it is written.
         self._stuck: set[str] = set()
 
+    def save(self, key: Any, data: Any) -> None:
+        """Keep a compiled function in a file that is named after its key.
+
+        numba takes the first number that the index leaves free: two processes that compile one function for different
+        signatures at the same time take the same, and an index that names the other's file may remain. Here, the one
+        that writes the index first may lose its entry, and its function is compiled once more.
+        """
+        name = self._data_name(int.from_bytes(hashlib.sha256(repr(key).encode()).digest()[:16], "big"))
+        overloads = self._load_index()
+        if overloads.get(key) != name:
+            self._save_index({**overloads, key: name})
+        self._save_data(name, data)
+
     def drop_data(self, key: Any, error: Exception) -> None:
         """Drop the data file of an index entry, from which no compiled function could be made."""
         name = self._load_index().get(key)
@@ -232,8 +246,12 @@ class HealingCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled function of a signature; None where it is to be compiled."""
         try:
-            return super().load_overload(sig, target_context)
-        except Exception as error:  # what was unpickled is no compiled function
+            found = super().load_overload(sig, target_context)
+            arguments, _ = normalize_signature(sig)
+            if found is not None and tuple(found.signature.args) != arguments:
+                raise ValueError(f"it holds the function for {found.signature.args}, not for {arguments}")
+            return found
+        except Exception as error:  # what was unpickled is no compiled function, or not this one
             self._cache_file.drop_data(self._index_key(sig, target_context.codegen()), error)
             return None
 

@@ -189,6 +189,46 @@ def test_a_damaged_file_is_dropped_and_made_anew(source: Path, suffix: str, dama
     assert started(source) == (True, []), "it healed"
 
 
+def doubled(source: Path) -> Any:
+    """The kernel `double` of a new process, with the healing cache."""
+    with numba_cache.kernel_cache(source):
+        return executed(source).double
+
+
+def test_two_processes_that_compile_for_two_types_at_once_keep_apart(source: Path, monkeypatch):
+    """Both read the index before either writes it, and one writes its data last."""
+    one, other = doubled(source), doubled(source)
+    save_data = one._cache._cache_file._save_data
+
+    def overtaken(name: str, data: Any) -> None:
+        with monkeypatch.context() as patched:
+            patched.setattr(other._cache._cache_file, "_load_index", lambda: {})
+            assert other(1j) == 2j
+        save_data(name, data)
+
+    monkeypatch.setattr(one._cache._cache_file, "_save_data", overtaken)
+    assert one(1.5) == 3.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for hits in (1, 2):
+            later = doubled(source)
+            assert (later(1.5), later(1j)) == (3.0, 2j)
+            assert sum(later.stats.cache_hits.values()) == hits
+
+
+def test_an_index_that_names_a_file_for_other_types_is_healed(source: Path):
+    """As plain numba's names of data files, by number, can leave it."""
+    first = doubled(source)
+    assert (first(1.5), first(21)) == (3.0, 42.0)
+    one, other = (first._cache._cache_file._data_path(name) for name in first._cache._cache_file._load_index().values())
+    shutil.copy(one, other)
+    with pytest.warns(RuntimeWarning, match=r"it holds the function for \(float64,\), not for \(int64,\)"):
+        later = doubled(source)
+        assert (later(1.5), later(21)) == (3.0, 42.0)
+    healed = doubled(source)
+    assert (healed(1.5), healed(21)) == (3.0, 42.0) and sum(healed.stats.cache_hits.values()) == 2
+
+
 def test_files_have_a_checksum_that_plain_numba_does_not_mind(source: Path):
     started(source)
     for suffix in (".nbi", ".nbc"):

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_env.bench.measurement import Effort, interleaved, spread
-from surgsim_env.bench.report import Figure, Section, core_count
+from surgsim_env.bench.report import Figure, Section
+from surgsim_env.coupling.lane_group import core_count
 
 SCENE = "phantom"
 ENV_ID = "SurgSim/Palpate-v0"

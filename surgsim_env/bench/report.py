@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from msdm_core.kernels.vector_kernels import GROUP, lane_counts, register_bits
+from surgsim_env.coupling.lane_group import core_count
 from surgsim_env.reports.output_folder import OutputFolder
 
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
@@ -26,11 +27,6 @@ this machine and this run; compare the ratios. No test asserts any of them.
 
 class AbsentError(Exception):
     """Something that this run cannot measure, such as a peer that is not installed; the message says why."""
-
-
-def core_count() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def processor() -> str:

@@ -9,7 +9,8 @@ import gymnasium as gym
 import numpy as np
 
 from surgsim_env.bench.measurement import Effort, spread
-from surgsim_env.bench.report import AbsentError, Figure, Section, absent, core_count
+from surgsim_env.bench.report import AbsentError, Figure, Section, absent
+from surgsim_env.coupling.lane_group import core_count
 from surgsim_env.rendering.gl import NoGLError
 
 LANES = 16

@@ -16,8 +16,9 @@ from rich.console import Console
 
 from msdm_core.kernels.substep_kernels import advance_substeps
 from msdm_core.numba_cache import FOLDER_PREFIX
-from surgsim_env.bench.report import core_count, processor, registers
+from surgsim_env.bench.report import processor, registers
 from surgsim_env.coupling import mujoco_library
+from surgsim_env.coupling.lane_group import core_count
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import SitePress, press_alone, press_phases
 from surgsim_env.rendering import gl

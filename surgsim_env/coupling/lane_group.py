@@ -1,6 +1,7 @@
 """Simulations of one scene that advance side by side in one compiled call, with the same results as alone."""
 
 import math
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +23,11 @@ from msdm_core.lanes.lanes import (
 from surgsim_env.coupling.exchange import step_outcome, steps_taken
 from surgsim_env.coupling.haptic_kernels import StepPlan, advance_lane_haptic_steps
 from surgsim_env.coupling.simulation import Simulation
+
+
+def core_count() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class LaneGroup:

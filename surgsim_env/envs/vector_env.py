@@ -13,7 +13,7 @@ from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
 from msdm_core.kernels.vector_kernels import lane_counts
-from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.coupling.lane_group import LaneGroup, core_count
 from surgsim_env.envs import ids
 from surgsim_env.envs.surgical_env import SurgicalEnv
 
@@ -62,7 +62,7 @@ class LaneVectorEnv(SyncVectorEnv):
 
         super().__init__([make] * num_envs, autoreset_mode=autoreset_mode)
         self._singles: list[SurgicalEnv] = [env.unwrapped for env in self.envs]  # type: ignore[misc]
-        threads = threads if threads is not None else os.cpu_count() or 1
+        threads = threads if threads is not None else core_count()
         width = group_width(num_envs, np.dtype(dtype), threads)
         self._members = [range(first, min(first + width, num_envs)) for first in range(0, num_envs, width)]
         self._groups = [

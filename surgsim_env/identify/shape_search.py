@@ -6,7 +6,6 @@ interpolation.
 """
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ from scipy.optimize import minimize
 from scipy.stats import qmc
 
 from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.lane_group import core_count
 from surgsim_env.identify.press_model import PressCurve, PressSetting, PressShape, press_block
 from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites
 
@@ -103,7 +103,7 @@ class PressLibrary:
 
     space: ShapeSpace
     setting: PressSetting
-    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    workers: int = field(default_factory=core_count)
     points: list[FloatArray] = field(default_factory=list)
     curves: list[PressCurve] = field(default_factory=list)
     linear_places: list[float] = field(default_factory=list)

@@ -7,7 +7,6 @@ to all.
 """
 
 import contextlib
-import hashlib
 from collections import OrderedDict
 from pathlib import Path
 from threading import Lock
@@ -28,6 +27,7 @@ from surgsim_env.palpation.chart import (
 )
 from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, MemberName, load_anatomy
+from surgsim_env.scene.digest import content_digest
 from surgsim_env.scene.family import make_member
 from surgsim_env.scene.load import with_instrument
 from surgsim_env.scene.model import Scene
@@ -76,9 +76,8 @@ def member_map(template: Anatomy, name: MemberName, progress: StepProgress | Non
 def _read_or_press(member: Anatomy, progress: StepProgress | None) -> HealthyMap:
     template, folder = member.template, cache_folder()
     assert template is not None
-    base = hashlib.blake2b(Path(__file__).read_bytes(), digest_size=12)
-    base.update(map_digest(template).encode() + map_digest(member).encode())
-    path = None if folder is None else folder / f"healthy-{base.hexdigest()}.npy"
+    digest = content_digest(Path(__file__), map_digest(template), map_digest(member))
+    path = None if folder is None else folder / f"healthy-{digest}.npy"
     with contextlib.suppress(OSError, ValueError, EOFError):
         if path is not None:
             return HealthyMap(np.load(path, allow_pickle=False))

@@ -1,6 +1,5 @@
 """Presses along the surface normal: a plan of control steps that one simulation, lanes or many threads execute."""
 
-import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,7 @@ import numpy as np
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import TissueLoad
-from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.coupling.lane_group import LaneGroup, core_count
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.scene.anatomy import Anatomy
@@ -286,11 +285,6 @@ def _far_travel(simulation: Simulation, site: FloatArray) -> float:
     far = distance >= np.median(distance)
     moved = simulation.organ_state.node_position[far] - rest[far] - simulation.ground_shift(rest[far])
     return float(np.linalg.norm(moved, axis=1).max())
-
-
-def core_count() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def scan(

@@ -14,6 +14,7 @@ from surgsim_env.palpation.bell_fit import BellFit, framed
 from surgsim_env.palpation.chart import ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.scene.model import PalpationSettings, Scene, Vector
+from surgsim_env.scene.palpable_surface import hertz_force
 
 # Speed of the tip between sites [m/s]; this travel is counted, not simulated.
 TRAVEL_SPEED = 0.02
@@ -175,9 +176,8 @@ class Indenter:
     material: Material
 
     def force(self, depth: float) -> float:
-        """Hertz's force [N] at a depth [m]: 4/3 E / (1 - nu^2) sqrt(R) d^1.5 (Johnson, Contact Mechanics, 1985)."""
-        modulus = self.material.youngs_modulus / (1.0 - self.material.poisson_ratio**2)
-        return 4.0 / 3.0 * modulus * math.sqrt(self.radius) * max(depth, 0.0) ** 1.5
+        """`hertz_force` [N] at a depth [m]; 0 above the surface."""
+        return hertz_force(self.material, self.radius, max(depth, 0.0))
 
 
 class TouchMemory:

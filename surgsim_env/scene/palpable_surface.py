@@ -311,9 +311,9 @@ def share_text(cell: float, tip_radius: float, press_depth: float) -> str:
 
 
 def hertz_force(material: Material, tip_radius: float, press_depth: float) -> float:
-    """Force of a ball on an elastic half space, F = 4/3 E / (1 - nu^2) sqrt(R d^3) (Hertz 1881) [N]."""
+    """Force of a ball on an elastic half space, F = 4/3 E / (1 - nu^2) R^0.5 d^1.5 (Hertz 1881) [N]."""
     stiffness = material.youngs_modulus / (1.0 - material.poisson_ratio**2)
-    return 4.0 / 3.0 * stiffness * math.sqrt(tip_radius * press_depth**3)
+    return 4.0 / 3.0 * stiffness * math.sqrt(tip_radius) * press_depth**1.5
 
 
 def hidden_share(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> float:

@@ -150,11 +150,11 @@ class Browser(Link):
 
     def wait_until(self, condition: Callable[[], Any], state: Callable[[], Any] = lambda: "not told") -> None:
         """Until something is true on the server's side, while the page goes on; a failure shows the state."""
-        assert self._becomes(condition, PATIENCE), (
+        assert self.becomes(condition, PATIENCE), (
             f"the condition stays false; state: {state()}; console: {self.complaints()}"
         )
 
-    def _becomes(self, condition: Callable[[], Any], timeout: float) -> bool:
+    def becomes(self, condition: Callable[[], Any], timeout: float) -> bool:
         """Whether something becomes true on the server's side within some time [s], while the page goes on."""
         deadline = time.monotonic() + timeout
         while not condition():
@@ -187,7 +187,7 @@ class Browser(Link):
         self.next_frame()
         for _ in range(PRESSES):
             self.mouse("mousePressed", x, y, 1)
-            if grabbed is None or self._becomes(grabbed, GRAB_TIMEOUT):
+            if grabbed is None or self.becomes(grabbed, GRAB_TIMEOUT):
                 break
             self.mouse("mouseReleased", x, y)
             self.next_frame()

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from tests.chromium import GRAB_TIMEOUT
+
 # What the browser made of a page, once that is whole: pictures that are not there, the widest part beside the window,
 # what came from elsewhere, the height of the highest formula.
 MADE = """({
@@ -69,13 +71,19 @@ def test_a_word_that_is_typed_is_found(address, site_folder, chromium, place, pa
     with chromium.page(1280, 900) as browser:
         browser.open(f"{address if place == 'served' else site_folder.as_uri()}/{page}")
         browser.wait_for_page()
-        browser.wait_for("!!document.querySelector('input.md-search__input')")
-        browser.run("document.querySelector('input.md-search__input').focus()")
-        browser.do("Input.insertText", text="watchdog")
-        browser.wait_for(f"{FOUND}.length > 0")
+        browser.wait_for(f"!!{SEARCHED}")
+
+        def answers() -> bool:
+            """Whether the word is found soon after it was typed: the page may not listen yet."""
+            browser.run(f"{SEARCHED}.focus(), {SEARCHED}.select()")
+            browser.do("Input.insertText", text="watchdog")
+            return browser.becomes(lambda: browser.run(f"{FOUND}.length > 0"), GRAB_TIMEOUT)
+
+        browser.wait_until(answers)
         found = browser.run(f"{FOUND}.map(one => [one.href, one.textContent])")
         assert any("haptics.html" in link and "watchdog" in text.lower() for link, text in found), found
         assert browser.complaints() == []
 
 
+SEARCHED = "document.querySelector('input.md-search__input')"
 FOUND = "[...document.querySelectorAll('a.md-search-result__link')]"

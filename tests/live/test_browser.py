@@ -117,7 +117,8 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
         plot_before = browser.run(PLOT)
 
         drag_into_the_organ(browser, served)
-        assert np.linalg.norm(session.frame()["node"] - rest, axis=1).max() > 0.001
+        # The tip is still on its way.
+        browser.wait_until(lambda: np.linalg.norm(session.frame()["node"] - rest, axis=1).max() > 0.001)
         browser.wait_until(lambda: browser.run(PLOT) != plot_before)
         box = browser.run(f"(() => {{ const r = {CANVAS}; return [r.x, r.y, r.width, r.height]; }})()")
         middle = (slice(int(0.2 * box[3]), int(0.9 * box[3])), slice(int(0.25 * box[2]), int(0.6 * box[2])))

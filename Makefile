@@ -21,14 +21,14 @@ WITH_LEROBOT := --editable=.[dev,demonstrations] huggingface_hub~=0.34 datasets=
 # A file's tests run in one worker, which makes what they share once.
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: help demo test test-all test-agents test-distributed with-ray test-lerobot with-lerobot bench soak docs lint dist test-dist release clean distclean
+.PHONY: help demo test test-all test-agents test-agents-all test-distributed with-ray test-lerobot with-lerobot bench soak docs lint dist test-dist committed release clean distclean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo         press the simulated probe into the liver; results in runs/demo"
 	@echo "make test         the tests (PYTEST_ARGS='-n 2 --dist loadfile' is the default)"
 	@echo "make test-all     the slow ones too"
-	@echo "make test-agents  those that need stable-baselines3 (installs torch)"
+	@echo "make test-agents  those that need stable-baselines3 (installs torch); make test-agents-all the slow ones too"
 	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
 	@echo "make test-lerobot  those that read data sets with LeRobot, in $(VENV)-lerobot (Python 3.11; installs 2.2 GB)"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
@@ -37,7 +37,7 @@ help:
 	@echo "make lint         ruff and pyright"
 	@echo "make dist         the source archive and the wheel, in dist/"
 	@echo "make test-dist    installs the wheel, nothing else, for each Python from 3.11 that is here, and tries it"
-	@echo "make release      all tests, dist, test-dist, and a local tag of the version"
+	@echo "make release      all of these but bench and soak, slow tests too, and a local tag of the version"
 	@echo "make clean        remove what runs, tests and builds left; make distclean removes $(VENV) as well"
 	@echo "PYTHON=/path/to/python picks the interpreter (3.11 or newer) that $(VENV) is made from"
 
@@ -45,8 +45,8 @@ demo: $(VENV)/.ready-demo
 	$(VENV)/bin/surgsim palpate --scene liver --out runs/demo
 
 # Tests run side by side: threads that wait for their parts of a small matrix cost more than they save.
-test test-all test-agents: export OMP_NUM_THREADS := 1
-test test-all test-agents: export OPENBLAS_NUM_THREADS := 1
+test test-all test-agents test-agents-all: export OMP_NUM_THREADS := 1
+test test-all test-agents test-agents-all: export OPENBLAS_NUM_THREADS := 1
 
 test: $(VENV)/.ready-dev
 	$(PY) -m tests.compile_kernels
@@ -58,6 +58,9 @@ test-all: $(VENV)/.ready-dev
 
 test-agents: $(VENV)/.ready-agents
 	$(PY) -m pytest $(PYTEST_ARGS) -m "agents and not slow"
+
+test-agents-all: $(VENV)/.ready-agents
+	$(PY) -m pytest $(PYTEST_ARGS) -m agents
 
 # Ray in an environment of its own: what agents need is tested without it, it without what they need.
 test-distributed:
@@ -112,11 +115,18 @@ test-dist: dist
 	        && $$folder/env/bin/python -m pip install -qq --disable-pip-version-check dist/*.whl \
 	        && (cd $$folder/work && NUMBA_CACHE_DIR=$$folder/cache \
 	            $$folder/env/bin/python $(CURDIR)/tests/packaging/alone.py $(CURDIR)/README.md $(ALONE)) || exit 1; \
-	done
+	done; \
+	[ "$$tried" != " " ] || { echo "surgsim: no Python from 3.11 on among: $(PYTHONS)" >&2; exit 2; }
+
+# A tag is of what is committed and tested, and of a version that has none yet.
+committed:
+	@[ -z "$$(git status --porcelain)" ] || { git status --short; echo "surgsim: that is not committed" >&2; exit 1; }
+	@! git rev-parse --quiet --verify "refs/tags/v$(VERSION)" >/dev/null \
+	    || { echo "surgsim: v$(VERSION) is tagged already: raise the version in pyproject.toml" >&2; exit 1; }
 
 release: ALONE = --all
-release: lint docs test-all test-dist
-	git diff --quiet HEAD || { echo "surgsim: there are changes that are not committed" >&2; exit 1; }
+release: committed lint docs test-all test-agents-all test-distributed test-lerobot test-dist
+	@$(MAKE) --no-print-directory committed
 	git tag -a v$(VERSION) -m "surgsim $(VERSION)"
 	@echo "surgsim: tagged v$(VERSION); its notes are in CHANGELOG.md; publish dist/ and the tag by hand"
 

@@ -2,7 +2,8 @@
 
 `<!-- environment ID -->` becomes the docstring of that environment (Gymnasium's headings), whose tables of commands,
 channels and rewards come from the task's declaration; its spaces are added. `<!-- commands -->` becomes the help texts
-of `surgsim` and each of its commands.
+of `surgsim` and each of its commands. What stands from there to `<!-- made from the code -->` is for those who read
+the file itself, and is replaced.
 """
 
 import contextlib
@@ -18,8 +19,8 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
-ENVIRONMENT = re.compile(r"<!-- environment (\S+) -->")
-COMMANDS = "<!-- commands -->"
+ENVIRONMENT = re.compile(r"<!-- environment (\S+) -->\n.*?<!-- made from the code -->", re.DOTALL)
+COMMANDS = re.compile(r"<!-- commands -->\n.*?<!-- made from the code -->", re.DOTALL)
 # Wide enough for each option to be on one line.
 COLUMNS = {"COLUMNS": "4000"}
 
@@ -27,7 +28,7 @@ COLUMNS = {"COLUMNS": "4000"}
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Fill the marks in."""
     markdown = ENVIRONMENT.sub(lambda mark: environment_text(mark[1]), markdown)
-    return markdown.replace(COMMANDS, command_list()) if COMMANDS in markdown else markdown
+    return COMMANDS.sub(lambda mark: command_list(), markdown)
 
 
 def environment_text(id: str) -> str:

@@ -110,6 +110,18 @@ def test_every_environment_has_a_page_with_gymnasiums_headings(id):
     assert "Arguments" in told and all(told.values())
 
 
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if "<!-- made from the code -->" in page.read_text(encoding="utf-8")],
+    ids=lambda one: one.stem,
+)
+def test_what_stands_for_the_generated_part_is_replaced(page):
+    text = page.read_text(encoding="utf-8")
+    made = hook("generated_parts").on_page_markdown(text, None, None, None)
+    assert "The site (`make docs`)" in text and "The site (`make docs`)" not in made
+    assert len(made) > 2 * len(text) and "<!--" not in made
+
+
 @pytest.mark.parametrize("id", IDS)
 def test_tables_have_every_command_channel_and_reward(id):
     task, text = TASKS[id], hook("generated_parts").environment_text(id)

@@ -1,7 +1,7 @@
 """A person at the keyboard: the keys held down in the window give the action.
 
     python -m agents.record_demonstrations SurgSim/Retract-v0 --env-arguments '{"render_mode": "human"}' \
-        --by agents.keyboard:Keyboard --episodes 5 --dataset surgsim/retract/human-v0
+        --by keyboard --episodes 5 --dataset surgsim/retract/human-v0
 
     A D left, right    S W near, far    F R down, up    Q E turn the wrist
     space: close the jaw, or "the lesion is here"
@@ -10,6 +10,7 @@ One control step is 50 ms of simulated time; on a machine that takes longer, the
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +26,7 @@ SHARE = 0.5
 
 
 class Keyboard:
-    """Plays an environment of one arm with the keys of its window."""
+    """Plays an environment of one arm with the keys of its window (an `EpisodeActor`)."""
 
     def __init__(self, env: gym.Env) -> None:
         """Take an environment with render_mode="human".
@@ -41,11 +42,14 @@ class Keyboard:
         self._env, self._size = env.unwrapped, size
         self._jaw = hasattr(self._env.task, "jaw_place")  # type: ignore[attr-defined]
 
-    def reset(self) -> None:
+    def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
         """Begin an episode; there is no state."""
 
-    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """The action of the keys held down.
+    def end(self, index: int) -> None:
+        """The episode is over; there is no state."""
+
+    def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """The action of the keys held down, shape (1, n_action).
 
         Raises:
             KeyboardInterrupt: the window was closed.
@@ -53,7 +57,7 @@ class Keyboard:
         window = self._env.window  # type: ignore[attr-defined]
         if window is None or window.closed:
             raise KeyboardInterrupt("the window was closed")
-        return self.action(window.held_keys())
+        return self.action(window.held_keys())[None]
 
     def action(self, held: str) -> NDArray[np.float32]:
         """The action of some keys, shape (n_action,)."""

@@ -1,9 +1,10 @@
 """A scripted agent for SurgSim/Palpate-v0: press a raster, go back to the stiffest place, declare it.
 
 It uses the observation (tip position, force) and the scene file (height of the phantom, force limits) only, so a
-learning agent should beat its score. Run it from a checkout:
+learning agent should beat its score. Run it, or score it, from a checkout:
 
     python -m agents.raster --episodes 5
+    surgsim evaluate --agent agents.raster:RasterAgent --env SurgSim/Palpate-v0 --scene phantom --seeds 0:4
 """
 
 import argparse
@@ -14,6 +15,7 @@ import numpy as np
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
+from surgsim_env.scoring.episodes import EpisodeFacts, agent_generator, episode_facts
 
 PRESS_DEPTH = 0.0035  # [m] below the resting surface
 TRAVEL_GAP = 0.0006  # [m] between tip and surface while moving sideways
@@ -25,18 +27,24 @@ CLOSE_ENOUGH = 0.0007  # [m]
 class RasterAgent:
     """Presses a grid of sites on a flat top, remembers each force, then declares at the stiffest."""
 
-    def __init__(self, env: gym.Env, *, sites_per_side: int = 5) -> None:
-        self.env, scene = env.unwrapped, env.unwrapped.scene
+    def __init__(self, sites_per_side: int = 5) -> None:
+        self.sites_per_side = sites_per_side
+
+    def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
+        """Begin an episode; it draws nothing from the random numbers."""
+        self.env = gym.make(facts.env_id, **facts.env_kwargs).unwrapped
+        scene = self.env.scene
         if scene.mesh.block is None:
             raise ValueError(f"this agent presses the flat top of a block; {scene.name!r} is not a block: use phantom")
         width, depth, self.top = scene.mesh.block.size
         self.radius = scene.instrument.tip_radius
-        self.slices = env.unwrapped.observation_slices
-        self.soft_force = scene.limits.soft_force
+        self.slices, self.soft_force = facts.observation_slices, facts.soft_force
         rim = scene.lesion.rim_distance
-        xs, ys = np.linspace(rim, width - rim, sites_per_side), np.linspace(rim, depth - rim, sites_per_side)
+        xs, ys = (np.linspace(rim, side - rim, self.sites_per_side) for side in (width, depth))
         # Rows in alternating directions shorten the path.
         self.sites = [(x, y) for row, y in enumerate(ys) for x in (xs if row % 2 == 0 else xs[::-1])]
+        self.forces: list[float] = []
+        self._plan = self._search()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The next action, from an observation."""
@@ -44,11 +52,6 @@ class RasterAgent:
         self.tip = seen[self.slices["tip_position"]]
         self.force = float(seen[self.slices["contact_force"]][2])
         return next(self._plan)
-
-    def reset(self) -> None:
-        """Begin an episode."""
-        self.forces: list[float] = []
-        self._plan = self._search()
 
     def _search(self) -> Iterator[np.ndarray]:
         travel = self.top + self.radius + TRAVEL_GAP
@@ -85,7 +88,8 @@ class RasterAgent:
 def run_episode(env: gym.Env, agent: RasterAgent, seed: int) -> dict:
     """Play one episode; returns its last info with return and number of steps."""
     observation, info = env.reset(seed=seed)
-    agent.reset()
+    assert env.spec is not None
+    agent.reset(agent_generator(seed), episode_facts(env, env.spec.id, env.spec.kwargs))
     total, steps, over = 0.0, 0, False
     while not over:
         observation, reward, terminated, truncated, info = env.step(agent.act(observation))
@@ -100,7 +104,7 @@ def main() -> None:
     parser.add_argument("--scene", default="phantom")
     arguments = parser.parse_args()
     env = gym.make("SurgSim/Palpate-v0", scene=arguments.scene)
-    agent = RasterAgent(env)
+    agent = RasterAgent()
     for seed in range(arguments.episodes):
         record = run_episode(env, agent, seed)
         print(

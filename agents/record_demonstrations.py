@@ -11,7 +11,8 @@ episodes are written one by one, and the same command goes on where it was stopp
 
 Minari's datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored
 with its seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations
-to the bit. A person plays with `agents/keyboard.py`. `Recorder` records any other code that steps an environment:
+to the bit. A person plays with `--by keyboard` (`agents/keyboard.py`). `Recorder` records any other code that steps an
+environment:
 
     env = Recorder(gym.make("SurgSim/Palpate-v0"))
     ...  # reset and step it
@@ -27,7 +28,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -36,19 +36,24 @@ from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
+from agents.keyboard import Keyboard
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.scene.digest import content_digest, source_files
-from surgsim_env.scoring.episodes import agent_generator
-from surgsim_env.scoring.evaluate import named_class
+from surgsim_env.scoring.episodes import AgentActor, EpisodeActor, agent_generator, episode_facts
+from surgsim_env.scoring.evaluate import named_class, strangers_agent
 from surgsim_env.scoring.origin import file_digest
+from surgsim_env.scoring.results import SITES
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
+from surgsim_env.training.site_agent import site_facts
 
 with one_line_errors(__name__, "agents", "demonstrations"):
     import minari
     from minari.data_collector.episode_buffer import EpisodeBuffer
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage.datasets_root_dir import get_dataset_path
     from tqdm import tqdm
 
     from agents.lerobot_format import LeRobotFolder
@@ -58,6 +63,8 @@ CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".safetensors", ".zip")
 # Least frames a second of a LeRobot data set.
 LEAST_RATE = 20
+# With --hours alone a recording ends when so many episodes in a row added nothing.
+FAILURES_MOST = 100
 
 # Plays one episode in an environment, reset with a seed.
 Player = Callable[[gym.Env, int], None]
@@ -163,40 +170,43 @@ def play_oracle(env: gym.Env, seed: int) -> None:
 
 
 def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
-    """The player of a name: "oracle", a policy's file, or MODULE:CLASS with `reset()` and `act(observation)`.
+    """The player of a name.
 
     Args:
-        by: the name.
-        env: where it plays.
+        by: "oracle", "keyboard", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
+        env: where it plays, made with gym.make.
         trust_pickle: the policy may be a zip of stable-baselines3, which runs any code that its author put there.
+
+    Raises:
+        ValueError: another name, a policy for another environment, or a class that is no agent (says which method).
     """
     if by == "oracle":
         return play_oracle
+    if by == "keyboard":
+        keyboard = Keyboard(env)
+        return lambda env, seed: play_actor(env, seed, keyboard)
     if by.endswith(POLICY_SUFFIXES):
         from surgsim_env.training.policy_files import load_policy
 
         policy = load_policy(Path(by), trust_pickle=trust_pickle)
         policy.check_environment(env, f"policy {by}")
-
-        def play_policy(env: gym.Env, seed: int) -> None:
-            def begin() -> None:
-                policy.reset(1)
-                # Sampled actions are those of the episode of this seed, as it is scored.
-                policy.begin(0, env, agent_generator(seed))
-
-            play_agent(env, seed, SimpleNamespace(reset=begin, act=lambda seen: policy.act(seen[None])[0]))
-
-        return play_policy
+        policy.reset(1)
+        return lambda env, seed: play_actor(env, seed, policy)
     if ":" not in by:
-        raise ValueError(f"--by is {by!r}; the rule is oracle, NAME.safetensors or MODULE:CLASS")
-    agent = named_class(by, "--by")(env)
-    return lambda env, seed: play_agent(env, seed, agent)
+        raise ValueError(f"--by is {by!r}; the rule is oracle, keyboard, NAME.safetensors or MODULE:CLASS")
+    make, _ = strangers_agent(by, "--by")
+    assert env.spec is not None
+    env_id, kwargs = env.spec.id, env.spec.kwargs
+    actor = AgentActor(make, site_facts if env_id == SITES else lambda one: episode_facts(one, env_id, kwargs))
+    return lambda env, seed: play_actor(env, seed, actor)
 
 
 def player_digests(by: str) -> dict[str, str]:
-    """Digests of what a player (`player`) consists of, by the name of each file, or of the oracle's code."""
+    """Digests of what a player consists of, by the name of each file, or of the oracle's code; none of a person."""
     if by == "oracle":
         return {"scripting": content_digest(*source_files("scripting"))}
+    if by == "keyboard":
+        return {}
     if by.endswith(POLICY_SUFFIXES):
         files = [Path(by), Path(by).with_suffix(".json")]
     else:
@@ -205,14 +215,15 @@ def player_digests(by: str) -> dict[str, str]:
     return {path.name: file_digest(path) for path in files}
 
 
-def play_agent(env: gym.Env, seed: int, agent: Any) -> None:
-    """Play one episode of an agent with `reset()` and `act(observation)`."""
+def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
+    """Play one episode, with the random numbers with which the episode of this seed is scored."""
     observation, _ = env.reset(seed=seed)
-    agent.reset()
-    over = False
+    actor.begin(0, env, agent_generator(seed))
+    begins, over = np.ones(1, dtype=np.bool_), False
     while not over:
-        observation, _, terminated, truncated, _ = env.step(agent.act(observation))
-        over = terminated or truncated
+        observation, _, terminated, truncated, _ = env.step(actor(observation[None], begins)[0])
+        begins, over = np.zeros_like(begins), terminated or truncated
+    actor.end(0)
 
 
 def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[RecordedEpisode]:
@@ -261,11 +272,12 @@ def record_into(
         keep_failures: write them too.
 
     Raises:
-        ValueError: the next seed is reserved for scores.
+        ValueError: the next seed is reserved for scores, or FAILURES_MOST episodes in a row added nothing and only
+            `hours` would end the recording; what was recorded before is whole.
     """
     known = readings([name.removeprefix(PICTURES) for name in folder.feature_names if name.startswith(PICTURES)])
     recorder = Recorder(env, known)
-    first, most = folder.next_seed, math.inf if last_seed is None else last_seed
+    first, most, failures = folder.next_seed, math.inf if last_seed is None else last_seed, 0
     progress = tqdm(unit="episode", total=None if last_seed is None else max(last_seed + 1 - first, 0))
     try:
         while folder.next_seed <= most and (hours is None or folder.duration < 3600.0 * hours):
@@ -280,16 +292,49 @@ def record_into(
             episode = recorder.all_episodes[0]
             if episode.actions and (episode.success or keep_failures):
                 folder.add(seed, episode.frames(), success=episode.success)
+                failures = 0
             else:
                 folder.skip(seed)
+                failures += 1
             progress.update()
             progress.set_postfix(hours=f"{folder.duration / 3600.0:.3f}", failures=len(folder.waiting))
+            if last_seed is None and failures == FAILURES_MOST:
+                break
         folder.finish()
     except KeyboardInterrupt:
         # A half-written episode is removed when the folder is opened again, and by nothing before.
         raise SystemExit("stopped while an episode was written; the same command goes on") from None
     finally:
         progress.close()
+    if last_seed is None and failures == FAILURES_MOST:
+        # Who plays and what is kept are those of the folder.
+        raise ValueError(
+            f"the last {failures} episodes, up to seed {folder.next_seed - 1}, all "
+            f"{'had no step' if keep_failures else 'failed'}, and {folder.duration / 3600.0:.3f} of {hours:g} h are "
+            "recorded: limit the number of seeds by --episodes, or record into another folder with another --by"
+            + " or with --keep-failures"
+            * (not keep_failures)
+        )
+
+
+def check_dataset_name(name: str) -> None:
+    """Check that a Minari data set of this name can be written.
+
+    Raises:
+        ValueError: a name that Minari does not take, or one that is taken.
+    """
+    try:
+        parse_dataset_id(name)
+    # Without a version Minari raises a TypeError.
+    except (ValueError, TypeError):
+        raise ValueError(
+            f"--dataset is {name!r}; the rule of Minari is NAME-vNUMBER or SPACE/NAME-vNUMBER, of letters, digits, _ "
+            "and -, SPACE of at least two"
+        ) from None
+    if get_dataset_path(name).exists():
+        raise ValueError(
+            f"--dataset {name} is there already ({get_dataset_path(name)}): raise its version, or remove it"
+        )
 
 
 def write_dataset(
@@ -337,7 +382,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
-    parser.add_argument("--by", default="oracle", help="oracle, a policy's NAME.safetensors, or MODULE:CLASS")
+    parser.add_argument("--by", default="oracle", help="oracle, keyboard, a policy's NAME.safetensors, or MODULE:CLASS")
     parser.add_argument("--trust-pickle", action="store_true", help="let --by be a zip, which runs code of its author")
     parser.add_argument("--episodes", type=int, help="number of episodes to play; 10 by default")
     parser.add_argument("--first-seed", type=int, default=0)
@@ -357,6 +402,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if given.hours is not None or given.images:
         raise ValueError("--hours and --images are for --format lerobot: add it, or leave them out")
+    check_dataset_name(given.dataset)
     env = gym.make(given.env, **given.env_arguments)
     seeds = range(given.first_seed, given.first_seed + (10 if given.episodes is None else given.episodes))
     episodes = record(

@@ -192,6 +192,25 @@ def named_class(text: str, option: str) -> Any:
     return getattr(found, name)
 
 
+def strangers_agent(text: str, option: str) -> tuple[Callable[[], Any], Any]:
+    """What makes the agents of MODULE:CLASS, and one of them.
+
+    Args:
+        text: MODULE:CLASS.
+        option: where it was given, for messages.
+
+    Raises:
+        ValueError: as in `named_class` and `check_agent`, or it cannot be made without arguments.
+    """
+    make = named_class(text, option)
+    try:
+        agent = make()
+    except TypeError as error:
+        raise ValueError(f"{option} {text}: it is made without arguments, and that failed: {error}") from None
+    check_agent(agent, f"{option} {text}: it")
+    return make, agent
+
+
 def find_agent(name: str) -> Callable[[], SiteAgent]:
     """The factory of the site search with a name.
 
@@ -253,7 +272,8 @@ def find_player(name: str, options: ScoringOptions) -> Player:
 
 
 def _strangers_player(name: str, options: ScoringOptions) -> Player:
-    make, env_id = named_class(name, "--agent"), options.env or SITES
+    make, agent = strangers_agent(name, "--agent")
+    env_id = options.env or SITES
     for argument in (*PLACES, "split", "motion", "budget"):
         if argument in options.env_kwargs and getattr(options, argument) is not None:
             raise ValueError(f"{argument} is given by --{argument} and in --env-arguments: leave one out")
@@ -263,11 +283,6 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     command = f"surgsim evaluate --agent {name}" + f" --env {env_id}" * (env_id != SITES)
     command += f" --env-arguments '{json.dumps(options.env_kwargs)}'" * bool(options.env_kwargs)
     command += _place_options(_places(options, {}))
-    try:
-        agent = make()
-    except TypeError as error:
-        raise ValueError(f"--agent {name}: it is made without arguments, and that failed: {error}") from None
-    check_agent(agent, f"--agent {name}: it")
     facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, _arguments(player, options))
     file = inspect.getsourcefile(type(agent))
     files = () if file is None else (Path(file),)

@@ -16,7 +16,7 @@ def test_raster_agent_finds_the_lesion():
     import raster
 
     env = gym.make("SurgSim/Palpate-v0")
-    record = raster.run_episode(env, raster.RasterAgent(env), seed=1)
+    record = raster.run_episode(env, raster.RasterAgent(), seed=1)
     assert record["declared"] and record["success"]
     assert record["error_mm"] < 5.0
     assert record["return"] > 7.0

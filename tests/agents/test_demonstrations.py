@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from rich.console import Console
 
 import surgsim_env  # noqa: F401
 
@@ -94,20 +95,10 @@ def test_a_policy_with_a_memory_is_cloned(dataset, tmp_path):
 
 
 def test_any_agent_is_recorded_and_failures_are_kept_if_asked(folder):
-    from agents.record_demonstrations import Recorder, play_agent, record, write_dataset
-
-    class Idle:
-        def reset(self):
-            pass
-
-        def act(self, observation):
-            return np.zeros(4, dtype=np.float32)
+    from agents.record_demonstrations import Recorder, player, record, write_dataset
 
     env = gym.make("SurgSim/Palpate-v0", max_episode_steps=5)
-
-    def play(env, seed):
-        play_agent(env, seed, Idle())
-
+    play = player(f"{__name__}:Idle", env)
     assert record(env, play, range(2)) == []
     episodes = record(env, play, range(2), keep_failures=True)
     assert [episode.seed for episode in episodes] == [0, 1] and len(episodes[0].actions) == 5
@@ -136,6 +127,100 @@ def test_what_cannot_be_recorded_is_refused(folder):
         player("raster", env)
 
 
+class Idle:
+    """Commands nothing."""
+
+    def reset(self, rng, facts):
+        self.size = facts.action_size
+
+    def act(self, observation):
+        return np.zeros(self.size, dtype=np.float32)
+
+
+class Wanderer:
+    """Presses where its random numbers say."""
+
+    def reset(self, rng, facts):
+        self.rng = rng
+
+    def act(self, observation):
+        return self.rng.uniform(-0.8, 0.8, 2).astype(np.float32)
+
+
+class Seer(Idle):
+    """Is told where the lesion is, and presses where its random numbers say."""
+
+    sees_truth = True
+
+    def reset(self, rng, facts):
+        self.rng, self.told = rng, (facts.env_id, facts.env_kwargs)
+
+    def see(self, task):
+        self.task = task
+
+    def act(self, observation):
+        assert self.told == ("SurgSim/Palpate-v0", {"scene": "phantom_small"}) and self.task.drawn
+        return np.array([*self.rng.uniform(-0.5, 0.5, 2), -1.0, -1.0], dtype=np.float32)
+
+
+class OfEnvironment:
+    """Asks for an environment, as no agent may."""
+
+    def __init__(self, env):
+        self.env = env
+
+
+def test_a_recorded_episode_of_presses_is_the_one_that_is_scored():
+    from agents.record_demonstrations import player, record
+    from surgsim_env.scoring.evaluate import evaluate, find_player
+    from surgsim_env.scoring.options import ScoringOptions
+
+    options = ScoringOptions(scene="phantom_small", budget=4, seeds="3,4", envs=2)
+    result = evaluate(find_player(f"{__name__}:Wanderer", options), options, Console(quiet=True))
+    env = gym.make("SurgSim/PalpateSites-v0", scene="phantom_small", level="standard", budget=4)
+    episodes = record(env, player(f"{__name__}:Wanderer", env), (3, 4), keep_failures=True)
+    errors = [[info["error_mm"] for info in one.infos[1:]] for one in episodes]
+    # A result has two decimals, and lanes of float32 round.
+    np.testing.assert_allclose(errors, result.errors_mm, atol=0.01)
+
+
+def test_a_recorded_episode_of_control_steps_is_the_one_that_is_scored_to_the_bit():
+    from agents.record_demonstrations import player, record
+    from surgsim_env.scoring.episodes import make_envs, play_tasks
+    from surgsim_env.scoring.evaluate import find_player
+    from surgsim_env.scoring.options import ScoringOptions
+
+    env_id, short = "SurgSim/Palpate-v0", {"scene": "phantom_small", "max_episode_steps": 15}
+    actor = find_player(f"{__name__}:Seer", ScoringOptions(env=env_id, scene="phantom_small", seeds="3,4")).actor
+    scored = play_tasks(actor, make_envs(env_id, 2, dtype="float64", **short), (3, 4))
+    env = gym.make(env_id, **short)
+    episodes = record(env, player(f"{__name__}:Seer", env), (3, 4), keep_failures=True)
+    for one, other in zip(episodes, scored, strict=True):
+        assert [info["force_peak"] for info in one.infos[1:]] == other.force_peaks
+        assert max(other.force_peaks) > 0.0 and sum(one.rewards) == other.total
+    assert episodes[0].actions[0].tolist() != episodes[1].actions[0].tolist()
+
+
+def test_a_class_that_is_no_agent_is_refused():
+    from agents.record_demonstrations import player
+
+    env = gym.make("SurgSim/Palpate-v0")
+    with pytest.raises(ValueError, match=r"--by .*:OfEnvironment: it is made without arguments, and that failed: "):
+        player(f"{__name__}:OfEnvironment", env)
+
+
+def test_a_name_that_minari_refuses_is_refused_before_anything_is_played(folder, dataset, monkeypatch):
+    from agents import record_demonstrations
+
+    monkeypatch.setattr(record_demonstrations, "record", None)
+    for name, said in (
+        *((name, f"--dataset is '{name}'; the rule of Minari is NAME-v") for name in ("palpate", "a b-v0", "x/y-v0")),
+        (NAME, f"--dataset {NAME} is there already"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            record_demonstrations.main(["SurgSim/Palpate-v0", "--dataset", name])
+
+
 class Shown(gym.Env):
     """As much of an environment in a window as the keyboard asks for."""
 
@@ -162,14 +247,14 @@ def test_a_person_plays_with_the_keys_that_are_held():
 
     env = Shown(4)
     keyboard = Keyboard(env)
-    np.testing.assert_array_equal(keyboard.act(None), [0.0, 0.0, -0.5, 0.0])
+    np.testing.assert_array_equal(keyboard(None, None), [[0.0, 0.0, -0.5, 0.0]])
     np.testing.assert_array_equal(keyboard.action("DWE "), [0.5, 0.5, 0.0, 1.0], "no wrist to turn; declared")
     retracting = Keyboard(Shown(5, jaw=True))
     np.testing.assert_array_equal(retracting.action("AQ"), [-0.5, 0.0, 0.0, -0.5, 1.0], "the jaw is open")
     np.testing.assert_array_equal(retracting.action("RF "), [0.0, 0.0, 0.0, 0.0, -1.0])
     env.window.closed = True
     with pytest.raises(KeyboardInterrupt, match="the window was closed"):
-        keyboard.act(None)
+        keyboard(None, None)
     with pytest.raises(ValueError, match="render_mode is None; a person needs the window"):
         Keyboard(gym.make("SurgSim/Palpate-v0"))
     with pytest.raises(ValueError, match="the keys move one tip"):

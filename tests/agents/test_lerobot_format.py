@@ -334,11 +334,14 @@ def test_a_control_step_without_a_whole_rate_is_refused(tmp_path):
             record(tmp_path / "never", arguments={"scene": str(scene)})
 
 
-def test_hours_are_of_simulated_time(tmp_path):
-    """A thousandth of an hour is 72 frames of 0.05 s; an episode has 45 at most. Failures are left out."""
+def test_hours_are_of_simulated_time(tmp_path, monkeypatch):
+    """0.0013 h are 94 frames of 0.05 s; an episode has 45 at most. Failures are left out, two that are not in a row."""
+    from agents import record_demonstrations
+
+    monkeypatch.setattr(record_demonstrations, "FAILURES_MOST", 2)
     folder = tmp_path / "hours"
-    record(folder, "--hours", "0.001")
-    assert 72 <= info(folder)["total_frames"] < 72 + 45
+    record(folder, "--hours", "0.0013")
+    assert 94 <= info(folder)["total_frames"] < 94 + 45 and info(folder)["surgsim"]["next_seed"] > 7
     assert set(info(folder)["splits"]) == {"train", "success"}
     assert all(line["success"] for line in lines(folder, "episodes"))
 
@@ -417,3 +420,44 @@ def test_one_process_at_a_time_writes(dataset, tmp_path):
         first.add(0, {"action": np.zeros(2)}, success=True)
     first.close()
     LeRobotFolder(tmp_path, features, **stated).close()
+
+
+class Idle:
+    """Commands nothing, and so never succeeds."""
+
+    def reset(self, rng, facts):
+        self.size = facts.action_size
+
+    def act(self, observation):
+        return np.zeros(self.size, dtype=np.float32)
+
+
+def test_hours_end_where_every_episode_fails(tmp_path, monkeypatch):
+    from agents import record_demonstrations
+
+    monkeypatch.setattr(record_demonstrations, "FAILURES_MOST", 2)
+    idle = {"arguments": {"max_episode_steps": 3}}
+    said = r"last 2 episodes, up to seed 4, all failed, and 0\.000 of 9 h are recorded: .* or with --keep-failures$"
+    with pytest.raises(ValueError, match=said):
+        record(tmp_path / "set", "--by", f"{__name__}:Idle", "--hours", "9", **idle)
+    assert info(tmp_path / "set")["total_episodes"] == 0
+    # The same command goes on, and --episodes limits the seeds.
+    record(tmp_path / "set", "--by", f"{__name__}:Idle", "--hours", "9", "--episodes", "5", **idle)
+    assert info(tmp_path / "set")["surgsim"]["next_seed"] == 8
+    # Failures that are kept count as recorded time: 0.0002 h are 14.4 frames.
+    record(tmp_path / "kept", "--by", f"{__name__}:Idle", "--hours", "0.0002", "--keep-failures", **idle)
+    assert info(tmp_path / "kept")["splits"]["failure"] == "0:5"
+
+
+def test_hours_end_where_no_episode_has_a_step(tmp_path, monkeypatch):
+    from agents import record_demonstrations
+    from agents.lerobot_format import Feature, LeRobotFolder
+
+    monkeypatch.setattr(record_demonstrations, "FAILURES_MOST", 2)
+    stated = {"frame_rate": 20, "robot": "probe", "task": "Wait.", "recorded": {}, "first_seed": 0}
+    folder = LeRobotFolder(tmp_path, [Feature("action", "float32", (4,))], **stated)
+    with pytest.raises(ValueError, match=r"up to seed 1, all had no step, .* with another --by$"):
+        record_demonstrations.record_into(
+            folder, gym.make(ID), lambda env, seed: env.reset(seed=seed), hours=1.0, keep_failures=True
+        )
+    folder.close()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from agents.raster import RasterAgent
+from surgsim_env.scoring.episodes import agent_generator, episode_facts
 from surgsim_env.tasks.palpate import DECLARE_STEPS, EPISODE_STEPS, PalpateTask
 from surgsim_env.tasks.task import SPEED_FULL_SCALE
 from tests.envs.strategies import Now, mean_return, play
@@ -22,8 +23,8 @@ def move(x: float = 0.0, y: float = 0.0, z: float = 0.0, declare: float = 0.0) -
 
 def raster(now: Now) -> Iterator[np.ndarray]:
     """The honest agent: presses 4 x 4 sites, goes back to the stiffest and declares it, by observations alone."""
-    agent = RasterAgent(now.env, sites_per_side=4)
-    agent.reset()
+    agent = RasterAgent(sites_per_side=4)
+    agent.reset(agent_generator(0), episode_facts(now.env, ID, now.env.spec.kwargs))
     while True:
         yield agent.act(now.observation)
 

@@ -24,7 +24,7 @@ def move(x: float = 0.0, y: float = 0.0, z: float = 0.0, declare: float = 0.0) -
 def raster(now: Now) -> Iterator[np.ndarray]:
     """The honest agent: presses 4 x 4 sites, goes back to the stiffest and declares it, by observations alone."""
     agent = RasterAgent(sites_per_side=4)
-    agent.reset(agent_generator(0), episode_facts(now.env, ID, now.env.spec.kwargs))
+    agent.reset(agent_generator(0), episode_facts(now.env, ID, {"scene": SCENE}))
     while True:
         yield agent.act(now.observation)
 

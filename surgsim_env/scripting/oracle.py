@@ -67,7 +67,9 @@ JAW_PLAY, SECTION_STEP, THIN, FRICTION_KEPT = 0.002, 0.0005, 0.001, 0.06
 BESIDE, FOLD_SHARE, LIFT_SHARE = -0.008, 0.66, 0.7
 # Waypoints of the right tip [m]: before the lobe (from the target in x, from the free edge in y, height), at its mouth
 # (from the target in x and y, height), over the target (free height).
-BEFORE, MOUTH, OVER = (0.010, 0.018, 0.022), (0.002, 0.012, 0.010), 0.0015
+BEFORE, MOUTH, OVER = (0.010, 0.018, 0.022), (0.002, 0.012, 0.010), 0.0005
+# It touches the target this share of its radius nearer to the free edge than its middle, where the lobe hangs higher.
+OUTER_SHARE = 0.85
 # Force on the target [N], the middle of the range that counts as a touch, and speed [m/s].
 PRESSING_FORCE, REACHING_SPEED = 0.6, 0.015
 
@@ -154,7 +156,7 @@ def bimanual_oracle(task: BimanualRetractTask, simulation: Simulation) -> list[S
     target, radius = task.target.centre, simulation.anatomy.scene.instrument.tip_radius
     edge = float(simulation.organ_model.node_rest_position[:, 1].max())
     x, y, z = target.tolist()
-    over = (x, y, z + radius + OVER)
+    over = (x, y + OUTER_SHARE * task.table.target_radius, z + radius + OVER)
     right = [
         MoveTo((x + BEFORE[0], edge + BEFORE[1], BEFORE[2]), tolerance=0.001, name="come to its mouth"),
         MoveTo((x + MOUTH[0], y + MOUTH[1], MOUTH[2]), REACHING_SPEED, 0.001, name="reach under"),

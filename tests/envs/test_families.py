@@ -182,7 +182,8 @@ def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(bloc
     for number in (0, 1, 0):
         found = member_map.member_map(template, MemberName("test", number))
         np.testing.assert_allclose(found.grid, 100.0, rtol=1e-12)
-    assert pressed == [("test 0", 32, "test 0"), ("test 1", 32, "test 1")]
+    count = member_map.PRESS_COUNT
+    assert pressed == [("test 0", count, "test 0"), ("test 1", count, "test 1")]
     assert len(list((tmp_path / "cache").iterdir())) == 2
     member_map._maps.clear()
     member_map.member_map(template, MemberName("test", 0))

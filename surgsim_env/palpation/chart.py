@@ -180,20 +180,29 @@ class Site:
 
 @dataclass(frozen=True, eq=False)
 class ChartedFace:
-    """A palpable face, its chart, and the radius of the tip that presses it [m]."""
+    """The palpable face of an anatomy, and its chart."""
 
-    face: PalpableFace
+    anatomy: Anatomy
     chart: Chart
-    tip_radius: float
+
+    @property
+    def face(self) -> PalpableFace:
+        """The palpable face."""
+        return self.anatomy.face
+
+    @property
+    def tip_radius(self) -> float:
+        """Radius of the tip that presses it [m]."""
+        return self.anatomy.scene.instrument.tip_radius
 
     def site(self, place: ArrayLike) -> Site:
         """The site at a place of the chart (2,); the grid's nearest one if that may not be pressed.
 
-        A place may not be pressed beyond the face, nearer to its rim than its margin, and over too thin tissue.
+        A place may not be pressed beyond the face, nearer to its rim than its margin, over too thin tissue, and under
+        what holds the organ (`Anatomy.clear_of_supports`): a press there feels a ligament, not the tissue.
         """
         asked = np.asarray(place, dtype=np.float64)
-        u, v = self.chart.plane_point(asked).tolist()
-        found = self.face.site(u, v, slack=ROUNDING)
+        found = self._found(asked)
         if found is not None:
             return Site(asked, *found, moved=0.0)
         places, points, normals = self._allowed
@@ -205,6 +214,12 @@ class ChartedFace:
         """The sites of the chart's grid, each moved to one that may be pressed."""
         return [self.site(place) for place in self.chart.sites]
 
+    def _found(self, place: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Surface point [m] and normal at a place of the chart (2,), (3,) each; None where it may not be pressed."""
+        u, v = self.chart.plane_point(place).tolist()
+        found = self.face.site(u, v, slack=ROUNDING)
+        return found if found is not None and self.anatomy.clear_of_supports(found[0][None])[0] else None
+
     @cached_property
     def _allowed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Places (n, 2), surface points [m] and normals (n, 3) of the grid's sites that may be pressed.
@@ -212,15 +227,11 @@ class ChartedFace:
         Raises:
             ValueError: there is none.
         """
-        points = self.chart.plane_point(self.chart.sites).tolist()
-        sites = [
-            (place, self.face.site(u, v, slack=ROUNDING))
-            for place, (u, v) in zip(self.chart.sites, points, strict=True)
-        ]
-        allowed = [(place, *site) for place, site in sites if site is not None]
+        allowed = [(place, *site) for place in self.chart.sites if (site := self._found(place)) is not None]
         if not allowed:
             raise ValueError(
-                "no site of the palpable face may be pressed: lower palpation.face_margin or thickness_smallest"
+                "no site of the palpable face may be pressed: lower palpation.face_margin or thickness_smallest, or "
+                "move the anchors"
             )
         places, points, normals = (np.array(values) for values in zip(*allowed, strict=True))
         return places, points, normals
@@ -231,8 +242,7 @@ class ChartedFace:
         extent = self.chart.extent
         plain = TouchMap(extent, self.cell, np.ones(MAP_SIDE**2, dtype=np.bool_))
         on_chart = (np.abs(plain.places) <= 1.0 + ROUNDING).all(axis=1)
-        points = self.chart.plane_point(plain.places).tolist()
-        allowed = [self.face.site(u, v, slack=ROUNDING) is not None for u, v in points]
+        allowed = [self._found(place) is not None for place in plain.places]
         return TouchMap(extent, plain.cell, np.array(allowed) & on_chart)
 
     @property
@@ -290,8 +300,7 @@ class HealthyMap:
 @lru_cache(maxsize=KEPT_MOST + 8)
 def charted_face(anatomy: Anatomy) -> ChartedFace:
     """The palpable face of an anatomy with its chart; the same anatomy gives the same object."""
-    tip_radius = anatomy.scene.instrument.tip_radius
-    return ChartedFace(anatomy.face, make_chart(anatomy.face, tip_radius), tip_radius)
+    return ChartedFace(anatomy, make_chart(anatomy.face, anatomy.scene.instrument.tip_radius))
 
 
 def healthy_map(scene: Scene) -> HealthyMap:

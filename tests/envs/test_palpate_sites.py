@@ -110,7 +110,7 @@ def test_charts_hold_the_sites_that_keep_the_margin():
         chart = make_chart(anatomy.face, scene.instrument.tip_radius)
         np.testing.assert_allclose(chart.extent, extent, rtol=1e-12)
         assert chart.side_count == side
-        charted = ChartedFace(anatomy.face, chart)
+        charted = ChartedFace(anatomy, chart)
         for place in ([-1.0, -1.0], [1.0, 1.0], [0.3, -0.7]):
             site = charted.site(place)
             assert site.moved == 0.0

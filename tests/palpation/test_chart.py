@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.chart import MAP_SIDE, charted_face, make_chart
+from surgsim_env.palpation.chart import MAP_SIDE, ChartedFace, charted_face, make_chart
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
@@ -50,7 +50,8 @@ def test_the_touch_map_holds_the_sites_that_may_be_pressed(scene: str, count: in
     assert np.abs(allowed).max() <= 1.0 + 1e-12
     assert max(charted.site(place).moved for place in allowed) == 0.0
     beyond = touch_map.places[~touch_map.pressable & (np.abs(touch_map.places) <= 1.0).all(axis=1)]
-    assert all(face.site(*chart.plane_point(place).tolist(), slack=1e-9) is None for place in beyond)
+    on_face = [face.site(*chart.plane_point(place).tolist(), slack=1e-9) for place in beyond]
+    assert not any(charted.anatomy.clear_of_supports(site[0][None])[0] for site in on_face if site is not None)
     # A place is nearest to the site of its cell, and those beyond the square have none.
     cell = 2.0 * charted.cell / chart.extent
     assert touch_map.nearest(0.49 * cell) == middle
@@ -59,10 +60,31 @@ def test_the_touch_map_holds_the_sites_that_may_be_pressed(scene: str, count: in
 
 
 def test_a_face_too_long_for_the_map_has_larger_cells():
-    charted = charted_face(load_anatomy(make_scene("phantom")))
-    small = replace(charted, tip_radius=0.001)
+    anatomy = load_anatomy(make_scene("phantom"))
+    fine = replace(anatomy.scene.instrument, tip_radius=0.001)
+    small = ChartedFace(replace(anatomy, scene=replace(anatomy.scene, instrument=fine)), charted_face(anatomy).chart)
     assert small.cell == pytest.approx(0.040 / (MAP_SIDE - 1))
     assert small.touch_map.pressable.all()
+
+
+def test_no_site_lies_under_a_ligament():
+    """A press there feels what holds the organ: several times the stiffness of the tissue, whatever hides below."""
+    anatomy = load_anatomy(make_scene("liver"))
+    charted = charted_face(anatomy)
+    (ligament,) = (one.ball for one in anatomy.scene.anchors if one.name == "falciform ligament, back")
+    touch_map, chart, tip = charted.touch_map, charted.chart, charted.tip_radius
+    on_face = [anatomy.face.site(*chart.plane_point(place).tolist()) for place in touch_map.places]
+    held = anatomy.mesh.points[anatomy.foundation_nodes]
+    covered = [
+        number
+        for number, site in enumerate(on_face)
+        if site is not None and np.linalg.norm(held - site[0], axis=1).min() <= tip
+    ]
+    assert len(covered) > 10 and not touch_map.pressable[covered].any()
+    assert any(np.linalg.norm(on_face[number][0] - ligament.centre) < ligament.radius for number in covered)
+    sites = [*charted.grid_sites(), *(charted.site(touch_map.places[number]) for number in covered)]
+    assert min(np.linalg.norm(held - site.point, axis=1).min() for site in sites) > tip
+    assert min(site.moved for site in sites[-len(covered) :]) > 0.0
 
 
 def test_a_margin_that_leaves_nothing_is_refused():

@@ -198,8 +198,8 @@ class ChartedFace:
     def site(self, place: ArrayLike) -> Site:
         """The site at a place of the chart (2,); the grid's nearest one if that may not be pressed.
 
-        A place may not be pressed beyond the face, nearer to its rim than its margin, over too thin tissue, and under
-        what holds the organ (`Anatomy.clear_of_supports`): a press there feels a ligament, not the tissue.
+        A place may not be pressed beyond the face, nearer to its rim than its margin, over too thin tissue, and where a
+        ligament or another support covers the face (`Anatomy.is_covered`).
         """
         asked = np.asarray(place, dtype=np.float64)
         found = self._found(asked)
@@ -218,7 +218,7 @@ class ChartedFace:
         """Surface point [m] and normal at a place of the chart (2,), (3,) each; None where it may not be pressed."""
         u, v = self.chart.plane_point(place).tolist()
         found = self.face.site(u, v, slack=ROUNDING)
-        return found if found is not None and self.anatomy.clear_of_supports(found[0][None])[0] else None
+        return None if found is None or self.anatomy.is_covered(found[0]) else found
 
     @cached_property
     def _allowed(self) -> tuple[FloatArray, FloatArray, FloatArray]:

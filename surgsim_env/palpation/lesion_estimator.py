@@ -21,8 +21,9 @@ EXCESS_LENGTH = 0.010
 # Deviation of healthy presses that the sensor's noise does not explain: a capsule that the map lacks, the mesh.
 MODEL_SPREAD = 0.05
 # Deviation of healthy presses about the map of a curved organ: capsules and moduli that the map lacks show where the
-# tissue is thinner. On members of the training split of `liver_family` 0.026 to 0.049; on blocks, whose faces are flat,
-# 0.007 to 0.016, which EXCESS_LEAST covers.
+# tissue is thinner, and a member's map is off. On members of the training split of `liver_family` 0.009 to 0.032; more
+# costs nothing there, less adds false lesions (docs/palpation.md). On blocks, whose faces are flat, 0.007 to 0.016,
+# which EXCESS_LEAST covers.
 ORGAN_MAP_SPREAD = 0.035
 # A lesion is a maximum of the excess above the first of these plus the second times the sensor's noise plus the third
 # times the map's deviation,

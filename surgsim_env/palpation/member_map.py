@@ -34,12 +34,12 @@ from surgsim_env.scene.load import with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.motions import STILL, with_motion
 
-# Sites that are pressed, six times as many as float32 has lanes. On nine members of the validation split of
-# `liver_family`, pressed at every site, log k is then off by 0.018 (standard deviation) and by at most 0.10; with 32
-# sites by 0.026 and 0.17, the most at a thin edge, where searches took it for a lesion.
+# Sites that are pressed, six times as many as float32 has lanes. On the 16 members of the validation split of
+# `liver_family`, pressed at every site, log k is then off by 0.017 (standard deviation) and by at most 0.15, the most
+# beside the falciform ligament and at the rim.
 PRESS_COUNT = 96
 # Standard deviations of log r about its mean, each with its correlation length over the longer half side of the chart:
-# the smooth deformation, and what it makes of thin edges. The deviation of one press, by cells that are stretched.
+# the smooth deformation, and what it makes of edges and ligaments. The deviation of one press, by stretched cells.
 RATIO_TERMS, PRESS_SPREAD = ((0.15, 0.5), (0.05, 0.08)), 0.015
 # Members whose maps are kept in memory, 5 kB each.
 MAPS_MOST = 1000

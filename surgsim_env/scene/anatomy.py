@@ -146,6 +146,20 @@ class Anatomy:
             dtype=np.bool_,
         )
 
+    @cached_property
+    def _face_supports(self) -> FloatArray:
+        """Nodes of the palpable face that are fixed or that elastic tissue holds [m], (n, 3)."""
+        held = np.union1d(self.anchors, self.foundation_nodes)
+        return self.mesh.points[np.intersect1d(held, self.face.triangles)]
+
+    def is_covered(self, point: FloatArray) -> bool:
+        """Whether a ligament or another support covers a point of the palpable face [m] (3,).
+
+        It holds nodes of the face within a tip radius: the tip would press the support, not the tissue.
+        """
+        distance = np.linalg.norm(self._face_supports - point, axis=1)
+        return bool((distance <= self.scene.instrument.tip_radius).any())
+
     def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
         """The organ with given lesions, all moduli of the healthy tissue and its capsule multiplied by a factor.
 

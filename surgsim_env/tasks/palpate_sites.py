@@ -66,8 +66,8 @@ class PalpateSitesTask(Task):
 
     ## Action Space
     `Box(-1, 1, (2,), float32)`: a place on the chart of the palpable face, the rectangle across the scene's approach
-    that holds all sites which keep the face's margin. A place that may not be pressed is moved to the nearest site of
-    the chart's grid that may.
+    that holds all sites which keep the face's margin. A place that may not be pressed (over thin tissue, beside the
+    rim, under a ligament or another support) is moved to the nearest site of the chart's grid that may.
 
     ## Observation Space
     With `memory=True` `Box((5055,), float32)`: maps of n x n sites, n = 41, 0.4 tip radii apart, over the middle

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from surgsim_env.scoring.episodes import agent_generator
 from surgsim_env.scoring.results import SITES
+from surgsim_env.scripting.observations import stacked_observations
 
 matplotlib.use("Agg")
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -51,11 +52,7 @@ def episode_frames(policy: Any, env: gym.Env, seed: int) -> list[NDArray[np.uint
     tips: list[NDArray[np.float64]] = []
     frames: list[NDArray[np.uint8]] = []
     while not over:
-        seen: Any = (
-            {name: part[None] for name, part in observation.items()}
-            if isinstance(observation, dict)
-            else observation[None]
-        )
+        seen = stacked_observations(env.observation_space, [observation])
         observation, _, terminated, truncated, info = env.step(policy.act(seen)[0])
         over, steps = terminated or truncated, steps + 1
         forces.append(float(info["force_peak"]))

@@ -1,16 +1,17 @@
 """Run a script in an environment and record it."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from surgsim_env.coupling.simulation import HapticRecord, Simulation
-from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.envs.surgical_env import Observation, SurgicalEnv
 from surgsim_env.instruments.arm.pair import SIDES, Pair
+from surgsim_env.scripting.observations import stacked_observations
 from surgsim_env.scripting.steps import Action, Control, MayEnd, Script, Step, StepFailed, View
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
 from surgsim_env.tasks.task import Task
@@ -25,7 +26,7 @@ class ScriptError(Exception):
 
 
 def run_script(
-    env: gym.Env, script: Script, *, seed: int | None = None, observation: NDArray[np.floating] | None = None
+    env: gym.Env, script: Script, *, seed: int | None = None, observation: Observation | None = None
 ) -> Trace:
     """Run the steps of a script one after the other and record everything; recording changes no bit of the episode.
 
@@ -58,7 +59,7 @@ def run_script(
     elif observation is None:
         observation = inner.observation
     with inner.simulation.recording() as record:
-        run = _Run(env, inner, task, record, np.asarray(observation), inner.simulation.time)
+        run = _Run(env, inner, task, record, observation, inner.simulation.time)
         failure = ""
         for index, (step, name) in enumerate(zip(script, names, strict=True)):
             began = inner.simulation.time
@@ -83,10 +84,10 @@ class _Run:
     inner: SurgicalEnv
     task: Task
     record: HapticRecord
-    observation: NDArray[np.floating]
+    observation: Observation
     start: float
     times: list[float] = field(default_factory=list)
-    observations: list[NDArray[np.floating]] = field(default_factory=list)
+    observations: list[Observation] = field(default_factory=list)
     actions: list[Action] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
     infos: list[dict[str, Any]] = field(default_factory=list)
@@ -125,8 +126,6 @@ class _Run:
     def trace(self, failure: str) -> Trace:
         """The trace of the run so far."""
         record, simulation = self.record, self.inner.simulation
-        shapes = self.inner.observation_space.shape, self.inner.action_space.shape
-        assert shapes[0] is not None and shapes[1] is not None
         return Trace(
             start=self.start,
             haptic_time=record.time,
@@ -135,8 +134,8 @@ class _Run:
             tip_orientation=record.tip_orientation,
             depth=contact_depth(record.wrench, record.tip_position, simulation.anatomy.face.approach),
             control_time=np.array(self.times),
-            observation=np.array(self.observations) if self.times else np.zeros((0, *shapes[0])),
-            action=np.array(self.actions) if self.times else np.zeros((0, *shapes[1])),
+            observation=stacked_observations(self.env.observation_space, self.observations),
+            action=np.array(self.actions) if self.times else np.zeros((0, self.task.action_size)),
             reward=np.array(self.rewards),
             infos=tuple(self.infos),
             steps=tuple(self.steps),
@@ -154,7 +153,7 @@ class _Run:
             time=simulation.time,
             step_time=simulation.time - began,
             control_step=simulation.anatomy.scene.timing.control_step,
-            observation=np.array(self.observation),
+            observation=copy.deepcopy(self.observation),
             tip_position=instrument.tip_position,
             tip_velocity=instrument.tip_velocity,
             true_force=simulation.contact_force,
@@ -177,7 +176,7 @@ class _Run:
                 f"a wrapper in {self.env} changes the actions of step {name!r}: run the script on the environment "
                 "inside it, or put what the wrapper takes into a Control step"
             )
-        self.observation = np.array(observation)
+        self.observation = copy.deepcopy(observation)
         self.terminated, self.truncated = bool(terminated), bool(truncated)
         self.times.append(self.inner.simulation.time)
         self.observations.append(self.observation)

@@ -1,5 +1,6 @@
 """The steps of a script: motions of the tip, presses, the jaw, controllers, steps that wrap others; what they see."""
 
+import copy
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -11,8 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.tracking import SurfaceTracker
+from surgsim_env.envs.surgical_env import Observation
 from surgsim_env.haptics.trajectory import ROWS_LARGEST, TIP, read_motion
 from surgsim_env.instruments.instrument import Grasp
+from surgsim_env.scripting.observations import make_read_only
 from surgsim_env.tasks.task import Task
 
 Action = NDArray[np.floating]
@@ -53,7 +56,7 @@ class View:
     time: float
     step_time: float
     control_step: float
-    observation: NDArray[np.floating]
+    observation: Observation
     tip_position: FloatArray
     tip_velocity: FloatArray
     true_force: FloatArray
@@ -68,8 +71,7 @@ class View:
 
     def __post_init__(self) -> None:
         for value in vars(self).values():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
+            make_read_only(value)
 
     def action(self, velocity: FloatArray, **commands: Any) -> Action:
         """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`).
@@ -448,7 +450,7 @@ class Control(_Checked):
         if reset is not None:
             reset()
         while not (_over(view, self.timeout) if self.until is None else self.until(view)):
-            view = yield np.asarray(self.controller(view.observation.copy()))
+            view = yield np.asarray(self.controller(copy.deepcopy(view.observation)))
 
 
 def _over(view: View, duration: float) -> bool:

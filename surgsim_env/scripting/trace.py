@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.envs.surgical_env import Observation
+from surgsim_env.scripting.observations import make_read_only, selected_observations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +41,7 @@ class Trace:
         depth: how far the tip is past where the present contact began, along the approach [m]; 0 without contact  (n,)
         control_time: end of each control step [s]                                                        (m,)
         observation, action, reward: after, in and for each control step                    (m, n_obs), (m, n_act), (m,)
+            observations that are dictionaries give a dictionary of arrays (m, ...)
         infos: of each control step
         steps: when each step of the script ran
         tool_names: of the bodies that tissue feels
@@ -53,7 +56,7 @@ class Trace:
     tip_orientation: FloatArray
     depth: FloatArray
     control_time: FloatArray
-    observation: NDArray[np.floating]
+    observation: Observation
     action: NDArray[np.floating]
     reward: FloatArray
     infos: tuple[dict[str, Any], ...]
@@ -65,8 +68,7 @@ class Trace:
 
     def __post_init__(self) -> None:
         for value in vars(self).values():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
+            make_read_only(value)
 
     @property
     def force(self) -> FloatArray:
@@ -110,7 +112,7 @@ class Trace:
             self,
             start=start,
             **{name: getattr(self, name)[haptic] for name in at_haptic_rate},
-            **{name: getattr(self, name)[control] for name in at_control_rate},
+            **{name: selected_observations(getattr(self, name), control) for name in at_control_rate},
             steps=self.steps[begin : end + 1],
         )
 
@@ -193,14 +195,14 @@ def _haptic_rows(trace: Trace) -> Iterator[list]:
 
 def _control_rows(trace: Trace) -> Iterator[list]:
     """The columns' names, then a row for each control step; observations that are pictures are left out."""
-    pictures = trace.observation.ndim != 2
-    observed = np.zeros((len(trace.observation), 0)) if pictures else trace.observation
-    parts = {"observation": observed, "action": trace.action}
+    observed = trace.observation if isinstance(trace.observation, dict) else {"": trace.observation}
+    parts = {"observation" + f"_{name}" * bool(name): part for name, part in observed.items() if part.ndim == 2}
+    parts["action"] = trace.action
     entries = [f"{part}_{index}" for part, values in parts.items() for index in range(values.shape[1])]
     names, keys = trace.step_names(trace.control_time), sorted(trace.info)
     yield ["time_s", "step", *entries, "reward", *keys]
     for row, time in enumerate(trace.control_time.tolist()):
-        values = [*observed[row].tolist(), *trace.action[row].tolist(), float(trace.reward[row])]
+        values = [*(value for part in parts.values() for value in part[row].tolist()), float(trace.reward[row])]
         yield [time, names[row], *values, *(trace.infos[row].get(key, "") for key in keys)]
 
 

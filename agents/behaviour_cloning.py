@@ -39,7 +39,15 @@ def clone_dataset(
         recurrent: a policy with an LSTM, fitted to whole episodes.
         width: of the two layers (of the LSTM).
         options: of the fit.
+
+    Raises:
+        ValueError: observations of another kind, such as pictures or dictionaries (says which).
     """
+    if len(dataset.observation_space.shape or ()) != 1:
+        raise ValueError(
+            f"the observations are {dataset.observation_space}; a policy is cloned from flat ones: record the "
+            'environment with obs_mode="state"'
+        )
     episodes = list(dataset.iterate_episodes())
     observations = [np.asarray(episode.observations)[:-1] for episode in episodes]
     actions = [np.asarray(episode.actions) for episode in episodes]

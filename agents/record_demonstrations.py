@@ -47,6 +47,7 @@ from surgsim_env.scoring.evaluate import named_class, strangers_agent
 from surgsim_env.scoring.origin import file_digest
 from surgsim_env.scoring.results import SITES
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
+from surgsim_env.scripting.observations import stacked_observations
 from surgsim_env.training.site_agent import site_facts
 
 with one_line_errors(__name__, "agents", "demonstrations"):
@@ -75,7 +76,7 @@ class RecordedEpisode:
     """A recorded episode, with one observation, one info and one of each reading more than actions."""
 
     seed: int | None
-    observations: list[NDArray] = field(default_factory=list)
+    observations: list[Any] = field(default_factory=list)
     infos: list[dict[str, float]] = field(default_factory=list)
     actions: list[NDArray] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
@@ -100,14 +101,14 @@ class RecordedEpisode:
             "next.success": np.array([bool(info.get("success", False)) for info in self.infos[1:]]),
         }
 
-    def buffer(self, index: int) -> EpisodeBuffer:
+    def buffer(self, index: int, observation_space: gym.Space) -> EpisodeBuffer:
         """The episode in Minari's form; an unfinished episode counts as truncated."""
         ends = np.zeros((2, len(self.actions)), dtype=np.bool_)
         ends[:, -1] = self.terminated, self.truncated or not self.terminated
         return EpisodeBuffer(
             id=index,
             seed=self.seed,
-            observations=list(self.observations),
+            observations=stacked_observations(observation_space, self.observations),
             actions=list(self.actions),
             rewards=list(self.rewards),
             terminations=list(ends[0]),
@@ -154,7 +155,7 @@ class Recorder(gym.Wrapper):
     def _see(self, observation: Any, info: dict[str, Any]) -> None:
         """Record observation and info; Minari stores infos as typed arrays, so only numbers and booleans are kept."""
         episode = self.all_episodes[-1]
-        episode.observations.append(np.array(observation))
+        episode.observations.append(copy.deepcopy(observation))
         for name, read in self._readings.items():
             episode.readings.setdefault(name, []).append(np.array(read(self.env)))
         episode.infos.append({name: value for name, value in info.items() if isinstance(value, bool | int | float)})
@@ -169,12 +170,13 @@ def play_oracle(env: gym.Env, seed: int) -> None:
         print(f"seed {seed}: {failure}")
 
 
-def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
+def player(by: str, env: gym.Env, env_arguments: dict[str, Any], *, trust_pickle: bool = False) -> Player:
     """The player of a name.
 
     Args:
         by: "oracle", "keyboard", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
         env: where it plays, made with gym.make.
+        env_arguments: of the environment, as an agent is told them; without those of the recording's pictures.
         trust_pickle: the policy may be a zip of stable-baselines3, which runs any code that its author put there.
 
     Raises:
@@ -196,8 +198,8 @@ def player(by: str, env: gym.Env, *, trust_pickle: bool = False) -> Player:
         raise ValueError(f"--by is {by!r}; the rule is oracle, keyboard, NAME.safetensors or MODULE:CLASS")
     make, _ = strangers_agent(by, "--by")
     assert env.spec is not None
-    env_id, kwargs = env.spec.id, env.spec.kwargs
-    actor = AgentActor(make, site_facts if env_id == SITES else lambda one: episode_facts(one, env_id, kwargs))
+    env_id = env.spec.id
+    actor = AgentActor(make, site_facts if env_id == SITES else lambda one: episode_facts(one, env_id, env_arguments))
     return lambda env, seed: play_actor(env, seed, actor)
 
 
@@ -221,7 +223,8 @@ def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
     actor.begin(0, env, agent_generator(seed))
     begins, over = np.ones(1, dtype=np.bool_), False
     while not over:
-        observation, _, terminated, truncated, _ = env.step(actor(observation[None], begins)[0])
+        seen = stacked_observations(env.observation_space, [observation])
+        observation, _, terminated, truncated, _ = env.step(actor(seen, begins)[0])
         begins, over = np.zeros_like(begins), terminated or truncated
     actor.end(0)
 
@@ -229,15 +232,24 @@ def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
 def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[RecordedEpisode]:
     """Play an episode for each seed; returns those that succeeded, or all.
 
+    Ctrl-C, and a person who closes the window, end it with the episodes that were played to their end.
+
     Raises:
         ValueError: seeds that are reserved for scores.
     """
     check_seeds(seeds)
     recorder = Recorder(env)
-    progress = tqdm(seeds, unit="episode")
-    for seed in progress:
-        play(recorder, seed)
-        progress.set_postfix(success=f"{np.mean([episode.success for episode in recorder.episodes]):.0%}")
+    # Of `all_episodes`, those that were played to their end.
+    whole = 0
+    with tqdm(seeds, unit="episode") as progress:
+        try:
+            for seed in progress:
+                play(recorder, seed)
+                whole = len(recorder.all_episodes)
+                progress.set_postfix(success=f"{np.mean([episode.success for episode in recorder.episodes]):.0%}")
+        except KeyboardInterrupt:
+            del recorder.all_episodes[whole:]
+            print(f"stopped after {whole} of {len(seeds)} episodes")
     return [episode for episode in recorder.episodes if keep_failures or episode.success]
 
 
@@ -366,7 +378,7 @@ def write_dataset(
         warnings.filterwarnings("ignore", message=".*is set to None")
         return minari.create_dataset_from_buffers(
             name,
-            [episode.buffer(index) for index, episode in enumerate(episodes)],
+            [episode.buffer(index, env.observation_space) for index, episode in enumerate(episodes)],
             env=spec,
             algorithm_name=algorithm_name,
             author=author,
@@ -405,9 +417,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     check_dataset_name(given.dataset)
     env = gym.make(given.env, **given.env_arguments)
     seeds = range(given.first_seed, given.first_seed + (10 if given.episodes is None else given.episodes))
-    episodes = record(
-        env, player(given.by, env, trust_pickle=given.trust_pickle), seeds, keep_failures=given.keep_failures
-    )
+    play = player(given.by, env, given.env_arguments, trust_pickle=given.trust_pickle)
+    episodes = record(env, play, seeds, keep_failures=given.keep_failures)
     dataset = write_dataset(episodes, env, given.dataset, algorithm_name=who)
     print(
         f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps, in {dataset.spec.data_path}"
@@ -454,7 +465,7 @@ def _record_lerobot(given: argparse.Namespace, who: str) -> None:
         record_into(
             folder,
             env,
-            player(given.by, env, trust_pickle=given.trust_pickle),
+            player(given.by, env, given.env_arguments, trust_pickle=given.trust_pickle),
             last_seed=None if count is None else given.first_seed + count - 1,
             hours=given.hours,
             keep_failures=given.keep_failures,

@@ -1,11 +1,14 @@
 """Episodes are recorded as Minari datasets, come back to the bit, and a policy is cloned from them in one script."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
 
 import surgsim_env  # noqa: F401
+from surgsim_env.rendering import gl
 
 pytestmark = pytest.mark.agents
 pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
@@ -98,7 +101,7 @@ def test_any_agent_is_recorded_and_failures_are_kept_if_asked(folder):
     from agents.record_demonstrations import Recorder, player, record, write_dataset
 
     env = gym.make("SurgSim/Palpate-v0", max_episode_steps=5)
-    play = player(f"{__name__}:Idle", env)
+    play = player(f"{__name__}:Idle", env, {})
     assert record(env, play, range(2)) == []
     episodes = record(env, play, range(2), keep_failures=True)
     assert [episode.seed for episode in episodes] == [0, 1] and len(episodes[0].actions) == 5
@@ -111,8 +114,76 @@ def test_any_agent_is_recorded_and_failures_are_kept_if_asked(folder):
     recorder.reset(seed=1)
     recorder.step(np.zeros(4, dtype=np.float32))
     (left,) = recorder.episodes
-    buffer = left.buffer(0)
+    buffer = left.buffer(0, env.observation_space)
     assert left.seed == 1 and buffer.truncations == [True] and len(buffer.observations) == 2
+
+
+class Leaver:
+    """Plays whole episodes, and presses Ctrl-C in the third."""
+
+    def __init__(self):
+        self.begun = 0
+
+    def __call__(self, env, seed):
+        self.begun += 1
+        env.reset(seed=seed)
+        for step in range(4):
+            if self.begun == 3 and step == 2:
+                raise KeyboardInterrupt
+            env.step(np.zeros(4, dtype=np.float32))
+
+
+def test_a_recording_that_is_interrupted_is_written(folder, monkeypatch, capsys):
+    """The episodes before the one that was cut short are in the data set; it is not."""
+    from agents import record_demonstrations
+
+    monkeypatch.setattr(record_demonstrations, "player", lambda *given, **options: Leaver())
+    name = "surgsim/palpate/interrupted-v0"
+    record_demonstrations.main(["SurgSim/Palpate-v0", "--episodes", "5", "--keep-failures", "--dataset", name])
+    assert "stopped after 2 of 5 episodes" in capsys.readouterr().out
+    written = minari.load_dataset(name)
+    assert [one["seed"] for one in written.storage.get_episode_metadata([0, 1])] == [0, 1]
+    assert written.total_episodes == 2 and written.total_steps == 8
+
+
+class Watching:
+    """Commands nothing, and says what it was shown: an actor that takes batches, as policies do."""
+
+    def begin(self, index, env, rng):
+        self.shapes = []
+
+    def end(self, index):
+        pass
+
+    def __call__(self, observations, begins):
+        self.shapes.append({name: part.shape for name, part in observations.items()})
+        return np.zeros((len(begins), 5), dtype=np.float32)
+
+
+def test_dictionaries_of_observations_come_back_to_the_bit(folder):
+    """Pictures and forces, played by an actor and by the oracle, whose script is cut short."""
+    from agents.behaviour_cloning import clone_dataset
+    from agents.record_demonstrations import play_actor, play_oracle, record, write_dataset
+
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    env, watching = gym.make("SurgSim/Retract-v0", obs_mode="rgb_force", max_episode_steps=3), Watching()
+    players = [lambda env, seed: play_actor(env, seed, watching), play_oracle]
+    episodes = [record(env, play, [7], keep_failures=True)[0] for play in players]
+    force = env.observation_space["force"].shape  # type: ignore[index]
+    assert watching.shapes == [{"picture": (1, 84, 84, 3), "force": (1, *force)}] * 3
+    written = write_dataset(episodes, env, "surgsim/retract/pictures-v0", algorithm_name="nobody")
+    again = written.recover_environment()
+    for episode in written.iterate_episodes():
+        seen = [again.reset(seed=7)[0], *(again.step(action)[0] for action in episode.actions)]
+        assert len(seen) == 4 and set(episode.observations) == {"picture", "force"}
+        for name, stored in episode.observations.items():
+            assert stored.dtype == seen[0][name].dtype
+            np.testing.assert_array_equal(stored, [one[name] for one in seen])
+    with pytest.raises(ValueError, match=r'observations are Dict\(.*record the environment with obs_mode="state"'):
+        clone_dataset(written)
 
 
 def test_what_cannot_be_recorded_is_refused(folder):
@@ -124,7 +195,7 @@ def test_what_cannot_be_recorded_is_refused(folder):
     with pytest.raises(ValueError, match="there is no episode to write"):
         write_dataset([], env, "surgsim/palpate/none-v0", algorithm_name="nobody")
     with pytest.raises(ValueError, match="--by is 'raster'; the rule is"):
-        player("raster", env)
+        player("raster", env, {})
 
 
 class Idle:
@@ -159,7 +230,8 @@ class Seer(Idle):
         self.task = task
 
     def act(self, observation):
-        assert self.told == ("SurgSim/Palpate-v0", {"scene": "phantom_small"}) and self.task.drawn
+        assert self.told == ("SurgSim/Palpate-v0", {"scene": "phantom_small", "max_episode_steps": 15})
+        assert self.task.drawn
         return np.array([*self.rng.uniform(-0.5, 0.5, 2), -1.0, -1.0], dtype=np.float32)
 
 
@@ -177,8 +249,9 @@ def test_a_recorded_episode_of_presses_is_the_one_that_is_scored():
 
     options = ScoringOptions(scene="phantom_small", budget=4, seeds="3,4", envs=2)
     result = evaluate(find_player(f"{__name__}:Wanderer", options), options, Console(quiet=True))
-    env = gym.make("SurgSim/PalpateSites-v0", scene="phantom_small", level="standard", budget=4)
-    episodes = record(env, player(f"{__name__}:Wanderer", env), (3, 4), keep_failures=True)
+    arguments = {"scene": "phantom_small", "level": "standard", "budget": 4}
+    env = gym.make("SurgSim/PalpateSites-v0", **arguments)
+    episodes = record(env, player(f"{__name__}:Wanderer", env, arguments), (3, 4), keep_failures=True)
     errors = [[info["error_mm"] for info in one.infos[1:]] for one in episodes]
     # A result has two decimals, and lanes of float32 round.
     np.testing.assert_allclose(errors, result.errors_mm, atol=0.01)
@@ -191,10 +264,11 @@ def test_a_recorded_episode_of_control_steps_is_the_one_that_is_scored_to_the_bi
     from surgsim_env.scoring.options import ScoringOptions
 
     env_id, short = "SurgSim/Palpate-v0", {"scene": "phantom_small", "max_episode_steps": 15}
-    actor = find_player(f"{__name__}:Seer", ScoringOptions(env=env_id, scene="phantom_small", seeds="3,4")).actor
+    options = ScoringOptions(env=env_id, env_arguments=json.dumps(short), seeds="3,4")
+    actor = find_player(f"{__name__}:Seer", options).actor
     scored = play_tasks(actor, make_envs(env_id, 2, dtype="float64", **short), (3, 4))
     env = gym.make(env_id, **short)
-    episodes = record(env, player(f"{__name__}:Seer", env), (3, 4), keep_failures=True)
+    episodes = record(env, player(f"{__name__}:Seer", env, short), (3, 4), keep_failures=True)
     for one, other in zip(episodes, scored, strict=True):
         assert [info["force_peak"] for info in one.infos[1:]] == other.force_peaks
         assert max(other.force_peaks) > 0.0 and sum(one.rewards) == other.total
@@ -206,7 +280,7 @@ def test_a_class_that_is_no_agent_is_refused():
 
     env = gym.make("SurgSim/Palpate-v0")
     with pytest.raises(ValueError, match=r"--by .*:OfEnvironment: it is made without arguments, and that failed: "):
-        player(f"{__name__}:OfEnvironment", env)
+        player(f"{__name__}:OfEnvironment", env, {})
 
 
 def test_a_name_that_minari_refuses_is_refused_before_anything_is_played(folder, dataset, monkeypatch):

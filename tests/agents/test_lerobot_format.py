@@ -4,6 +4,7 @@ import itertools
 import json
 import shutil
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -290,7 +291,7 @@ def test_episodes_of_a_sampled_policy_are_those_of_their_seeds():
     env = gym.make("SurgSim/Retract-v0", max_episode_steps=6)
     recorder = Recorder(env)
     path = policies_folder() / "retract_scratch.safetensors"
-    play, policy = player(str(path), env), load_policy(path)
+    play, policy = player(str(path), env, {}), load_policy(path)
     for seed in (3, 4, 3):
         play(recorder, seed)
         # As `surgsim evaluate` plays it.
@@ -375,6 +376,32 @@ def test_pictures_are_videos(tmp_path):
         np.ravel(stats["mean"]), np.mean(pictures, (0, 1, 2)) / 255, atol=0.03
     )
     env.close()
+
+
+class Told:
+    """Commands nothing, and keeps what it was told."""
+
+    facts: ClassVar[list] = []
+
+    def reset(self, rng, facts):
+        self.facts.append(facts)
+
+    def act(self, observation):
+        return np.zeros(self.facts[-1].action_size, dtype=np.float32)
+
+
+def test_an_agent_is_told_the_environments_arguments_and_not_the_recordings(tmp_path):
+    """Size and looks of the recorded pictures are no arguments of the environment: scored, it is told none."""
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    pytest.importorskip("imageio_ffmpeg")
+    arguments = {"scene": "phantom_small", "max_episode_steps": 2}
+    more = ["--episodes", "1", "--keep-failures", "--images", "side", "--image-size", "32", "32"]
+    record(tmp_path / "told", "--by", f"{__name__}:Told", *more, arguments=arguments)
+    (facts,) = Told.facts
+    assert facts.env_kwargs == arguments
 
 
 def test_two_arms_have_two_wrenches():

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
 from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, press_errors, with_intervals
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
+from surgsim_env.scripting.observations import selected_observations
 from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR, PalpateSitesTask
 from surgsim_env.training.site_agent import site_facts
 
 # Of the seeds that belong to agents, among those that follow from an episode's (`SeedSequence.spawn_key`).
 AGENT_STREAM = 0x41_67_65_6E_74
-# Actions (n, n_action) for observations (n, n_observation); where the second (n,) is true an episode begins.
-Actor = Callable[[NDArray[Any], NDArray[np.bool_]], NDArray[Any]]
+# Actions (n, n_action) for observations (n, n_observation), or for a dictionary of arrays (n, ...); where the second
+# (n,) is true an episode begins.
+Actor = Callable[[Any, NDArray[np.bool_]], NDArray[Any]]
 
 
 @runtime_checkable
@@ -38,7 +40,7 @@ class EpisodeActor(Protocol):
         """The episode of environment `index` is over, if there was one."""
         ...
 
-    def __call__(self, observations: NDArray[Any], begins: NDArray[np.bool_]) -> NDArray[Any]:
+    def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray[Any]:
         """Actions, as an `Actor` gives them."""
         ...
 
@@ -172,7 +174,7 @@ class EpisodeAgent(Protocol):
         """Begin the episode."""
         ...
 
-    def act(self, observation: NDArray[Any]) -> NDArray[np.float32]:
+    def act(self, observation: Any) -> NDArray[np.float32]:
         """The next action, shape (action_size,), for an observation as the environment gives it."""
         ...
 
@@ -253,11 +255,11 @@ class AgentActor:
         """Forget the agent of environment `index`, if there is one."""
         self.agents.pop(index, None)
 
-    def __call__(self, observations: NDArray[Any], begins: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray[np.float32]:
         """The next action of each agent (n, n_action); 0 where an environment has none."""
         chosen = [
-            self.agents[index].act(one) if index in self.agents else self._idle
-            for index, one in enumerate(observations)
+            self.agents[index].act(selected_observations(observations, index)) if index in self.agents else self._idle
+            for index in range(len(begins))
         ]
         return np.stack(chosen)
 

@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from surgsim_env.palpation.scores import MapScore, press_errors
+from surgsim_env.rendering import gl
 from surgsim_env.scoring.episodes import (
     AgentActor,
     EpisodeFacts,
@@ -217,6 +218,42 @@ class Still:
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         return np.zeros(self.told[-1][1].action_size, dtype=np.float32)
+
+
+class Looking:
+    """Moves where its random numbers say, and keeps what it was shown."""
+
+    shown: ClassVar[list[list[dict[str, np.ndarray]]]] = []
+
+    def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
+        self.rng, self.size, self.seen = rng, facts.action_size, []
+        self.shown.append(self.seen)
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        self.seen.append({name: part.copy() for name, part in observation.items()})
+        return self.rng.uniform(-1.0, 1.0, self.size).astype(np.float32)
+
+
+def test_each_agent_is_shown_its_own_part_of_dictionaries():
+    """Three episodes on two lanes, the second of which ends without a seed: each as it is alone, picture and force."""
+    try:
+        gl.context()
+    except gl.NoGLError as error:
+        pytest.skip(f"no pictures on this machine: {error}")
+    env_id, kwargs = "SurgSim/Retract-v0", {"obs_mode": "rgb_force", "max_episode_steps": 2}
+    Looking.shown.clear()
+    actor = AgentActor(Looking, lambda env: episode_facts(env, env_id, kwargs))
+    play_tasks(actor, make_envs(env_id, 2, dtype="float64", **kwargs), [8, 9, 10])
+    assert [len(shown) for shown in Looking.shown] == [2, 2, 2]
+    single = gym.make(env_id, **kwargs)
+    for seed, shown in zip((8, 9, 10), Looking.shown, strict=True):
+        rng = agent_generator(seed)
+        seen = [single.reset(seed=seed)[0]]
+        seen.append(single.step(rng.uniform(-1.0, 1.0, single.action_space.shape).astype(np.float32))[0])
+        for one, other in zip(shown, seen, strict=True):
+            assert set(one) == {"picture", "force"}
+            for name, part in one.items():
+                np.testing.assert_array_equal(part, other[name])
 
 
 def test_an_agent_plays_an_environment_of_control_steps():

@@ -68,9 +68,12 @@ def test_play_presses_what_the_policy_chooses():
 def test_the_cost_is_lower_the_earlier_a_lesion_is_found():
     assert [presses_to_stay(np.array(one), 5.0) for one in ([4.0, 3.0], [9.0, 4.0], [4.0, 9.0])] == [1, 2, 3]
     early, late = (np.where(np.arange(25) < found, 20.0, 1.0) for found in (5, 15))
-    # Means 4.8 and 12.4 mm over 20 mm; 6 and 16 of 25 presses.
-    assert cost([early]) == pytest.approx(4.8 / 20.0 + 6 / 25)
-    assert cost([early, late]) == pytest.approx(0.5 * (4.8 / 20.0 + 6 / 25 + 12.4 / 20.0 + 16 / 25))
+    # Means 4.8 and 12.4 mm over 20 mm; 6 and 16 of 25 presses; above 5 mm after 0 and 8 of the presses 8 to 20, where
+    # errors of 1 and 20 mm count as 1 / (1 + e^4) and 1.
+    low = 1.0 / (1.0 + np.exp(4.0))
+    costs = 4.8 / 20.0 + 6 / 25 + low, 12.4 / 20.0 + 16 / 25 + (8 + 5 * low) / 13
+    assert cost([early]) == pytest.approx(costs[0], abs=1e-6)
+    assert cost([early, late]) == pytest.approx(np.mean(costs), abs=1e-6)
 
 
 def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):

@@ -6,22 +6,26 @@
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
 `cma`) changes the 13 numbers of `surgsim_env.training.site_policy.Acquisition`, beginning at the upper confidence
 bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes of
-`surgsim_env/training/bell_sites.py`; each generation has new ones. An episode costs
+`surgsim_env/training/bell_sites.py`; each generation has new ones. Processes share the episodes. An episode costs
 
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
     + mean over presses 8 to 20 of 1 / (1 + exp((5 mm - error) / 1 mm))
 
 with the lines 5 mm and 3.3 mm. The last term is a smooth share of episodes whose error is above 5 mm after so many
-presses: the leaderboard counts the presses until that is a half of them. Without it a search leaves lesions at 5 to
-9 mm and looks for others, which costs less on average and more in the median. The result is a policy of stable-baselines3's PPO,
-whose convolutional part is 0; `surgsim train` can go on from it (`warm_start`). A generation takes half a minute of
-processor time. The policy of the generation that costs least on other episodes is kept.
+presses: the leaderboard counts the presses until that is a half of them. Without it a search leaves lesions at errors
+of 5 to 9 mm and looks for others, which costs less on average and more in the median. The result is a policy of
+stable-baselines3's PPO, whose convolutional part is 0; `surgsim train` can go on from it (`warm_start`). A generation
+of 12 candidates and 96 episodes takes a minute of processor time. The policy of the generation that costs least on
+other episodes is kept.
 """
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import gymnasium as gym
@@ -52,6 +56,9 @@ with one_line_errors(__name__, "agents"):
         open_sites,
         stacked_features,
     )
+
+# From an acquisition function and seeds to the errors [mm] after each press (budget,) of their episodes.
+Play = Callable[[Acquisition, Sequence[int]], list[NDArray[np.float64]]]
 
 ID = "SurgSim/PalpateSites-v0"
 # Steps of the parameters that count alike, in the order of `Acquisition.values`.
@@ -108,6 +115,13 @@ def play(acquisition: Acquisition, seeds: Sequence[int]) -> list[NDArray[np.floa
     return [np.array(one) for one in errors]
 
 
+def played(acquisition: Acquisition, seeds: Sequence[int], pool: Executor, shares: int) -> list[NDArray[np.float64]]:
+    """As `play`, the episodes in so many shares on the processes of a pool."""
+    parts = [seeds[share::shares] for share in range(shares)]
+    errors = list(pool.map(play, [acquisition] * shares, parts))
+    return [errors[number % shares][number // shares] for number in range(len(seeds))]
+
+
 def presses_to_stay(errors: NDArray[np.float64], line: float) -> int:
     """Presses after which errors (n,) are and stay at most a line; n + 1 if they never do."""
     above = np.flatnonzero(errors > line)
@@ -131,12 +145,14 @@ class Evolution:
         episodes: of each candidate.
         seed: of the candidates and the episodes.
         start: the acquisition function to begin at.
+        play: plays the episodes.
     """
 
     population: int
     episodes: int
     seed: int
     start: Acquisition
+    play: Play = play
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
@@ -168,7 +184,7 @@ class Evolution:
         seeds = range(first, first + self.episodes)
         candidates = self.strategy.ask()
         shown = tqdm(candidates, desc=f"generation {self.generation + 1}", leave=False)
-        self.strategy.tell(candidates, [cost(play(self.acquisition(one), seeds)) for one in shown])
+        self.strategy.tell(candidates, [cost(self.play(self.acquisition(one), seeds)) for one in shown])
         self.generation += 1
         self.episode_count += self.population * self.episodes
 
@@ -195,9 +211,15 @@ def policy_acquisition(path: Path) -> Acquisition:
 
 def learn(arguments: argparse.Namespace) -> None:
     """Search; print a line after each generation, and write the policy where it costs less than all before."""
-    torch.set_num_threads(1)
+    context, one_thread = get_context("spawn"), {"initializer": torch.set_num_threads, "initargs": (1,)}
+    with ProcessPoolExecutor(arguments.processes, context, **one_thread) as pool:
+        search(arguments, partial(played, pool=pool, shares=arguments.processes))
+
+
+def search(arguments: argparse.Namespace, play: Play) -> None:
+    """As `learn`, with a function that plays the episodes."""
     start = Acquisition() if arguments.start is None else policy_acquisition(arguments.start)
-    evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, start)
+    evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, start, play)
     check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
     made = gym.make(ID, scene="phantom_small").unwrapped
     least = cost(play(evolution.best, check))
@@ -236,6 +258,7 @@ def main() -> None:
     parser.add_argument("--population", type=int, default=12, help="candidates of a generation")
     parser.add_argument("--episodes", type=int, default=96, help="of each candidate")
     parser.add_argument("--check-episodes", type=int, default=192, help="that generations are compared by")
+    parser.add_argument("--processes", type=int, default=2, help="that episodes are shared among")
     parser.add_argument("--seed", type=int, default=0)
     learn(parser.parse_args())
 

@@ -2,6 +2,8 @@
 
 import argparse
 import re
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from agents.learn_sites import (
     cost,
     learn,
     play,
+    played,
     policy_acquisition,
     presses_to_stay,
 )
@@ -65,6 +68,13 @@ def test_play_presses_what_the_policy_chooses():
     np.testing.assert_allclose(errors, said, atol=1e-9)
 
 
+def test_processes_play_the_same_episodes():
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        shared = played(Acquisition(), range(3), pool, 2)
+    for one, alone in zip(shared, play(Acquisition(), range(3)), strict=True):
+        np.testing.assert_array_equal(one, alone)
+
+
 def test_the_cost_is_lower_the_earlier_a_lesion_is_found():
     assert [presses_to_stay(np.array(one), 5.0) for one in ([4.0, 3.0], [9.0, 4.0], [4.0, 9.0])] == [1, 2, 3]
     early, late = (np.where(np.arange(25) < found, 20.0, 1.0) for found in (5, 15))
@@ -80,9 +90,9 @@ def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
     """On a cost whose least is known, so that the test says nothing of luck."""
     steps = torch.tensor(PARAMETER_STEPS)
     wanted = torch.tensor(Acquisition.INITIAL) + 0.7 * steps
-    monkeypatch.setattr(learn_sites, "play", lambda acquisition, seeds: acquisition.values.detach())
     monkeypatch.setattr(learn_sites, "cost", lambda values: float((((values - wanted) / steps) ** 2).sum()))
-    first, again = (Evolution(population=12, episodes=1, seed=3, start=Acquisition()) for _ in range(2))
+    settings = {"start": Acquisition(), "play": lambda acquisition, seeds: acquisition.values.detach()}
+    first, again = (Evolution(population=12, episodes=1, seed=3, **settings) for _ in range(2))
     begin = learn_sites.cost(first.best.values.detach())
     for _ in range(30):
         first.step()
@@ -93,7 +103,7 @@ def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
 
 def test_the_script_writes_a_policy_that_presses(tmp_path, capsys):
     out = tmp_path / "sites.safetensors"
-    sizes = {"generations": 6, "population": 4, "episodes": 4, "check_episodes": 4}
+    sizes = {"generations": 6, "population": 4, "episodes": 4, "check_episodes": 4, "processes": 2}
     learn(argparse.Namespace(out=out, start=None, seed=0, **sizes))
     said = [float(cost) for cost in re.findall(r"cost (\d+\.\d+)", capsys.readouterr().out)]
     assert len(said) == 7 and min(said[1:]) < said[0]

@@ -1,12 +1,14 @@
 """Learn where to press on any organ: an evolution strategy finds the acquisition function of a site policy.
 
     python -m agents.learn_sites --out runs/sites.safetensors
-    python -m agents.learn_sites --start agents/policies/sites_evolved.safetensors --out runs/sites.safetensors
+    python -m agents.learn_sites --faces runs/liver_faces.npz --start agents/policies/sites_evolved.safetensors \
+        --out runs/sites.safetensors
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
 `cma`) changes the 13 numbers of `surgsim_env.training.site_policy.Acquisition`, beginning at the upper confidence
-bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes of
-`surgsim_env/training/bell_sites.py`; each generation has new ones. Processes share the episodes. An episode costs
+bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes on faces of
+`surgsim_env/training/bell_sites.py`, and as many on those that `agents.record_faces` has recorded; each generation has
+new ones. Processes share the episodes. An episode costs
 
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
     + mean over presses 8 to 20 of 1 / (1 + exp((5 mm - error) / 1 mm))
@@ -43,8 +45,9 @@ with one_line_errors(__name__, "agents"):
 
     from surgsim_env.palpation.chart import MAP_SIDE
     from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
-    from surgsim_env.training.bell_sites import BellSites
+    from surgsim_env.training.bell_sites import BellFaces
     from surgsim_env.training.policy_files import describe, load_policy, policy_path, save_policy
+    from surgsim_env.training.recorded_faces import load_faces
     from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
     from surgsim_env.training.site_policy import (
         CHOICE_SPACE,
@@ -56,9 +59,11 @@ with one_line_errors(__name__, "agents"):
         open_sites,
         stacked_features,
     )
+    from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
 
-# From an acquisition function and seeds to the errors [mm] after each press (budget,) of their episodes.
-Play = Callable[[Acquisition, Sequence[int]], list[NDArray[np.float64]]]
+Draw = Callable[[np.random.Generator], SurrogateFace]
+# From an acquisition function, seeds and what draws faces to the errors [mm] after each press (budget,) of episodes.
+Play = Callable[[Acquisition, Sequence[int], Draw], list[NDArray[np.float64]]]
 
 ID = "SurgSim/PalpateSites-v0"
 # Steps of the parameters that count alike, in the order of `Acquisition.values`.
@@ -81,9 +86,9 @@ class SitesSpaces(gym.Env):
     action_space = CHOICE_SPACE
 
 
-def play(acquisition: Acquisition, seeds: Sequence[int]) -> list[NDArray[np.float64]]:
+def play(acquisition: Acquisition, seeds: Sequence[int], draw: Draw) -> list[NDArray[np.float64]]:
     """Errors [mm] after each press (budget,) of episodes that an acquisition function plays side by side."""
-    envs = [BellSites() for _ in seeds]
+    envs = [SiteSurrogate(draw) for _ in seeds]
     begun = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
     processes = [SiteProcess(observed_facts(observation)) for observation in begun]
     beliefs = [GrowingBelief(process, env.budget) for process, env in zip(processes, envs, strict=True)]
@@ -108,17 +113,19 @@ def play(acquisition: Acquisition, seeds: Sequence[int]) -> list[NDArray[np.floa
             worth = acquisition(maps, values[:, -NUMBERS:]).masked_fill(~open_sites(maps), -torch.inf)
         for index, site in zip(playing, worth.flatten(1).argmax(dim=1).tolist(), strict=True):
             env = envs[index]
-            _, _, _, _, info = env.step(env.map.places[site].astype(np.float32))
+            _, _, _, _, info = env.step(env.face.map.places[site].astype(np.float32))
             beliefs[index].add(site, env.values[-1])
             pressed[index, site] = 1.0
             errors[index].append(info["error_mm"])
     return [np.array(one) for one in errors]
 
 
-def played(acquisition: Acquisition, seeds: Sequence[int], pool: Executor, shares: int) -> list[NDArray[np.float64]]:
+def played(
+    acquisition: Acquisition, seeds: Sequence[int], draw: Draw, *, pool: Executor, shares: int
+) -> list[NDArray[np.float64]]:
     """As `play`, the episodes in so many shares on the processes of a pool."""
     parts = [seeds[share::shares] for share in range(shares)]
-    errors = list(pool.map(play, [acquisition] * shares, parts))
+    errors = list(pool.map(play, [acquisition] * shares, parts, [draw] * shares))
     return [errors[number % shares][number // shares] for number in range(len(seeds))]
 
 
@@ -142,9 +149,11 @@ class Evolution:
 
     Args:
         population: candidates of a generation.
-        episodes: of each candidate.
+        episodes: of each candidate, on faces of each source.
         seed: of the candidates and the episodes.
         start: the acquisition function to begin at.
+        sources: what draws faces.
+        spread: standard deviation of the first generation in PARAMETER_STEPS.
         play: plays the episodes.
     """
 
@@ -152,6 +161,8 @@ class Evolution:
     episodes: int
     seed: int
     start: Acquisition
+    sources: Sequence[Draw]
+    spread: float = FIRST_SPREAD
     play: Play = play
 
     def __post_init__(self) -> None:
@@ -163,7 +174,7 @@ class Evolution:
             "seed": np.nan,
             "verbose": -9,
         }
-        self.strategy = cma.CMAEvolutionStrategy(np.zeros(len(PARAMETER_STEPS)), FIRST_SPREAD, settings)
+        self.strategy = cma.CMAEvolutionStrategy(np.zeros(len(PARAMETER_STEPS)), self.spread, settings)
         self.generation = self.episode_count = 0
 
     def acquisition(self, steps: NDArray[np.float64]) -> Acquisition:
@@ -178,15 +189,19 @@ class Evolution:
         """The mean of the candidates' distribution."""
         return self.acquisition(self.strategy.mean)
 
+    def cost(self, acquisition: Acquisition, seeds: Sequence[int]) -> float:
+        """The mean cost of the episodes of seeds on faces of all sources."""
+        return float(np.mean([cost(self.play(acquisition, seeds, draw)) for draw in self.sources]))
+
     def step(self) -> None:
         """Play one generation."""
         first = FIRST_SEED + (1000 * self.seed + self.generation) * GENERATION_SEEDS
         seeds = range(first, first + self.episodes)
         candidates = self.strategy.ask()
         shown = tqdm(candidates, desc=f"generation {self.generation + 1}", leave=False)
-        self.strategy.tell(candidates, [cost(self.play(self.acquisition(one), seeds)) for one in shown])
+        self.strategy.tell(candidates, [self.cost(self.acquisition(one), seeds) for one in shown])
         self.generation += 1
-        self.episode_count += self.population * self.episodes
+        self.episode_count += self.population * self.episodes * len(self.sources)
 
 
 def as_policy(acquisition: Acquisition, seed: int) -> PPO:
@@ -219,14 +234,17 @@ def learn(arguments: argparse.Namespace) -> None:
 def search(arguments: argparse.Namespace, play: Play) -> None:
     """As `learn`, with a function that plays the episodes."""
     start = Acquisition() if arguments.start is None else policy_acquisition(arguments.start)
-    evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, start, play)
+    sources: list[Draw] = [BellFaces(), *[load_faces(path) for path in arguments.faces]]
+    evolution = Evolution(
+        arguments.population, arguments.episodes, arguments.seed, start, sources, arguments.spread, play
+    )
     check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
     made = gym.make(ID, scene="phantom_small").unwrapped
-    least = cost(play(evolution.best, check))
+    least = evolution.cost(evolution.best, check)
     print(f"begins at cost {least:.3f}", flush=True)
     while evolution.generation < arguments.generations:
         evolution.step()
-        said = cost(play(evolution.best, check))
+        said = evolution.cost(evolution.best, check)
         print(
             f"generation {evolution.generation}: cost {said:.3f} on {len(check)} other episodes, "
             f"{time.time() - began:.0f} s",
@@ -254,10 +272,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
     parser.add_argument("--start", type=Path, help="a policy to begin at, in place of the upper confidence bound")
+    parser.add_argument("--faces", type=Path, nargs="*", default=[], help="recordings of agents.record_faces")
     parser.add_argument("--generations", type=int, default=40)
     parser.add_argument("--population", type=int, default=12, help="candidates of a generation")
     parser.add_argument("--episodes", type=int, default=96, help="of each candidate")
     parser.add_argument("--check-episodes", type=int, default=192, help="that generations are compared by")
+    parser.add_argument("--spread", type=float, default=FIRST_SPREAD, help="of the first generation, in steps")
     parser.add_argument("--processes", type=int, default=2, help="that episodes are shared among")
     parser.add_argument("--seed", type=int, default=0)
     learn(parser.parse_args())

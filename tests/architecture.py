@@ -28,7 +28,7 @@ ORDER = {
     ),
     # One script each.
     "agents": (
-        *("__init__", "command_line", "raster", "keyboard", "make_press_library", "learn_palpate"),
+        *("__init__", "command_line", "raster", "keyboard", "make_press_library", "record_faces", "learn_palpate"),
         *("learn_palpate_organs", "learn_palpate_recurrent", "learn_retract", "learn_retract_pixels", "learn_sites"),
         *(
             "lerobot_format",

@@ -1,4 +1,4 @@
-"""A fast surrogate of SurgSim/PalpateSites-v0 on faces of any size: contrast from bell curves instead of an organ.
+"""Faces of any size for the surrogate of SurgSim/PalpateSites-v0: contrast from bell curves instead of an organ.
 
 Each episode draws a face, between a phantom's and a whole liver's in size, round or rectangular, and up to three
 lesions in it. The log contrast of a press at x is
@@ -7,32 +7,25 @@ lesions in it. The log contrast of a press at x is
 
 with b what all presses share, m a smooth deviation of healthy tissue that the map of the healthy organ does not have,
 and the sensor's noise. On a curved organ the maximum of a bell lies beside the lesion's place, and m is larger. Lengths
-are in tip radii. Touch map, estimator, score and rewards of finding are the environment's; there are no forces. Ranges
-are those of presses of the full physics (`DRAWS`).
+are in tip radii. Ranges are those of presses of the full physics (`DRAWS`).
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimator
-from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
-from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask
-from surgsim_env.training.site_agent import OBSERVATION_SIZE, SLICES
-
-# Tip radius of the estimator's own lengths: an error in tip radii over it is one in metres of the benchmark.
-TIP = 0.008
+from surgsim_env.training.site_surrogate import SurrogateFace
 
 
 @dataclass(frozen=True)
 class BellDraws:
-    """Ranges of an episode's draw, lengths in tip radii.
+    """Ranges of an episode's draw, lengths in tip radii but for the first.
 
     Args:
+        tip_radius: of the scene [m]: an error of 5 mm is small under a wide tip.
         side: of the face's bounding rectangle, each.
         aspect: shorter over longer side.
         organ_share: share of faces that are superellipses of curved organs; the others are rectangles of blocks.
@@ -48,6 +41,7 @@ class BellDraws:
         noise: deviation of the sensor's noise.
     """
 
+    tip_radius: tuple[float, float] = (0.005, 0.012)
     side: tuple[float, float] = (3.5, 17.0)
     aspect: tuple[float, float] = (0.5, 1.0)
     organ_share: float = 0.5
@@ -71,89 +65,41 @@ DRAWS = BellDraws()
 WAVES = 12
 
 
-class BellSites(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """SurgSim/PalpateSites-v0 with memory, without an organ; `info`: `error_mm` (under a tip of 8 mm) and `success`."""
+@dataclass(frozen=True)
+class BellFaces:
+    """Draws faces with lesions from ranges."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    draws: BellDraws = DRAWS
 
-    def __init__(self, draws: BellDraws = DRAWS) -> None:
-        """Draw episodes from these ranges."""
-        self.draws = draws
-        self.observation_space = gym.spaces.Box(-100.0, 100.0, (OBSERVATION_SIZE,), dtype=np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
-        self.cutoff = ospa_cutoff(TIP)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Draw a face and its lesions; no options are known."""
-        super().reset(seed=seed)
-        rng, draws = self.np_random, self.draws
-        self.is_organ = bool(rng.random() < draws.organ_share)
-        self.map = self._draw_face(rng)
-        self.budget = BUDGET_WIDE if self.map.extent.max() > WIDE else BUDGET
-        self.noise = float(np.exp(rng.uniform(*np.log(draws.noise))))
-        self.lesion_radius = float(np.exp(rng.uniform(*np.log(draws.lesion_radius))))
-        self.estimator = LesionEstimator(
-            self.map.extent * TIP,
-            lesion_radius=self.lesion_radius * TIP,
-            noise=self.noise,
-            map_spread=ORGAN_MAP_SPREAD if self.is_organ else 0.0,
+    def __call__(self, rng: np.random.Generator) -> SurrogateFace:
+        """Draw a face."""
+        draws = self.draws
+        tip_radius = float(np.exp(rng.uniform(*np.log(draws.tip_radius))))
+        is_organ = bool(rng.random() < draws.organ_share)
+        touch_map = self._draw_map(rng, is_organ)
+        noise = float(np.exp(rng.uniform(*np.log(draws.noise))))
+        lesion_radius = float(np.exp(rng.uniform(*np.log(draws.lesion_radius))))
+        middles = self._draw_lesions(rng, touch_map, lesion_radius)
+        count = len(middles)
+        truth = middles + rng.normal(0.0, draws.offset * lesion_radius if is_organ else 0.0, (count, 2))
+        amplitude = rng.uniform(*draws.amplitude, count)
+        spread = rng.uniform(*draws.spread, count) * lesion_radius
+        squared = ((touch_map.sites[:, None] - middles) ** 2).sum(axis=2)
+        contrast = rng.normal(0.0, draws.background) + (amplitude * np.exp(-0.5 * squared / spread**2)).sum(axis=1)
+        waves, phases = rng.normal(0.0, 1.0, (WAVES, 2)), rng.uniform(0.0, 2.0 * np.pi, WAVES)
+        rough = draws.model[is_organ] * np.sqrt(2.0 / WAVES)
+        contrast += rough * np.cos(touch_map.sites @ waves.T + phases).sum(axis=1)
+        estimator = LesionEstimator(
+            touch_map.extent * tip_radius,
+            lesion_radius=lesion_radius * tip_radius,
+            noise=noise,
+            map_spread=ORGAN_MAP_SPREAD if is_organ else 0.0,
         )
-        self.middles = self._draw_lesions(rng) * TIP
-        count = len(self.middles)
-        offset = draws.offset * self.lesion_radius * TIP if self.is_organ else 0.0
-        self.truth = self.middles + rng.normal(0.0, offset, (count, 2))
-        self.amplitude = rng.uniform(*draws.amplitude, count)
-        self.spread = rng.uniform(*draws.spread, count) * self.lesion_radius * TIP
-        self.background = rng.normal(0.0, draws.background)
-        self.waves = rng.normal(0.0, 1.0 / TIP, (WAVES, 2)), rng.uniform(0.0, 2.0 * np.pi, WAVES)
-        self.places: list[NDArray[np.float64]] = []
-        self.values: list[float] = []
-        self.memory = np.zeros(OBSERVATION_SIZE, dtype=np.float32)
-        self.memory[SLICES["face_map"]] = self.map.pressable
-        self.memory[SLICES["map_cell"]] = self.map.cell
-        self.memory[SLICES["chart_share"]] = self.map.extent / (self.map.cell * (MAP_SIDE - 1))
-        self.memory[SLICES["contrast_noise"]] = self.noise
-        self.memory[SLICES["excess_least"]] = self.estimator.excess_least
-        self.memory[SLICES["lesion_radius"]] = self.lesion_radius
-        self.memory[SLICES["presses_left"]] = 1.0
-        self.error, self.found = self._judged()
-        return self.memory.copy(), {"error_mm": 1000.0 * self.error}
-
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Press at the site of the map that is nearest to a place of the chart and may be pressed."""
-        asked = 0.5 * (np.asarray(action, dtype=np.float64) + 1.0) * self.map.extent
-        squared = ((self.map.sites - asked) ** 2).sum(axis=1)
-        site = int(np.argmin(np.where(self.map.pressable, squared, np.inf)))
-        place = self.map.sites[site] * TIP
-        value = float(self.contrast(place[None])[0] + self.np_random.normal(0.0, self.noise))
-        self.places.append(place)
-        self.values.append(value)
-        self.memory[SLICES["contrast_map"]][site], self.memory[SLICES["pressed_map"]][site] = value, 1.0
-        self.memory[SLICES["presses_left"]] = 1.0 - len(self.places) / self.budget
-        found_before = self.found
-        self.error, self.found = self._judged()
-        weights = PalpateSitesTask.weights
-        reward = weights["error"] * self.error / self.cutoff / self.budget
-        reward += weights["found"] * (self.found - found_before)
-        over = len(self.places) >= self.budget
-        info = {"error_mm": 1000.0 * self.error, "success": over and self.error <= SUCCESS_ERROR}
-        return self.memory.copy(), reward, over, False, info
-
-    def contrast(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log contrast without the sensor's noise at places (n, 2) [m]."""
-        squared = ((places[:, None] - self.middles) ** 2).sum(axis=2)
-        bells = (self.amplitude * np.exp(-0.5 * squared / self.spread**2)).sum(axis=1)
-        direction, phase = self.waves
-        rough = (
-            self.draws.model[self.is_organ] * np.sqrt(2.0 / WAVES) * np.cos(places @ direction.T + phase).sum(axis=1)
+        return SurrogateFace(
+            touch_map, tip_radius, estimator, contrast, truth * tip_radius, surface=lambda points: points
         )
-        return self.background + bells + rough
 
-    # ---- the draw --------------------------------------------------------------------------------------------------
-
-    def _draw_face(self, rng: np.random.Generator) -> TouchMap:
+    def _draw_map(self, rng: np.random.Generator, is_organ: bool) -> TouchMap:
         """A face as a touch map, lengths in tip radii."""
         draws = self.draws
         longest = float(np.exp(rng.uniform(*np.log(draws.side))))
@@ -162,26 +108,17 @@ class BellSites(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         plain = TouchMap(extent, cell, np.ones(MAP_SIDE**2, dtype=np.bool_))
         away = np.abs(plain.places)
         inside = (away <= 1.0 + 1e-9).all(axis=1)
-        if self.is_organ:
+        if is_organ:
             inside &= (away ** rng.uniform(2.0, 6.0)).sum(axis=1) <= 1.0
         return TouchMap(extent, cell, inside)
 
-    def _draw_lesions(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def _draw_lesions(self, rng: np.random.Generator, touch_map: TouchMap, lesion_radius: float) -> NDArray[np.float64]:
         """Middles of bells apart from each other (n, 2); fewer where the face has no room."""
-        sites, apart = self.map.sites[self.map.pressable], self.draws.apart * self.lesion_radius
+        sites, apart = touch_map.sites[touch_map.pressable], self.draws.apart * lesion_radius
         places: list[NDArray[np.float64]] = []
         for _ in range(int(rng.choice(len(self.draws.count_weights), p=self.draws.count_weights))):
             free = [one for one in sites if all(np.linalg.norm(one - other) >= apart for other in places)]
             if free:
-                shift = rng.uniform(-0.5, 0.5, 2) * self.map.cell
-                places.append(np.clip(free[int(rng.integers(len(free)))] + shift, 0.0, self.map.extent))
+                shift = rng.uniform(-0.5, 0.5, 2) * touch_map.cell
+                places.append(np.clip(free[int(rng.integers(len(free)))] + shift, 0.0, touch_map.extent))
         return np.array(places).reshape(-1, 2)
-
-    def _judged(self) -> tuple[float, float]:
-        """Error of the estimate (OSPA) [m], and the share of lesions with an estimate near them."""
-        points = self.estimator.estimate(np.array(self.places).reshape(-1, 2), np.array(self.values)).points
-        error = ospa(self.truth, points, self.cutoff)
-        if len(self.truth) == 0:
-            return error, float(len(points) == 0)
-        distance = np.linalg.norm(self.truth[:, None] - points, axis=2)
-        return error, float((distance <= FOUND_SHARE * self.cutoff).any(axis=1).mean())

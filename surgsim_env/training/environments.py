@@ -63,9 +63,10 @@ def _bare(settings: EnvironmentSettings, count: int) -> VecEnv:
 
         return DummyVecEnv([lambda: PressLibraryEnv(settings.library, **settings.kwargs)] * count)
     if settings.kind == "bells":
-        from surgsim_env.training.bell_sites import BellSites
+        from surgsim_env.training.bell_sites import BellFaces
+        from surgsim_env.training.site_surrogate import SiteSurrogate
 
-        return DummyVecEnv([BellSites] * count)
+        return DummyVecEnv([lambda: SiteSurrogate(BellFaces())] * count)
     if settings.kind == "surrogate":
         from surgsim_env.training.palpate_surrogate import PalpateSurrogate
 

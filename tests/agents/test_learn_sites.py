@@ -13,6 +13,7 @@ import torch
 
 from agents import learn_sites
 from agents.learn_sites import (
+    FIRST_SPREAD,
     PARAMETER_STEPS,
     Evolution,
     as_policy,
@@ -24,21 +25,22 @@ from agents.learn_sites import (
     presses_to_stay,
 )
 from surgsim_env.scoring.evaluate import policies_folder
-from surgsim_env.training.bell_sites import BellSites
+from surgsim_env.training.bell_sites import BellFaces
 from surgsim_env.training.policy_files import load_policy
 from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
 from surgsim_env.training.site_policy import Acquisition, belief_features, site_actions
+from surgsim_env.training.site_surrogate import SiteSurrogate
 
 pytestmark = pytest.mark.agents
 
 
 def test_a_growing_belief_is_that_of_all_presses_at_once():
-    env, rng = BellSites(), np.random.default_rng(0)
+    env, rng = SiteSurrogate(BellFaces()), np.random.default_rng(0)
     observation, _ = env.reset(seed=11)
     process = SiteProcess(observed_facts(observation))
     growing = GrowingBelief(process, 20)
-    for site in rng.choice(np.flatnonzero(env.map.pressable), 20, replace=False).tolist():
-        observation, *_ = env.step(env.map.places[site].astype(np.float32))
+    for site in rng.choice(np.flatnonzero(env.face.map.pressable), 20, replace=False).tolist():
+        observation, *_ = env.step(env.face.map.places[site].astype(np.float32))
         growing.add(site, env.values[-1])
     whole = process.belief(observation)
     # The observation holds contrasts and lengths in single precision.
@@ -48,7 +50,7 @@ def test_a_growing_belief_is_that_of_all_presses_at_once():
 
 def test_a_search_goes_on_from_a_policy():
     start = policy_acquisition(policies_folder() / "sites_evolved.safetensors")
-    evolution = Evolution(population=4, episodes=1, seed=0, start=start)
+    evolution = Evolution(population=4, episodes=1, seed=0, start=start, sources=[])
     assert evolution.best.values.tolist() == start.values.tolist() != Acquisition().values.tolist()
     with pytest.raises(ValueError, match="has no acquisition function"):
         policy_acquisition(policies_folder() / "retract_ppo.safetensors")
@@ -57,8 +59,8 @@ def test_a_search_goes_on_from_a_policy():
 def test_play_presses_what_the_policy_chooses():
     acquisition = Acquisition()
     acquisition.values.data += 0.1
-    (errors,) = play(acquisition, [7])
-    policy, env = as_policy(acquisition, 0).policy, BellSites()
+    (errors,) = play(acquisition, [7], BellFaces())
+    policy, env = as_policy(acquisition, 0).policy, SiteSurrogate(BellFaces())
     observation, _ = env.reset(seed=7)
     said, over = [], False
     while not over:
@@ -70,8 +72,8 @@ def test_play_presses_what_the_policy_chooses():
 
 def test_processes_play_the_same_episodes():
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        shared = played(Acquisition(), range(3), pool, 2)
-    for one, alone in zip(shared, play(Acquisition(), range(3)), strict=True):
+        shared = played(Acquisition(), range(3), BellFaces(), pool=pool, shares=2)
+    for one, alone in zip(shared, play(Acquisition(), range(3), BellFaces()), strict=True):
         np.testing.assert_array_equal(one, alone)
 
 
@@ -91,7 +93,8 @@ def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
     steps = torch.tensor(PARAMETER_STEPS)
     wanted = torch.tensor(Acquisition.INITIAL) + 0.7 * steps
     monkeypatch.setattr(learn_sites, "cost", lambda values: float((((values - wanted) / steps) ** 2).sum()))
-    settings = {"start": Acquisition(), "play": lambda acquisition, seeds: acquisition.values.detach()}
+    settings = {"start": Acquisition(), "sources": [BellFaces()]}
+    settings["play"] = lambda acquisition, seeds, draw: acquisition.values.detach()
     first, again = (Evolution(population=12, episodes=1, seed=3, **settings) for _ in range(2))
     begin = learn_sites.cost(first.best.values.detach())
     for _ in range(30):
@@ -103,11 +106,19 @@ def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
 
 def test_the_script_writes_a_policy_that_presses(tmp_path, capsys):
     out = tmp_path / "sites.safetensors"
-    sizes = {"generations": 6, "population": 4, "episodes": 4, "check_episodes": 4, "processes": 2}
+    sizes = {
+        "generations": 6,
+        "population": 4,
+        "episodes": 4,
+        "check_episodes": 4,
+        "processes": 2,
+        "faces": [],
+        "spread": FIRST_SPREAD,
+    }
     learn(argparse.Namespace(out=out, start=None, seed=0, **sizes))
     said = [float(cost) for cost in re.findall(r"cost (\d+\.\d+)", capsys.readouterr().out)]
     assert len(said) == 7 and min(said[1:]) < said[0]
     policy = load_policy(out)
     assert policy.description.score == pytest.approx(-min(said), abs=1e-3)
-    observation, _ = BellSites().reset(seed=1)
+    observation, _ = SiteSurrogate(BellFaces()).reset(seed=1)
     assert (np.abs(policy.act(observation[None], np.ones(1, dtype=bool))) <= 1.0).all()

@@ -1,0 +1,36 @@
+"""Record the faces of organs, on which a site policy trains at thousands of presses a second; a stopped run continues.
+
+python -m agents.record_faces --scene liver_family --split train --faces 128 --out runs/liver_faces.npz
+
+Two processes with an --out of their own record two hours of `liver_family` in one.
+"""
+
+import argparse
+from pathlib import Path
+
+from agents.command_line import one_line_errors
+from surgsim_env.training.recorded_faces import LANES, record_faces
+
+
+def main() -> None:
+    """Record, or continue a recording."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="liver_family")
+    parser.add_argument("--split", default="train", help='of a family; "" for a scene without one')
+    parser.add_argument("--level", default="standard")
+    parser.add_argument("--faces", type=int, default=128, help=f"at least so many, in batches of {LANES}")
+    parser.add_argument("--out", type=Path, default=Path("runs/faces.npz"))
+    arguments = parser.parse_args()
+    record_faces(
+        arguments.out,
+        arguments.scene,
+        arguments.split,
+        arguments.level,
+        arguments.faces,
+        progress=lambda done: print(f"{done} of {arguments.faces} faces", flush=True),
+    )
+
+
+if __name__ == "__main__":
+    with one_line_errors(__name__):
+        main()

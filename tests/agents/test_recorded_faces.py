@@ -1,0 +1,128 @@
+"""Recorded faces: what is recorded is what the environment feels, and a recording is a surrogate to learn on."""
+
+from dataclasses import fields, replace
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
+
+from surgsim_env.palpation.chart import MAP_SIDE, interpolated
+from surgsim_env.training import recorded_faces
+from surgsim_env.training.bell_sites import BellFaces
+from surgsim_env.training.recorded_faces import (
+    FIRST_SEED,
+    LANES,
+    SURFACE_SIDE,
+    RecordedFaces,
+    load_faces,
+    record_faces,
+)
+from surgsim_env.training.site_surrogate import SiteSurrogate
+
+pytestmark = pytest.mark.agents
+
+
+def flat_recording(count, first=0):
+    """A recording of drawn faces, which are flat."""
+    kept = {field.name: [] for field in fields(RecordedFaces)[3:]}
+    axis = np.linspace(0.0, 1.0, SURFACE_SIDE)
+    for seed in range(first, first + count):
+        face = BellFaces()(np.random.default_rng(seed))
+        tip, extent = face.tip_radius, face.map.extent * face.tip_radius
+        grid = np.stack(np.meshgrid(axis * extent[0], axis * extent[1]), axis=-1)
+        truth = np.full((3, 3), np.nan)
+        truth[: len(face.truth)] = np.pad(face.truth, ((0, 0), (0, 1)))
+        row = {
+            "extent": extent,
+            "cell": face.map.cell * tip,
+            "pressable": face.map.pressable,
+            "log_contrast": face.log_contrast,
+            "surface": np.pad(grid, ((0, 0), (0, 0), (0, 1))),
+            "truth": truth,
+            "tip_radius": tip,
+            "lesion_radius": face.estimator.lesion_radius,
+            "noise": face.estimator.noise,
+            "map_spread": 0.0,
+        }
+        for name, values in kept.items():
+            values.append(row[name])
+    return RecordedFaces("drawn", "", "standard", **{name: np.array(values) for name, values in kept.items()})
+
+
+def test_a_recorded_face_plays_as_the_face_that_was_recorded(tmp_path):
+    flat_recording(6).save(tmp_path / "faces.npz")
+    recorded = load_faces(tmp_path / "faces.npz")
+    for number in range(6):
+        drawn = BellFaces()(np.random.default_rng(number))
+        # The estimator of a flat face, as recorded.
+        drawn = replace(drawn, estimator=recorded.faces[number].estimator)
+        one, other = (
+            SiteSurrogate(partial(lambda rng, face: face, face=face)) for face in (drawn, recorded.faces[number])
+        )
+        first = one.reset(seed=number)[0], other.reset(seed=number)[0]
+        np.testing.assert_allclose(*first, rtol=1e-6)
+        sites = drawn.map.places[drawn.map.pressable]
+        rng, over = np.random.default_rng(0), False
+        while not over:
+            action = sites[rng.integers(len(sites))].astype(np.float32)
+            (seen, reward, over, _, info), (*again, info_again) = one.step(action), other.step(action)
+            np.testing.assert_allclose(seen, again[0], rtol=1e-5, atol=1e-6)
+            assert again[1] == pytest.approx(reward, abs=1e-6)
+            assert info_again["error_mm"] == pytest.approx(info["error_mm"], abs=1e-6)
+
+
+def test_draws_are_of_all_faces():
+    recorded, rng = flat_recording(3), np.random.default_rng(0)
+    drawn = [recorded(rng) for _ in range(60)]
+    assert {id(face) for face in drawn} == {id(face) for face in recorded.faces}
+
+
+def test_it_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
+    seeds = []
+
+    def record_batch(envs, given):
+        seeds.extend(given)
+        batch = flat_recording(len(given), given[0] - FIRST_SEED)
+        names = [field.name for field in fields(batch)[3:]]
+        return [{name: getattr(batch, name)[number] for name in names} for number in range(len(given))]
+
+    monkeypatch.setattr(recorded_faces, "_record_batch", record_batch)
+    monkeypatch.setattr(recorded_faces.gym, "make_vec", lambda *_, **__: gym.make("SurgSim/PalpateSites-v0"))
+    path, said = tmp_path / "faces.npz", []
+    first = record_faces(path, "drawn", "", "standard", 5, said.append)
+    assert len(first) == LANES and said == [LANES]
+    whole = record_faces(path, "drawn", "", "standard", LANES + 1, said.append)
+    assert said == [LANES, 2 * LANES] and seeds == list(range(FIRST_SEED, FIRST_SEED + 2 * LANES))
+    np.testing.assert_array_equal(whole.log_contrast[:LANES], first.log_contrast)
+    assert [item.name for item in tmp_path.iterdir()] == ["faces.npz"]
+    with pytest.raises(ValueError, match=r"holds faces of scene 'drawn', split '', level 'standard', not of 'drawn'"):
+        record_faces(path, "drawn", "train", "standard", 40)
+    (tmp_path / "no.npz").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="is not a recording of faces"):
+        load_faces(tmp_path / "no.npz")
+
+
+@pytest.mark.slow
+def test_what_is_recorded_is_what_the_environment_feels(tmp_path):
+    """At the recorded sites to float32's forces, between them within a few hundredths."""
+    recorded = record_faces(tmp_path / "faces.npz", "phantom_small", "", "standard", 1)
+    env = gym.make("SurgSim/PalpateSites-v0", scene="phantom_small", level="standard").unwrapped
+    for number in (0, 5):
+        env.reset(seed=FIRST_SEED + number)
+        env.task.reading.sensor = replace(env.task.reading.sensor, noise=0.0, bias=0.0)
+        env.task.reading.bias = np.zeros(3)
+        face, task = recorded.faces[number], env.task
+        np.testing.assert_allclose(face.truth, task.truth)
+        middle = np.array([[0.3, -0.4]])
+        np.testing.assert_allclose(
+            interpolated(recorded.surface[number], middle), task.charted.surface(middle), atol=1e-3
+        )
+        even = ((face.map.numbers - MAP_SIDE // 2) % 2 == 0).all(axis=1)
+        rng = np.random.default_rng(0)
+        for sites, tolerance in ((face.map.pressable & even, 0.01), (face.map.pressable & ~even, 0.06)):
+            for site in rng.choice(np.flatnonzero(sites), 3, replace=False).tolist():
+                env.step(face.map.places[site].astype(np.float32))
+                assert task.felt.last.log_contrast == pytest.approx(face.log_contrast[site], abs=tolerance)

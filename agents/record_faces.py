@@ -2,7 +2,7 @@
 
 python -m agents.record_faces --scene liver_family --split train --faces 128 --out runs/liver_faces.npz
 
-Two processes with an --out of their own record two hours of `liver_family` in one.
+Of `liver_family`, 128 faces take two hours of processor time.
 """
 
 import argparse

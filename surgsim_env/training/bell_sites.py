@@ -25,7 +25,7 @@ class BellDraws:
     """Ranges of an episode's draw, lengths in tip radii but for the first.
 
     Args:
-        tip_radius: of the scene [m]: an error of 5 mm is small under a wide tip.
+        tip_radius: of the scene [m]; scores count errors in metres, not in tip radii.
         side: of the face's bounding rectangle, each.
         aspect: shorter over longer side.
         organ_share: share of faces that are superellipses of curved organs; the others are rectangles of blocks.

@@ -140,7 +140,7 @@ def record_faces(
 
     Raises:
         ValueError: the file is of another scene, split or level.
-        RuntimeError: a press ended in a fault.
+        RuntimeError: a press ended its episode, by a fault or the hard limit (names the seed and the site).
     """
     recorded = load_faces(path) if path.exists() else None
     if recorded is not None and (recorded.scene, recorded.split, recorded.level) != (scene, split, level):
@@ -188,7 +188,11 @@ def _record_batch(envs: gym.vector.VectorEnv, seeds: list[int]) -> list[dict[str
         lanes.pause(over)
         _, _, terminated, _, infos = envs.step(np.clip(actions, -1.0, 1.0).astype(np.float32))
         if terminated.any():
-            raise RuntimeError(f"a press ended its episode: {infos}")
+            lane = int(np.argmax(terminated))
+            raise RuntimeError(
+                f"episode {seeds[lane]}, site {todo[lane][press]}: the press ended it, by a fault "
+                f"({infos['sim_fault'][lane]!r}) or the hard limit; record a scene whose presses end in neither"
+            )
     return [_recorded(task) for task in tasks]
 
 

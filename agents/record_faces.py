@@ -16,7 +16,7 @@ def main() -> None:
     """Record, or continue a recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="liver_family")
-    parser.add_argument("--split", default="train", help='of a family; "" for a scene without one')
+    parser.add_argument("--split", help="of a family, train by default")
     parser.add_argument("--level", default="standard")
     parser.add_argument("--faces", type=int, default=128, help=f"at least so many, in batches of {LANES}")
     parser.add_argument("--out", type=Path, default=Path("runs/faces.npz"))

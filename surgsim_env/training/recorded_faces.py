@@ -1,8 +1,8 @@
 """Recorded faces for the surrogate of SurgSim/PalpateSites-v0: the contrasts that presses of real episodes feel.
 
-Organs, of a family each of another shape, are drawn as the environment draws them and pressed at every other site of
-their touch maps, once (`agents/record_faces.py`); between these sites contrasts are interpolated. Scores are computed
-on the environment itself, never on a recording.
+Organs, of a family each of another shape, are drawn as the environment draws them and pressed once at every other row
+and column of their touch maps (`agents/record_faces.py`); between these sites contrasts are interpolated. Scores are
+computed on the environment itself, never on a recording.
 """
 
 import os
@@ -21,6 +21,8 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap, interpolated
 from surgsim_env.palpation.lesion_estimator import LESIONS_MOST, ORGAN_MAP_SPREAD, LesionEstimator
+from surgsim_env.scene.family import DEFAULT_SPLIT
+from surgsim_env.scene.load import make_scene
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.training.site_surrogate import SurrogateFace
 
@@ -28,6 +30,8 @@ from surgsim_env.training.site_surrogate import SurrogateFace
 FIRST_SEED = 6_000_000
 # Organs that are pressed side by side.
 LANES = 16
+# Of the touch map's rows and columns, every so many are pressed.
+SITE_STEP = 2
 # Sites of the recorded surface on each side of the chart.
 SURFACE_SIDE = 49
 # Pressed sites that an interpolated contrast depends on, and the smoothing of the cubic spline.
@@ -126,27 +130,33 @@ def load_faces(path: str | Path) -> RecordedFaces:
 
 
 def record_faces(
-    path: Path, scene: str, split: str, level: str, count: int, progress: Callable[[int], object] = lambda done: None
+    path: Path,
+    scene: str,
+    split: str | None,
+    level: str,
+    count: int,
+    progress: Callable[[int], object] = lambda done: None,
 ) -> RecordedFaces:
     """Record until a file has `count` faces at least, in batches of LANES; each is saved when it is complete.
 
     Args:
         path: of the file; one that exists is continued.
         scene: by name or path.
-        split: of a family; "" for a scene without one.
+        split: of a family, DEFAULT_SPLIT if None.
         level: what an episode draws.
         count: of faces.
         progress: called with the number of faces after each batch.
 
     Raises:
-        ValueError: the file is of another scene, split or level.
+        ValueError: the file is of another scene, split or level; a split for a scene without a family.
         RuntimeError: a press ended its episode, by a fault or the hard limit (names the seed and the site).
     """
     recorded = load_faces(path) if path.exists() else None
-    if recorded is not None and (recorded.scene, recorded.split, recorded.level) != (scene, split, level):
+    said = split or (DEFAULT_SPLIT if make_scene(scene).family is not None else "")
+    if recorded is not None and (recorded.scene, recorded.split, recorded.level) != (scene, said, level):
         raise ValueError(
             f"{path} holds faces of scene {recorded.scene!r}, split {recorded.split!r}, level {recorded.level!r}, not "
-            f"of {scene!r}, {split!r}, {level!r}: give another --out"
+            f"of {scene!r}, {said!r}, {level!r}: give another --out"
         )
     # The budget ends no episode before all sites were pressed.
     settings: dict[str, Any] = {"scene": scene, "level": level, "budget": MAP_SIDE**2}
@@ -160,7 +170,7 @@ def record_faces(
         stacked = {name: np.stack([one[name] for one in batch]) for name in batch[0]}
         if recorded is not None:
             stacked = {name: np.concatenate([getattr(recorded, name), values]) for name, values in stacked.items()}
-        recorded = RecordedFaces(scene, split, level, **stacked)
+        recorded = RecordedFaces(scene, said, level, **stacked)
         recorded.save(path)
         progress(len(recorded))
     envs.close()
@@ -172,13 +182,14 @@ def _record_batch(envs: gym.vector.VectorEnv, seeds: list[int]) -> list[dict[str
     lanes: Any = envs.unwrapped
     envs.reset(seed=seeds)  # type: ignore[arg-type]
     tasks: list[PalpateSitesTask] = [env.unwrapped.task for env in lanes.envs]
+    readings = [task.reading for task in tasks]
     todo = []
     for task in tasks:
         # Contrast without the sensor; the estimator keeps its noise.
         ideal = replace(task.reading.sensor, noise=0.0, bias=0.0, drift=0.0, hysteresis=0.0)
         task.reading = ForceReading(ideal)
-        even = ((task.charted.touch_map.numbers - MAP_SIDE // 2) % 2 == 0).all(axis=1)
-        todo.append(np.flatnonzero(task.charted.touch_map.pressable & even))
+        pressed = ((task.charted.touch_map.numbers - MAP_SIDE // 2) % SITE_STEP == 0).all(axis=1)
+        todo.append(np.flatnonzero(task.charted.touch_map.pressable & pressed))
     for press in range(max(map(len, todo))):
         over = np.array([press >= len(sites) for sites in todo])
         actions = [
@@ -193,6 +204,9 @@ def _record_batch(envs: gym.vector.VectorEnv, seeds: list[int]) -> list[dict[str
                 f"episode {seeds[lane]}, site {todo[lane][press]}: the press ended it, by a fault "
                 f"({infos['sim_fault'][lane]!r}) or the hard limit; record a scene whose presses end in neither"
             )
+    # The next reset draws from the scene's sensor.
+    for task, reading in zip(tasks, readings, strict=True):
+        task.reading = reading
     return [_recorded(task) for task in tasks]
 
 

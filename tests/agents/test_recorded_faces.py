@@ -1,5 +1,6 @@
 """Recorded faces: what is recorded is what the environment feels, and a recording is a surrogate to learn on."""
 
+import sys
 from dataclasses import fields, replace
 from functools import partial
 
@@ -9,7 +10,9 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 
+from agents import record_faces as script
 from surgsim_env.palpation.chart import MAP_SIDE, interpolated
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.training import recorded_faces
 from surgsim_env.training.bell_sites import BellFaces
 from surgsim_env.training.recorded_faces import (
@@ -92,23 +95,54 @@ def test_it_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(recorded_faces, "_record_batch", record_batch)
     monkeypatch.setattr(recorded_faces.gym, "make_vec", lambda *_, **__: gym.make("SurgSim/PalpateSites-v0"))
     path, said = tmp_path / "faces.npz", []
-    first = record_faces(path, "drawn", "", "standard", 5, said.append)
+    first = record_faces(path, "phantom", None, "standard", 5, said.append)
     assert len(first) == LANES and said == [LANES]
-    whole = record_faces(path, "drawn", "", "standard", LANES + 1, said.append)
+    whole = record_faces(path, "phantom", None, "standard", LANES + 1, said.append)
     assert said == [LANES, 2 * LANES] and seeds == list(range(FIRST_SEED, FIRST_SEED + 2 * LANES))
     np.testing.assert_array_equal(whole.log_contrast[:LANES], first.log_contrast)
     assert [item.name for item in tmp_path.iterdir()] == ["faces.npz"]
-    with pytest.raises(ValueError, match=r"holds faces of scene 'drawn', split '', level 'standard', not of 'drawn'"):
-        record_faces(path, "drawn", "train", "standard", 40)
+    with pytest.raises(ValueError, match=r"of scene 'phantom', split '', level 'standard', not of 'liver_family', 'train',"):
+        record_faces(path, "liver_family", None, "standard", 40)
     (tmp_path / "no.npz").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="is not a recording of faces"):
         load_faces(tmp_path / "no.npz")
 
 
+@pytest.fixture
+def few_presses(monkeypatch):
+    """Two organs at once, a few sites of each."""
+    monkeypatch.setattr(recorded_faces, "LANES", 2)
+    monkeypatch.setattr(recorded_faces, "SITE_STEP", 4)
+
+
+def test_each_batch_is_drawn_as_the_first(few_presses, tmp_path, monkeypatch):
+    """At level "clinical" an episode draws the map's shift after the sensor's bias and drift."""
+
+    def recorded(name, faces):
+        options = ("--scene", "phantom_small", "--level", "clinical", "--faces", str(faces))
+        monkeypatch.setattr(sys, "argv", ["record_faces", *options, "--out", str(tmp_path / name)])
+        script.main()
+        return load_faces(tmp_path / name)
+
+    both = recorded("both.npz", 3)
+    assert len(both) == 4 and (both.scene, both.split, both.level) == ("phantom_small", "", "clinical")
+    monkeypatch.setattr(recorded_faces, "FIRST_SEED", FIRST_SEED + 2)
+    second = recorded("second.npz", 2)
+    np.testing.assert_array_equal(both.truth[2:], second.truth)
+    np.testing.assert_array_equal(both.log_contrast[2:], second.log_contrast)
+
+
+def test_a_press_beyond_the_hard_limit_ends_the_recording(few_presses, tmp_path, monkeypatch):
+    monkeypatch.setattr(PalpateSitesTask, "force_limit", 0.02)
+    with pytest.raises(RuntimeError, match=rf"episode {FIRST_SEED}, site \d+: the press ended it, .* the hard limit"):
+        record_faces(tmp_path / "faces.npz", "phantom_small", None, "standard", 1)
+    assert not (tmp_path / "faces.npz").exists()
+
+
 @pytest.mark.slow
 def test_what_is_recorded_is_what_the_environment_feels(tmp_path):
     """At the recorded sites to float32's forces, between them within a few hundredths."""
-    recorded = record_faces(tmp_path / "faces.npz", "phantom_small", "", "standard", 1)
+    recorded = record_faces(tmp_path / "faces.npz", "phantom_small", None, "standard", 1)
     env = gym.make("SurgSim/PalpateSites-v0", scene="phantom_small", level="standard").unwrapped
     for number in (0, 5):
         env.reset(seed=FIRST_SEED + number)

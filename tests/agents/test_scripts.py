@@ -29,6 +29,7 @@ ELSEWHERE = {
     "organ_film": "test_evaluate.py",
     "raster": "test_agents.py",
     "record_demonstrations": "test_demonstrations.py",
+    "record_faces": "test_recorded_faces.py",
     "train_rllib": "test_rllib.py",
 }
 

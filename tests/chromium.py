@@ -163,6 +163,12 @@ class Browser(Link):
             self.run("new Promise(done => setTimeout(done, 50))")
         return True
 
+    def type(self, text: str) -> None:
+        """Press and release a key for each letter: pages listen to keys, which text that is pasted does not send."""
+        for letter in text:
+            self.do("Input.dispatchKeyEvent", type="keyDown", text=letter, key=letter)
+            self.do("Input.dispatchKeyEvent", type="keyUp", key=letter)
+
     def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
         pressed = {"button": "left"} if kind != "mouseMoved" or buttons else {}
         self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=buttons, clickCount=1, **pressed)

@@ -30,6 +30,7 @@ def test_the_formula_presses_as_the_organ_does():
     """Down to 3.5 mm, away from the lesion: within 15 % or 15 mN, where the sensor's noise is 10 mN (standard)."""
     env = gym.make(ID, scaled=False).unwrapped
     made = surrogate(1)
+    made.reset(seed=0)
     compared = 0
     for seed in range(30):
         observation, _ = env.reset(seed=seed)

@@ -76,7 +76,7 @@ def test_a_word_that_is_typed_is_found(address, site_folder, chromium, place, pa
         def answers() -> bool:
             """Whether the word is found soon after it was typed: the page may not listen yet."""
             browser.run(f"{SEARCHED}.focus(), {SEARCHED}.select()")
-            browser.do("Input.insertText", text="watchdog")
+            browser.type("watchdog")
             return browser.becomes(lambda: browser.run(f"{FOUND}.length > 0"), GRAB_TIMEOUT)
 
         browser.wait_until(answers)

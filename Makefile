@@ -104,19 +104,24 @@ dist: $(VENV)/.ready-dev
 	@rm -f dist.log
 	@ls -sh dist
 
-# In folders of their own under dist/, each with an empty numba cache.
+# In folders of their own under dist/, side by side, each with an empty numba cache.
 test-dist: dist
-	@tried=" "; for python in $(PYTHONS); do \
+	@tried=" "; begun=; for python in $(PYTHONS); do \
 	    found=$$("$$python" -c 'import sys; ($(SUITABLE)) and print("python%d.%d" % sys.version_info[:2])' 2>/dev/null); \
 	    case " $$tried " in *" $$found "*) continue;; esac; tried="$$tried $$found"; \
 	    folder=$(CURDIR)/dist/$$found; \
-	    echo "surgsim: the wheel alone, in $$folder"; \
-	    mkdir -p $$folder/work && "$$python" -m venv $$folder/env \
+	    echo "surgsim: the wheel alone, for minutes, in $$folder (see log there)"; \
+	    mkdir -p $$folder/work; \
+	    { "$$python" -m venv $$folder/env \
 	        && $$folder/env/bin/python -m pip install -qq --disable-pip-version-check dist/*.whl \
-	        && (cd $$folder/work && NUMBA_CACHE_DIR=$$folder/cache \
-	            $$folder/env/bin/python $(CURDIR)/tests/packaging/alone.py $(CURDIR)/README.md $(ALONE)) || exit 1; \
+	        && cd $$folder/work && NUMBA_CACHE_DIR=$$folder/cache \
+	            $$folder/env/bin/python $(CURDIR)/tests/packaging/alone.py $(CURDIR)/README.md $(ALONE); } \
+	        >$$folder/log 2>&1 & \
+	    begun="$$begun $$!:$$folder"; \
 	done; \
-	[ "$$tried" != " " ] || { echo "surgsim: no Python from 3.11 on among: $(PYTHONS)" >&2; exit 2; }
+	[ "$$tried" != " " ] || { echo "surgsim: no Python from 3.11 on among: $(PYTHONS)" >&2; exit 2; }; \
+	failed=; for one in $$begun; do wait $${one%%:*} || failed="$$failed $${one#*:}"; cat $${one#*:}/log; done; \
+	[ -z "$$failed" ] || { echo "surgsim: failed:$$failed" >&2; exit 1; }
 
 # A tag is of what is committed and tested, and of a version that has none yet.
 committed:

@@ -152,11 +152,11 @@ def record_faces(
         RuntimeError: a press ended its episode, by a fault or the hard limit (names the seed and the site).
     """
     recorded = load_faces(path) if path.exists() else None
-    said = split or (DEFAULT_SPLIT if make_scene(scene).family is not None else "")
-    if recorded is not None and (recorded.scene, recorded.split, recorded.level) != (scene, said, level):
+    split = split or (DEFAULT_SPLIT if make_scene(scene).family is not None else "")
+    if recorded is not None and (recorded.scene, recorded.split, recorded.level) != (scene, split, level):
         raise ValueError(
             f"{path} holds faces of scene {recorded.scene!r}, split {recorded.split!r}, level {recorded.level!r}, not "
-            f"of {scene!r}, {said!r}, {level!r}: give another --out"
+            f"of {scene!r}, {split!r}, {level!r}: give another --out"
         )
     # The budget ends no episode before all sites were pressed.
     settings: dict[str, Any] = {"scene": scene, "level": level, "budget": MAP_SIDE**2}
@@ -170,7 +170,7 @@ def record_faces(
         stacked = {name: np.stack([one[name] for one in batch]) for name in batch[0]}
         if recorded is not None:
             stacked = {name: np.concatenate([getattr(recorded, name), values]) for name, values in stacked.items()}
-        recorded = RecordedFaces(scene, said, level, **stacked)
+        recorded = RecordedFaces(scene, split, level, **stacked)
         recorded.save(path)
         progress(len(recorded))
     envs.close()

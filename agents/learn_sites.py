@@ -1,14 +1,14 @@
 """Learn where to press on any organ: an evolution strategy finds the acquisition function of a site policy.
 
     python -m agents.learn_sites --out runs/sites.safetensors
-    python -m agents.learn_sites --faces runs/liver_faces.npz --start agents/policies/sites_evolved.safetensors \
-        --out runs/sites.safetensors
+    python -m agents.learn_sites --faces runs/liver_faces.npz --check-faces runs/validation_faces.npz \
+        --start agents/policies/sites_evolved.safetensors --out runs/sites.safetensors
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
 `cma`) changes the 13 numbers of `surgsim_env.training.site_policy.Acquisition`, beginning at the upper confidence
 bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes on faces of
-`surgsim_env/training/bell_sites.py`, and as many on those that `agents.record_faces` has recorded; each generation has
-new ones. Processes share the episodes. An episode costs
+`surgsim_env/training/bell_sites.py`, and as many on those that `agents.record_faces` has recorded, whose share of the
+cost is `--faces-weight`; each generation has new ones. Processes share the episodes. An episode costs
 
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
     + mean over presses 8 to 20 of 1 / (1 + exp((5 mm - error) / 1 mm))
@@ -18,7 +18,7 @@ presses: the leaderboard counts the presses until that is a half of them. Withou
 of 5 to 9 mm and looks for others, which costs less on average and more in the median. The result is a policy of
 stable-baselines3's PPO, whose convolutional part is 0; `surgsim train` can go on from it (`warm_start`). A generation
 of 12 candidates and 96 episodes takes a minute of processor time. The policy of the generation that costs least on
-other episodes is kept.
+other episodes is kept: on the faces of `--check-faces`, if given, so that faces it has learned on do not choose it.
 """
 
 import argparse
@@ -152,7 +152,7 @@ class Evolution:
         episodes: of each candidate, on faces of each source.
         seed: of the candidates and the episodes.
         start: the acquisition function to begin at.
-        sources: what draws faces.
+        sources: what draws faces, and its weight in the cost; the weights' sum is 1.
         spread: standard deviation of the first generation in PARAMETER_STEPS.
         play: plays the episodes.
     """
@@ -161,7 +161,7 @@ class Evolution:
     episodes: int
     seed: int
     start: Acquisition
-    sources: Sequence[Draw]
+    sources: Sequence[tuple[Draw, float]]
     spread: float = FIRST_SPREAD
     play: Play = play
 
@@ -189,9 +189,12 @@ class Evolution:
         """The mean of the candidates' distribution."""
         return self.acquisition(self.strategy.mean)
 
-    def cost(self, acquisition: Acquisition, seeds: Sequence[int]) -> float:
-        """The mean cost of the episodes of seeds on faces of all sources."""
-        return float(np.mean([cost(self.play(acquisition, seeds, draw)) for draw in self.sources]))
+    def cost(
+        self, acquisition: Acquisition, seeds: Sequence[int], sources: Sequence[tuple[Draw, float]] | None = None
+    ) -> float:
+        """The mean cost of the episodes of seeds on faces of weighted sources, those of the search if None."""
+        played = self.sources if sources is None else sources
+        return sum(weight * cost(self.play(acquisition, seeds, draw)) for draw, weight in played)
 
     def step(self) -> None:
         """Play one generation."""
@@ -224,6 +227,19 @@ def policy_acquisition(path: Path) -> Acquisition:
     return networks.mlp_extractor.acquisition  # type: ignore[union-attr, return-value]
 
 
+def weighted_sources(paths: Sequence[Path], faces_weight: float) -> list[tuple[Draw, float]]:
+    """Bell curves, and recordings that share a weight; without a recording bell curves alone.
+
+    Raises:
+        ValueError: a weight outside of [0, 1].
+    """
+    if not 0.0 <= faces_weight <= 1.0:
+        raise ValueError(f"--faces-weight is {faces_weight}; it is a share of the cost, from 0 to 1")
+    if not paths:
+        return [(BellFaces(), 1.0)]
+    return [(BellFaces(), 1.0 - faces_weight), *[(load_faces(path), faces_weight / len(paths)) for path in paths]]
+
+
 def learn(arguments: argparse.Namespace) -> None:
     """Search; print a line after each generation, and write the policy where it costs less than all before."""
     context, one_thread = get_context("spawn"), {"initializer": torch.set_num_threads, "initargs": (1,)}
@@ -234,17 +250,18 @@ def learn(arguments: argparse.Namespace) -> None:
 def search(arguments: argparse.Namespace, play: Play) -> None:
     """As `learn`, with a function that plays the episodes."""
     start = Acquisition() if arguments.start is None else policy_acquisition(arguments.start)
-    sources: list[Draw] = [BellFaces(), *[load_faces(path) for path in arguments.faces]]
+    sources = weighted_sources(arguments.faces, arguments.faces_weight)
+    check_sources = weighted_sources(arguments.check_faces or arguments.faces, arguments.faces_weight)
     evolution = Evolution(
         arguments.population, arguments.episodes, arguments.seed, start, sources, arguments.spread, play
     )
     check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
     made = gym.make(ID, scene="phantom_small").unwrapped
-    least = evolution.cost(evolution.best, check)
+    least = evolution.cost(evolution.best, check, check_sources)
     print(f"begins at cost {least:.3f}", flush=True)
     while evolution.generation < arguments.generations:
         evolution.step()
-        said = evolution.cost(evolution.best, check)
+        said = evolution.cost(evolution.best, check, check_sources)
         print(
             f"generation {evolution.generation}: cost {said:.3f} on {len(check)} other episodes, "
             f"{time.time() - began:.0f} s",
@@ -273,6 +290,12 @@ def main() -> None:
     parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
     parser.add_argument("--start", type=Path, help="a policy to begin at, in place of the upper confidence bound")
     parser.add_argument("--faces", type=Path, nargs="*", default=[], help="recordings of agents.record_faces")
+    parser.add_argument(
+        "--faces-weight", type=float, default=0.5, help="of recordings in the cost, bells have the rest"
+    )
+    parser.add_argument(
+        "--check-faces", type=Path, nargs="*", default=[], help="recordings that generations are compared on"
+    )
     parser.add_argument("--generations", type=int, default=40)
     parser.add_argument("--population", type=int, default=12, help="candidates of a generation")
     parser.add_argument("--episodes", type=int, default=96, help="of each candidate")

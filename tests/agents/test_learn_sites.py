@@ -4,6 +4,7 @@ import argparse
 import re
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from agents.learn_sites import (
     played,
     policy_acquisition,
     presses_to_stay,
+    weighted_sources,
 )
 from surgsim_env.scoring.evaluate import policies_folder
 from surgsim_env.training.bell_sites import BellFaces
@@ -88,12 +90,29 @@ def test_the_cost_is_lower_the_earlier_a_lesion_is_found():
     assert cost([early, late]) == pytest.approx(np.mean(costs), abs=1e-6)
 
 
+def test_sources_count_by_their_weights(monkeypatch):
+    costs = {"bells": 1.0, "first": 3.0, "second": 5.0, "unseen": 9.0}
+    monkeypatch.setattr(learn_sites, "BellFaces", lambda: "bells")
+    monkeypatch.setattr(learn_sites, "load_faces", str)
+    monkeypatch.setattr(learn_sites, "cost", lambda played: costs[played])
+    learned, checked = (
+        weighted_sources([Path(one) for one in paths], 0.75) for paths in (["first", "second"], ["unseen"])
+    )
+    settings = {"population": 4, "episodes": 1, "seed": 0, "play": lambda acquisition, seeds, draw: draw}
+    evolution = Evolution(start=Acquisition(), sources=learned, **settings)
+    assert evolution.cost(Acquisition(), [0]) == pytest.approx(0.25 * 1.0 + 0.75 * 4.0)
+    assert evolution.cost(Acquisition(), [0], checked) == pytest.approx(0.25 * 1.0 + 0.75 * 9.0)
+    assert weighted_sources([], 0.75) == [("bells", 1.0)]
+    with pytest.raises(ValueError, match=r"--faces-weight is 1\.5"):
+        weighted_sources([], 1.5)
+
+
 def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
     """On a cost whose least is known, so that the test says nothing of luck."""
     steps = torch.tensor(PARAMETER_STEPS)
     wanted = torch.tensor(Acquisition.INITIAL) + 0.7 * steps
     monkeypatch.setattr(learn_sites, "cost", lambda values: float((((values - wanted) / steps) ** 2).sum()))
-    settings = {"start": Acquisition(), "sources": [BellFaces()]}
+    settings = {"start": Acquisition(), "sources": [(BellFaces(), 1.0)]}
     settings["play"] = lambda acquisition, seeds, draw: acquisition.values.detach()
     first, again = (Evolution(population=12, episodes=1, seed=3, **settings) for _ in range(2))
     begin = learn_sites.cost(first.best.values.detach())
@@ -113,6 +132,8 @@ def test_the_script_writes_a_policy_that_presses(tmp_path, capsys):
         "check_episodes": 4,
         "processes": 2,
         "faces": [],
+        "faces_weight": 0.5,
+        "check_faces": [],
         "spread": FIRST_SPREAD,
     }
     learn(argparse.Namespace(out=out, start=None, seed=0, **sizes))

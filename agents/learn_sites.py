@@ -7,18 +7,19 @@
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
 `cma`) changes the 13 numbers of `surgsim_env.training.site_policy.Acquisition`, beginning at the upper confidence
 bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes on faces of
-`surgsim_env/training/bell_sites.py`, and as many on those that `agents.record_faces` has recorded, whose share of the
-cost is `--faces-weight`; each generation has new ones. Processes share the episodes. An episode costs
+`surgsim_env/training/bell_sites.py`, and as many on those that `agents.record_faces` has recorded, with `--weights`
+in the cost; each generation has new ones. Processes share the episodes. An episode costs
 
-    mean error / 20 mm + mean over lines of (presses until the error stays below the line) / budget
+    mean error / 20 mm + mean over lines of (presses until the error stays below the line) / presses
     + mean over presses 8 to 20 of 1 / (1 + exp((5 mm - error) / 1 mm))
 
-with the lines 5 mm and 3.3 mm. The last term is a smooth share of episodes whose error is above 5 mm after so many
-presses: the leaderboard counts the presses until that is a half of them. Without it a search leaves lesions at errors
-of 5 to 9 mm and looks for others, which costs less on average and more in the median. The result is a policy of
-stable-baselines3's PPO, whose convolutional part is 0; `surgsim train` can go on from it (`warm_start`). A generation
-of 12 candidates and 96 episodes takes a minute of processor time. The policy of the generation that costs least on
-other episodes is kept: on the faces of `--check-faces`, if given, so that faces it has learned on do not choose it.
+with the lines 5 mm and 3.3 mm, over the first 30 presses. The last term is a smooth share of episodes whose error is
+above 5 mm after so many presses: the leaderboard counts the presses until that is a half of them. Without it a search
+leaves lesions at errors of 5 to 9 mm and looks for others, which costs less on average and more in the median. The
+result is a policy of stable-baselines3's PPO, whose convolutional part is 0; `surgsim train` can go on from it
+(`warm_start`). A generation of 12 candidates and 96 episodes takes a minute of processor time. The policy of the
+generation that costs least on other episodes is kept: on the faces of `--check-faces`, if given, so that faces it has
+learned on do not choose it.
 """
 
 import argparse
@@ -62,7 +63,7 @@ with one_line_errors(__name__, "agents"):
     from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
-# From an acquisition function, seeds and what draws faces to the errors [mm] after each press (budget,) of episodes.
+# From an acquisition function, seeds and what draws faces to the errors [mm] after each press of episodes.
 Play = Callable[[Acquisition, Sequence[int], Draw], list[NDArray[np.float64]]]
 
 ID = "SurgSim/PalpateSites-v0"
@@ -74,6 +75,8 @@ FIRST_SPREAD = 0.5
 LINES_MM = (1000.0 * ERROR_LINE, 1000.0 * ERROR_LINE / 1.5)
 # Presses after which the cost counts errors above the first line, and the width of that step [mm].
 EARLY, STEP_WIDTH_MM = slice(7, 20), 1.0
+# Presses of an episode that are played and count: later ones are slow, and hardly differ between candidates.
+PRESSES_MOST = 30
 # Episodes of generation g are drawn from seeds after FIRST_SEED + g GENERATION_SEEDS; those that generations are
 # compared by have seeds of their own.
 FIRST_SEED, GENERATION_SEEDS, CHECK_SEED = 4_000_000, 1000, 3_900_000
@@ -87,14 +90,17 @@ class SitesSpaces(gym.Env):
 
 
 def play(acquisition: Acquisition, seeds: Sequence[int], draw: Draw) -> list[NDArray[np.float64]]:
-    """Errors [mm] after each press (budget,) of episodes that an acquisition function plays side by side."""
+    """Errors [mm] after each press of episodes that an acquisition function plays side by side.
+
+    Of each episode the first PRESSES_MOST, or the budget where that is less.
+    """
     envs = [SiteSurrogate(draw) for _ in seeds]
     begun = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
     processes = [SiteProcess(observed_facts(observation)) for observation in begun]
     beliefs = [GrowingBelief(process, env.budget) for process, env in zip(processes, envs, strict=True)]
     pressed = np.zeros((len(envs), MAP_SIDE**2))
     errors: list[list[float]] = [[] for _ in envs]
-    while playing := [index for index, env in enumerate(envs) if len(errors[index]) < env.budget]:
+    while playing := [index for index, env in enumerate(envs) if len(errors[index]) < min(env.budget, PRESSES_MOST)]:
         features = np.stack(
             [
                 stacked_features(
@@ -227,17 +233,21 @@ def policy_acquisition(path: Path) -> Acquisition:
     return networks.mlp_extractor.acquisition  # type: ignore[union-attr, return-value]
 
 
-def weighted_sources(paths: Sequence[Path], faces_weight: float) -> list[tuple[Draw, float]]:
-    """Bell curves, and recordings that share a weight; without a recording bell curves alone.
+def weighted_sources(paths: Sequence[Path], weights: Sequence[float] | None = None) -> list[tuple[Draw, float]]:
+    """Recordings with their weights, by default equal ones of half in all, and bell curves with the rest.
 
     Raises:
-        ValueError: a weight outside of [0, 1].
+        ValueError: not a weight for each recording, negative ones, or a sum above 1.
     """
-    if not 0.0 <= faces_weight <= 1.0:
-        raise ValueError(f"--faces-weight is {faces_weight}; it is a share of the cost, from 0 to 1")
-    if not paths:
-        return [(BellFaces(), 1.0)]
-    return [(BellFaces(), 1.0 - faces_weight), *[(load_faces(path), faces_weight / len(paths)) for path in paths]]
+    if weights is None:
+        weights = [0.5 / len(paths)] * len(paths) if paths else []
+    if len(weights) != len(paths) or min(weights, default=0.0) < 0.0 or sum(weights) > 1.0:
+        raise ValueError(
+            f"{len(weights)} weights {list(weights)} for {len(paths)} recordings; each has one, none is negative, and "
+            "bell curves have the rest of 1"
+        )
+    recorded = [(load_faces(path), weight) for path, weight in zip(paths, weights, strict=True)]
+    return [(BellFaces(), 1.0 - sum(weights)), *recorded]
 
 
 def learn(arguments: argparse.Namespace) -> None:
@@ -250,8 +260,8 @@ def learn(arguments: argparse.Namespace) -> None:
 def search(arguments: argparse.Namespace, play: Play) -> None:
     """As `learn`, with a function that plays the episodes."""
     start = Acquisition() if arguments.start is None else policy_acquisition(arguments.start)
-    sources = weighted_sources(arguments.faces, arguments.faces_weight)
-    check_sources = weighted_sources(arguments.check_faces or arguments.faces, arguments.faces_weight)
+    sources = weighted_sources(arguments.faces, arguments.weights)
+    check_sources = weighted_sources(arguments.check_faces or arguments.faces, arguments.weights)
     evolution = Evolution(
         arguments.population, arguments.episodes, arguments.seed, start, sources, arguments.spread, play
     )
@@ -291,10 +301,10 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="a policy to begin at, in place of the upper confidence bound")
     parser.add_argument("--faces", type=Path, nargs="*", default=[], help="recordings of agents.record_faces")
     parser.add_argument(
-        "--faces-weight", type=float, default=0.5, help="of recordings in the cost, bells have the rest"
+        "--weights", type=float, nargs="*", help="of the recordings in the cost, bell curves have the rest of 1"
     )
     parser.add_argument(
-        "--check-faces", type=Path, nargs="*", default=[], help="recordings that generations are compared on"
+        "--check-faces", type=Path, nargs="*", default=[], help="as many, that generations are compared on"
     )
     parser.add_argument("--generations", type=int, default=40)
     parser.add_argument("--population", type=int, default=12, help="candidates of a generation")

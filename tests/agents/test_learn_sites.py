@@ -16,6 +16,7 @@ from agents import learn_sites
 from agents.learn_sites import (
     FIRST_SPREAD,
     PARAMETER_STEPS,
+    PRESSES_MOST,
     Evolution,
     as_policy,
     cost,
@@ -69,7 +70,8 @@ def test_play_presses_what_the_policy_chooses():
         sites, _ = policy.predict(belief_features(observation[None]), deterministic=True)
         observation, _, over, _, info = env.step(site_actions(observation[None], sites)[0])
         said.append(info["error_mm"])
-    np.testing.assert_allclose(errors, said, atol=1e-9)
+    assert len(errors) == min(len(said), PRESSES_MOST)
+    np.testing.assert_allclose(errors, said[:PRESSES_MOST], atol=1e-9)
 
 
 def test_processes_play_the_same_episodes():
@@ -95,16 +97,16 @@ def test_sources_count_by_their_weights(monkeypatch):
     monkeypatch.setattr(learn_sites, "BellFaces", lambda: "bells")
     monkeypatch.setattr(learn_sites, "load_faces", str)
     monkeypatch.setattr(learn_sites, "cost", lambda played: costs[played])
-    learned, checked = (
-        weighted_sources([Path(one) for one in paths], 0.75) for paths in (["first", "second"], ["unseen"])
-    )
+    learned = weighted_sources([Path("first"), Path("second")], [0.5, 0.25])
+    checked = weighted_sources([Path("unseen")])
     settings = {"population": 4, "episodes": 1, "seed": 0, "play": lambda acquisition, seeds, draw: draw}
     evolution = Evolution(start=Acquisition(), sources=learned, **settings)
-    assert evolution.cost(Acquisition(), [0]) == pytest.approx(0.25 * 1.0 + 0.75 * 4.0)
-    assert evolution.cost(Acquisition(), [0], checked) == pytest.approx(0.25 * 1.0 + 0.75 * 9.0)
-    assert weighted_sources([], 0.75) == [("bells", 1.0)]
-    with pytest.raises(ValueError, match=r"--faces-weight is 1\.5"):
-        weighted_sources([], 1.5)
+    assert evolution.cost(Acquisition(), [0]) == pytest.approx(0.25 * 1.0 + 0.5 * 3.0 + 0.25 * 5.0)
+    assert evolution.cost(Acquisition(), [0], checked) == pytest.approx(0.5 * 1.0 + 0.5 * 9.0)
+    assert weighted_sources([]) == [("bells", 1.0)]
+    for weights in ([0.5], [0.75, 0.5], [-0.1, 0.5]):
+        with pytest.raises(ValueError, match="for 2 recordings"):
+            weighted_sources([Path("first"), Path("second")], weights)
 
 
 def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
@@ -132,7 +134,7 @@ def test_the_script_writes_a_policy_that_presses(tmp_path, capsys):
         "check_episodes": 4,
         "processes": 2,
         "faces": [],
-        "faces_weight": 0.5,
+        "weights": None,
         "check_faces": [],
         "spread": FIRST_SPREAD,
     }

@@ -98,10 +98,12 @@ class RecordedFaces:
         )
 
     def save(self, path: Path) -> None:
-        """Write the recording atomically."""
+        """Write the recording atomically, numbers in single precision."""
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part.npz")
-        np.savez_compressed(part, **{field.name: getattr(self, field.name) for field in fields(self)})
+        values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        single = {name: one.astype(np.float32) if one.dtype == np.float64 else one for name, one in values.items()}
+        np.savez_compressed(part, **single)
         os.replace(part, path)
 
 
@@ -123,7 +125,14 @@ def load_faces(path: str | Path) -> RecordedFaces:
         raise ValueError(
             f"{path} is not a recording of faces ({error}): make one with python -m agents.record_faces"
         ) from None
-    return RecordedFaces(**{name: str(value) if value.ndim == 0 else value for name, value in kept.items()})
+    return RecordedFaces(**{name: _as_used(value) for name, value in kept.items()})
+
+
+def _as_used(value: NDArray[Any]) -> Any:
+    """A text, or an array of what the faces compute with."""
+    if value.ndim == 0:
+        return str(value)
+    return value.astype(np.float64) if value.dtype == np.float32 else value
 
 
 # ---- recording -------------------------------------------------------------------------------------------------------
@@ -170,8 +179,8 @@ def record_faces(
         stacked = {name: np.stack([one[name] for one in batch]) for name in batch[0]}
         if recorded is not None:
             stacked = {name: np.concatenate([getattr(recorded, name), values]) for name, values in stacked.items()}
-        recorded = RecordedFaces(scene, split, level, **stacked)
-        recorded.save(path)
+        RecordedFaces(scene, split, level, **stacked).save(path)
+        recorded = load_faces(path)
         progress(len(recorded))
     envs.close()
     return recorded

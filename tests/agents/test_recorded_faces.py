@@ -74,7 +74,8 @@ def test_a_recorded_face_plays_as_the_face_that_was_recorded(tmp_path):
             (seen, reward, over, _, info), (*again, info_again) = one.step(action), other.step(action)
             np.testing.assert_allclose(seen, again[0], rtol=1e-5, atol=1e-6)
             assert again[1] == pytest.approx(reward, abs=1e-6)
-            assert info_again["error_mm"] == pytest.approx(info["error_mm"], abs=1e-6)
+            # Places of up to 0.2 m are kept in single precision.
+            assert info_again["error_mm"] == pytest.approx(info["error_mm"], abs=2e-4)
 
 
 def test_draws_are_of_all_faces():

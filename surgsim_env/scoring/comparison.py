@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ class Difference:
 
     Fields:
         figure: "presses_to_median" (presses to 5 mm), "error_mm" or "success"
+        lesion_count: of the organs that the figure is of; None where it is of all
         one, other: the figure of each, means over their training seeds
         difference: one - other, with its interval
         ratio: one / other, with its interval; None where `other` may be 0
@@ -24,6 +26,7 @@ class Difference:
     """
 
     figure: str
+    lesion_count: int | None
     one: float
     other: float
     difference: ScoreEstimate
@@ -35,29 +38,41 @@ def compare(one: Sequence[Result], other: Sequence[Result], rng: np.random.Gener
     """Differences of two methods, each one result or one for each seed of its training.
 
     A draw takes the same episodes, with replacement, for both (Efron & Tibshirani 1993, ch. 8), and of a method with
-    several training seeds as many of those, with replacement.
+    several training seeds as many of those, with replacement. Presses are also counted on organs with one lesion, two
+    and so on, where EPISODES_LEAST episodes have as many.
 
     Raises:
         ValueError: results of other seeds or another environment, or without single episodes or digests (names both).
     """
     _check([*one, *other])
     groups = [[_Episodes.of(result) for result in group] for group in (one, other)]
-    figures: dict[str, Figure] = {"success": _success}
+    figures: dict[tuple[str, int | None], Figure] = {("success", None): _success}
     if one[0].env_id == SITES:
-        figures = {"presses_to_median": _presses, "error_mm": _error, **figures}
+        presses = {("presses_to_median", count): partial(_presses, lesion_count=count) for count in _counts(one[0])}
+        figures = {**presses, ("error_mm", None): _error, **figures}
     count = len(one[0].seeds)
     everyone = np.arange(count)
     whole = {name: (_mean(of, groups[0], everyone), _mean(of, groups[1], everyone)) for name, of in figures.items()}
-    draws: dict[str, list[tuple[float, float]]] = {name: [] for name in figures}
+    draws: dict[tuple[str, int | None], list[tuple[float, float]]] = {name: [] for name in figures}
     for _ in range(RESAMPLES):
         chosen = rng.integers(count, size=count)
         members = [[group[index] for index in rng.integers(len(group), size=len(group))] for group in groups]
         for name, of in figures.items():
             draws[name].append((_mean(of, members[0], chosen), _mean(of, members[1], chosen)))
-    return [_difference(name, *whole[name], np.array(draws[name])) for name in figures]
+    return [_difference(*name, *whole[name], np.array(draws[name])) for name in figures]
 
 
-def _difference(name: str, one: float, other: float, draws: NDArray[np.float64]) -> Difference:
+def _counts(result: Result) -> list[int | None]:
+    """Which organs presses are counted on: all (None), then those with so many lesions, if they differ in that."""
+    counts, episodes = np.unique([count for count in result.lesion_counts if count > 0], return_counts=True)
+    if len(counts) < 2:
+        return [None]
+    return [None, *counts[episodes >= EPISODES_LEAST].tolist()]
+
+
+def _difference(
+    name: str, lesion_count: int | None, one: float, other: float, draws: NDArray[np.float64]
+) -> Difference:
     with np.errstate(invalid="ignore"):
         # Never less never, and never over never, is undefined: NaN.
         differences, ratios = draws[:, 0] - draws[:, 1], None
@@ -65,12 +80,14 @@ def _difference(name: str, one: float, other: float, draws: NDArray[np.float64])
             ratios = figure_with_interval(float(np.float64(one) / other), draws[:, 0] / draws[:, 1])
         whole = float(np.float64(one) - other)
     interval = figure_with_interval(whole, differences)
-    return Difference(name, one, other, interval, ratios, float(np.isnan(differences).mean()))
+    return Difference(name, lesion_count, one, other, interval, ratios, float(np.isnan(differences).mean()))
 
 
 def describe(difference: Difference, one: str, other: str) -> str:
     """One line: both figures, their difference, and the ratio where there is one."""
     heading, digits, factor, unit = SHOWN[difference.figure]
+    if difference.lesion_count is not None:
+        heading += f" with {difference.lesion_count} lesion{'s' * (difference.lesion_count > 1)}"
 
     def shown(value: float | None, form: str = "") -> str:
         if value is None or math.isnan(value):
@@ -93,6 +110,8 @@ def describe(difference: Difference, one: str, other: str) -> str:
     return line
 
 
+# Organs with so many lesions are compared by themselves where so many episodes have them.
+EPISODES_LEAST = 10
 # Heading, digits, factor and unit of each figure.
 SHOWN = {
     "presses_to_median": ("presses to 5 mm", 1, 1.0, ""),
@@ -127,16 +146,16 @@ def _faults(one: Result, other: Result) -> Iterator[str]:
 
 @dataclass(frozen=True, eq=False)
 class _Episodes:
-    """Errors after each press [m] (n, n_press), which episodes hide a lesion (n,) and which succeeded (n,)."""
+    """Errors after each press [m] (n, n_press), how many lesions episodes hide (n,) and which succeeded (n,)."""
 
     errors: NDArray[np.float64]
-    has_lesion: NDArray[np.bool_]
+    lesion_counts: NDArray[np.intp]
     succeeded: NDArray[np.bool_]
 
     @classmethod
     def of(cls, result: Result) -> "_Episodes":
         errors = 0.001 * np.array(result.errors_mm, dtype=np.float64)
-        return cls(errors, np.array(result.lesion_counts) > 0, np.array(result.successes))
+        return cls(errors, np.array(result.lesion_counts, dtype=np.intp), np.array(result.successes))
 
 
 # A figure of one result over the episodes that a draw has taken.
@@ -147,10 +166,11 @@ def _mean(of: Figure, group: Sequence[_Episodes], chosen: NDArray[np.intp]) -> f
     return float(np.mean([of(one, chosen) for one in group]))
 
 
-def _presses(episodes: _Episodes, chosen: NDArray[np.intp]) -> float:
-    """Presses until the median error over the organs with lesions is and stays at most 5 mm."""
-    with_lesion = chosen[episodes.has_lesion[chosen]]
-    return presses_to_line(episodes.errors[with_lesion], 50.0) if len(with_lesion) else math.nan
+def _presses(episodes: _Episodes, chosen: NDArray[np.intp], lesion_count: int | None) -> float:
+    """Presses until the median error over the organs with (so many) lesions is and stays at most 5 mm."""
+    counts = episodes.lesion_counts[chosen]
+    counted = chosen[counts > 0 if lesion_count is None else counts == lesion_count]
+    return presses_to_line(episodes.errors[counted], 50.0) if len(counted) else math.nan
 
 
 def _error(episodes: _Episodes, chosen: NDArray[np.intp]) -> float:

@@ -97,6 +97,22 @@ def test_episodes_without_lesions_do_not_count_for_presses():
     assert first.one == 2.0
 
 
+def test_presses_are_compared_by_the_number_of_lesions():
+    """Twice as fast where there are two lesions, as fast where there is one; too few organs have three."""
+    counts = [1] * 15 + [2] * 20 + [3] * 5
+    one, other = (
+        result(name, falling(np.repeat([3, slow], [15, 25])), lesion_counts=counts)
+        for name, slow in (("a", 4), ("b", 8))
+    )
+    whole, single, double, error, success = compare([one], [other], np.random.default_rng(0))
+    assert [each.lesion_count for each in (whole, single, double, error, success)] == [None, 1, 2, None, None]
+    assert (whole.one, whole.other) == (4.0, 8.0)
+    assert single.difference == ScoreEstimate(0.0, 0.0, 0.0)
+    assert double.ratio == ScoreEstimate(0.5, 0.5, 0.5)
+    assert describe(single, "a", "b").startswith("presses to 5 mm with 1 lesion: a 3.0, b 3.0;")
+    assert describe(double, "a", "b").startswith("presses to 5 mm with 2 lesions: a 4.0, b 8.0;")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import fields, replace
 from functools import partial
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -26,6 +27,7 @@ from surgsim_env.training.recorded_faces import (
 from surgsim_env.training.site_surrogate import SiteSurrogate
 
 pytestmark = pytest.mark.agents
+FACES = Path(script.__file__).parent / "faces"
 
 
 def flat_recording(count, first=0):
@@ -107,6 +109,25 @@ def test_it_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
     (tmp_path / "no.npz").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="is not a recording of faces"):
         load_faces(tmp_path / "no.npz")
+
+
+@pytest.mark.parametrize("path", sorted(FACES.glob("*.npz")), ids=lambda path: path.stem)
+def test_the_recordings_of_the_checkout_can_be_learned_on(path):
+    """Drawn as the environment draws: lesions on the face, and contrasts that rise above them."""
+    recorded = load_faces(path)
+    assert len(recorded) % LANES == 0 and path.stem == "_".join(filter(None, _kind(recorded)))
+    for face in recorded.faces:
+        truth, grid = face.truth, face.surface(face.map.sites * face.tip_radius)
+        distance = np.linalg.norm(grid[:, None] - truth, axis=2)
+        assert (distance[face.map.pressable].min(axis=0, initial=np.inf) < face.tip_radius).all()
+        if len(truth):
+            over = face.map.pressable & (distance.min(axis=1) < face.tip_radius)
+            assert face.log_contrast[over].max() > np.median(face.log_contrast[face.map.pressable])
+
+
+def _kind(recorded):
+    """Scene, and split or level: what the file is named after."""
+    return recorded.scene, recorded.split or recorded.level
 
 
 @pytest.fixture

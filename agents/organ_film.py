@@ -58,7 +58,7 @@ class Episode:
         places: of the presses, along the chart's sides [mm] (n_press, 2)
         extent: lengths of the chart's sides [mm] (2,)
         estimated: places of the lesions that the estimator reports at the end [mm] (k, 2)
-        truth: places and radii of the lesions [mm] (n_lesion, 3)
+        truth: places of the face nearest to the lesions, and their radii [mm] (n_lesion, 3)
         error_mm: of the estimate after each press
     """
 
@@ -96,7 +96,8 @@ def play(policy: Any, name: str, settings: dict[str, str], seed: int, budget: in
     opened.close()
     extent = 1000.0 * task.charted.chart.extent
     truth = [
-        [*(0.5 * (task.charted.chart.place(one.centre) + 1.0) * extent), 1000.0 * one.radius] for one in task.lesions
+        [*(0.5 * (task.charted.chart.place(point) + 1.0) * extent), 1000.0 * one.radius]
+        for one, point in zip(task.lesions, task.truth, strict=True)
     ]
     half = 0.5 * process.facts.map.cell
     return Episode(

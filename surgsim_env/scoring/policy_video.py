@@ -96,7 +96,10 @@ def _draw_forces(axes: Any, env: Any, forces: Sequence[float], presses: bool) ->
 
 
 def draw_belief(axes: Any, task: Any) -> None:
-    """The estimator's excess map with presses (dots), estimates (crosses) and true lesions (circles), in mm."""
+    """The estimator's excess map with presses (dots), estimates (crosses) and true lesions (circles), in mm.
+
+    Circles are about the points of the face nearest to the lesions' centres, of which the error is the distance.
+    """
     estimate, chart = task.estimate, task.charted.chart
     extent = 1000.0 * chart.extent
     shown = axes.imshow(
@@ -106,8 +109,8 @@ def draw_belief(axes: Any, task: Any) -> None:
     axes.plot(*places.T, ".", color="white", markersize=4)
     axes.plot(*(1000.0 * estimate.points).T, "x", color="red", markersize=9, markeredgewidth=2)
     angle = np.linspace(0.0, 2.0 * np.pi, 60)
-    for lesion in task.lesions:
-        x, y = 0.5 * (chart.place(lesion.centre) + 1.0) * extent
+    for lesion, point in zip(task.lesions, task.truth, strict=True):
+        x, y = 0.5 * (chart.place(point) + 1.0) * extent
         radius = 1000.0 * lesion.radius
         axes.plot(x + radius * np.cos(angle), y + radius * np.sin(angle), "--", color="white", linewidth=1)
     axes.set_xlim(0.0, extent[0])

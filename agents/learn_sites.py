@@ -23,6 +23,7 @@ learned on do not choose it.
 """
 
 import argparse
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -199,8 +200,8 @@ class Evolution:
         self, acquisition: Acquisition, seeds: Sequence[int], sources: Sequence[tuple[Draw, float]] | None = None
     ) -> float:
         """The mean cost of the episodes of seeds on faces of weighted sources, those of the search if None."""
-        played = self.sources if sources is None else sources
-        return sum(weight * cost(self.play(acquisition, seeds, draw)) for draw, weight in played)
+        weighted = self.sources if sources is None else sources
+        return sum(weight * cost(self.play(acquisition, seeds, draw)) for draw, weight in weighted)
 
     def step(self) -> None:
         """Play one generation."""
@@ -241,13 +242,13 @@ def weighted_sources(paths: Sequence[Path], weights: Sequence[float] | None = No
     """
     if weights is None:
         weights = [0.5 / len(paths)] * len(paths) if paths else []
-    if len(weights) != len(paths) or min(weights, default=0.0) < 0.0 or sum(weights) > 1.0:
+    if len(weights) != len(paths) or min(weights, default=0.0) < 0.0 or math.fsum(weights) > 1.0:
         raise ValueError(
             f"{len(weights)} weights {list(weights)} for {len(paths)} recordings; each has one, none is negative, and "
             "bell curves have the rest of 1"
         )
     recorded = [(load_faces(path), weight) for path, weight in zip(paths, weights, strict=True)]
-    return [(BellFaces(), 1.0 - sum(weights)), *recorded]
+    return [(BellFaces(), 1.0 - math.fsum(weights)), *recorded]
 
 
 def learn(arguments: argparse.Namespace) -> None:

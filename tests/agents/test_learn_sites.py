@@ -104,6 +104,8 @@ def test_sources_count_by_their_weights(monkeypatch):
     assert evolution.cost(Acquisition(), [0]) == pytest.approx(0.25 * 1.0 + 0.5 * 3.0 + 0.25 * 5.0)
     assert evolution.cost(Acquisition(), [0], checked) == pytest.approx(0.5 * 1.0 + 0.5 * 9.0)
     assert weighted_sources([]) == [("bells", 1.0)]
+    # In floating point these add up to a little more than 1, one after the other.
+    assert weighted_sources([Path("first")] * 4, [0.2, 0.4, 0.3, 0.1])[0] == ("bells", 0.0)
     for weights in ([0.5], [0.75, 0.5], [-0.1, 0.5]):
         with pytest.raises(ValueError, match="for 2 recordings"):
             weighted_sources([Path("first"), Path("second")], weights)

@@ -2,7 +2,7 @@
 
 python -m agents.record_faces --scene liver_family --split train --faces 128 --out runs/liver_faces.npz
 
-Of `liver_family`, 128 faces take two hours of processor time.
+Of `liver_family`, 128 faces take 80 to 120 minutes of processor time.
 """
 
 import argparse

@@ -132,7 +132,9 @@ def _draw_way(axes: Any, env: Any, tips: Sequence[NDArray[np.float64]]) -> None:
         chart, touched = memory.chart, memory.map
         extent = 1000.0 * chart.extent
         way = 0.5 * (chart.place(np.array(tips)) + 1.0) * extent
-        lesions = [0.5 * (chart.place(lesion.centre) + 1.0) * extent for lesion in env.task.lesions]
+        # The points of the face nearest to their centres, of which the error is the distance.
+        nearest = [env.task.anatomy.face.project(lesion.centre)[0] for lesion in env.task.lesions]
+        lesions = [0.5 * (chart.place(point) + 1.0) * extent for point in nearest]
         contrast = np.where(memory.visited > 0.0, memory.contrast, np.nan)
         columns, rows = (1000.0 * axis for axis in touched.axes)
         cells = contrast.reshape(len(rows), len(columns))

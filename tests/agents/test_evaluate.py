@@ -492,6 +492,27 @@ def test_an_episode_with_a_touch_map_is_filmed() -> None:
     assert coloured[1] > coloured[0] + 500, "what was felt is painted"
 
 
+def test_lesions_are_drawn_where_errors_are_measured_from() -> None:
+    """About the point of the face nearest to the centre: a report of that point is a cross in the circle's middle."""
+    from matplotlib.figure import Figure
+
+    from surgsim_env.scoring.policy_video import draw_belief
+
+    nearest, centre = np.array([0.02, 0.01, 0.03]), np.array([0.03, 0.02, 0.0])
+    chart = SimpleNamespace(extent=np.array([0.04, 0.04]), place=lambda point: np.asarray(point)[:2] / 0.02 - 1.0)
+    task = SimpleNamespace(
+        estimate=SimpleNamespace(excess=np.zeros((3, 3)), points=nearest[None, :2]),
+        charted=SimpleNamespace(chart=chart),
+        felt=SimpleNamespace(places=np.zeros((1, 2))),
+        lesions=[SimpleNamespace(centre=centre, radius=0.004)],
+        truth=nearest[None],
+    )
+    axes = Figure().subplots()
+    draw_belief(axes, task)
+    _, cross, circle = (np.array(line.get_data()) for line in axes.lines)
+    np.testing.assert_allclose(0.5 * (circle.min(axis=1) + circle.max(axis=1)), cross[:, 0], atol=0.01)
+
+
 def test_organs_are_filmed_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A picture a press, and one of the truth, which is shown for longer; what is hidden is not in the others."""
     pytest.importorskip("safetensors", reason="needs the `agents` extra")

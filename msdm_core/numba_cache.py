@@ -32,6 +32,7 @@ from typing import Any
 from numba.core import config
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.registry import CPUDispatcher
+from numba.core.runtime import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.core.target_extension import dispatcher_registry, target_registry
 from numba.misc.appdirs import AppDirs
@@ -246,7 +247,11 @@ class HealingCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled function of a signature; None where it is to be compiled."""
         try:
-            found = super().load_overload(sig, target_context)
+            # Unlike numba's own, without `target_context.refresh`: it imports for a tenth of a second what compiling
+            # needs and running does not, and numba calls it before it compiles.
+            rtsys.initialize(target_context)
+            with self._guard_against_spurious_io_errors():
+                found = self._load_overload(sig, target_context)
             arguments, _ = normalize_signature(sig)
             if found is not None and tuple(found.signature.args) != arguments:
                 raise ValueError(f"it holds the function for {found.signature.args}, not for {arguments}")

@@ -460,7 +460,8 @@ def map_digest(anatomy: Anatomy) -> str:
         tuple(one for one in scene.anchors if one.is_elastic),
     )
     here = Path(__file__)
-    sources = (here.parents[1] / "scene" / "palpable_surface.py", here.with_name("press.py"), here)
+    scenes = here.parents[1] / "scene"
+    sources = (scenes / "palpable_surface.py", scenes / "anatomy.py", here.with_name("press.py"), here)
     instrument = scenes_folder() / "instruments" / scene.instrument.model
     arrays = (anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors)
     return content_digest(*arrays, parts, *sources, *source_files("instruments", "coupling"), instrument)

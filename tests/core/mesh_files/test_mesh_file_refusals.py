@@ -39,7 +39,7 @@ def test_a_unit_that_is_none_is_refused(tmp_path, random_mesh, unit, message):
 @pytest.mark.parametrize("name", ["a.vtu", "a.vtk", "a.msh", "a.mesh"])
 def test_a_foreign_file_needs_a_unit(tmp_path, name):
     path = written(tmp_path / name, file_format="gmsh22" if name == "a.msh" else None)
-    with pytest.raises(MeshError, match=f'{name}: states no length unit; give length_unit="m", "cm", "mm"'):
+    with pytest.raises(MeshError, match=f'{name}: states no length unit; give "m", "cm", "mm"'):
         read_mesh(path)
 
 

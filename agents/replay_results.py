@@ -1,0 +1,100 @@
+"""Play the first episodes of scores of presses again, and note in each file the source with which they are the same.
+
+python -m agents.replay_results [FILE ...] --episodes 8
+
+An edit of the source that changes no episode, such as an import moved, changes the digest in a result's `origin`, and
+`surgsim evaluate --check` then finds that it was played with another source. To play all of them again takes hours.
+This plays the first episodes of each file that is given (default: all of SurgSim/PalpateSites-v0 in agents/results that
+were played with another source). Where errors after each press, lesions and successes are the file's, `origin` gets
+the versions and digests of here, and `origin.replayed` the number of episodes and the digests with which all were
+played. Where they are not, the file is left alone, and the exit status is 1.
+"""
+
+import argparse
+import shlex
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from agents.command_line import one_line_errors
+from surgsim_env.cli.main import main as surgsim
+from surgsim_env.scoring.origin import check_origin
+from surgsim_env.scoring.results import SITES, Result, load_result, shipped_results
+
+# Entries of a result with one value for each episode.
+PER_EPISODE = ("seeds", "errors_mm", "lesion_counts", "successes")
+
+
+def played_again(result: Result, episodes: int) -> Result:
+    """The result's command once more, for its first episodes.
+
+    Raises:
+        ValueError: the command fails (names it).
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "result.json"
+        command = [*shlex.split(result.command)[1:], "--episodes", str(episodes), "--submit", str(file)]
+        try:
+            status = surgsim(command)
+        except SystemExit as end:
+            status = end.code
+        if status:
+            raise ValueError(f"surgsim {shlex.join(command)} ends with {status}")
+        return load_result(file)
+
+
+def differences(result: Result, again: Result) -> Iterator[str]:
+    """In what the first episodes of a result differ from those that were played again."""
+    for name in PER_EPISODE:
+        for seed, one, other in zip(again.seeds, getattr(result, name), getattr(again, name), strict=False):
+            if one != other:
+                yield f"{name} of seed {seed}: {one} in the file, {other} here"
+    for name, digest in result.origin["agent"].items():
+        if again.origin["agent"].get(name) != digest:
+            yield f"{name} of the agent is another file"
+    if again.origin["dtype"] != result.origin["dtype"]:
+        yield f"dtype is {result.origin['dtype']} in the file, {again.origin['dtype']} here"
+
+
+def noted(result: Result, again: Result) -> Result:
+    """The result with the origin of the episodes that were played again."""
+    first = result.origin.get("replayed", {}).get("environment", result.origin["environment"])
+    return replace(
+        result, origin={**again.origin, "replayed": {"episodes": len(again.seeds), "environment": first}}
+    )
+
+
+def main() -> None:
+    """Replay the files of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="*", type=Path)
+    parser.add_argument("--episodes", type=int, default=8)
+    given = parser.parse_args()
+    if given.episodes < 1:
+        raise ValueError(f"--episodes is {given.episodes}; it must be at least 1")
+    failed = 0
+    for file in given.files or sorted(shipped_results().glob("PalpateSites_*.json")):
+        result = load_result(file)
+        if result.env_id != SITES:
+            raise ValueError(
+                f"{file} is of {result.env_id}, of whose episodes it has the success alone: play all of it again, "
+                f"{result.command}"
+            )
+        if not (given.files or any(check_origin(result))):
+            continue
+        again = played_again(result, given.episodes)
+        found = list(differences(result, again))
+        if found:
+            failed += 1
+            print(f"{file}: DIFFERS: {'; '.join(found)}")
+        else:
+            noted(result, again).write(file)
+            print(f"{file}: the same in {len(again.seeds)} episodes")
+    if failed:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    with one_line_errors(__name__):
+        main()

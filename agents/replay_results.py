@@ -60,9 +60,7 @@ def differences(result: Result, again: Result) -> Iterator[str]:
 def noted(result: Result, again: Result) -> Result:
     """The result with the origin of the episodes that were played again."""
     first = result.origin.get("replayed", {}).get("environment", result.origin["environment"])
-    return replace(
-        result, origin={**again.origin, "replayed": {"episodes": len(again.seeds), "environment": first}}
-    )
+    return replace(result, origin={**again.origin, "replayed": {"episodes": len(again.seeds), "environment": first}})
 
 
 def main() -> None:

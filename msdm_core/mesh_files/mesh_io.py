@@ -200,7 +200,9 @@ def _chosen_unit(file: Path, asked: float | None, stated: float | None) -> float
     if stated is not None:
         stated = metres_per_unit(stated)
     if asked is None and stated is None:
-        raise MeshError(f'{file}: states no length unit; give "m", "cm", "mm" or metres per unit as length_unit (--length-unit)')
+        raise MeshError(
+            f'{file}: states no length unit; give "m", "cm", "mm" or metres per unit as length_unit (--length-unit)'
+        )
     if asked is not None and stated is not None and abs(asked - stated) > 1e-12 * stated:
         warnings.warn(
             f"{file}: states {stated:g} m per unit, but length_unit says {asked:g}; length_unit is used", stacklevel=3

@@ -1,9 +1,11 @@
 """Compiled code is taken from disk, and made anew when a compiled file has changed or one of the cache is damaged."""
 
 import gc
+import importlib
 import importlib.util
 import os
 import pickle
+import pkgutil
 import shutil
 import subprocess
 import sys
@@ -307,6 +309,42 @@ def test_the_kernels_have_a_cache_that_heals_and_others_are_left_alone():
         raise KeyboardInterrupt
     assert dispatcher_registry[target_registry["cpu"]] is CPUDispatcher
     shutil.rmtree(Path(__file__).parent / "__pycache__", ignore_errors=True)
+
+
+def test_every_file_of_kernels_is_decorated_where_the_cache_heals():
+    """A file that is first imported elsewhere would have numba's own cache."""
+    plain = []
+    for package in (msdm_core, surgsim_env):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if module.name.endswith("_kernels"):
+                for name, found in vars(importlib.import_module(module.name)).items():
+                    if isinstance(found, CPUDispatcher) and not isinstance(found, numba_cache.KernelDispatcher):
+                        plain.append(f"{module.name}.{name}")
+    assert not plain
+
+
+FIRST_STEP = """
+import sys
+import gymnasium
+import surgsim_env
+from surgsim_env.coupling.haptic_kernels import advance_haptic_steps
+env = gymnasium.make("SurgSim/Palpate-v0", scene="phantom_small")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print(sum(advance_haptic_steps.stats.cache_hits.values()))
+print(*(name for name in ("numba.cpython.unicode", "numba.np.arrayobj", "scipy.optimize") if name in sys.modules))
+"""
+
+
+def test_a_warm_start_imports_no_compiler():
+    """What numba lowers functions with, and scipy.optimize, take a third of a second to import."""
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", FIRST_STEP], capture_output=True, text=True, check=True)
+        hits, loaded = done.stdout.splitlines()
+        if hits == "1":
+            assert loaded == ""
+            return
+    pytest.fail("the second start compiled again")
 
 
 def test_a_cache_that_another_process_removes_meanwhile_is_no_error(source: Path, monkeypatch):

@@ -1,13 +1,14 @@
-"""Play the first episodes of scores of presses again, and note in each file the source with which they are the same.
+"""Play the first episodes of scores again, and note in each file the source with which they are the same.
 
 python -m agents.replay_results [FILE ...] --episodes 8
 
 An edit of the source that changes no episode, such as an import moved, changes the digest in a result's `origin`, and
 `surgsim evaluate --check` then finds that it was played with another source. To play all of them again takes hours.
-This plays the first episodes of each file that is given (default: all of SurgSim/PalpateSites-v0 in agents/results that
-were played with another source). Where errors after each press, lesions and successes are the file's, `origin` gets
-the versions and digests of here, and `origin.replayed` the number of episodes and the digests with which all were
-played. Where they are not, the file is left alone, and the exit status is 1.
+This plays the first episodes of each file that is given (default: those in agents/results that were played with another
+source). Where errors after each press, lesions and successes are the file's, `origin` gets the versions and digests of
+here, and `origin.replayed` the number of episodes and the digests with which all were played. Where they are not, the
+file is left alone, and the exit status is 1. Of environments other than SurgSim/PalpateSites-v0 a file has the success
+of each episode alone, which is a weak check: play all of those where anything may have changed.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from pathlib import Path
 from agents.command_line import one_line_errors
 from surgsim_env.cli.main import main as surgsim
 from surgsim_env.scoring.origin import check_origin
-from surgsim_env.scoring.results import SITES, Result, load_result, shipped_results
+from surgsim_env.scoring.results import Result, load_result, shipped_results
 
 # Entries of a result with one value for each episode.
 PER_EPISODE = ("seeds", "errors_mm", "lesion_counts", "successes")
@@ -72,14 +73,9 @@ def main() -> None:
     if given.episodes < 1:
         raise ValueError(f"--episodes is {given.episodes}; it must be at least 1")
     failed = 0
-    for file in given.files or sorted(shipped_results().glob("PalpateSites_*.json")):
+    for file in given.files or sorted(shipped_results().glob("[!r]*.json")):
         result = load_result(file)
-        if result.env_id != SITES:
-            raise ValueError(
-                f"{file} is of {result.env_id}, of whose episodes it has the success alone: play all of it again, "
-                f"{result.command}"
-            )
-        if not (given.files or any(check_origin(result))):
+        if not given.files and (not result.origin or not any(check_origin(result))):
             continue
         again = played_again(result, given.episodes)
         found = list(differences(result, again))

@@ -39,7 +39,7 @@ ORDER = {
             "leaderboard_tables",
             "leaderboard",
         ),
-        *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
+        *("palpation_figures", "organ_film", "learning_curves", "convert_policy", "replay_results"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

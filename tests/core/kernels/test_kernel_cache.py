@@ -334,6 +334,12 @@ env.step(env.action_space.sample())
 print(sum(advance_haptic_steps.stats.cache_hits.values()))
 print(*(name for name in ("numba.cpython.unicode", "numba.np.arrayobj", "scipy.optimize") if name in sys.modules))
 """
+COLLECTS = """
+import gc
+gc.enable() if {enabled} else gc.disable()
+import surgsim_env
+print(gc.isenabled(), gc.get_freeze_count() > 10_000)
+"""
 
 
 def test_a_warm_start_imports_no_compiler():
@@ -345,6 +351,13 @@ def test_a_warm_start_imports_no_compiler():
             assert loaded == ""
             return
     pytest.fail("the second start compiled again")
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_importing_leaves_the_collector_as_it_was_and_modules_to_no_collection(enabled: bool):
+    code = COLLECTS.format(enabled=enabled)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(enabled), "True"]
 
 
 def test_a_cache_that_another_process_removes_meanwhile_is_no_error(source: Path, monkeypatch):

@@ -1,6 +1,6 @@
 """Play the first episodes of scores again, and note in each file the source with which they are the same.
 
-python -m agents.replay_results [FILE ...] --episodes 8
+python -m agents.replay_results [FILE ...] --episodes 16
 
 An edit of the source that changes no episode, such as an import moved, changes the digest in a result's `origin`, and
 `surgsim evaluate --check` then finds that it was played with another source. To play all of them again takes hours.
@@ -78,7 +78,7 @@ def main() -> None:
     """Replay the files of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="*", type=Path)
-    parser.add_argument("--episodes", type=int, default=8)
+    parser.add_argument("--episodes", type=int, default=16)
     given = parser.parse_args()
     if given.episodes < 1:
         raise ValueError(f"--episodes is {given.episodes}; it must be at least 1")

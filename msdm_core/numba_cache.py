@@ -248,7 +248,8 @@ class HealingCache(FunctionCache):
         """The compiled function of a signature; None where it is to be compiled."""
         try:
             # Unlike numba's own, without `target_context.refresh`: it imports for a tenth of a second what compiling
-            # needs and running does not, and numba calls it before it compiles.
+            # needs and running does not, and numba calls it before it compiles. Symbols of LAPACK and of numba's random
+            # numbers come with it: kernels have neither.
             rtsys.initialize(target_context)
             with self._guard_against_spurious_io_errors():
                 found = self._load_overload(sig, target_context)

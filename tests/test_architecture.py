@@ -189,8 +189,10 @@ def kernels_repeat_to_the_bit(source: Source) -> Iterator[str]:
             yield f"line {node.value.lineno}: parallel={ast.unparse(node.value)}"
         if source.path in KERNEL_FILES and isinstance(node, ast.Call):
             function = ast.unparse(node.func)
+            # A kernel that is loaded has no symbols of LAPACK and of numba's random numbers (`HealingCache`).
             if re.fullmatch(
-                r"(math|np|numpy)\.(exp|expm1|log\w*|a?(sin|cos|tan)h?|atan2|arctan2?|pow|power)", function
+                r"(math|np|numpy)\.(exp|expm1|log\w*|a?(sin|cos|tan)h?|atan2|arctan2?|pow|power|(linalg|random)\..+)",
+                function,
             ):
                 yield f"line {node.lineno}: {function}"
 
@@ -296,6 +298,7 @@ PLANTED = [
     (kernels_repeat_to_the_bit, "msdm_core/kernels/substep_kernels.py", "@njit(parallel=True)\ndef f(): pass"),
     (kernels_repeat_to_the_bit, "msdm_core/kernels/substep_kernels.py", "def f(x):\n    return math.exp(x)"),
     (kernels_repeat_to_the_bit, "msdm_core/kernels/substep_kernels.py", "def f(x):\n    return np.arctan2(x, x)"),
+    (kernels_repeat_to_the_bit, "msdm_core/kernels/substep_kernels.py", "def f(x):\n    return np.linalg.det(x)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "def judge(simulation):\n    simulation.haptic_step()"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "env.step(action)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "simulation.control_step(50)"),

@@ -85,7 +85,7 @@ def main() -> None:
     failed = 0
     for file in given.files or sorted(shipped_results().glob("[!r]*.json")):
         result = load_result(file)
-        if not given.files and (not result.origin or not any(check_origin(result))):
+        if not given.files and not (result.origin and any(check_origin(result))):
             continue
         again = played_again(result, given.episodes)
         found = list(differences(result, again))

@@ -27,14 +27,17 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import llvmlite.binding as llvm
 from numba.core import config
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.core.target_extension import dispatcher_registry, target_registry
+from numba.core.targetconfig import ConfigStack
 from numba.misc.appdirs import AppDirs
 
 LOGGER = logging.getLogger("msdm_core")
@@ -43,6 +46,8 @@ FOLDER_PREFIX = "surgsim-kernels-"
 STALE_AGE = 7 * 24 * 3600.0  # [s]
 # The last bytes of a file of the cache, followed by the SHA-256 of those before; unpickling does not read them.
 CHECKSUM_MARK = b"surgsim-sha256:"
+# How a `KernelLibrary` without machine code is marked on disk.
+INNER_KIND = "inner"
 CHECKSUM_LENGTH = len(CHECKSUM_MARK) + hashlib.sha256().digest_size
 # As the third threshold of `gc`: the oldest generation is left alone.
 NEVER = 2**31 - 1
@@ -322,6 +327,63 @@ class InnerUncached(_Inner, UncachedDispatcher):
     """`UncachedDispatcher` of a function that compiled code alone calls."""
 
 
+class KernelLibrary(JITCodeLibrary):
+    """LLVM's code of a function; one without any wrapper becomes machine code as a part of its callers alone.
+
+    A function is linked into its callers before they are optimised. numba optimises it by itself as well and makes
+    machine code of it, which nothing calls where there is no wrapper: a sixth of the time that compiling takes.
+    """
+
+    # numba's environments of functions without machine code, by symbol, for those that they are linked into.
+    _environments: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, codegen: Any, name: str) -> None:
+        super().__init__(codegen, name)
+        flags = ConfigStack.top_or_none()
+        self._is_inner = flags is not None and flags.no_cpython_wrapper and flags.no_cfunc_wrapper
+
+    @property
+    def codegen(self) -> Any:
+        """Where numba sets the environment of a function that it has compiled or loaded."""
+        return self if self._is_inner else self._codegen
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Keep the environment until a caller has machine code."""
+        self._environments[name] = environment
+
+    def serialize_using_object_code(self) -> tuple[str, str, Any]:
+        """What is kept on disk."""
+        if self._is_inner:
+            return self.name, INNER_KIND, self._get_module_for_linking().as_bitcode()
+        return super().serialize_using_object_code()
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: tuple[str, str, Any]) -> Any:
+        name, kind, data = state
+        if kind != INNER_KIND:
+            return super()._unserialize(codegen, state)
+        library = codegen.create_library(name)
+        library._is_inner = True
+        library._final_module = llvm.parse_bitcode(data)
+        library._finalize_final_module()
+        return library
+
+    def _optimize_final_module(self) -> None:
+        if not self._is_inner:
+            super()._optimize_final_module()
+
+    def _finalize_final_module(self) -> None:
+        if self._is_inner:
+            self._finalize_dynamic_globals()
+            self._verify_declare_only_symbols()
+            self._finalized = True
+            return
+        super()._finalize_final_module()
+        for variable in self._final_module.global_variables:
+            if variable.name in self._environments:
+                self._codegen.set_env(variable.name, self._environments[variable.name])
+
+
 class Compiling:
     """Functions that are being compiled.
 
@@ -342,6 +404,7 @@ class Compiling:
             self._begin, self._said = time.monotonic(), False
             self._gc_thresholds = gc.get_threshold()
             gc.set_threshold(*self._gc_thresholds[:2], NEVER)
+            JITCPUCodegen._library_class = KernelLibrary
         self._depth += 1
         try:
             yield
@@ -353,6 +416,7 @@ class Compiling:
                 LOGGER.warning("surgsim: compiling for this processor, once: up to a minute ...")
             if self._depth == 0:
                 gc.set_threshold(*self._gc_thresholds)
+                JITCPUCodegen._library_class = JITCodeLibrary
                 if self._said:
                     LOGGER.warning("surgsim: compiled in %.0f s", spent)
 

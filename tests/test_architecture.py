@@ -28,7 +28,7 @@ KERNEL_FILES = tuple(
     for package in PACKAGES
     for path in sorted((REPOSITORY / package).rglob(numba_cache.KERNEL_FILES))
 )
-KERNEL_IMPORTS = {"math", "typing", "collections", "operator", "numpy", "numba", "llvmlite"}
+KERNEL_IMPORTS = {"math", "typing", "collections", "operator", "hashlib", "numpy", "numba", "llvmlite"}
 # The one kernels file that imports MuJoCo: it takes its functions, which compiled code calls by name, and a constant.
 MUJOCO_CALLS = "surgsim_env/instruments/mujoco_kernels.py"
 # May import numba, though nothing in it is compiled.

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, KERNEL
+from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
 
 # Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
 CANDIDATE_MARGIN = 1e-3
@@ -38,7 +38,7 @@ PLACE_WIDTH = 5
 SWEEPS = (1.0, 2.0, 2.0)
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def find_candidates(model, state, shapes, duration):
     """Broad phase of one call: the triangles that a shape may touch within a duration, by bounding boxes and spheres.
 
@@ -119,7 +119,7 @@ def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
     return kept * ux, kept * uy, kept * uz
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
     """Contact forces of every shape on its candidate triangles as they are now, and the reaction on the tools.
 
@@ -269,7 +269,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
     return count
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wrench):
     """Make contact implicit: pressure and friction of each quadrature point at the END of the substep.
 
@@ -581,7 +581,7 @@ def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
     return gx, gy, gz
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def stretch_by_lag(model, state, shapes, response, candidate_count):
     """Shift the stretch of sticking friction by each tool's lag, to where MuJoCo puts the tool at the end of the step.
 

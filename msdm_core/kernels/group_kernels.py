@@ -34,7 +34,7 @@ from msdm_core.kernels.gather_kernels import (
     push_corners,
     tet_edges,
 )
-from msdm_core.kernels.option_kernels import INLINED, KERNEL
+from msdm_core.kernels.option_kernels import INLINED, INNER
 from msdm_core.kernels.vector_kernels import (
     GROUP,
     any_below,
@@ -72,7 +72,7 @@ def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
     store_group(relief, first, total)
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """Energies of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_energies`.
 
@@ -88,7 +88,7 @@ def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, b
     return whole
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
     """`tissue_kernels.set_node_laws` of whole groups of nodes.
 
@@ -114,7 +114,7 @@ def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, ex
     return whole, stiffens, steepens
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count):
     """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
 
@@ -150,7 +150,7 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
     return whole, steep_count
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """Sums at nodes over whole groups of tets; arguments as in `tissue_kernels.sum_at_nodes`.
 
@@ -170,7 +170,7 @@ def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length
     return whole
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_tet_groups(
     position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed, law,
     steep_count,

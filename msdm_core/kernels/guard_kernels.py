@@ -6,7 +6,7 @@ from typing import NamedTuple
 from numba import njit
 
 from msdm_core.kernels.contact_kernels import closest_on_axis
-from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER, KERNEL
+from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
 
 # The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
 GUARD_SHARE = 0.6
@@ -36,7 +36,7 @@ class _NearPoint(NamedTuple):
     stiffness: float
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def guard_axes(model, state, shapes, law, response, dt, candidate_count, reference, wrench):
     """Keep the surface off the axes of the shapes, which the quadrature points alone may let pass.
 

@@ -19,7 +19,7 @@ from msdm_core.kernels.layout_kernels import (
     store_column,
     take_from_node,
 )
-from msdm_core.kernels.option_kernels import INLINED, KERNEL
+from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 # Implicit stiffness of a steep spring over what stiffening adds to its tangent: with a larger one fewer sweeps hold the
@@ -37,7 +37,7 @@ SWEEPS_PER_TANGENT = 1.0 / 3.0
 SWEEPS_LEAST = 4
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def hold_squeezed(
     position, velocity, force, inverse_mass, tets, inverse_volume, averaged_bulk, squeezed, count, width, dt
 ):  # fmt: skip

@@ -12,7 +12,7 @@ from numba import njit
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from msdm_core.kernels.option_kernels import INLINED, INLINED_VIEW
+from msdm_core.kernels.option_kernels import INLINED, INLINED_VIEW, JITABLE
 
 FloatArray = NDArray[np.float64]
 # float64 or float32, eight or sixteen lanes.
@@ -554,7 +554,7 @@ def lanes_of(model: OrganModel | LaneModel) -> tuple[int, ...]:
     return model.lanes if isinstance(model, LaneModel) else ()
 
 
-@overload(lanes_of)
+@overload(lanes_of, jit_options=JITABLE)
 def _(model):
     return (lambda model: model.lanes) if model.instance_class is LaneModel else (lambda model: ())
 

@@ -15,6 +15,7 @@ from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
 from msdm_core.kernels.layout_kernels import load_part, store_part
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
+from msdm_core.kernels.reference_kernels import by_reference
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
@@ -63,7 +64,7 @@ from msdm_core.kernels.tissue_kernels import (
 FADE_INTERVAL = 1e-3
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def move_shapes(shapes, dt):
     """Carry the shapes along the twist of their tool for one substep: x <- x + dt (v + w x (x - c)).
 
@@ -91,7 +92,7 @@ def move_shapes(shapes, dt):
             shapes.tool_centre[tool, axis] += dt * twist[tool, axis]
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def push_tools(shapes, response, dt, substep, wrench):
     """Change the tools' twists by the wrench of a substep, before the shapes move along them: twist += dt (a + B w).
 
@@ -426,23 +427,15 @@ def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
         _put_back_forces(lanes, state)
 
 
-@njit(**KERNEL)
-def advance_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
-    """Advance organs by some substeps against moving shapes; the kernel behind `organ.advance` and `advance_lanes`.
-
-    Organs side by side (LaneModel, LaneState) have the lane as first index of shapes, response, reference and wrench.
-    A fault stops an organ at the substep that showed it: an organ alone until the next call, a lane for good.
-
-    Model: model, law, response
-    In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point of each tool's torque [m] (n_tool, 3)
-    Out:   state, shapes (moved), wrench: MEAN force [N] and torque [N m] on each tool (n_tool, 6)
-    Returns the FAULT_ code of an organ alone, or of the first lane; `state.lane_fault` has all of them.
-    """
+@njit(**INNER)
+def advance_inside(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
+    """`advance_substeps`, as a part of a kernel that calls it."""
+    model, state, shapes = by_reference(model), by_reference(state), by_reference(shapes)
     lanes = lanes_of(model)
     wrench[:] = 0.0
     _wake(lanes, state)
     _load_rows(lanes, state)
-    rows = in_rows(lanes, state)
+    rows = by_reference(in_rows(lanes, state))
     _begin(lanes, model, rows, shapes, response, dt * substep_count)
     fade_every = max(1, int(FADE_INTERVAL / dt + 0.5))
     faded = 0
@@ -470,13 +463,29 @@ def advance_substeps(model, state, shapes, law, response, dt, decay, substep_cou
 
 
 @njit(**KERNEL)
+def advance_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
+    """Advance organs by some substeps against moving shapes; the kernel behind `organ.advance` and `advance_lanes`.
+
+    Organs side by side (LaneModel, LaneState) have the lane as first index of shapes, response, reference and wrench.
+    A fault stops an organ at the substep that showed it: an organ alone until the next call, a lane for good.
+
+    Model: model, law, response
+    In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point of each tool's torque [m] (n_tool, 3)
+    Out:   state, shapes (moved), wrench: MEAN force [N] and torque [N m] on each tool (n_tool, 6)
+    Returns the FAULT_ code of an organ alone, or of the first lane; `state.lane_fault` has all of them.
+    """
+    return advance_inside(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench)
+
+
+@njit(**KERNEL)
 def evaluate_forces(model, state):
     """Internal forces and gravity of a state, without contact, supports and foundations.
 
     In:  model, state: positions [m] and velocities [m/s] (n_node, 3)
     Out: state: node_force [N] (n_node, 3), volume_ratio_smallest (1,)
     """
+    model, state = by_reference(model), by_reference(state)
     lanes = lanes_of(model)
     _load_rows(lanes, state)
-    _evaluate(model, in_rows(lanes, state), False, 0.0)
+    _evaluate(model, by_reference(in_rows(lanes, state)), False, 0.0)
     _store_force(lanes, state)

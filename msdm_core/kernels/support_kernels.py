@@ -6,7 +6,7 @@ from numba import njit
 
 from msdm_core.kernels.contact_kernels import stick_or_slip
 from msdm_core.kernels.layout_kernels import load_item, load_part, parts_of, store_part, where_moving
-from msdm_core.kernels.option_kernels import INLINED, KERNEL
+from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.vector_kernels import load_row
 
 PLANE, SPHERE, CAPSULE, BOX = 0, 1, 2, 3
@@ -120,7 +120,7 @@ def place_ground(model, motion, foundation, support):
             support[item, 1, axis] = speed
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def carry_anchors(model, motion, velocity):
     """Give anchored nodes the speed of the ground, v = sum of ds_m/dt d_m.
 
@@ -153,7 +153,7 @@ def _lanes_shift(lanes, shift, number, node, part):
     return shift[number, node, part]
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def drag_along(lanes, shift, rate, moving, decay, velocity):
     """Let the integration that follows, v' = decay v + ..., damp velocities relative to the ground's.
 
@@ -177,7 +177,7 @@ def drag_along(lanes, shift, rate, moving, decay, velocity):
             store_part(lanes, velocity, parts * node + part, where_moving(lanes, moving, after, before))
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def move_ground(model, position, force, foundation, load, motion, dt):
     """Count the work of the ground on the organ, and advance the signals by a step.
 
@@ -217,7 +217,7 @@ def move_ground(model, position, force, foundation, load, motion, dt):
         motion[number, 0] += motion[number, 1] * dt
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def depth_inside(kind, first, second, third, x, y, z):
     """Depth of a point in a solid, and the outward normal there, in the frame of the solid.
 

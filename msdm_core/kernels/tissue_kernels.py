@@ -51,7 +51,7 @@ from msdm_core.kernels.layout_kernels import (
     three_edges,
     where_moving,
 )
-from msdm_core.kernels.option_kernels import INLINED, KERNEL
+from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.vector_kernels import GROUP, any_below, keep_lower
 
 
@@ -63,7 +63,7 @@ def group_width(lanes):
     return 1
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def set_gravity(lanes, force, mass, gravity):
     """F = m g.
 
@@ -80,7 +80,7 @@ def set_gravity(lanes, force, mass, gravity):
                 store_item(lanes, force, 3 * node + axis, load_item(lanes, mass, node) * gravity[axis])
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving, finite_sum):
     """Symplectic Euler of the organs that move: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt).
 
@@ -101,7 +101,7 @@ def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving,
     store_sum(lanes, finite_sum, check)
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def put_back(lanes, values, kept, moving):
     """Restore the kept values of organs that do not move.
 
@@ -161,7 +161,7 @@ def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
     return spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """Twice the energy of linear springs from number `begin` on, k (l - l0)^2, at both ends of each.
 
@@ -186,7 +186,7 @@ def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset
     return 0, False, False
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
     """From the sums of volumes and energies around nodes to the tension of the averaged volumes and to `node_law`.
 
@@ -260,7 +260,7 @@ def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic,
     store_item(lanes, relief, spring, where_moving(lanes, moving, total, load_item(lanes, relief, spring)))
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, begin, law, moving):
     """Springs from number `begin` on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their law.
 
@@ -303,7 +303,7 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
     return steep_count
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta):
     """Rayleigh's beta along all springs: f = k beta dl/dt.
 
@@ -325,7 +325,7 @@ def _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness,
     return 0
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """Six times the volume of each tet added up at its corners; where springs stiffen, with twice its spring's energy.
 
@@ -359,7 +359,7 @@ def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
         store_item(lanes, tension, node, node_tension(load_item(lanes, tension, node), inverse, bulk))
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffens):
     """Beta's share of the averaged volume term: beta times the rates of volumes, to what `sum_at_nodes` adds up.
 
@@ -408,7 +408,7 @@ def _add_groups_of_tets(
     return 0, 0, steep_count
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_tet_forces(
     lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving,
     squeezed, law, steep_count,
@@ -475,7 +475,7 @@ def add_tet_forces(
     return count, steep_count
 
 
-@njit(**KERNEL)
+@njit(**INNER)
 def add_volume_damping(lanes, position, velocity, force, tets, inverse_volume, bulk, beta):
     """Beta's share of each tet's own volume term: tension K beta dJ/dt.
 

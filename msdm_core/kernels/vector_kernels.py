@@ -19,7 +19,8 @@ from numba import extending, types
 from numba.core import cgutils
 from numba.core.datamodel.models import PrimitiveModel
 from numba.core.registry import cpu_target
-from numba.extending import overload, register_model
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.extending import lower_builtin, register_model
 from numpy.typing import NDArray
 
 # Untyped: a compiled function is called without the typing context that an intrinsic is defined with.
@@ -105,21 +106,23 @@ def _common(a: Any, b: Any) -> VectorType | None:
 
 
 def _define_operator(function: Callable[..., Any], instruction: str) -> None:
-    @intrinsic
-    def apply(_typing: Any, a: Any, b: Any) -> Any:
-        vector = _common(a, b)
-        if vector is None:
-            return None
+    """Let numba's own operator take vectors; an `overload` would compile a function for each pair of types."""
 
-        def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
-            pair = [_operand(context, builder, value, kind, vector) for value, kind in zip(values, (a, b), strict=True)]
-            return getattr(builder, instruction)(*pair, flags=FLAGS)
+    @infer_global(function)
+    class _VectorOperator(AbstractTemplate):
+        def generic(self, operands: Any, named: Any) -> Any:
+            vector = None if named or len(operands) != 2 else _common(*operands)
+            return None if vector is None else vector(*operands)
 
-        return vector(a, b), generate
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
+        pair = [
+            _operand(context, builder, value, kind, signature.return_type)
+            for value, kind in zip(values, signature.args, strict=True)
+        ]
+        return getattr(builder, instruction)(*pair, flags=FLAGS)
 
-    @overload(function, inline="never")
-    def _(a, b):  # numba compares the names of both, annotations included
-        return (lambda a, b: apply(a, b)) if _common(a, b) is not None else None
+    for kinds in ((VectorType, VectorType), (VectorType, types.Number), (types.Number, VectorType)):
+        lower_builtin(function, *kinds)(generate)
 
 
 for _function, _instruction in (

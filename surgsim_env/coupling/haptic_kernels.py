@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numba.extending import register_jitable
+from numba.extending import overload, register_jitable
 from numpy.typing import NDArray
 
-from msdm_core.kernels.option_kernels import KERNEL
+from msdm_core.kernels.option_kernels import JITABLE, KERNEL
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LANE_EMPTY, response_of, shapes_of
-from msdm_core.kernels.substep_kernels import advance_substeps
+from msdm_core.kernels.substep_kernels import advance_inside, advance_substeps
 from surgsim_env.coupling.motion_kernels import steer_motion
 from surgsim_env.instruments.mujoco_kernels import mj_step1, mj_step2
 from surgsim_env.instruments.tool_kernels import drive_servo, read_response, read_shapes
@@ -73,7 +73,16 @@ class StepOutcome(NamedTuple):
     pull_peak: FloatArray
 
 
-@register_jitable(error_model="numpy")
+def _advance_organs(*given):
+    return advance_substeps(*given)
+
+
+@overload(_advance_organs, jit_options=JITABLE)
+def _(*given):
+    return lambda *given: advance_inside(*given)
+
+
+@register_jitable(**JITABLE)
 def begin_step(tools, drive, shapes, response, motion, reference):
     """A haptic step up to the organ's substeps: mj_step1, the servo, what the organ sees of the tools, its motions.
 
@@ -131,7 +140,7 @@ def pull_force(jaws, wrench):
     return largest
 
 
-@register_jitable(error_model="numpy")
+@register_jitable(**JITABLE)
 def clear_outcome(outcome, lane):
     """Forget the last call's steps of a lane."""
     outcome.step_count[lane] = 0
@@ -140,7 +149,7 @@ def clear_outcome(outcome, lane):
     outcome.pull_peak[lane] = 0.0
 
 
-@register_jitable(error_model="numpy")
+@register_jitable(**JITABLE)
 def end_step(tools, fault, plan, outcome, lane):
     """The rest of a haptic step: check the mean wrench, apply it to the tools, mj_step2, compare forces with limits.
 
@@ -181,7 +190,7 @@ def advance_haptic_steps(model, state, law, shapes, response, tools, drive, plan
     clear_outcome(outcome, 0)
     for _ in range(plan.step_count):
         begin_step(tools, drive, shapes, response, state.motion, reference)
-        fault = advance_substeps(
+        fault = _advance_organs(
             model, state, shapes, law, response, plan.dt, plan.decay, plan.substep_count, reference, mean
         )
         end_step(tools, fault, plan, outcome, 0)
@@ -211,7 +220,7 @@ def advance_lane_haptic_steps(model, state, law, shapes, response, tools, drives
                     state.motion[lane],
                     outcome.reference[lane],
                 )
-        advance_substeps(
+        _advance_organs(
             model, state, shapes, law, response, plan.dt, plan.decay, plan.substep_count, outcome.reference,
             outcome.mean,
         )  # fmt: skip

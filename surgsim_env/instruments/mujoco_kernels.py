@@ -12,6 +12,8 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
+from msdm_core.kernels.option_kernels import JITABLE
+
 # The objtype of a body in `mj_objectVelocity`.
 OBJECT_BODY = int(mujoco.mjtObj.mjOBJ_BODY)
 
@@ -43,39 +45,39 @@ MUJOCO_FUNCTIONS = tuple(
 )
 
 
-@overload(mj_step1)
+@overload(mj_step1, jit_options=JITABLE)
 def _(model, data):
     return lambda model, data: _step1(model, data)
 
 
-@overload(mj_step2)
+@overload(mj_step2, jit_options=JITABLE)
 def _(model, data):
     return lambda model, data: _step2(model, data)
 
 
-@overload(mj_fwdActuation)
+@overload(mj_fwdActuation, jit_options=JITABLE)
 def _(model, data):
     return lambda model, data: _actuation(model, data)
 
 
-@overload(mj_fwdAcceleration)
+@overload(mj_fwdAcceleration, jit_options=JITABLE)
 def _(model, data):
     return lambda model, data: _acceleration(model, data)
 
 
-@overload(mj_fullM)
+@overload(mj_fullM, jit_options=JITABLE)
 def _(model, data, inertia):
     return lambda model, data, inertia: _inertia(model, data, inertia.ctypes.data)
 
 
-@overload(mj_jacBodyCom)
+@overload(mj_jacBodyCom, jit_options=JITABLE)
 def _(model, data, linear, angular, body):
     return lambda model, data, linear, angular, body: _jacobian(
         model, data, linear.ctypes.data, angular.ctypes.data, np.int32(body)
     )
 
 
-@overload(mj_objectVelocity)
+@overload(mj_objectVelocity, jit_options=JITABLE)
 def _(model, data, kind, index, velocity, local):
     return lambda model, data, kind, index, velocity, local: _velocity(
         model, data, np.int32(kind), np.int32(index), velocity.ctypes.data, np.int32(local)

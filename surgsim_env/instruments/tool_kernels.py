@@ -11,7 +11,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from msdm_core.kernels.option_kernels import KERNEL
+from msdm_core.kernels.option_kernels import JITABLE, KERNEL
 from surgsim_env.instruments.mujoco_kernels import (
     OBJECT_BODY,
     mj_fullM,
@@ -143,7 +143,7 @@ def tool_mobility(factors, jacobians, tool, smooth_force, yielded, mobility, acc
                 mobility[other, tool, row, part] = value
 
 
-@register_jitable(error_model="numpy")
+@register_jitable(**JITABLE)
 def drive_servo(tools):
     """Move the servo's targets on by one step at the commanded speeds; they stop at their limits.
 
@@ -165,7 +165,7 @@ def drive_servo(tools):
             control[pace] = 0.0 if held != target else servo.command[joint]
 
 
-@register_jitable(error_model="numpy")
+@register_jitable(**JITABLE)
 def read_shapes(tools, shapes):
     """Read pose and twist of every contact shape of the current step; call after mj_step1.
 
@@ -188,7 +188,7 @@ def read_shapes(tools, shapes):
             shapes.tool_twist[tool, 3 + axis] = tools.velocity[axis]
 
 
-@register_jitable(error_model="numpy")
+@register_jitable(**JITABLE)
 def read_inertia(tools, dt):
     """Read M + dt D: joint-space inertia, armature included, and the joints' damping D over dt [s].
 
@@ -200,7 +200,7 @@ def read_inertia(tools, dt):
         inertia[joint, joint] += dt * tools.joint_damping[joint]
 
 
-@register_jitable(error_model="numpy")
+@register_jitable(**JITABLE)
 def read_jacobian(tools, tool):
     """Read the Jacobian from joint velocities to a tool's twist at its centre of mass.
 
@@ -210,7 +210,7 @@ def read_jacobian(tools, tool):
     mj_jacBodyCom(tools.model, tools.data, jacobian[:3], jacobian[3:], tools.bodies[tool])
 
 
-@register_jitable(error_model="numpy")
+@register_jitable(**JITABLE)
 def read_response(tools, response):
     """Read how the tools move on without the tissue, and how they yield to it; call after `drive_servo`.
 

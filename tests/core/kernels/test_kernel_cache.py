@@ -18,6 +18,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.registry import CPUDispatcher
 from numba.core.target_extension import dispatcher_registry, target_registry
 
@@ -384,6 +385,49 @@ def test_a_function_without_a_wrapper_refuses_python():
     assert type(guard_kernels._foot) is numba_cache.InnerHealing
     with pytest.raises(TypeError, match=r"_foot is called by compiled code alone .* decorate it with KERNEL"):
         guard_kernels._foot(np.zeros(3))
+
+
+INNER_AND_OUTER = """
+import numba
+
+@numba.njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def double(x):
+    print("doubles", x)
+    return 2.0 * x
+
+@numba.njit(cache=True)
+def sum_of_doubles(x, y):
+    return double(x) + double(y)
+"""
+
+
+def test_a_function_without_a_wrapper_is_kept_without_machine_code_and_works_in_its_callers(source: Path, capfd):
+    """`print` needs numba's environment of the inner function, which is not loaded by itself."""
+    (source / "tiny_kernels.py").write_text(INNER_AND_OUTER)
+    hits = []
+    for _ in range(3):
+        with numba_cache.kernel_cache(source):
+            module = executed(source)
+        assert module.sum_of_doubles(1.0, 2.5) == 7.0
+        assert capfd.readouterr().out.split() == ["doubles", "1.0", "doubles", "2.5"]
+        hits.append([sum(kernel.stats.cache_hits.values()) for kernel in (module.double, module.sum_of_doubles)])
+        if len(hits) == 1:
+            (inner,) = module.double.overloads.values()
+            assert inner.library.serialize_using_object_code()[1] == numba_cache.INNER_KIND
+            # The caller is compiled again, and what it calls taken from disk.
+            for file in source.rglob("*sum_of_doubles*.nbc"):
+                file.unlink()
+    assert hits == [[0, 0], [1, 0], [0, 1]]
+
+
+def test_functions_of_others_are_compiled_as_numba_does(source: Path):
+    """numba's libraries are replaced while kernels compile alone."""
+    started(source)
+    assert JITCPUCodegen._library_class is JITCodeLibrary
+    plain = numba.njit(lambda x: x + 1.0)
+    assert plain(1.0) == 2.0
+    (compiled,) = plain.overloads.values()
+    assert type(compiled.library) is JITCodeLibrary
 
 
 def test_compiling_that_takes_long_says_so_once(caplog):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba import njit
 from numpy.typing import NDArray
 
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
@@ -28,12 +29,18 @@ def gradients(corners: NDArray) -> NDArray:
     return slope
 
 
+@njit(error_model="numpy")
+def hold(*given):
+    """`hold_squeezed`, which has no wrapper for Python."""
+    hold_squeezed(*given)
+
+
 def held(ratio: float, velocity: NDArray, force: NDArray) -> NDArray:
     """What `hold_squeezed` adds to the forces on a tet of that volume ratio [N], shape (4, 3)."""
     after = force.copy()
     inverse_volume = np.array([ratio / tet_volumes(CORNERS, TET)[0]])
     group = np.zeros(1, dtype=np.int32)
-    hold_squeezed(
+    hold(
         CORNERS, velocity, after, INVERSE_MASS, TET, inverse_volume, np.array([MODULUS]), group, 1, 8, DT
     )  # fmt: skip
     return after - force

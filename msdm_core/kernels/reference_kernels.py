@@ -1,0 +1,79 @@
+"""Structures passed by reference between compiled functions.
+
+numba passes a NamedTuple of arrays by value: seven numbers or more for each array, some 400 for an `OrganModel`, at
+every call. Most of the time that compiling takes goes into those. A reference is one address.
+"""
+
+import hashlib
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import (
+    infer_getattr,
+    intrinsic,
+    lower_getattr_generic,
+    models,
+    register_model,
+)
+
+
+class StructureReference(types.Type):
+    """The type of a reference to a NamedTuple; its fields are read as those of the NamedTuple are."""
+
+    def __init__(self, structure: types.NamedTuple) -> None:
+        self.structure = structure
+        super().__init__(name=f"StructureReference({structure})")
+
+    @property
+    def instance_class(self) -> type:
+        """The class of the NamedTuple, under the name that numba gives it in a NamedTuple's own type."""
+        return self.structure.instance_class
+
+    @property
+    def mangling_args(self) -> tuple[str, tuple]:
+        """What names of functions hold of this type: the fields' types would be thousands of characters."""
+        digest = hashlib.sha256(self.name.encode()).hexdigest()[:16]
+        return f"{self.structure.instance_class.__name__}Reference{digest}", ()
+
+
+@register_model(StructureReference)
+class _AddressModel(models.PrimitiveModel):
+    """A reference is the address of the structure."""
+
+    def __init__(self, models_known: Any, reference: StructureReference) -> None:
+        address = models_known.lookup(reference.structure).get_value_type().as_pointer()
+        super().__init__(models_known, reference, address)
+
+
+@infer_getattr
+class _Fields(AttributeTemplate):
+    key = StructureReference
+
+    def generic_resolve(self, reference: StructureReference, name: str) -> types.Type | None:
+        """The type of a field; None where there is no such field, which numba reports."""
+        fields = reference.structure.fields
+        return reference.structure.types[fields.index(name)] if name in fields else None
+
+
+@lower_getattr_generic(StructureReference)
+def _load_field(context: Any, builder: Any, reference: StructureReference, address: ir.Value, name: str) -> ir.Value:
+    return builder.load(cgutils.gep_inbounds(builder, address, 0, reference.structure.fields.index(name)))
+
+
+@intrinsic
+def by_reference(_typing_context, structure):
+    """A reference to a NamedTuple, which the compiled function that calls this keeps until it returns.
+
+    A function must not return a reference that it made. A reference is returned as it is.
+    """
+    if isinstance(structure, StructureReference):
+        return structure(structure), lambda _context, _builder, _signature, values: values[0]
+    if isinstance(structure, types.NamedTuple):
+        return StructureReference(structure)(structure), _keep
+    return None
+
+
+def _keep(_context: Any, builder: Any, _signature: Any, values: Any) -> ir.Value:
+    return cgutils.alloca_once_value(builder, values[0])

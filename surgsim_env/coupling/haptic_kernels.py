@@ -74,6 +74,7 @@ class StepOutcome(NamedTuple):
 
 
 def _advance_organs(*given):
+    """`advance_substeps`; within a kernel, where its wrapper for Python is of no use, what that consists of."""
     return advance_substeps(*given)
 
 

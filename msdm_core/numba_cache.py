@@ -351,7 +351,7 @@ class KernelLibrary(JITCodeLibrary):
         """Keep the environment until a caller has machine code."""
         self._environments[name] = environment
 
-    def serialize_using_object_code(self) -> tuple[str, str, Any]:
+    def serialize_using_object_code(self) -> Any:
         """What is kept on disk."""
         if self._is_inner:
             return self.name, INNER_KIND, self._get_module_for_linking().as_bitcode()
@@ -379,9 +379,10 @@ class KernelLibrary(JITCodeLibrary):
             self._finalized = True
             return
         super()._finalize_final_module()
+        machine: Any = self._codegen
         for variable in self._final_module.global_variables:
             if variable.name in self._environments:
-                self._codegen.set_env(variable.name, self._environments[variable.name])
+                machine.set_env(variable.name, self._environments[variable.name])
 
 
 class Compiling:

@@ -12,7 +12,7 @@ _ALL: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt"
 # Called from Python, kept on disk, and runs without the interpreter's lock.
 KERNEL: dict[str, Any] = {**_ALL, "cache": True, "nogil": True}
 # For `register_jitable`: a part of a kernel that runs in Python too.
-JITABLE: dict[str, Any] = _ALL
+JITABLE: Any = _ALL
 # A kernel that kernels call.
 INNER: dict[str, Any] = {**KERNEL, "no_cpython_wrapper": True}
 # Becomes part of each function that calls it.

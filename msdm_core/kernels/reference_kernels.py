@@ -9,14 +9,12 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.errors import LoweringError
+from numba.core.imputils import impl_ret_borrowed
 from numba.core.typing.templates import AttributeTemplate
-from numba.extending import (
-    infer_getattr,
-    intrinsic,
-    lower_getattr_generic,
-    models,
-    register_model,
-)
+from numba.extending import infer_getattr, lower_getattr_generic, models, register_model
+
+from msdm_core.kernels.vector_kernels import intrinsic
 
 
 class StructureReference(types.Type):
@@ -59,7 +57,9 @@ class _Fields(AttributeTemplate):
 
 @lower_getattr_generic(StructureReference)
 def _load_field(context: Any, builder: Any, reference: StructureReference, address: ir.Value, name: str) -> ir.Value:
-    return builder.load(cgutils.gep_inbounds(builder, address, 0, reference.structure.fields.index(name)))
+    index = reference.structure.fields.index(name)
+    value = builder.load(cgutils.gep_inbounds(builder, address, 0, index))
+    return impl_ret_borrowed(context, builder, reference.structure.types[index], value)
 
 
 @intrinsic
@@ -67,6 +67,10 @@ def by_reference(_typing_context, structure):
     """A reference to a NamedTuple, which the compiled function that calls this keeps until it returns.
 
     A function must not return a reference that it made. A reference is returned as it is.
+
+    Raises:
+        LoweringError: the function counts references to arrays (it is compiled without `_nrt=False`), and an array
+            might be freed while its structure is still referred to
     """
     if isinstance(structure, StructureReference):
         return structure(structure), lambda _context, _builder, _signature, values: values[0]
@@ -75,5 +79,10 @@ def by_reference(_typing_context, structure):
     return None
 
 
-def _keep(_context: Any, builder: Any, _signature: Any, values: Any) -> ir.Value:
+def _keep(context: Any, builder: Any, _signature: Any, values: Any) -> ir.Value:
+    if context.enable_nrt:
+        raise LoweringError(
+            "by_reference is for functions without numba's runtime, which frees arrays that only a reference holds: "
+            "decorate the function with KERNEL, INNER or INLINED of msdm_core/kernels/option_kernels.py"
+        )
     return cgutils.alloca_once_value(builder, values[0])

@@ -108,7 +108,7 @@ def _common(a: Any, b: Any) -> VectorType | None:
 def _define_operator(function: Callable[..., Any], instruction: str) -> None:
     """Let numba's own operator take vectors; an `overload` would compile a function for each pair of types."""
 
-    @infer_global(function)
+    @infer_global(function)  # pyright: ignore[reportOptionalCall]
     class _VectorOperator(AbstractTemplate):
         def generic(self, operands: Any, named: Any) -> Any:
             vector = None if named or len(operands) != 2 else _common(*operands)

@@ -33,6 +33,7 @@ import llvmlite.binding as llvm
 from numba.core import config
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
+from numba.core.compiler import Flags
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.sigutils import normalize_signature
@@ -360,9 +361,11 @@ class KernelLibrary(JITCodeLibrary):
     @classmethod
     def _unserialize(cls, codegen: Any, state: tuple[str, str, Any]) -> Any:
         name, kind, data = state
-        if kind != INNER_KIND:
-            return super()._unserialize(codegen, state)
-        library = codegen.create_library(name)
+        # The flags are those of the function that compiles, which may have no wrapper where this one has.
+        with ConfigStack().enter(Flags()):
+            if kind != INNER_KIND:
+                return super()._unserialize(codegen, state)
+            library = codegen.create_library(name)
         library._is_inner = True
         library._final_module = llvm.parse_bitcode(data)
         library._finalize_final_module()

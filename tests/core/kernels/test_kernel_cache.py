@@ -390,10 +390,14 @@ def test_a_function_without_a_wrapper_refuses_python():
 INNER_AND_OUTER = """
 import numba
 
+@numba.njit(cache=True, no_cfunc_wrapper=True)
+def half(x):
+    return 0.5 * x
+
 @numba.njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def double(x):
     print("doubles", x)
-    return 2.0 * x
+    return 4.0 * half(x)
 
 @numba.njit(cache=True)
 def sum_of_doubles(x, y):
@@ -418,6 +422,29 @@ def test_a_function_without_a_wrapper_is_kept_without_machine_code_and_works_in_
             for file in source.rglob("*sum_of_doubles*.nbc"):
                 file.unlink()
     assert hits == [[0, 0], [1, 0], [0, 1]]
+
+
+USE_INNER = """
+from pathlib import Path
+from msdm_core import numba_cache
+with numba_cache.kernel_cache(Path.cwd()):
+    import tiny_kernels
+print(tiny_kernels.sum_of_doubles(1.0, 2.5), sum(tiny_kernels.half.stats.cache_hits.values()), tiny_kernels.half(3.0))
+"""
+
+
+def test_a_function_that_is_loaded_while_one_without_a_wrapper_compiles_can_be_called(source: Path):
+    """numba's flags are those of the function that compiles."""
+    (source / "tiny_kernels.py").write_text(INNER_AND_OUTER)
+    for hits in ("0", "1"):
+        done = subprocess.run(
+            [sys.executable, "-c", USE_INNER], cwd=source, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines()[-1].split() == ["7.0", hits, "1.5"]
+        for name in ("double", "sum_of_doubles"):
+            for file in source.rglob(f"*.{name}*.nbc"):
+                file.unlink()
 
 
 def test_functions_of_others_are_compiled_as_numba_does(source: Path):

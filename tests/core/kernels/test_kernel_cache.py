@@ -436,9 +436,15 @@ print(tiny_kernels.sum_of_doubles(1.0, 2.5), sum(tiny_kernels.half.stats.cache_h
 def test_a_function_that_is_loaded_while_one_without_a_wrapper_compiles_can_be_called(source: Path):
     """numba's flags are those of the function that compiles."""
     (source / "tiny_kernels.py").write_text(INNER_AND_OUTER)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(source / "cache")}
     for hits in ("0", "1"):
         done = subprocess.run(
-            [sys.executable, "-c", USE_INNER], cwd=source, capture_output=True, text=True, check=False
+            [sys.executable, "-c", USE_INNER],
+            cwd=source,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         assert done.stdout.splitlines()[-1].split() == ["7.0", hits, "1.5"]

@@ -10,6 +10,9 @@ A cache is pickled code, which runs when it is read: a folder that others may wr
 Kernels decorated in `kernel_cache` have a cache that heals (`HealingCache`): a file that is damaged is dropped with a
 warning, and its function compiled again; where there is no room to write, functions are compiled and not kept. Files
 carry a checksum, as a flipped bit in machine code would run unnoticed.
+
+While they compile, functions have a `KernelLibrary`: one that compiled code alone calls becomes machine code in its
+callers only.
 """
 
 import atexit

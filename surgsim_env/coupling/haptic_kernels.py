@@ -74,7 +74,7 @@ class StepOutcome(NamedTuple):
 
 
 def _advance_organs(*given):
-    """`advance_substeps`; within a kernel, where its wrapper for Python is of no use, what that consists of."""
+    """`advance_substeps` in Python; in a kernel `advance_inside`, which is compiled as a part of that kernel alone."""
     return advance_substeps(*given)
 
 

@@ -23,7 +23,18 @@ ORDER = {
         "__init__",
     ),
     "msdm_core": (
-        *("errors", "numba_cache", "kernels", "mesh", "mesh_files", "material", "meshing", "organ", "lanes"),
+        *(
+            "errors",
+            "numba_cache",
+            "kernels",
+            "arithmetic",
+            "mesh",
+            "mesh_files",
+            "material",
+            "meshing",
+            "organ",
+            "lanes",
+        ),
         "__init__",
     ),
     # One script each.

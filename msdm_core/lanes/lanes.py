@@ -6,13 +6,13 @@ also differ in their rest shape, in what is anchored, and in how foundations hol
 of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its neighbours.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import exp
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
 from msdm_core.kernels.structure_kernels import (
@@ -407,7 +407,7 @@ def advance_lanes(
             f"{substep_count} substeps of {dt:g} s: at least one is needed, above 0 and at most {limit:.4g} s long, "
             f"the stable step of lane {slowest} of {lanes}"
         )
-    decay = math.exp(-model.alpha * dt)
+    decay = float(exp(-model.alpha * dt))
     reference = shapes.tool_centre.copy()
     advance_substeps(model, state, shapes, contact, response, dt, decay, substep_count, reference, wrench)
     return state.lane_fault

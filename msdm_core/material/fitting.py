@@ -42,6 +42,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.csgraph import dijkstra
 
+from msdm_core.arithmetic import cbrt, dot, log, matmul, norm, power
 from msdm_core.errors import OrganError
 from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
 
@@ -185,7 +186,7 @@ def _fit_factors(matrix: csr_array, target: FloatArray, pull: FloatArray) -> Flo
 
 
 def _relative(part: FloatArray, whole: FloatArray) -> float:
-    return (dot(part, part) / dot(whole, whole)) ** 0.5
+    return float(np.sqrt(dot(part, part) / dot(whole, whole)))
 
 
 def _pull_to_lloyd(mesh: TetMesh) -> FloatArray:
@@ -194,8 +195,8 @@ def _pull_to_lloyd(mesh: TetMesh) -> FloatArray:
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(mesh.node_count,) * 2).tocsr()
     layer = dijkstra(graph, directed=False, indices=mesh.boundary_nodes, unweighted=True, min_only=True)
     beyond = np.maximum(layer[edges].min(axis=1) + 1 - WEAK_LAYERS, 0.0)
-    doublings = np.minimum(beyond, np.log2(LARGEST_PULL / PULL_TO_LLOYD) / np.log2(PULL_GROWTH))
-    return PULL_TO_LLOYD * PULL_GROWTH**doublings
+    doublings = np.minimum(beyond, log(LARGEST_PULL / PULL_TO_LLOYD) / log(PULL_GROWTH))
+    return PULL_TO_LLOYD * power(PULL_GROWTH, doublings)
 
 
 def _inner_imbalance(mesh: TetMesh) -> float:
@@ -204,14 +205,15 @@ def _inner_imbalance(mesh: TetMesh) -> float:
     inside[mesh.tets[np.isin(mesh.tets, mesh.boundary_nodes).any(axis=1)]] = False
     ends = mesh.edges.astype(np.int64)
     span = mesh.points[ends[:, 1]] - mesh.points[ends[:, 0]]
-    length = np.linalg.norm(span, axis=1)
+    length = norm(span, axis=1)
     along = span / length[:, None]
     share = lloyd_share(mesh, np.ones(mesh.tet_count))
     tension = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(ends)) * length
-    moment = (np.einsum("ei,ej,ek->eijk", along, along, along) * tension[:, None, None, None]).reshape(-1, 27)
+    cubes = along[:, :, None, None] * along[:, None, :, None] * along[:, None, None, :]
+    moment = (cubes * tension[:, None, None, None]).reshape(-1, 27)
     # Seen from its two ends a spring points in opposite directions.
     signs = csr_array((np.tile([1.0, -1.0], len(ends)), (ends.ravel(), np.repeat(np.arange(len(ends)), 2))))
-    imbalance = np.linalg.norm(signs @ moment, axis=1) / (abs(signs) @ tension)
+    imbalance = norm(signs @ moment, axis=1) / (abs(signs) @ tension)
     return float(imbalance[inside].max(initial=0.0))
 
 
@@ -237,7 +239,7 @@ def _region_scalars(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> Fl
     C_iijj = (1 / V) sum k l^2 = 6 E for lambda = mu = 2 E / 5, so the scalar is 6 sum E_t V_t / sum k_et l_e^2.
     """
     spans = mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]]
-    squares = np.einsum("ei,ei->e", spans, spans)[mesh.tet_edges].sum(axis=1)
+    squares = dot(spans, spans)[mesh.tet_edges].sum(axis=1)
     tags, region = np.unique(mesh.region, return_inverse=True)
     wanted = 6.0 * np.bincount(region, modulus * mesh.volumes, len(tags))
     return (wanted / np.bincount(region, share * squares, len(tags)))[region]
@@ -256,7 +258,8 @@ def _force_equations(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> t
     stiffness = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(edges))
     weight = _node_weights(mesh, modulus)
     spans = mesh.points[edges[:, 1]] - mesh.points[edges[:, 0]]
-    stretch = np.einsum("ei,mij,ej->em", spans, UNIT_STRAINS, spans) / np.einsum("ei,ei->e", spans, spans)[:, None]
+    strained = matmul(UNIT_STRAINS, spans[:, None, :, None])[..., 0]
+    stretch = dot(strained, spans[:, None]) / dot(spans, spans)[:, None]
     tension = ((stiffness[:, None] * stretch)[:, :, None] * spans[:, None, :]).reshape(-1, 18)
     values = np.concatenate([-weight[edges[:, 0], None] * tension, weight[edges[:, 1], None] * tension])
     rows = 18 * np.concatenate([edges[:, 0], edges[:, 1]])[:, None] + np.arange(18)
@@ -275,14 +278,14 @@ def _surface_averages(mesh: TetMesh) -> csr_array:
     """
     triangles, node_count = mesh.boundary_triangles, mesh.node_count
     corners = mesh.points[triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     around = np.bincount(triangles.ravel(), np.repeat(area, 3), node_count)
     owner = np.repeat(np.arange(len(triangles)), 3)
     places, shape = (owner, triangles.ravel()), (len(triangles), node_count)
     shared = csr_array((np.repeat(area, 3) / around[triangles.ravel()], places), shape=shape)
     handed = csr_array((np.full(owner.size, 1.0 / 3.0), places), shape=shape)
     single = np.ones(node_count)
-    single[mesh.boundary_nodes] = SINGLE_NODE_SHARE**0.5
+    single[mesh.boundary_nodes] = np.sqrt(SINGLE_NODE_SHARE)
     return csr_array(kron(vstack([handed.T @ shared, diags_array(single)]), eye_array(18), format="csr"))
 
 
@@ -293,7 +296,7 @@ def _node_weights(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
         np.bincount(corners, np.repeat(values, 4), mesh.node_count)
         for values in (np.ones(mesh.tet_count), mesh.volumes, modulus)
     )
-    return count / (stiffness * np.cbrt(volume / count) ** 2)
+    return count / (stiffness * np.square(cbrt(volume / count)))
 
 
 def _solid_forces(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
@@ -306,7 +309,7 @@ def _solid_forces(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
     stress = 0.4 * (trace[:, None, None] * np.eye(3) + 2.0 * UNIT_STRAINS)
     faces = mesh.points[mesh.tets[:, TET_FACES]]
     area = 0.5 * np.cross(faces[:, :, 1] - faces[:, :, 0], faces[:, :, 2] - faces[:, :, 0])
-    force = np.einsum("mij,taj->tami", stress, area * (modulus / -3.0)[:, None, None]).reshape(-1, 18)
+    force = matmul(area * (modulus / -3.0)[:, None, None], stress.reshape(18, 3).T).reshape(-1, 18)
     corners = mesh.tets.ravel()
     columns = [np.bincount(corners, column, mesh.node_count) for column in force.T]
     return np.column_stack(columns).astype(np.float64)
@@ -317,7 +320,7 @@ def lloyd_share(mesh: TetMesh, youngs_modulus: FloatArray) -> FloatArray:
 
     l_t = (12 V_t / sqrt 2)^(1/3) is the edge of the regular tet of the same volume; E_t [Pa], shape (n_tet,).
     """
-    length = np.cbrt(mesh.volumes * (12.0 / math.sqrt(2.0)))
+    length = cbrt(mesh.volumes * (12.0 / math.sqrt(2.0)))
     return (2.0 * math.sqrt(2.0) / 25.0) * length * youngs_modulus
 
 
@@ -377,23 +380,18 @@ def _conjugate_gradients(matrix: csr_array, right: FloatArray, diagonal: FloatAr
     solution, residual = np.zeros_like(right), right.copy()
     scaled = residual / diagonal
     direction = scaled.copy()
-    power = start = dot(residual, scaled)
+    energy = start = dot(residual, scaled)
     for _ in range(1000):
-        if power <= accuracy * accuracy * start:
+        if energy <= accuracy * accuracy * start:
             break
-        product = matrix @ direction
-        length = power / dot(direction, product)
+        pushed = matrix @ direction
+        length = energy / dot(direction, pushed)
         solution += length * direction
-        residual -= length * product
+        residual -= length * pushed
         scaled = residual / diagonal
-        power, before = dot(residual, scaled), power
-        direction = scaled + (power / before) * direction
+        energy, before = dot(residual, scaled), energy
+        direction = scaled + (energy / before) * direction
     return solution
-
-
-def dot(left: FloatArray, right: FloatArray) -> float:
-    """A sum whose order does not depend on the number of threads, as BLAS's may."""
-    return float((left * right).sum())
 
 
 def write_fit(path: Path, mesh: TetMesh) -> SpringFit:

@@ -49,7 +49,7 @@ def voronoi_fractions(points: ArrayLike, tets: ArrayLike) -> FloatArray:
 def _batch_fractions(corners: FloatArray) -> FloatArray:
     """Voronoi shares of tets given by their corners [m], shape (n_tet, 4, 3)."""
     tet_count = len(corners)
-    squared = np.sum((corners[:, :, None] - corners[:, None]) ** 2, axis=3)
+    squared = np.sum(np.square(corners[:, :, None] - corners[:, None]), axis=3)
     shares = np.empty((tet_count, 4))
     for corner in range(4):
         others = [other for other in range(4) if other != corner]

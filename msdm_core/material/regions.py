@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import dot, expm1, log1p, matmul, norm, power
 from msdm_core.errors import OrganError
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, TetMesh
@@ -104,7 +105,8 @@ class Damping:
 
     def compressed(self, frequency: float) -> "Damping":
         """The paper's form, all in one inertial term: alpha' = alpha + beta w^2 damps that mode [Hz] alike."""
-        return Damping(alpha=self.alpha + self.beta * (2.0 * math.pi * frequency) ** 2)
+        omega = 2.0 * math.pi * frequency
+        return Damping(alpha=self.alpha + self.beta * omega * omega)
 
 
 @dataclass(frozen=True)
@@ -199,14 +201,14 @@ def lesion_fraction(mesh: TetMesh, lesion: Lesion) -> FloatArray:
         return (mesh.region == mesh.region_tag(lesion.region)).astype(np.float64)
     axes = lesion.half_axes
     scaled = (mesh.points - np.asarray(lesion.centre)) / axes
-    inside = np.einsum("ij,ij->i", scaled, scaled) <= 1.0
+    inside = dot(scaled, scaled) <= 1.0
     corners_inside = inside[mesh.tets].sum(axis=1)
     fraction = (corners_inside == 4).astype(np.float64)
     centroid = scaled[mesh.tets].mean(axis=1)
-    reach = np.linalg.norm(scaled[mesh.tets] - centroid[:, None], axis=2).max(axis=1)
-    near = (np.linalg.norm(centroid, axis=1) < 1.0 + reach) & (corners_inside < 4)
+    reach = norm(scaled[mesh.tets] - centroid[:, None], axis=2).max(axis=1)
+    near = (norm(centroid, axis=1) < 1.0 + reach) & (corners_inside < 4)
     samples = tet_samples(scaled[mesh.tets[near]])
-    fraction[near] = (np.einsum("tij,tij->ti", samples, samples) <= 1.0).mean(axis=1)
+    fraction[near] = (dot(samples, samples) <= 1.0).mean(axis=1)
     _check_lesion(mesh, lesion, axes, fraction)
     return fraction
 
@@ -224,29 +226,29 @@ def lesion_extent(mesh: TetMesh, lesion: Lesion) -> tuple[FloatArray, FloatArray
         raise OrganError(f"{lesion.name}: region {lesion.region!r} of the mesh has no tets: leave it out")
     weight = mesh.volumes[chosen] / mesh.volumes[chosen].sum()
     corners = mesh.points[mesh.tets[chosen]]
-    centre = weight @ corners.mean(axis=1)
+    centre = matmul(weight, corners.mean(axis=1))
     corners = corners - centre
-    variance = weight @ ((corners**2).sum(axis=1) + corners.sum(axis=1) ** 2) / 20.0
+    variance = matmul(weight, (corners * corners).sum(axis=1) + np.square(corners.sum(axis=1))) / 20.0
     return centre, np.sqrt(5.0 * variance)
 
 
 def tet_samples(corners: FloatArray) -> FloatArray:
     """165 points spread evenly over each of the tets with corners (n, 4, 3), in their unit, shape (n, 165, 3)."""
-    return _BARYCENTRIC_SAMPLES @ corners
+    return matmul(_BARYCENTRIC_SAMPLES, corners)
 
 
 def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: FloatArray) -> None:
-    node = int(np.argmin(np.linalg.norm(mesh.points - np.asarray(lesion.centre), axis=1)))
+    node = int(np.argmin(norm(mesh.points - np.asarray(lesion.centre), axis=1)))
     # The smallest of the tets around: those at an outer face are cut along its diagonal.
     corners = mesh.points[mesh.tets[mesh.node_tets.of(node)]]
-    edges = np.linalg.norm(corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]], axis=2)
+    edges = norm(corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]], axis=2)
     cell = float(edges.max(axis=1).min())
     if 2.0 * axes.min() < cell:
         raise OrganError(
             f"{lesion.name}: radius {axes.min() * 1000:.3g} mm is less than half of the {cell * 1000:.3g} mm cells "
             "there; the mesh cannot show it: use a larger lesion or smaller cells"
         )
-    filled = float(fraction @ mesh.volumes)
+    filled = float(matmul(fraction, mesh.volumes))
     share = filled / (4.0 / 3.0 * math.pi * float(axes.prod()))
     if share < LESION_SHARE_INSIDE:
         where = ", ".join(f"{value * 1000:.1f}" for value in np.asarray(lesion.centre))
@@ -272,10 +274,10 @@ def mixed_moduli(
     by 4.7 % where every tet belongs wholly to one side.
     """
     share = 2.0 / 3.0 * spring_modulus
-    added = np.log1p(volume_modulus / share)
-    added_by_material = math.log1p(material.volume_modulus / (2.0 / 3.0 * material.spring_modulus))
-    spring = spring_modulus * (material.spring_modulus / spring_modulus) ** fraction
-    volume = 2.0 / 3.0 * spring * np.expm1((1.0 - fraction) * added + fraction * added_by_material)
+    added = log1p(volume_modulus / share)
+    added_by_material = float(log1p(material.volume_modulus / (2.0 / 3.0 * material.spring_modulus)))
+    spring = spring_modulus * power(material.spring_modulus / spring_modulus, fraction)
+    volume = 2.0 / 3.0 * spring * expm1((1.0 - fraction) * added + fraction * added_by_material)
     # log and exp round: a tet that the lesion does not reach keeps its modulus to the bit.
     return spring, np.where(fraction > 0.0, volume, volume_modulus)
 

@@ -5,6 +5,7 @@ from difflib import get_close_matches
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import dot, norm
 from msdm_core.errors import OrganError
 from msdm_core.material.fitting import lloyd_share, spring_fit
 from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, IntArray, TetMesh
@@ -72,7 +73,7 @@ def _summed(mesh: TetMesh, modulus: FloatArray, rule: str) -> FloatArray:
 def _van_gelder_shares(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
     corners = mesh.points[mesh.tets]
     spans = corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]]
-    return ((modulus * mesh.volumes)[:, None] / np.einsum("tij,tij->ti", spans, spans)).ravel()
+    return ((modulus * mesh.volumes)[:, None] / dot(spans, spans)).ravel()
 
 
 def check_stiffness_rule(rule: str) -> None:
@@ -92,8 +93,8 @@ def membrane_stiffness(mesh: TetMesh, youngs_modulus: float, thickness: float) -
     triangles = mesh.boundary_triangles
     corners = mesh.points[triangles]
     edges = corners[:, [1, 2, 0]] - corners
-    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    share = 3.0 * youngs_modulus * thickness * area / np.einsum("tij,tij->t", edges, edges)
+    area = 0.5 * norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    share = 3.0 * youngs_modulus * thickness * area / (edges * edges).sum(axis=(1, 2))
     pairs = np.sort(np.stack([triangles, triangles[:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1).astype(np.int64)
     known = mesh.edges.astype(np.int64)
     index = np.searchsorted(known[:, 0] * mesh.node_count + known[:, 1], pairs[:, 0] * mesh.node_count + pairs[:, 1])

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import exp
 from msdm_core.errors import OrganError
 from msdm_core.mesh.tet_mesh import FloatArray
 
@@ -68,13 +69,13 @@ class Stiffening:
         strain = np.asarray(strain, dtype=np.float64)
         beyond = np.maximum((np.abs(strain) - self.onset_strain) / self.width, 0.0)
         ramp = np.minimum(beyond, 1.0)
-        excess = (self.tangent_cap - 1.0) * self.width * (ramp**3 / 3.0 + (beyond - ramp))
+        excess = (self.tangent_cap - 1.0) * self.width * ((ramp * ramp * ramp) / 3.0 + (beyond - ramp))
         return strain + np.sign(strain) * excess
 
     def tangent(self, strain: ArrayLike) -> FloatArray:
         """w''(s) at strains s, 1 + (c - 1) v^2."""
         ramp = np.clip((np.abs(np.asarray(strain, dtype=np.float64)) - self.onset_strain) / self.width, 0.0, 1.0)
-        return 1.0 + (self.tangent_cap - 1.0) * ramp**2
+        return 1.0 + (self.tangent_cap - 1.0) * (ramp * ramp)
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,6 @@ class Relaxation:
         """Tension at times t [s] after a step of strain, over that at equilibrium: 1 + sum_i g_i exp(-t / tau_i)."""
         time = np.asarray(time, dtype=np.float64)
         return 1.0 + sum(
-            (modulus * np.exp(-time / tau) for modulus, tau in zip(self.relative_moduli, self.times, strict=True)),
+            (modulus * exp(-time / tau) for modulus, tau in zip(self.relative_moduli, self.times, strict=True)),
             start=np.zeros_like(time),
         )

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
+from msdm_core.arithmetic import dot, norm, solve
 from msdm_core.errors import MeshError
 from msdm_core.mesh.geodesic import nearest_weights
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
@@ -46,18 +47,18 @@ def find_carriers(points: FloatArray, mesh: TetMesh) -> Carriers:
     """What carries points [m] (n_point, 3) near the boundary of a mesh."""
     corners = mesh.points[mesh.boundary_triangles]
     triangle, weights = _nearest_triangles(points, corners)
-    nearest = np.einsum("pi,pij->pj", weights, corners[triangle])
+    nearest = (weights[:, :, None] * corners[triangle]).sum(axis=1)
     # Interpolated between nodes: where triangles share the nearest point, rounding decides which of them is found, and
     # the reach must not depend on it.
     longest = _longest_edges(mesh)[mesh.boundary_triangles[triangle]]
-    reach = REACH * np.einsum("pi,pi->p", weights, longest)
-    return Carriers(triangle, weights, nearest, np.linalg.norm(points - nearest, axis=1), reach)
+    reach = REACH * dot(weights, longest)
+    return Carriers(triangle, weights, nearest, norm(points - nearest, axis=1), reach)
 
 
 def _longest_edges(mesh: TetMesh) -> FloatArray:
     """Mean over the tets around each node of their longest edges [m], (n_node,)."""
     tets = mesh.points[mesh.tets]
-    longest = np.linalg.norm(tets[:, :, None] - tets[:, None], axis=3).max(axis=(1, 2))
+    longest = norm(tets[:, :, None] - tets[:, None], axis=3).max(axis=(1, 2))
     corners = mesh.tets.ravel()
     total = np.bincount(corners, np.repeat(longest, 4), mesh.node_count)
     return total / np.bincount(corners, minlength=mesh.node_count)
@@ -97,7 +98,7 @@ def node_gradients(mesh: TetMesh, nodes: IntArray) -> csr_array:
     tet, corner = np.nonzero(place[mesh.tets] >= 0)
     x = mesh.points[mesh.tets]
     # Rows of the inverse of the edges are the gradients of the last three corners' functions.
-    last = np.linalg.inv(np.swapaxes(x[:, 1:] - x[:, :1], 1, 2))
+    last = solve(np.swapaxes(x[:, 1:] - x[:, :1], 1, 2), np.broadcast_to(np.eye(3), (len(x), 3, 3)))
     slopes = np.concatenate([-last.sum(axis=1, keepdims=True), last], axis=1)
     at = place[mesh.tets[tet, corner]]
     around = np.bincount(at, mesh.volumes[tet], len(nodes))
@@ -115,9 +116,9 @@ def _nearest_triangles(points: FloatArray, corners: FloatArray) -> tuple[IntArra
     triangle, weights = np.zeros(len(points), dtype=np.int32), np.zeros((len(points), 3))
     gap = np.full(len(points), np.inf)
     centre = corners.mean(axis=1)
-    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    radius = norm(corners - centre[:, None], axis=2).max(axis=1)
     # Triangles of about one size, the small ones first: those of a graded mesh differ by a factor of 4.
-    size = np.floor(2.0 * np.log2(radius / radius.min())).astype(np.int64)
+    _, size = np.frexp(np.square(radius / radius.min()))
     for one in np.unique(size):
         some = np.flatnonzero(size == one)
         tree, reach, count = KDTree(centre[some]), float(radius[some].max()), min(NEAR_FIRST, len(some))
@@ -133,9 +134,7 @@ def _nearest_triangles(points: FloatArray, corners: FloatArray) -> tuple[IntArra
                 tried = some[near[row, column]]
                 mixed = nearest_weights(corners[tried], points[now[row]])
                 found = np.full(away.shape, np.inf)
-                found[useful] = np.linalg.norm(
-                    np.einsum("ti,tij->tj", mixed, corners[tried]) - points[now[row]], axis=1
-                )
+                found[useful] = norm((mixed[:, :, None] * corners[tried]).sum(axis=1) - points[now[row]], axis=1)
                 best = found.argmin(axis=1)
                 nearer = np.flatnonzero(found[np.arange(len(now)), best] < gap[now])
                 place = (np.cumsum(useful).reshape(useful.shape) - 1)[nearer, best[nearer]]

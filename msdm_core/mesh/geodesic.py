@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
 # Points put on each edge, besides its ends. Paths run between them: 2 % longer than the true geodesic over several
@@ -41,7 +42,7 @@ class SurfaceDistance:
             axis=0,
         )
         self._rows, self._columns = pairs[:, 0], pairs[:, 1]
-        self._lengths = np.linalg.norm(self._positions[self._rows] - self._positions[self._columns], axis=1)
+        self._lengths = norm(self._positions[self._rows] - self._positions[self._columns], axis=1)
 
     def __call__(self, source: ArrayLike, targets: ArrayLike) -> FloatArray:
         """Distance along the surface from a point (3,) to points (n, 3) [m], each first dropped onto the surface.
@@ -50,7 +51,7 @@ class SurfaceDistance:
         """
         queries = np.concatenate([np.reshape(source, (1, 3)), np.reshape(targets, (-1, 3))]).astype(np.float64)
         located = [self._nearest(query) for query in queries]
-        dropped = np.array([weights @ self._nearest.corners[triangle] for triangle, weights in located])
+        dropped = np.array([matmul(weights, self._nearest.corners[triangle]) for triangle, weights in located])
         node_count = len(self._positions)
         rows, columns, lengths = [self._rows], [self._columns], [self._lengths]
         for index, (triangle, _) in enumerate(located):
@@ -58,14 +59,14 @@ class SurfaceDistance:
             rows.append(np.full(len(members), node_count + index))
             columns.append(members)
             # A vanishing length would drop the edge from a sparse graph.
-            lengths.append(np.maximum(np.linalg.norm(self._positions[members] - dropped[index], axis=1), 1e-15))
+            lengths.append(np.maximum(norm(self._positions[members] - dropped[index], axis=1), 1e-15))
         graph = coo_array(
             (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))),
             shape=(node_count + len(queries),) * 2,
         )
         distance = dijkstra(graph.tocsr(), directed=False, indices=node_count)[node_count + 1 :]
         same = np.array([triangle == located[0][0] for triangle, _ in located[1:]], dtype=bool)
-        straight = np.linalg.norm(dropped[1:] - dropped[0], axis=1)
+        straight = norm(dropped[1:] - dropped[0], axis=1)
         return np.where(same, straight, distance)
 
 
@@ -95,7 +96,7 @@ def nearest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
     for first, second in ((0, 1), (1, 2), (2, 0)):
         span = corners[:, second] - corners[:, first]
         along = np.clip(((query - corners[:, first]) * span).sum(1) / (span * span).sum(1), 0.0, 1.0)
-        squared = ((corners[:, first] + along[:, None] * span - query) ** 2).sum(axis=1)
+        squared = np.square(corners[:, first] + along[:, None] * span - query).sum(axis=1)
         better = outside & (squared < smallest)
         smallest[better] = squared[better]
         weights[better] = 0.0
@@ -114,19 +115,19 @@ class NearestTriangle:
     def __init__(self, corners: FloatArray) -> None:
         self.corners = corners
         self._centre = corners.mean(axis=1)
-        reach = np.linalg.norm(corners - self._centre[:, None], axis=2).max(axis=1)
+        reach = norm(corners - self._centre[:, None], axis=2).max(axis=1)
         # Rounding must not exclude the nearest.
         self._radius = reach * (1.0 + 1e-9)
 
     def __call__(self, query: FloatArray) -> tuple[int, FloatArray]:
         """Index of the triangle nearest to a query point (3,) [m], and weights (3,) of its corners there."""
-        away = np.linalg.norm(self._centre - query, axis=1)
+        away = norm(self._centre - query, axis=1)
         # Distances that are not finite exclude nothing.
         near = np.flatnonzero(~(away - self._radius > away.min() * (1.0 + 1e-9)))
         corners = self.corners[near]
         weights = nearest_weights(corners, query)
-        points = np.einsum("ti,tij->tj", weights, corners)
-        best = int(np.argmin(((points - query) ** 2).sum(axis=1)))
+        points = (weights[:, :, None] * corners).sum(axis=1)
+        best = int(np.argmin(np.square(points - query).sum(axis=1)))
         return int(near[best]), weights[best]
 
     def distances(self, queries: FloatArray) -> FloatArray:
@@ -134,11 +135,11 @@ class NearestTriangle:
         found = []
         for start in range(0, len(queries), QUERIES_AT_ONCE):
             some = queries[start : start + QUERIES_AT_ONCE]
-            away = np.linalg.norm(some[:, None] - self._centre, axis=2)
+            away = norm(some[:, None] - self._centre, axis=2)
             query, near = np.nonzero(~(away - self._radius > away.min(axis=1, keepdims=True) * (1.0 + 1e-9)))
             corners = self.corners[near]
             weights = nearest_weights(corners, some[query])
-            gap = np.linalg.norm(np.einsum("ti,tij->tj", weights, corners) - some[query], axis=1)
+            gap = norm((weights[:, :, None] * corners).sum(axis=1) - some[query], axis=1)
             # Each point has at least one triangle, and they are sorted by points.
             found.append(np.minimum.reduceat(gap, np.searchsorted(query, np.arange(len(some)))))
         return np.concatenate(found) if found else np.zeros(0)

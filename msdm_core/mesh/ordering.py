@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
+from msdm_core.arithmetic import norm
 from msdm_core.kernels.layout_kernels import spread_order
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
@@ -53,7 +54,7 @@ def swept(points: FloatArray, items: NDArray[np.integer]) -> NDArray[np.intp]:
     if not len(items):
         return np.zeros(0, dtype=np.intp)
     corners = points[items]
-    edge = float(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1).mean())
+    edge = float(norm(corners[:, 1] - corners[:, 0], axis=1).mean())
     cells = np.floor((corners.mean(axis=1) - points.min(axis=0)) / edge + 0.25).astype(np.int64)
     along, across, within = np.argsort(-np.ptp(points, axis=0), kind="stable")
     base = np.lexsort((cells[:, within], cells[:, across], cells[:, along]))

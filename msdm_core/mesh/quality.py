@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import arccos, cbrt, dot, norm
 from msdm_core.mesh.surface import surface_volume
 from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
 
@@ -60,10 +61,10 @@ def dihedral_angles(mesh: TetMesh) -> FloatArray:
 def tet_angles(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     """`dihedral_angles` of tets with positive volumes [degrees], shape (n_tet, 6)."""
     normals = _face_area_vectors(points, tets)
-    normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = normals / norm(normals, axis=2, keepdims=True)
     i, j = np.triu_indices(4, k=1)
-    cosines = -np.einsum("nkx,nkx->nk", normals[:, i], normals[:, j])
-    return np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    cosines = -dot(normals[:, i], normals[:, j])
+    return np.degrees(arccos(np.clip(cosines, -1.0, 1.0)))
 
 
 def radius_ratios(mesh: TetMesh) -> FloatArray:
@@ -71,11 +72,11 @@ def radius_ratios(mesh: TetMesh) -> FloatArray:
 
     V is the volume, S the area of the four faces, a, b, c the edges from corner 0 (Liu and Joe 1994).
     """
-    area = np.linalg.norm(_face_area_vectors(mesh.points, mesh.tets), axis=2).sum(axis=1)
+    area = norm(_face_area_vectors(mesh.points, mesh.tets), axis=2).sum(axis=1)
     corners = mesh.points[mesh.tets]
     a, b, c = (corners[:, corner] - corners[:, 0] for corner in (1, 2, 3))
-    sums = sum((p**2).sum(axis=1, keepdims=True) * np.cross(q, r) for p, q, r in ((a, b, c), (b, c, a), (c, a, b)))
-    circumradius = np.linalg.norm(sums, axis=1) / (12 * mesh.volumes)
+    sums = sum((p * p).sum(axis=1, keepdims=True) * np.cross(q, r) for p, q, r in ((a, b, c), (b, c, a), (c, a, b)))
+    circumradius = norm(sums, axis=1) / (12 * mesh.volumes)
     return 3 * (3 * mesh.volumes / area) / circumradius
 
 
@@ -95,4 +96,4 @@ def surface_cell(mesh: TetMesh, triangles: NDArray[np.int32]) -> float:
     on_surface = np.zeros(mesh.node_count, dtype=bool)
     on_surface[triangles] = True
     touching = on_surface[mesh.tets].any(axis=1)
-    return float(np.cbrt(12.0 * np.median(mesh.volumes[touching])))
+    return float(cbrt(12.0 * np.median(mesh.volumes[touching])))

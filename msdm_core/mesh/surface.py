@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from msdm_core.arithmetic import cos, matmul, norm
 from msdm_core.errors import MeshError
 from msdm_core.kernels.ray_kernels import pierces
 
@@ -23,7 +24,7 @@ def surface_volume(vertices: ArrayLike, triangles: ArrayLike) -> float:
     """Enclosed volume, V = sum of a . (b x c) / 6 over the triangles [m^3], positive where normals point outward."""
     points = np.asarray(vertices, dtype=np.float64)
     a, b, c = (points[corner] - points.mean(axis=0) for corner in np.asarray(triangles).T)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+    return float((a * np.cross(b, c)).sum() / 6)
 
 
 def triangles_facing(
@@ -47,8 +48,8 @@ def outward_facing(
     a, b, c = (points[corner] for corner in triangles.T)
     normal = np.cross(b - a, c - a)
     along = np.asarray(direction, dtype=np.float64)
-    cosine = -(normal @ along) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(along))
-    return cosine >= np.cos(np.radians(angle_deg))
+    cosine = -matmul(normal, along) / (norm(normal, axis=1) * norm(along))
+    return cosine >= cos(np.radians(angle_deg))
 
 
 def node_normals(points: FloatArray, triangles: NDArray[np.integer]) -> FloatArray:
@@ -63,7 +64,7 @@ def node_normals(points: FloatArray, triangles: NDArray[np.integer]) -> FloatArr
     normals = np.zeros_like(points)
     for corner in range(3):
         np.add.at(normals, triangles[:, corner], area_vector)
-    length = np.linalg.norm(normals, axis=1)
+    length = norm(normals, axis=1)
     normals[length > 0.0] /= length[length > 0.0, None]
     return normals
 
@@ -127,8 +128,8 @@ def _checked_arrays(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArr
 
 def _check_shape(points: FloatArray, corners: Int64Array) -> None:
     a, b, c = (points[corner] for corner in corners.T)
-    longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    doubled_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.square(p - q).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    doubled_area = norm(np.cross(b - a, c - a), axis=1)
     flat = np.flatnonzero(doubled_area <= DEGENERATE_HEIGHT_RATIO * longest)
     if flat.size:
         triangle = int(flat[0])
@@ -211,10 +212,11 @@ def _near_pairs(points: FloatArray, corners: Int64Array) -> tuple[Int64Array, In
     """Pairs of triangles whose bounding boxes overlap, from grids whose cells double from level to level."""
     low, high = points[corners].min(axis=1), points[corners].max(axis=1)
     extent = (high - low).max(axis=1)
-    level = np.ceil(np.log2(extent / np.median(extent))).clip(min=0).astype(np.int64)
+    mantissa, exponent = np.frexp(extent / np.median(extent))
+    level = np.maximum(exponent - (mantissa == 0.5), 0)
     pairs = []
     for coarse in np.unique(level):
-        cell = np.median(extent) * 2.0**coarse
+        cell = np.ldexp(np.median(extent), coarse)
         members = np.flatnonzero(level == coarse)
         # Each box is at most one cell wide here, so it touches at most two cells along each axis.
         key, owner = _cells_of(low[members], high[members], members, cell)

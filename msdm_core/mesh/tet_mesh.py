@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from msdm_core.arithmetic import dot, norm
 from msdm_core.errors import MeshError
 
 FloatArray = NDArray[np.float64]
@@ -180,7 +181,7 @@ class TetMesh:
 def tet_volumes(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     """Signed volume of each tet, V = (b - a) . ((c - a) x (d - a)) / 6 [m^3], shape (n_tet,)."""
     a, b, c, d = (points[tets[:, corner]] for corner in range(4))
-    return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6.0
+    return dot(b - a, np.cross(c - a, d - a)) / 6.0
 
 
 def _frozen(array: NDArray) -> NDArray:
@@ -235,8 +236,9 @@ def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
     # The powers of coordinates above 1e100 overflow: such a tet has no ratio and is refused.
     with np.errstate(over="ignore", invalid="ignore"):
         volumes = tet_volumes(points, tets)
-        edge_lengths = np.linalg.norm(points[tets[:, TET_EDGES[:, 0]]] - points[tets[:, TET_EDGES[:, 1]]], axis=2)
-        ratios = np.abs(volumes) / edge_lengths.max(axis=1) ** 3
+        edge_lengths = norm(points[tets[:, TET_EDGES[:, 0]]] - points[tets[:, TET_EDGES[:, 1]]], axis=2)
+        longest = edge_lengths.max(axis=1)
+    ratios = np.abs(volumes) / (longest * longest * longest)
     flat = np.flatnonzero(~(ratios > DEGENERATE_VOLUME_RATIO))
     if flat.size:
         tet = int(flat[0])

@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.errors import MeshError
 from msdm_core.mesh.quality import tet_angles
 from msdm_core.mesh.surface import Int64Array
@@ -146,12 +147,12 @@ def _permitted_levels(corners: FloatArray, lattice: Lattice, fine_depth: float, 
 
 def _points_on(corners: FloatArray, spacing: float) -> FloatArray:
     """Points on triangles (n, 3, 3), along each side no farther apart than a spacing [m], shape (n_point, 3)."""
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    longest = norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     counts = np.ceil(longest / spacing).astype(np.int64)
     found = []
     for count in np.unique(counts).tolist():
         weights = np.array([(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]) / count
-        found.append(np.einsum("wc,tcx->twx", weights, corners[counts == count]).reshape(-1, 3))
+        found.append(matmul(weights, corners[counts == count]).reshape(-1, 3))
     return np.concatenate(found)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from msdm_core.arithmetic import cbrt
 from msdm_core.errors import MeshError
 from msdm_core.mesh.ordering import swept
 from msdm_core.mesh.surface import Int64Array, check_surface, surface_volume
@@ -216,9 +217,9 @@ def check_cell_size(extent: FloatArray, volume: float, size: float) -> None:
             f"cell_size {size:g} m is too coarse: the body is {smallest:.4g} m across its smallest extent, the "
             f"rule is at least {CELLS_ACROSS_MIN} cells: use {smallest / (2 * CELLS_ACROSS_MIN):.2g} m or less"
         )
-    tet_count = TETS_PER_CELL * volume / size**3
+    tet_count = TETS_PER_CELL * volume / (size * size * size)
     grid_count = np.prod(2 * extent / size)
-    finest = max((TETS_PER_CELL * volume / TET_LIMIT) ** (1 / 3), 2 * (np.prod(extent) / GRID_LIMIT) ** (1 / 3))
+    finest = max(float(cbrt(TETS_PER_CELL * volume / TET_LIMIT)), 2 * float(cbrt(np.prod(extent) / GRID_LIMIT)))
     if tet_count > TET_LIMIT or grid_count > GRID_LIMIT:
         raise MeshError(
             f"cell_size {size:g} m would give about {tet_count:.3g} tets in {grid_count / 8:.3g} cells; the rule is "

@@ -256,7 +256,7 @@ def _edge_cuts(body: Body, lattice: Lattice, sign: NDArray[np.int8]) -> Cuts:
     for step in np.concatenate([AXES, DIAGONALS]):
         node = _changing_edges(step, sign, lattice)
         fraction = body.fractions(step, node, sign, lattice)
-        found.append((node, node + step @ lattice.strides, fraction))
+        found.append((node, node + (step * lattice.strides).sum(), fraction))
     node, other, fraction = (np.concatenate(column) for column in zip(*found, strict=True))
     order = np.lexsort([other, node])
     is_long = (lattice.coordinates(node) % 2 == lattice.coordinates(other) % 2).all(axis=1)
@@ -285,7 +285,7 @@ def _warp(
     nearer_node = cuts.fraction < 0.5
     share = np.where(nearer_node, cuts.fraction, 1 - cuts.fraction)
     span = lattice.coordinates(cuts.other) - lattice.coordinates(cuts.node)
-    distance = share * np.sqrt((span**2).sum(axis=1))
+    distance = share * np.sqrt((span * span).sum(axis=1))
     limit = np.where(cuts.is_long, ALPHA_LONG, ALPHA_SHORT) if limit is None else limit
     violating = np.flatnonzero(share < limit)
     violating = violating[np.argsort(distance[violating], kind="stable")]
@@ -395,7 +395,7 @@ def _diagonal_from_first(a: Int64Array, b: Int64Array, out: Int64Array, lattice:
     three equally long edges in half pyramids alone, where these rules do not turn in a circle either.
     """
     from_a, from_b = (lattice.coordinates(nodes) - lattice.coordinates(out) for nodes in (a, b))
-    longer = (from_b**2).sum(axis=1) - (from_a**2).sum(axis=1)
+    longer = (from_b * from_b).sum(axis=1) - (from_a * from_a).sum(axis=1)
     even_a, even_b = ((steps > 0).sum(axis=1) % 2 == 0 for steps in (from_a, from_b))
     return np.where(longer != 0, longer > 0, np.where(even_a != even_b, even_a, a < b))
 

@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
@@ -115,7 +116,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
     corners = mesh.points[surface]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = 0.5 * norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     supports = support_fields(spec.supports, spec.support_law, mesh, surface, anchored)
     foundations = foundation_fields(spec.foundations, mesh, anchored)
     model = OrganModel(
@@ -124,7 +125,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         node_inverse_mass=_read_only(np.where(anchored, 0.0, 1.0 / mass)),
         spring_nodes=_read_only(nodes),
         spring_stiffness=_read_only(stiffness),
-        spring_rest_length=_read_only(np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
+        spring_rest_length=_read_only(norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
         **spring_law,
         tet_nodes=_read_only(order.tet_nodes),
         tet_rest_volume=_read_only(mesh.volumes),
@@ -266,7 +267,7 @@ def _relax(model: OrganModel, state: OrganState) -> None:
     relaxed = model._replace(alpha=0.0, beta=0.0, relaxes=False)
     free = model.node_inverse_mass > 0.0
     mass = model.node_mass[:, None]
-    weight = float(np.linalg.norm(model.gravity) * model.node_mass.sum())
+    weight = float(norm(model.gravity) * model.node_mass.sum())
     wrench = np.zeros((0, 6))
     dt = 0.8 * own_step(relaxed)
     for _ in range(ROUNDS):
@@ -282,11 +283,13 @@ def _relax(model: OrganModel, state: OrganState) -> None:
             relaxed.foundation_nodes, state.ground_foundation, relaxed.foundation_stiffness,
             state.node_position, state.node_force,
         )  # fmt: skip
-        if np.linalg.norm(state.node_force[free], axis=1).sum() <= FORCE_TOLERANCE * weight:
+        if norm(state.node_force[free], axis=1).sum() <= FORCE_TOLERANCE * weight:
             return
         displacement = state.node_position - model.node_rest_position
         held = float((displacement * (mass * model.gravity - state.node_force)).sum())
-        relaxed = relaxed._replace(alpha=2.0 * math.sqrt(max(held, 0.0) / float((mass * displacement**2).sum())))
+        relaxed = relaxed._replace(
+            alpha=2.0 * math.sqrt(max(held, 0.0) / float((mass * (displacement * displacement)).sum()))
+        )
     raise OrganDivergedError(
         f"the organ did not settle under gravity in {ROUNDS * ROUND_STEPS} steps: is it anchored, or does it "
         "rest on something? Give `anchors` or `supports`, or no gravity"
@@ -394,8 +397,8 @@ def _spring_law(
         )
         rise = node_mean(law.rise, weight)
         nodes = mesh.edges[springs]
-        length = np.linalg.norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)
-        sums = np.bincount(nodes.ravel(), np.repeat(stiffness * length**2, 2), mesh.node_count)
+        length = norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)
+        sums = np.bincount(nodes.ravel(), np.repeat(stiffness * (length * length), 2), mesh.node_count)
         fields["node_softness"] = _read_only(5.0 / sums)
         fields["node_onset"] = _read_only(onset)
         fields["node_growth"] = _read_only(1.0 / width)
@@ -418,8 +421,8 @@ def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray, springs:
     steep = rise > STEEP_EXCESS
     ramp = np.sqrt(STEEP_EXCESS / np.maximum(rise, STEEP_EXCESS))
     strain = onset + ramp * width
-    half = np.where(steep, rise * width * ramp**3 / (6.0 * strain), math.inf)[springs]
-    slope = (width * ramp * (3.0 * onset + 2.0 * ramp * width) / (12.0 * strain**2))[springs]
+    half = np.where(steep, rise * width * (ramp * ramp * ramp) / (6.0 * strain), math.inf)[springs]
+    slope = (width * ramp * (3.0 * onset + 2.0 * ramp * width) / (12.0 * (strain * strain)))[springs]
     both = half.sum(axis=1) - STEEP_EXCESS * np.abs(slope[:, 0] - slope[:, 1])
     least = np.where(steep[springs].all(axis=1), np.maximum(both, half.min(axis=1)), half.min(axis=1))
     # Lanes in float32 round.
@@ -446,7 +449,7 @@ def relax_arms(model: OrganModel, state: OrganState) -> None:
     if not model.relaxes:
         return
     ends = state.node_position[model.spring_nodes]
-    tension = spring_tensions(model, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)) / model.spring_rest_length
+    tension = spring_tensions(model, norm(ends[:, 1] - ends[:, 0], axis=1)) / model.spring_rest_length
     state.spring_arm_tension[:] = np.tile(tension, ARM_COUNT)
     state.spring_relief[:] = (model.spring_arm_modulus.reshape(ARM_COUNT, -1) * tension).sum(axis=0)
 

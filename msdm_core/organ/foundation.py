@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganError
 from msdm_core.mesh.tet_mesh import TetMesh
 
@@ -59,12 +60,12 @@ def foundation_fields(foundations: Sequence[Foundation], mesh: TetMesh, anchored
     corners = mesh.points[triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     # |a x b| is twice the area; n n^T A / 3 = (a x b)(a x b)^T / (6 |a x b|).
-    double = np.linalg.norm(across, axis=1)
+    double = norm(across, axis=1)
     for foundation in foundations:
         held = np.zeros(mesh.node_count, dtype=bool)
         held[_surface_nodes(foundation, mesh)] = True
         third = double[:, None, None] / 6.0 * np.eye(3)
-        normal = np.einsum("ti,tj->tij", across, across) / (6.0 * double[:, None, None])
+        normal = across[:, :, None] * across[:, None, :] / (6.0 * double[:, None, None])
         each = foundation.shear_stiffness * (third - normal) + foundation.stiffness * normal
         for corner in range(3):
             inside = held[triangles[:, corner]]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import dot, eigh, log, matmul, norm
 from msdm_core.kernels.contact_kernels import (
     QUADRATURE_BARYCENTRIC,
     QUADRATURE_COUNT,
@@ -28,7 +29,7 @@ ROUNDING = 1e-12
 
 def kinetic_energy(model: OrganModel, state: OrganState) -> float:
     """Energy of motion, T = sum_i m_i |v_i|^2 / 2 [J]."""
-    return 0.5 * float(model.node_mass @ np.einsum("ij,ij->i", state.node_velocity, state.node_velocity))
+    return 0.5 * float(matmul(model.node_mass, dot(state.node_velocity, state.node_velocity)))
 
 
 def potential_energy(model: OrganModel, state: OrganState) -> float:
@@ -42,22 +43,22 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     is not in it, nor what supports store.
     """
     ends = state.node_position[model.spring_nodes]
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    length = norm(ends[:, 1] - ends[:, 0], axis=1)
     springs = float(spring_energies(model, length).sum()) + arm_energy(model, state, length)
     ratio = volume_ratios(model, state)
-    volume = 0.5 * float((model.tet_bulk * model.tet_rest_volume) @ (ratio - 1.0) ** 2)
+    volume = 0.5 * float(matmul(model.tet_bulk * model.tet_rest_volume, np.square(ratio - 1.0)))
     squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_averaged_bulk > 0.0))
     share = np.maximum(ratio[squeezed], 0.0) / SQUEEZED_RATIO
     with np.errstate(divide="ignore"):
-        barrier = SQUEEZED_RATIO**2 * ((share - 1.0) - np.log(share))
-    volume += float((model.tet_averaged_bulk * model.tet_rest_volume)[squeezed] @ barrier)
+        barrier = SQUEEZED_RATIO * SQUEEZED_RATIO * ((share - 1.0) - log(share))
+    volume += float(matmul((model.tet_averaged_bulk * model.tet_rest_volume)[squeezed], barrier))
     quarter = np.repeat(ratio * model.tet_rest_volume / 4.0, 4)
     averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(model.node_mass)) / model.node_rest_volume
-    volume += 0.5 * float((model.node_bulk * model.node_rest_volume) @ (averaged - 1.0) ** 2)
-    lift = (state.node_position - model.node_rest_position) @ model.gravity
+    volume += 0.5 * float(matmul(model.node_bulk * model.node_rest_volume, np.square(averaged - 1.0)))
+    lift = matmul(state.node_position - model.node_rest_position, model.gravity)
     moved = state.node_position[model.foundation_nodes] - foundation_places(model, state)
-    held = 0.5 * float(np.einsum("ni,nij,nj->", moved, model.foundation_stiffness, moved))
-    return springs + volume + held - float(model.node_mass @ lift)
+    held = 0.5 * float((dot(model.foundation_stiffness, moved[:, None]) * moved).sum())
+    return springs + volume + held - float(matmul(model.node_mass, lift))
 
 
 def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:
@@ -72,7 +73,7 @@ def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:
 
 def node_strains(model: OrganModel, length: FloatArray) -> FloatArray:
     """Equivalent strain of each node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs of some lengths [m]."""
-    twice = model.spring_stiffness * (length - model.spring_rest_length) ** 2
+    twice = model.spring_stiffness * np.square(length - model.spring_rest_length)
     return np.sqrt(model.node_softness * np.bincount(model.spring_nodes.ravel(), np.repeat(twice, 2)))
 
 
@@ -80,7 +81,7 @@ def _node_rises(model: OrganModel, strain: FloatArray) -> FloatArray:
     """What stiffening adds to tension over that of linear springs (`element_kernels.node_law`), (n_node,)."""
     beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
     ramp = np.minimum(beyond, 1.0)
-    return model.node_excess * (ramp**3 / 3.0 + (beyond - ramp)) / np.maximum(strain, STRAIN_LEAST)
+    return model.node_excess * ((ramp * ramp * ramp) / 3.0 + (beyond - ramp)) / np.maximum(strain, STRAIN_LEAST)
 
 
 def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
@@ -90,16 +91,18 @@ def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
     tension and A_a = sum k l0^2 / 10 over the springs of node a; a node's part belongs to its springs as k (l - l0)^2
     does. The gradient is `spring_tensions`.
     """
-    twice = model.spring_stiffness * (length - model.spring_rest_length) ** 2
+    twice = model.spring_stiffness * np.square(length - model.spring_rest_length)
     if not model.stiffens:
         return 0.5 * twice
     strain = node_strains(model, length)
     beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
     ramp = np.minimum(beyond, 1.0)
     over = beyond - ramp
-    added = model.node_excess / model.node_growth * (ramp**4 / 12.0 + over / 3.0 + 0.5 * over**2)
+    added = (
+        model.node_excess / model.node_growth * (ramp * ramp * ramp * ramp / 12.0 + over / 3.0 + 0.5 * (over * over))
+    )
     # A_a w_a over the sum of k (l - l0)^2, which is s^2 / softness with A = 1 / (2 softness).
-    share = 0.5 * added / np.maximum(strain, STRAIN_LEAST) ** 2
+    share = 0.5 * added / np.square(np.maximum(strain, STRAIN_LEAST))
     return twice * (0.5 + share[model.spring_nodes].sum(axis=1))
 
 
@@ -123,7 +126,7 @@ def arm_energy(model: OrganModel, state: OrganState, length: FloatArray) -> floa
         strict=True,
     ):
         reached = _lengths_of(model, given)
-        total += float(modulus @ (energy - spring_energies(model, reached) - given * (length - reached)))
+        total += float(matmul(modulus, energy - spring_energies(model, reached) - given * (length - reached)))
     return total
 
 
@@ -147,7 +150,7 @@ def _lengths_of(model: OrganModel, tension: FloatArray) -> FloatArray:
         if (np.abs(wanted - rise) <= LENGTH_TOLERANCE * (1.0 + rise)).all():
             return length
         ramp = np.clip((strain - model.node_onset) * model.node_growth, 0.0, 1.0)
-        tangent = 1.0 + model.node_excess * model.node_growth * ramp**2
+        tangent = 1.0 + model.node_excess * model.node_growth * (ramp * ramp)
         rise = rise + (wanted - rise) * np.minimum((1.0 + wanted) / tangent, 1.0)
     raise ValueError(
         f"no lengths were found for the tensions that the arms have given way to, in {LENGTH_ROUNDS} rounds"
@@ -163,25 +166,27 @@ def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, 
     """
     corners = state.node_position[model.surface_triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    points = np.einsum("qc,tcx->tqx", QUADRATURE_BARYCENTRIC, corners)
+    normal /= norm(normal, axis=1)[:, None]
+    points = matmul(QUADRATURE_BARYCENTRIC, corners)
     energy = 0.0
     for shape, radius in enumerate(shapes.shape_radius):
         start, axis = shapes.shape_ends[shape, 0], np.diff(shapes.shape_ends[shape], axis=0)[0]
-        squared = float(axis @ axis)
-        along = np.clip((points - start) @ axis / squared, 0.0, 1.0) if squared > 0.0 else np.zeros(points.shape[:2])
+        squared = float(matmul(axis, axis))
+        along = (
+            np.clip(matmul(points - start, axis) / squared, 0.0, 1.0) if squared > 0.0 else np.zeros(points.shape[:2])
+        )
         offset = points - start - along[:, :, None] * axis
         span = shapes.shape_span[shape]
         if span.any():
-            offset -= np.clip(offset @ span / (span @ span), -1.0, 1.0)[:, :, None] * span
-        height = np.einsum("tqx,tx->tq", offset, normal)
-        chord_squared = radius**2 - (np.einsum("tqx,tqx->tq", offset, offset) - height**2)
+            offset -= np.clip(matmul(offset, span) / matmul(span, span), -1.0, 1.0)[:, :, None] * span
+        height = dot(offset, normal[:, None])
+        chord_squared = radius * radius - (dot(offset, offset) - height * height)
         chord = np.sqrt(np.maximum(chord_squared, 0.0))
         held = state.contact_engaged[shape].reshape(-1, QUADRATURE_COUNT) != 0
         inside = (chord_squared > 0.0) & (chord + height > 0.0) & (held | (height <= 0.0))
         depth = np.where(inside, chord * (chord + height) / radius, 0.0)
         area = model.surface_rest_area * QUADRATURE_WEIGHT
-        energy += 0.5 * contact.stiffness * float(area @ (depth * depth).sum(axis=1))
+        energy += 0.5 * contact.stiffness * float(matmul(area, (depth * depth).sum(axis=1)))
         energy += _guard_energy(corners, normal, shapes.shape_ends[shape], radius, contact.stiffness)
     return energy
 
@@ -193,19 +198,19 @@ def _guard_energy(corners: FloatArray, normal: FloatArray, ends: FloatArray, rad
     """
     reach = GUARD_SHARE * radius
     middle = corners.mean(axis=1)
-    size = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-    gap = np.linalg.norm(middle - ends.mean(axis=0), axis=1) - size - 0.5 * np.linalg.norm(ends[1] - ends[0])
+    size = norm(corners - middle[:, None], axis=2).max(axis=1)
+    gap = norm(middle - ends.mean(axis=0), axis=1) - size - 0.5 * norm(ends[1] - ends[0])
     energy = 0.0
     for triangle in np.flatnonzero(gap < reach):
         a, b, c = corners[triangle]
-        low = ends[np.argmin((ends - a) @ normal[triangle])]
+        low = ends[np.argmin(matmul(ends - a, normal[triangle]))]
         wb, wc = closest_in_triangle(*(b - a), *(c - a), *(low - a))
         point = a + wb * (b - a) + wc * (c - a)
         offset = point - np.array(closest_on_axis(ends[None], 0, *point))
-        distance = float(np.linalg.norm(offset))
-        if distance < reach and offset @ normal[triangle] < 0.0:
-            energy += reach * math.log(reach / distance) - (reach - distance)
-    return math.pi * radius**2 * stiffness * reach * energy
+        distance = float(norm(offset))
+        if distance < reach and matmul(offset, normal[triangle]) < 0.0:
+            energy += reach * float(log(reach / distance)) - (reach - distance)
+    return math.pi * (radius * radius) * stiffness * reach * energy
 
 
 class TissueLoad(NamedTuple):
@@ -238,11 +243,11 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
     gradient = np.zeros((len(push), 3, 3))
     add_gradients(model.node_rest_position, state.node_position, model.tet_nodes, gradient)
     gradient /= 4.0 * model.node_rest_volume[:, None, None]
-    squared = gradient.transpose(0, 2, 1) @ gradient
+    squared = matmul(gradient.transpose(0, 2, 1), gradient)
     # Eigenvalues lie within the mean +- twice the root of a sixth of the deviator's square (Smith 1961): nodes whose
     # bound is below a strain that is known need no closer look.
-    mean = np.einsum("nii->n", squared) / 3.0
-    spread = 2.0 * np.sqrt(np.maximum(np.einsum("nij,nij->n", squared, squared) - 3.0 * mean**2, 0.0) / 6.0)
+    mean = np.trace(squared, axis1=1, axis2=2) / 3.0
+    spread = 2.0 * np.sqrt(np.maximum((squared * squared).sum(axis=(1, 2)) - 3.0 * (mean * mean), 0.0) / 6.0)
     bound = np.maximum(np.sqrt(mean + spread) - 1.0, 1.0 - np.sqrt(np.maximum(mean - spread, 0.0)))
     near = np.flatnonzero(bound >= _principal_strain(squared[[bound.argmax()]])[0] - ROUNDING)
     strain = _principal_strain(squared[near])
@@ -251,18 +256,18 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
 
 def _principal_strain(squared: FloatArray) -> FloatArray:
     """Largest |lambda - 1| of the square roots lambda of the eigenvalues of C = F^T F (n, 3, 3), (n,)."""
-    return np.abs(np.sqrt(np.maximum(np.linalg.eigvalsh(squared), 0.0)) - 1.0).max(axis=1)
+    return np.abs(np.sqrt(np.maximum(eigh(squared)[0], 0.0)) - 1.0).max(axis=1)
 
 
 def momentum(model: OrganModel, state: OrganState) -> FloatArray:
     """Linear momentum, p = sum_i m_i v_i [kg m/s], shape (3,)."""
-    return model.node_mass @ state.node_velocity
+    return matmul(model.node_mass, state.node_velocity)
 
 
 def angular_momentum(model: OrganModel, state: OrganState, point: ArrayLike) -> FloatArray:
     """Angular momentum about a point [m], L = sum_i m_i (x_i - point) x v_i [kg m^2/s], shape (3,)."""
     arm = state.node_position - np.asarray(point, dtype=np.float64)
-    return model.node_mass @ np.cross(arm, state.node_velocity)
+    return matmul(model.node_mass, np.cross(arm, state.node_velocity))
 
 
 def volume_ratios(model: OrganModel, state: OrganState) -> FloatArray:

@@ -57,7 +57,9 @@ class Motion:
         places = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         share = np.ones(len(places))
         if self.centre is not None:
-            share = np.maximum(1.0 - ((places - np.array(self.centre)) ** 2).sum(axis=1) / self.reach**2, 0.0) ** 2
+            share = np.square(
+                np.maximum(1.0 - np.square(places - np.array(self.centre)).sum(axis=1) / np.square(self.reach), 0.0)
+            )
         return share[:, None] * np.array(self.displacement)
 
 
@@ -113,8 +115,8 @@ def place_on_ground(model: OrganModel, state: OrganState, signal: ArrayLike, rat
     state.motion[:, SIGNAL] = signal
     state.motion[:, RATE] = state.motion[:, RATE_BEFORE] = rate
     shift = model.motion_node_shift[:, :, :3]
-    state.node_position[:] += np.einsum("m,mni->ni", state.motion[:, SIGNAL], shift)
-    state.node_velocity[:] += np.einsum("m,mni->ni", state.motion[:, RATE], shift)
+    state.node_position[:] += (state.motion[:, SIGNAL, None, None] * shift).sum(axis=0)
+    state.node_velocity[:] += (state.motion[:, RATE, None, None] * shift).sum(axis=0)
 
 
 def ground_work(state: OrganState) -> FloatArray:
@@ -124,4 +126,4 @@ def ground_work(state: OrganState) -> FloatArray:
 
 def foundation_places(model: OrganModel, state: OrganState) -> FloatArray:
     """Where the organ's foundations hold their nodes now [m], shape (n_held, 3)."""
-    return model.foundation_position + np.einsum("m,mni->ni", state.motion[:, SIGNAL], model.motion_foundation_shift)
+    return model.foundation_position + (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)

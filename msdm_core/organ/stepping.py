@@ -1,10 +1,9 @@
 """Advancing an organ: contact shapes of tools, symplectic Euler substeps against them, messages about faults."""
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import exp, norm
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
 from msdm_core.kernels.structure_kernels import (
@@ -175,7 +174,7 @@ def advance_organ(
 
     With a `response` the force of the tissue changes `shapes.tool_twist` within the call.
     """
-    decay = math.exp(-model.alpha * dt)
+    decay = float(exp(-model.alpha * dt))
     reference = shapes.tool_centre.copy()
     if response is None:
         response = unyielding(len(reference))
@@ -192,7 +191,7 @@ def _largest_move(model: OrganModel, state: OrganState) -> tuple[int, float]:
     shortest = np.full(len(model.node_mass), np.inf)
     for end in range(2):
         np.minimum.at(shortest, model.spring_nodes[:, end], model.spring_rest_length)
-    share = np.linalg.norm(state.node_velocity, axis=1) * min(model.stable_step, 1.0) / shortest
+    share = norm(state.node_velocity, axis=1) * min(model.stable_step, 1.0) / shortest
     node = int(np.argmax(share))
     return node, float(share[node])
 

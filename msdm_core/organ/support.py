@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.errors import OrganError
 from msdm_core.kernels.support_kernels import BOX, CAPSULE, PLANE, SPHERE
 from msdm_core.mesh.quality import surface_cell
@@ -58,7 +59,7 @@ class Support:
             value = getattr(self, entry)
             if value is not None:
                 _require_numbers(f"{what}: {entry}", value, count)
-                if math.hypot(*value) < 1e-9:
+                if float(norm(value)) < 1e-9:
                     raise OrganError(f"{what}: {entry} is {value}; it must not be zero")
         _require_numbers(f"{what}: size", self.size, len(SIZES[self.kind]), SIZES[self.kind])
         if not all(number > 0.0 for number in self.size):
@@ -70,11 +71,11 @@ class Support:
     def quaternion(self) -> FloatArray:
         """Its orientation (w, x, y, z) of length 1, shape (4,)."""
         if self.rotation is not None:
-            return np.array(self.rotation) / math.hypot(*self.rotation)
-        x, y, z = np.array(self.axis or (0.0, 0.0, 1.0)) / math.hypot(*(self.axis or (1.0,)))
+            return np.array(self.rotation) / float(norm(self.rotation))
+        x, y, z = np.array(self.axis or (0.0, 0.0, 1.0)) / float(norm(self.axis or (1.0,)))
         # From z to the axis: half the angle about z x axis; straight down is a half turn about x.
         turn = np.array([1.0 + z, -y, x, 0.0])
-        length = float(np.linalg.norm(turn))
+        length = float(norm(turn))
         return np.array([0.0, 1.0, 0.0, 0.0]) if length < 1e-9 else turn / length
 
     @property
@@ -91,14 +92,14 @@ class Support:
 
     def reach(self, direction: FloatArray) -> float:
         """Its largest coordinate along a unit direction [m]; infinite for a plane."""
-        along = direction @ self.frame
+        along = matmul(direction, self.frame)
         if self.kind == "plane":
             return math.inf
         if self.kind == "box":
-            out = float(np.abs(along) @ self.size)
+            out = float(matmul(np.abs(along), self.size))
         else:
             out = self.size[0] + (self.size[1] * abs(float(along[2])) if self.kind == "capsule" else 0.0)
-        return float(direction @ np.array(self.position)) + out
+        return float(matmul(direction, np.array(self.position))) + out
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def support_fields(
     if supports:
         _check_sizes(supports, surface_cell(mesh, surface))
     corners = mesh.points[surface]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = 0.5 * norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     node_area = np.bincount(surface.ravel(), np.repeat(area / 3.0, 3), mesh.node_count)
     nodes = np.flatnonzero((node_area > 0.0) & ~anchored) if supports else np.zeros(0, dtype=np.int64)
     fields = {

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msdm_core.arithmetic import exp
 from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.stepping import describe_fault
@@ -82,7 +83,7 @@ def haptic_steps(
         raise TypeError(f"{type(instrument).__name__} has a drive of its own: haptic steps move the servo alone")
     if compiled and (missing := mujoco_library.missing()):
         raise RuntimeError(f"haptic steps cannot be compiled: {missing}; call haptic_steps with compiled=False")
-    plan = StepPlan(dt, math.exp(-model.alpha * dt), substep_count, count, force_limit, pull_limit)
+    plan = StepPlan(dt, float(exp(-model.alpha * dt)), substep_count, count, force_limit, pull_limit)
     outcome = step_outcome(1, instrument.tool_count)._replace(wrench=wrench[None])
     advance = advance_haptic_steps if compiled else advance_haptic_steps.py_func
     tools = instrument.views(compiled=compiled)
@@ -114,6 +115,6 @@ def describe(model: OrganModel, state: OrganState, wrench: FloatArray, fault: in
     if fault == FAULT_WRENCH_NOT_FINITE:
         return "the contact wrench is not finite"
     if fault == FAULT_FORCE_CAP:
-        force = float(np.sqrt((wrench[:, :3] ** 2).sum(axis=1)).max())
+        force = float(np.sqrt(np.square(wrench[:, :3]).sum(axis=1)).max())
         return f"contact force {force:.4g} N is beyond the physical cap of {FORCE_CAP:g} N"
     return describe_fault(model, state, fault)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import exp
 from msdm_core.kernels.structure_kernels import LANE_EMPTY, OrganModel
 from msdm_core.lanes.lanes import (
     get_lane,
@@ -72,7 +73,7 @@ class LaneGroup:
         views += [views[-1]] * (len(self._outcome.step_count) - len(views))
         drives = [one.drive for one in self.simulations]
         drives += [drives[-1]] * (len(self._outcome.step_count) - len(drives))
-        decay = math.exp(-self._model.alpha * first.substep_dt)
+        decay = float(exp(-self._model.alpha * first.substep_dt))
         plan = StepPlan(first.substep_dt, decay, first.substep_count, count, force_limit, pull_limit)
         outcome = self._outcome._replace(stopped=self._state.lane_fault)
         advance_lane_haptic_steps(

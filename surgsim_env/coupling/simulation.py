@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import matmul
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, SCRATCH_FIELDS, OrganModel, OrganState
@@ -189,7 +190,8 @@ class Simulation:
             return None
         corners = model.node_rest_position[model.surface_triangles]
         weights = engaged * model.surface_rest_area[:, None]
-        return np.einsum("tq,qc,tcx->x", weights, QUADRATURE_BARYCENTRIC, corners) / weights.sum()
+        points = matmul(QUADRATURE_BARYCENTRIC, corners)
+        return (weights[:, :, None] * points).sum(axis=(0, 1)) / weights.sum()
 
     def take_anatomy(self, anatomy: Anatomy) -> None:
         """Go on with another member of the scene's family; its organ comes with the `reset` that follows.

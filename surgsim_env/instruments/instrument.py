@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import dot, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
@@ -73,9 +74,9 @@ class Jaw:
         """Unit vectors out of the pads, towards each other, (2, 3); without pads, from one finger to the other."""
         data = self._instrument.data
         if self.has_pads:
-            return np.einsum("pxy,py->px", data.geom_xmat[self._pads].reshape(2, 3, 3), self._inward)
+            return dot(data.geom_xmat[self._pads].reshape(2, 3, 3), self._inward[:, None])
         gap = data.geom_xpos[self._pads[1]] - data.geom_xpos[self._pads[0]]
-        return np.stack([gap, -gap]) / np.linalg.norm(gap)
+        return np.stack([gap, -gap]) / norm(gap)
 
     @property
     def opening(self) -> float:
@@ -83,7 +84,7 @@ class Jaw:
         first, second = self._instrument.data.geom_xpos[self._pads]
         normals = self.normals
         mean = normals[0] - normals[1]
-        return float((second - first) @ mean / np.linalg.norm(mean) - self._half_thickness.sum())
+        return float(matmul(second - first, mean) / norm(mean) - self._half_thickness.sum())
 
     def command(self, target: float) -> None:
         """Command the fingers to a target from -1 (closed) to 1 (open), which they hold.
@@ -124,16 +125,16 @@ class Jaw:
         mujoco.mj_kinematics(model, data)
         gap = data.geom_xpos[self._pads[1]] - data.geom_xpos[self._pads[0]]
         axes = np.eye(3)[across]
-        outward = np.einsum("pxy,py->px", data.geom_xmat[self._pads].reshape(2, 3, 3), axes)
-        return axes * np.sign(outward @ gap * np.array([1.0, -1.0]))[:, None]
+        outward = dot(data.geom_xmat[self._pads].reshape(2, 3, 3), axes[:, None])
+        return axes * np.sign(matmul(outward, gap) * np.array([1.0, -1.0]))[:, None]
 
 
 def frame_along(direction: FloatArray) -> FloatArray:
     """Right-handed frame with -z along a direction and y as close to up as possible, as columns (3, 3)."""
-    z = -direction / np.linalg.norm(direction)
-    up = UP if abs(z @ UP) < 0.9 else UP_ELSE
-    y = up - (up @ z) * z
-    y /= np.linalg.norm(y)
+    z = -direction / norm(direction)
+    up = UP if abs(matmul(z, UP)) < 0.9 else UP_ELSE
+    y = up - matmul(up, z) * z
+    y /= norm(y)
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
@@ -171,11 +172,11 @@ def read_grasp(jaw: Jaw | None, wrench: FloatArray, friction: float) -> Grasp | 
     # Tissue pushes a pad back, against its normal.
     along = (forces * normals).sum(axis=1)
     pressing = np.maximum(-along, 0.0)
-    tangential = np.linalg.norm(forces - along[:, None] * normals, axis=1)
+    tangential = norm(forces - along[:, None] * normals, axis=1)
     return Grasp(
         opening=jaw.opening,
         grip_force=float(pressing.min()),
-        pull_force=float(np.linalg.norm(forces.sum(axis=0))),
+        pull_force=float(norm(forces.sum(axis=0))),
         friction_left=float((friction * jaw.friction * pressing - tangential).sum()),
         holds=bool((pressing > 0.0).all()),
     )

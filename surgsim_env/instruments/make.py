@@ -5,6 +5,7 @@ import math
 import mujoco
 import numpy as np
 
+from msdm_core.arithmetic import arctan2, cos, matmul, norm, sin
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm_instrument import ArmInstrument, is_arm
 from surgsim_env.instruments.arm.pair import Pair
@@ -118,13 +119,13 @@ class Grasper(Instrument):
     def _tip_from_hinge(self, pitch: float) -> FloatArray:
         """Vector from the hinge to the tip at an angle of the hinge [rad], world frame, (3,) [m]."""
         _, y, z = self._reach
-        c, s = math.cos(pitch), math.sin(pitch)
-        return self._rotation @ np.array([0.0, c * y - s * z, s * y + c * z])
+        c, s = float(cos(pitch)), float(sin(pitch))
+        return matmul(self._rotation, np.array([0.0, c * y - s * z, s * y + c * z]))
 
     def _pitch_towards(self, direction: tuple[float, float, float]) -> float:
         """Angle of the hinge at which the jaw points along a direction as closely as possible [rad]."""
-        _, y, z = self._rotation.T @ np.asarray(direction)
-        pitch = math.atan2(y, -z)
+        _, y, z = matmul(self._rotation.T, np.asarray(direction))
+        pitch = float(arctan2(y, -z))
         low, high = self.model.joint("pitch").range
         if not low <= pitch <= high:
             raise ValueError(
@@ -165,12 +166,12 @@ def _compile_probe(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco
 
 def _rotation_from_down(direction: FloatArray) -> FloatArray:
     """Quaternion (w, x, y, z) of the smallest rotation from -z to a direction."""
-    unit = direction / np.linalg.norm(direction)
+    unit = direction / norm(direction)
     down = np.array([0.0, 0.0, -1.0])
-    quaternion = np.concatenate([[1.0 + down @ unit], np.cross(down, unit)])
-    if np.linalg.norm(quaternion) < 1e-9:
+    quaternion = np.concatenate([[1.0 + matmul(down, unit)], np.cross(down, unit)])
+    if norm(quaternion) < 1e-9:
         return np.array([0.0, 1.0, 0.0, 0.0])
-    return quaternion / np.linalg.norm(quaternion)
+    return quaternion / norm(quaternion)
 
 
 def _compile_grasper(scene: Scene, rotation: FloatArray) -> mujoco.MjModel:

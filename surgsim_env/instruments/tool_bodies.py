@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import eigh, matmul, norm, solve
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import ContactLaw
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -259,9 +260,9 @@ def contact_area(tools: ToolBodies, tool: int) -> float:
     """
     mine = tools.shapes.shape_tool == tool
     radius = tools.shapes.shape_radius[mine]
-    length = np.linalg.norm(np.diff(tools.shapes.shape_ends[mine], axis=1)[:, 0], axis=1)
-    width = 2.0 * np.linalg.norm(tools.shapes.shape_span[mine], axis=1)
-    return float((np.pi * radius**2 + 2.0 * radius * (length + width) + width * length).sum())
+    length = norm(np.diff(tools.shapes.shape_ends[mine], axis=1)[:, 0], axis=1)
+    width = 2.0 * norm(tools.shapes.shape_span[mine], axis=1)
+    return float((np.pi * (radius * radius) + 2.0 * radius * (length + width) + width * length).sum())
 
 
 def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float, substep_count: int = 2) -> list[ToolMass]:
@@ -313,8 +314,8 @@ def effective_mass(tools: ToolBodies, tool: int, inertia: FloatArray) -> float:
     for end in np.concatenate([ends - span, ends + span]).reshape(-1, 3):
         x, y, z = end - tools.shapes.tool_centre[tool]
         # Velocity of that end: v + omega x (x, y, z).
-        there = jacobian[:3] + np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ jacobian[3:]
-        mobility = max(mobility, float(np.linalg.eigvalsh(there @ np.linalg.solve(inertia, there.T))[-1]))
+        there = jacobian[:3] + matmul(np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), jacobian[3:])
+        mobility = max(mobility, float(eigh(matmul(there, solve(inertia, there.T)))[0][-1]))
     return 1.0 / mobility if mobility > 0.0 else np.inf
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import exp, matmul, solve
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 
@@ -56,7 +57,7 @@ class BellFit:
         """
         rows, columns = (slice(numbers[0], numbers[-1] + 1) for numbers in touch_map.rows_and_columns)
         self._part = (..., rows, columns)
-        numbers = np.arange(MAP_SIDE**2).reshape(MAP_SIDE, MAP_SIDE)
+        numbers = np.arange(MAP_SIDE * MAP_SIDE).reshape(MAP_SIDE, MAP_SIDE)
         self.sites = numbers[rows, columns].ravel()
         self.places = touch_map.places[self.sites]
         self._noise, self._extent = noise, touch_map.extent
@@ -64,13 +65,13 @@ class BellFit:
         self._axes = second[rows], first[columns]
         self._pressable = touch_map.pressable.reshape(MAP_SIDE, MAP_SIDE)[rows, columns]
         width = BELL_WIDTH * lesion_radius
-        self._bells = [np.exp(-0.5 * ((axis[:, None] - axis) / width) ** 2) for axis in self._axes]
+        self._bells = [exp(-0.5 * np.square((axis[:, None] - axis) / width)) for axis in self._axes]
         v, u = np.meshgrid(
             *(2.0 * axis / side - 1.0 for axis, side in zip(self._axes, self._extent[::-1], strict=True)), indexing="ij"
         )
         self._terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])
         spread = np.array([MEAN_SPREAD, *[BACKGROUND_SPREAD] * (len(self._terms) - 1)])
-        self._prior = np.diag(1.0 / spread**2)
+        self._prior = np.diag(1.0 / (spread * spread))
 
     def cropped(self, values: FloatArray) -> FloatArray:
         """Values (..., MAP_SIDE**2) of the map at `sites`, (..., row, column)."""
@@ -100,23 +101,23 @@ class BellFit:
     def _score(self, product: FloatArray, square: FloatArray) -> FloatArray:
         """Decrease of the sum of squares by a bell at each site, (n, row, column); -inf where none may lie."""
         felt, terms = square > 0.0, self._terms.reshape(len(self._terms), -1)
-        weight = np.where(felt, square / (self._noise**2 + square * MODEL_ERROR**2), 0.0)
+        weight = np.where(felt, square / (np.square(self._noise) + square * (MODEL_ERROR * MODEL_ERROR)), 0.0)
         weighted = weight * np.divide(product, square, out=np.zeros_like(product), where=felt)
         flat, count = weight.reshape(len(weight), 1, -1), len(weight)
-        normal = (terms * flat) @ terms.T + self._prior
-        background = np.linalg.solve(normal, terms @ weighted.reshape(count, -1, 1))
+        normal = matmul(terms * flat, terms.T) + self._prior
+        background = solve(normal, matmul(weighted.reshape(count, -1), terms.T)[..., None])
         # Of bells at all sites: product with the background's terms, with the residual, and with themselves.
         across = self._with_bells(weight[:, None] * self._terms).reshape(count, len(terms), -1)
         residual = self._with_bells(weighted).reshape(count, -1) - (across * background).sum(axis=1)
         own = self._with_bells(weight, power=2).reshape(count, -1)
-        own = own - (across * np.linalg.solve(normal, across)).sum(axis=1) + 1.0 / BELL_SPREAD**2
-        score = (np.maximum(residual, 0.0) ** 2 / own).reshape(felt.shape)
+        own = own - (across * solve(normal, across)).sum(axis=1) + 1.0 / (BELL_SPREAD * BELL_SPREAD)
+        score = (np.square(np.maximum(residual, 0.0)) / own).reshape(felt.shape)
         return np.where(_bordering(felt) & self._pressable, score, -np.inf)
 
     def _with_bells(self, values: FloatArray, power: int = 1) -> FloatArray:
         """Sums of values (..., row, column) times a power of the bell around each site."""
-        along, across = (bell**power for bell in self._bells)
-        return along @ values @ across
+        along, across = (bell if power == 1 else bell * bell for bell in self._bells)
+        return matmul(matmul(along, values), across)
 
 
 def framed(values: np.ndarray, fill: float) -> np.ndarray:

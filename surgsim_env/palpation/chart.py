@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup, core_count
 from surgsim_env.coupling.simulation import Simulation
@@ -68,7 +69,7 @@ class Chart:
     def place(self, point: ArrayLike) -> FloatArray:
         """Place (..., 2) of a point (..., 3) [m] on the chart: -1 to 1 along each axis inside it."""
         values = np.asarray(point, dtype=np.float64)
-        plane = np.stack([values @ self.across, values @ self.along], axis=-1)
+        plane = np.stack([matmul(values, self.across), matmul(values, self.along)], axis=-1)
         return 2.0 * (plane - self.lower) / self.extent - 1.0
 
     def plane_point(self, place: ArrayLike) -> FloatArray:
@@ -91,7 +92,7 @@ def make_chart(face: PalpableFace, tip_radius: float) -> Chart:
     """
     across, along = tangent_axes(face.approach)
     corners = face.points[face.triangles].reshape(-1, 3)
-    plane = np.column_stack([corners @ across, corners @ along])
+    plane = np.column_stack([matmul(corners, across), matmul(corners, along)])
     lower, upper = plane.min(axis=0) + face.margin, plane.max(axis=0) - face.margin
     if not (upper > lower).all():
         raise ValueError(
@@ -140,7 +141,7 @@ class TouchMap:
     @cached_property
     def numbers(self) -> NDArray[np.intp]:
         """Column and row of each site (MAP_SIDE**2, 2)."""
-        return np.stack(np.divmod(np.arange(MAP_SIDE**2), MAP_SIDE)[::-1], axis=-1)
+        return np.stack(np.divmod(np.arange(MAP_SIDE * MAP_SIDE), MAP_SIDE)[::-1], axis=-1)
 
     @cached_property
     def rows_and_columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -206,7 +207,7 @@ class ChartedFace:
         if found is not None:
             return Site(asked, *found, moved=0.0)
         places, points, normals = self._allowed
-        distance = np.linalg.norm(0.5 * (places - asked) * self.chart.extent, axis=1)
+        distance = norm(0.5 * (places - asked) * self.chart.extent, axis=1)
         best = int(np.argmin(distance))
         return Site(places[best], points[best], normals[best], float(distance[best]))
 
@@ -240,7 +241,7 @@ class ChartedFace:
     def touch_map(self) -> TouchMap:
         """The sites of observations."""
         extent = self.chart.extent
-        plain = TouchMap(extent, self.cell, np.ones(MAP_SIDE**2, dtype=np.bool_))
+        plain = TouchMap(extent, self.cell, np.ones(MAP_SIDE * MAP_SIDE, dtype=np.bool_))
         on_chart = (np.abs(plain.places) <= 1.0 + ROUNDING).all(axis=1)
         allowed = [self._found(place) is not None for place in plain.places]
         return TouchMap(extent, plain.cell, np.array(allowed) & on_chart)
@@ -265,7 +266,7 @@ class ChartedFace:
         dropped = [self.face.drop(*self.chart.plane_point(place).tolist()) for place in places]
         known = np.array([index for index, point in enumerate(dropped) if point is not None])
         points = np.array([dropped[index][0] for index in known])  # type: ignore[index]
-        nearest = [int(np.argmin(((places[known] - place) ** 2).sum(axis=1))) for place in places]
+        nearest = [int(np.argmin(np.square(places[known] - place).sum(axis=1))) for place in places]
         return points[nearest].reshape(side, side, 3)
 
 
@@ -441,7 +442,7 @@ def press_sites(
 def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
     """Stiffness of a press on healthy tissue [N/m]."""
     result = press.result()
-    force = float(result.force @ press.normal)
+    force = float(matmul(result.force, press.normal))
     if result.fault or not force > 0.0:
         raise ValueError(
             f"scene {anatomy.scene.name!r}: a press on healthy tissue at {press.point.tolist()} m measured "

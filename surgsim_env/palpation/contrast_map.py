@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msdm_core.arithmetic import exp, log, lstsq, matmul, norm
 from msdm_core.mesh.geodesic import SurfaceDistance
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.lesion_estimator import strongest_apart
@@ -136,8 +137,8 @@ def contrast_with_neighbours(
         ValueError: names the site whose stiffness is not above 0.
     """
     _check_stiffness(stiffness, "stiffness")
-    log_stiffness = np.log(stiffness)
-    contrast = np.exp(log_stiffness - _robust_fit(_regressors(plane, geometry), log_stiffness))
+    log_stiffness = log(stiffness)
+    contrast = exp(log_stiffness - _robust_fit(_regressors(plane, geometry), log_stiffness))
     return contrast / healthy_majority(contrast)[0]
 
 
@@ -195,13 +196,13 @@ def _robust_fit(columns: FloatArray, values: FloatArray) -> FloatArray:
     for round_ in range(ROUNDS):
         root = np.sqrt(weight)
         matrix = np.concatenate([columns * root[:, None], held])
-        coefficients = np.linalg.lstsq(matrix, np.concatenate([values * root, zeros]), rcond=None)[0]
-        fitted = columns @ coefficients
+        coefficients = lstsq(matrix, np.concatenate([values * root, zeros]))
+        fitted = matmul(columns, coefficients)
         scaled = np.abs(values - fitted) / max(robust_spread(values - fitted), SMALLEST_SCALE)
         if round_ < HUBER_ROUNDS:
             weight = np.minimum(1.0, HUBER_LIMIT / np.maximum(scaled, HUBER_LIMIT))
         else:
-            weight = np.maximum(1.0 - (scaled / TUKEY_LIMIT) ** 2, 0.0) ** 2
+            weight = np.square(np.maximum(1.0 - np.square(scaled / TUKEY_LIMIT), 0.0))
     return fitted
 
 
@@ -218,7 +219,7 @@ def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> 
     """
     if len(sites) < 2:
         return []
-    distance = np.linalg.norm(sites[:, None] - sites[None], axis=2) / spacing
+    distance = norm(sites[:, None] - sites[None], axis=2) / spacing
     smooth = smoothed(sites, contrast, spacing=spacing)
     middle = healthy_majority(smooth)[0]
     threshold = felt_threshold(sites, contrast, spacing=spacing)
@@ -231,7 +232,7 @@ def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> 
     for peak, above in zip(maxima[chosen], excess[chosen], strict=True):
         pull = smooth - middle - EXCESS_SHARE * (smooth[peak] - middle)
         weight = np.where(near[peak], np.maximum(pull, 0.0), 0.0)
-        point = weight @ sites / weight.sum() if weight.any() else sites[peak]
+        point = matmul(weight, sites) / weight.sum() if weight.any() else sites[peak]
         largest = float(contrast[distance[peak] <= 1.0].max())
         estimates.append(Estimate(point=point, contrast=largest, excess=float(above)))
     return estimates
@@ -239,9 +240,9 @@ def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> 
 
 def smoothed(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> FloatArray:
     """The contrast smoothed over the sites by a Gaussian, shape (n_site,); arguments as in `feel_lesions`."""
-    distance = np.linalg.norm(sites[:, None] - sites[None], axis=2) / spacing
-    kernel = np.exp(-0.5 * (distance / KERNEL_SPACINGS) ** 2)
-    return kernel @ contrast / kernel.sum(axis=1)
+    distance = norm(sites[:, None] - sites[None], axis=2) / spacing
+    kernel = exp(-0.5 * np.square(distance / KERNEL_SPACINGS))
+    return matmul(kernel, contrast) / kernel.sum(axis=1)
 
 
 def felt_threshold(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> float:
@@ -273,7 +274,7 @@ def score_map(
     error = np.array([surface(truth.point, places) for truth in truths]).reshape(len(truths), len(places))
     rows, columns = linear_sum_assignment(np.minimum(error, MATCHING_REACH))
     matched = dict(zip(rows.tolist(), columns.tolist(), strict=True))
-    from_lesion = [np.linalg.norm(sites - truth.point, axis=1) for truth in truths]
+    from_lesion = [norm(sites - truth.point, axis=1) for truth in truths]
     scores = []
     for index, truth in enumerate(truths):
         over = contrast[from_lesion[index] <= truth.radius]

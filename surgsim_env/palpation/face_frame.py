@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import matmul
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.chart import ChartedFace
 
@@ -26,12 +27,12 @@ class FaceFrame:
         """The frame of a face."""
         chart, outward = charted.chart, -charted.face.approach
         axes = np.stack([chart.across, chart.along, outward])
-        top = float((charted.face.points[charted.face.triangles] @ outward).max())
-        return cls(axes, np.append(chart.plane_point(np.zeros(2)), top) @ axes)
+        top = float(matmul(charted.face.points[charted.face.triangles], outward).max())
+        return cls(axes, matmul(np.append(chart.plane_point(np.zeros(2)), top), axes))
 
     def vector(self, world: ArrayLike) -> FloatArray:
         """A vector of the world (..., 3) on these axes."""
-        return np.asarray(world, dtype=np.float64) @ self.axes.T
+        return matmul(np.asarray(world, dtype=np.float64), self.axes.T)
 
     def point(self, world: ArrayLike) -> FloatArray:
         """A point of the world [m] (..., 3) in this frame."""
@@ -39,4 +40,4 @@ class FaceFrame:
 
     def in_world(self, vector: ArrayLike) -> FloatArray:
         """A vector on these axes (..., 3) as the world has it."""
-        return np.asarray(vector, dtype=np.float64) @ self.axes
+        return matmul(np.asarray(vector, dtype=np.float64), self.axes)

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from msdm_core.arithmetic import cos, exp, matmul, norm, sin
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
@@ -196,7 +197,7 @@ def plan_sites(anatomy: Anatomy, around: Ball | None = None) -> tuple[FloatArray
     scene = anatomy.scene
     sites, normals = anatomy.face.raster(scene.palpation.site_spacing)
     if around is not None:
-        inside = np.linalg.norm(sites - np.asarray(around.centre), axis=1) <= around.radius
+        inside = norm(sites - np.asarray(around.centre), axis=1) <= around.radius
         sites, normals = sites[inside], normals[inside]
     free = anatomy.clear_of_supports(sites)
     if not free.any():
@@ -218,7 +219,7 @@ def _displaced(
     for site, normal in zip(sites, normals, strict=True):
         first, second = tangent_axes(normal)
         angle = rng.uniform(0.0, 2.0 * np.pi)
-        moved.append(face.project(site + MODEL_SITE_ERROR * (np.cos(angle) * first + np.sin(angle) * second)))
+        moved.append(face.project(site + MODEL_SITE_ERROR * (cos(angle) * first + sin(angle) * second)))
     return np.array([point for point, _ in moved]), np.array([normal for _, normal in moved])
 
 
@@ -237,7 +238,7 @@ def _maps(
         reading[used] / np.array([press.depth for press in pressed])[used]
         for reading, pressed in zip(readings, (presses, model_presses), strict=True)
     )
-    plane = sites @ np.column_stack(tangent_axes(anatomy.face.approach))
+    plane = matmul(sites, np.column_stack(tangent_axes(anatomy.face.approach)))
     contrasts = {
         NEIGHBOURS: contrast_with_neighbours(stiffness, plane, _geometry(anatomy.face, sites)),
         MODEL: contrast_with_model(stiffness, model_stiffness),
@@ -262,9 +263,9 @@ def _geometry(face: PalpableFace, sites: FloatArray) -> FloatArray | None:
     if not np.isfinite(face.thickness).any():
         return None
     centres = face.points[face.triangles].mean(axis=1)
-    thickness = np.array([face.thickness[np.argmin(((centres - site) ** 2).sum(axis=1))] for site in sites])
+    thickness = np.array([face.thickness[np.argmin(np.square(centres - site).sum(axis=1))] for site in sites])
     rim = np.array([face.rim_distance(site) for site in sites])
-    return np.column_stack([1.0 / thickness, np.exp(-rim / RIM_REACH)])
+    return np.column_stack([1.0 / thickness, exp(-rim / RIM_REACH)])
 
 
 def press_progress(console: Console | None) -> Progress:

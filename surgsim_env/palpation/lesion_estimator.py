@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import exp, matmul, solve
 from msdm_core.mesh.tet_mesh import FloatArray
 
 # The numbers below hold for lesions of 8 mm, the mean of those that `phantom` hides; lengths scale with the lesions'
@@ -66,18 +67,19 @@ class ContrastProcess:
         along, across = self._to_grid(places)
         if len(values) == 0:
             return 0.0, np.zeros((len(along), len(across)))
-        weights = np.linalg.solve(self._covariance(places), values)
+        weights = solve(self._covariance(places), values)
         # The covariance is a product over the axes: the map is one matrix product.
-        return BACKGROUND_SPREAD**2 * float(weights.sum()), EXCESS_SPREAD**2 * (along * weights) @ across.T
+        excess = matmul(EXCESS_SPREAD * EXCESS_SPREAD * (along * weights), across.T)
+        return BACKGROUND_SPREAD * BACKGROUND_SPREAD * float(weights.sum()), excess
 
     def spread(self, places: FloatArray) -> FloatArray:
         """Posterior standard deviation of the excess at the grid's points (g1, g0), given presses at places (n, 2)."""
         along, across = self._to_grid(places)
         if len(places) == 0:
             return np.full((len(along), len(across)), EXCESS_SPREAD)
-        between = EXCESS_SPREAD**2 * along[:, None] * across
-        explained = np.linalg.solve(self._covariance(places), between.reshape(-1, len(places)).T).T
-        variance = EXCESS_SPREAD**2 - (explained.reshape(between.shape) * between).sum(axis=2)
+        between = EXCESS_SPREAD * EXCESS_SPREAD * along[:, None] * across
+        explained = solve(self._covariance(places), between.reshape(-1, len(places)).T).T
+        variance = EXCESS_SPREAD * EXCESS_SPREAD - (explained.reshape(between.shape) * between).sum(axis=2)
         return np.sqrt(np.maximum(variance, 0.0))
 
     def _to_grid(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -88,16 +90,16 @@ class ContrastProcess:
     def excess_covariance(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Of the excess at places [m] (n, 2) and (m, 2): shape (n, m)."""
         columns, rows = (self._correlation(first[:, i], second[:, i]) for i in range(2))
-        return EXCESS_SPREAD**2 * (columns * rows)
+        return EXCESS_SPREAD * EXCESS_SPREAD * (columns * rows)
 
     def _covariance(self, places: FloatArray) -> FloatArray:
         """Of the presses' log contrasts, (n, n)."""
-        covariance = self.excess_covariance(places, places) + BACKGROUND_SPREAD**2
+        covariance = self.excess_covariance(places, places) + BACKGROUND_SPREAD * BACKGROUND_SPREAD
         covariance.flat[:: len(places) + 1] += self.noise_variance
         return covariance
 
     def _correlation(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        return np.exp(-0.5 * ((first[:, None] - second) / self.length) ** 2)
+        return exp(-0.5 * np.square((first[:, None] - second) / self.length))
 
 
 def contrast_process(
@@ -112,7 +114,7 @@ def contrast_process(
         length_share: factor on the correlation length.
     """
     length = length_share * (EXCESS_LENGTH * (lesion_radius / REFERENCE_LESION_RADIUS))
-    return ContrastProcess(axes, length, noise**2 + MODEL_SPREAD**2)
+    return ContrastProcess(axes, length, noise * noise + MODEL_SPREAD * MODEL_SPREAD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,14 +203,14 @@ class LesionEstimator:
 
     def _squared_distance(self, point: FloatArray) -> FloatArray:
         """From each of the map's points to a point [m^2], shape (g1, g0)."""
-        return (self.axes[1][:, None] - point[1]) ** 2 + (self.axes[0] - point[0]) ** 2
+        return np.square(self.axes[1][:, None] - point[1]) + np.square(self.axes[0] - point[0])
 
     def _centroid(self, excess: FloatArray, point: FloatArray) -> FloatArray:
         """Centroid [m] of the positive excess around a maximum: a grid's point would be half a spacing off."""
-        near = self._squared_distance(point) <= (CENTROID_RADIUS * self.scale) ** 2
+        near = self._squared_distance(point) <= (CENTROID_RADIUS * self.scale) * (CENTROID_RADIUS * self.scale)
         weight = np.where(near, np.maximum(excess, 0.0), 0.0)
         total = weight.sum()
-        return np.array([weight.sum(axis=0) @ self.axes[0], weight.sum(axis=1) @ self.axes[1]]) / total
+        return np.array([matmul(weight.sum(axis=0), self.axes[0]), matmul(weight.sum(axis=1), self.axes[1])]) / total
 
     def _outline(self, excess: FloatArray, points: FloatArray, strength: FloatArray) -> NDArray[np.bool_]:
         """Which of the map's points have more than a share of the excess of the lesion that they are nearest to."""
@@ -235,7 +237,7 @@ def strongest_apart(
     chosen: list[int] = []
     places = np.zeros((0, peaks.shape[1]))
     for index in np.argsort(-height, kind="stable").tolist():
-        if (np.sqrt(((places - peaks[index]) ** 2).sum(axis=1)) < distance_least).any():
+        if (np.sqrt(np.square(places - peaks[index]).sum(axis=1)) < distance_least).any():
             continue
         chosen.append(index)
         places = np.vstack([places, peaks[index] if place is None else place(index)])

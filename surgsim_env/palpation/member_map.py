@@ -13,6 +13,7 @@ from threading import Lock
 
 import numpy as np
 
+from msdm_core.arithmetic import exp, log, matmul, norm, solve
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.chart import (
     ChartedFace,
@@ -105,30 +106,33 @@ def _corrected(base: HealthyMap, member: Anatomy, progress: StepProgress) -> Flo
     spread = far_apart(charted, every)
     quick = quickened(member, progress)
     pressed = press_sites(quick, [every[index] for index in spread], progress, np.float32, str(member.member))
-    log_ratio = np.log(pressed / expected[spread])
+    log_ratio = log(pressed / expected[spread])
     points = np.array([site.place for site in every]) * charted.chart.extent / charted.chart.extent.max()
     mean = float(log_ratio.mean())
-    weights = np.linalg.solve(
-        _covariance(points[spread], points[spread]) + PRESS_SPREAD**2 * np.eye(len(spread)), log_ratio - mean
+    weights = solve(
+        _covariance(points[spread], points[spread]) + PRESS_SPREAD * PRESS_SPREAD * np.eye(len(spread)),
+        log_ratio - mean,
     )
-    ratio = np.exp(mean + _covariance(points, points[spread]) @ weights)
+    ratio = exp(mean + matmul(_covariance(points, points[spread]), weights))
     return (expected * ratio).reshape(charted.chart.side_count, -1)
 
 
 def _covariance(one: FloatArray, other: FloatArray) -> FloatArray:
     """Of log r about its mean between points (n, 2) and (m, 2), in longer half sides of the chart, shape (n, m)."""
-    square = ((one[:, None] - other) ** 2).sum(axis=2)
-    return np.sum([spread**2 * np.exp(-square / (2.0 * length**2)) for spread, length in RATIO_TERMS], axis=0)
+    square = np.square(one[:, None] - other).sum(axis=2)
+    return np.sum(
+        [spread * spread * exp(-square / (2.0 * (length * length))) for spread, length in RATIO_TERMS], axis=0
+    )
 
 
 def far_apart(charted: ChartedFace, sites: list[Site]) -> list[int]:
     """Indices of at most PRESS_COUNT different sites, each as far as possible from those before, from the middle on."""
     places = np.array([site.place for site in sites]) * charted.chart.extent
-    chosen, distance = [], np.linalg.norm(places, axis=1)
+    chosen, distance = [], norm(places, axis=1)
     index = int(np.argmin(distance))
     nearest = np.full(len(places), np.inf)
     while len(chosen) < PRESS_COUNT and nearest[index] > 0.0:
         chosen.append(index)
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[index], axis=1))
+        nearest = np.minimum(nearest, norm(places - places[index], axis=1))
         index = int(np.argmax(nearest))
     return chosen

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msdm_core.arithmetic import arccos, matmul, norm
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -108,7 +109,7 @@ def _hidden(anatomy: Anatomy, lesion: Lesion, truth: Truth) -> tuple[str, str] |
         return None
     more = f"{weights[best] / here:.1f} times" if here > 0.0 else "much"
     there = f"a press at {_place(points[best])} mm would strain it {more} as much"
-    facing = np.degrees(np.arccos(np.clip(-normals[best] @ anatomy.face.approach, -1.0, 1.0)))
+    facing = np.degrees(arccos(np.clip(matmul(-normals[best], anatomy.face.approach), -1.0, 1.0)))
     if facing <= anatomy.scene.palpation.face_angle_deg and not anatomy.clear_of_supports(points[best][None])[0]:
         return NEAR_SUPPORT, f"{there}, where the organ is held: move the anchor, if it is not there"
     into = ",".join(f"{value:.2f}" for value in -normals[best] + 0.0)
@@ -129,9 +130,9 @@ def _why(
     weak = contrast - 1.0 < one.threshold
     if hidden is not None and weak:
         return hidden
-    away = np.linalg.norm(pressed.sites - truth.point, axis=1)
+    away = norm(pressed.sites - truth.point, axis=1)
     if away.min() > pressed.spacing:
-        early = np.linalg.norm(pressed.ended_early - truth.point, axis=1) <= pressed.spacing
+        early = norm(pressed.ended_early - truth.point, axis=1) <= pressed.spacing
         said = f"{int(early.sum())} presses near it ended early, " if early.any() else ""
         return NO_SITE, f"{said}the nearest site of the map is {away.min() * 1e3:.1f} mm away"
     if reach.below:
@@ -139,7 +140,7 @@ def _why(
     if weak:
         return TOO_DEEP, f"{felt}; this map shows what exceeds its surroundings by {one.threshold:.2f}"
     for other in one.scores:
-        apart = float(np.linalg.norm(other.truth.point - truth.point))
+        apart = float(norm(other.truth.point - truth.point))
         if other is not score and apart < APART_SPACINGS * pressed.spacing:
             return MASKED, (
                 f"{felt}, but {other.truth.name} is felt {apart * 1e3:.1f} mm beside it: maxima nearer than "

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import TissueLoad
@@ -214,7 +215,7 @@ class SitePress:
         self._over = force_peak > self._hard_force
         if phase.read or self._over:
             surface = self.point + self.simulation.ground_shift(self.point)
-            below = (surface - self.simulation.instrument.tip_position) @ self.normal + self._radius
+            below = matmul(surface - self.simulation.instrument.tip_position, self.normal) + self._radius
             self.readings.append((self.simulation.contact_force, float(below)))
 
     def result(self) -> PressResult:
@@ -260,7 +261,7 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
     end = result.fault
     if not end and pressed.force_peak > scene.limits.hard_force:
         end = f"force limit {scene.limits.hard_force:g} N"
-    curve = np.array([(depth, force @ normal) for force, depth in pressed.readings]).reshape(-1, 2)
+    curve = np.array([(depth, matmul(force, normal)) for force, depth in pressed.readings]).reshape(-1, 2)
     # Without a reading before a fault depth and force are 0, as in `SitePress.result`.
     last = curve[-1 if end else -round(AVERAGE_TIME / simulation.haptic_dt) :] if len(curve) else np.zeros((1, 2))
     return Press(
@@ -281,10 +282,10 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
 def _far_travel(simulation: Simulation, site: FloatArray) -> float:
     """`Press.far_travel` of the present state [m]."""
     rest = simulation.anatomy.mesh.points
-    distance = np.linalg.norm(rest - site, axis=1)
+    distance = norm(rest - site, axis=1)
     far = distance >= np.median(distance)
     moved = simulation.organ_state.node_position[far] - rest[far] - simulation.ground_shift(rest[far])
-    return float(np.linalg.norm(moved, axis=1).max())
+    return float(norm(moved, axis=1).max())
 
 
 def scan(

@@ -61,7 +61,7 @@ def matched_distances(
     """Indices of true and estimated places as OSPA matches them, one to one, and distances [m], each (min(m, k),)."""
     from scipy.optimize import linear_sum_assignment
 
-    distance = np.sqrt(((np.asarray(truth)[:, None] - np.asarray(estimate)) ** 2).sum(axis=2))
+    distance = np.sqrt(np.square(np.asarray(truth)[:, None] - np.asarray(estimate)).sum(axis=2))
     rows, columns = linear_sum_assignment(np.minimum(distance, cutoff))
     return rows, columns, distance[rows, columns]
 

@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import log
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.bell_fit import BellFit, framed
@@ -102,7 +103,7 @@ class SiteTouches:
         healthy = float(self.healthy.stiffness(site.place + 2.0 * self.map_shift / self.charted.chart.extent))
         # Bias and noise may reverse a small force, and an arm may not reach below the surface: the least contrast.
         contrast = force / (result.depth * healthy) if result.depth > 0.0 else 0.0
-        log_contrast = math.log(contrast) if contrast > 0.0 else -math.inf
+        log_contrast = float(log(contrast)) if contrast > 0.0 else -math.inf
         bounded = min(max(log_contrast, -LOG_CONTRAST_BOUND), LOG_CONTRAST_BOUND)
         u, v = site.place.tolist()
         cut = bounded != log_contrast
@@ -243,7 +244,7 @@ class TouchMemory:
             return
         healthy = self.indenter.force(depth)
         self.product[site] += force * healthy
-        self.square[site] += healthy**2
+        self.square[site] += healthy * healthy
         self._stiffest = None
 
     @property

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.material.regions import Lesion, lesion_extent
 from msdm_core.mesh.surface import node_normals, triangle_lattice
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
@@ -86,27 +87,27 @@ def felt_weights(anatomy: Anatomy, lesion: Lesion, points: FloatArray, normals: 
         normals: unit outward normals there, shape (n_point, 3).
     """
     scene = anatomy.scene
-    spread = contact_radius(scene.instrument.tip_radius, scene.palpation.press_depth) ** 2
+    spread = np.square(contact_radius(scene.instrument.tip_radius, scene.palpation.press_depth))
     centre, half_axes = lesion_extent(anatomy.mesh, lesion)
     line = (np.arange(GRID) + 0.5) * 2.0 / GRID - 1.0
     grid = np.stack(np.meshgrid(line, line, line), axis=-1).reshape(-1, 3)
-    inside = centre + grid[(grid**2).sum(axis=1) <= 1.0] * half_axes
+    inside = centre + grid[(grid * grid).sum(axis=1) <= 1.0] * half_axes
     weights = np.empty(len(points))
     for index, (point, normal) in enumerate(zip(points, normals, strict=True)):
         away = inside - point
-        squared = (away**2).sum(axis=1)
-        depth = np.maximum(-(away @ normal), 0.0)
-        weights[index] = (depth**2 / (np.maximum(squared, 1e-18) * (squared + spread) ** 2)).sum()
+        squared = (away * away).sum(axis=1)
+        depth = np.maximum(-matmul(away, normal), 0.0)
+        weights[index] = (depth * depth / (np.maximum(squared, 1e-18) * np.square(squared + spread))).sum()
     return weights
 
 
 def _spread(points: FloatArray, normals: FloatArray, triangles: IntArray) -> tuple[FloatArray, FloatArray]:
     counts, _ = triangle_lattice(SPLITS)
     shares = counts / SPLITS
-    place = np.einsum("ps,tsi->tpi", shares, points[triangles]).reshape(-1, 3)
-    normal = np.einsum("ps,tsi->tpi", shares, normals[triangles]).reshape(-1, 3)
+    place = matmul(shares, points[triangles]).reshape(-1, 3)
+    normal = matmul(shares, normals[triangles]).reshape(-1, 3)
     # Corners and edges belong to several triangles.
     _, first = np.unique(np.round(place, 9), axis=0, return_index=True)
     first = np.sort(first)
     normal = normal[first]
-    return place[first], normal / np.linalg.norm(normal, axis=1)[:, None]
+    return place[first], normal / norm(normal, axis=1)[:, None]

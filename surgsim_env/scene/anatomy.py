@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import cos, matmul, norm
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion, Material
@@ -127,7 +128,7 @@ class Anatomy:
     def downward(self) -> FloatArray:
         """Unit vector that points down in pictures: gravity's direction, or without gravity the approach."""
         gravity = np.asarray(self.scene.gravity, dtype=np.float64)
-        return gravity / np.linalg.norm(gravity) if gravity.any() else self.face.approach
+        return gravity / norm(gravity) if gravity.any() else self.face.approach
 
     @cached_property
     def along_surface(self) -> SurfaceDistance:
@@ -142,7 +143,7 @@ class Anatomy:
         tip, nodes = self.scene.instrument.tip_radius, self.mesh.points
         held = ((nodes[self.anchors], SUPPORT_TIP_RADII * tip), (nodes[self.foundation_nodes], tip))
         return np.array(
-            [all((np.linalg.norm(near - point, axis=1) > gap).all() for near, gap in held) for point in points],
+            [all((norm(near - point, axis=1) > gap).all() for near, gap in held) for point in points],
             dtype=np.bool_,
         )
 
@@ -157,7 +158,7 @@ class Anatomy:
 
         It holds nodes of the face within a tip radius: the tip would press the support, not the tissue.
         """
-        distance = np.linalg.norm(self._face_supports - point, axis=1)
+        distance = norm(self._face_supports - point, axis=1)
         return bool((distance <= self.scene.instrument.tip_radius).any())
 
     def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
@@ -260,7 +261,7 @@ class Anatomy:
     def surface_distance(self, point: FloatArray) -> float:
         """Distance from a point to the free part of the organ's surface [m]."""
         triangle, weights = self._free_surface(point)
-        return float(np.linalg.norm(weights @ self._free_surface.corners[triangle] - point))
+        return float(norm(matmul(weights, self._free_surface.corners[triangle]) - point))
 
     @cached_property
     def _free_surface(self) -> NearestTriangle:
@@ -279,9 +280,9 @@ class Anatomy:
         centre = np.asarray(lesion.centre, dtype=np.float64)
         triangle, weights = self._surface(centre)
         corners = self._surface.corners[triangle]
-        nearest = weights @ corners
-        inward = (nearest - centre) @ np.cross(corners[1] - corners[0], corners[2] - corners[0]) > 0.0
-        depth = float(np.linalg.norm(nearest - centre))
+        nearest = matmul(weights, corners)
+        inward = matmul(nearest - centre, np.cross(corners[1] - corners[0], corners[2] - corners[0])) > 0.0
+        depth = float(norm(nearest - centre))
         x, y, z = nearest * 1e3
         if not inward:
             raise ValueError(
@@ -439,15 +440,15 @@ def _inside(mesh: TetMesh, anchor: Anchor, on_surface: NDArray[np.bool_]) -> NDA
         within = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
         return np.asarray(within & on_surface if anchor.is_elastic else within, dtype=np.bool_)
     if anchor.bed is not None:
-        depth: FloatArray = mesh.points @ np.asarray(anchor.bed.direction)
+        depth: FloatArray = matmul(mesh.points, np.asarray(anchor.bed.direction))
         deep = depth >= depth.max() - anchor.bed.share * np.ptp(depth)
         return on_surface & np.asarray(deep, dtype=np.bool_)
     if anchor.side is not None:
-        direction = np.asarray(anchor.side.direction) / np.linalg.norm(anchor.side.direction)
+        direction = np.asarray(anchor.side.direction) / norm(anchor.side.direction)
         if anchor.side.angle_deg == 180.0:
             return on_surface
-        facing = node_normals(mesh.points, mesh.boundary_triangles) @ direction
+        facing = matmul(node_normals(mesh.points, mesh.boundary_triangles), direction)
         # The flanks of a block, at a right angle up to rounding, face neither way.
-        return on_surface & np.asarray(facing > math.cos(math.radians(anchor.side.angle_deg)) + SIDE_ROUNDING)
+        return on_surface & np.asarray(facing > float(cos(math.radians(anchor.side.angle_deg))) + SIDE_ROUNDING)
     assert anchor.ball is not None
-    return on_surface & (np.linalg.norm(mesh.points - np.asarray(anchor.ball.centre), axis=1) <= anchor.ball.radius)
+    return on_surface & (norm(mesh.points - np.asarray(anchor.ball.centre), axis=1) <= anchor.ball.radius)

@@ -17,6 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from msdm_core.arithmetic import cbrt, cos, exp, log, matmul, norm, sin
 from msdm_core.errors import MeshError
 from msdm_core.mesh.quality import radius_ratios
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -29,7 +30,7 @@ from surgsim_env.scene.palpable_surface import moved_face, tangent_axes
 DEFAULT_SPLIT = "train"
 # Draws of a member until its ranges are too wide.
 TRIES_MOST = 200
-# Waves of the outline around the organ.
+# Waves of the outline around the organ, from two on.
 WAVES = (2, 3, 4)
 # Members whose anatomy is kept, the most recently used: a liver with the tables of its chart takes some 5 MB.
 KEPT_MOST = 128
@@ -62,22 +63,24 @@ class MemberShape:
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Where points of the template [m] (n, 3) are in the member [m] (n, 3)."""
-        places = (np.asarray(points, dtype=np.float64) - self.middle) @ self.frame.T
+        places = matmul(np.asarray(points, dtype=np.float64) - self.middle, self.frame.T)
         spread = places[:, :2] / self.half_length[:2]
         places = places * self.stretch
-        turned = spread[:, 0] + 1j * spread[:, 1]
-        outline = sum(
-            (turned**wave * complex(cosine, -sine)).real for wave, (cosine, sine) in zip(WAVES, self.wave, strict=True)
-        )
-        places[:, :2] *= 1.0 + np.asarray(outline).reshape(-1, 1)
+        u, v = spread.T
+        # Parts of (u + i v)^m: r^m cos(m p) and r^m sin(m p). numpy's complex products differ by processor.
+        along, across, outline = u, v, np.zeros(len(places))
+        for cosine, sine in self.wave:
+            along, across = along * u - across * v, along * v + across * u
+            outline += along * cosine + across * sine
+        places[:, :2] *= 1.0 + outline[:, None]
         bumped = places.copy()
         for place, way, width in zip(self.bump_place, self.bump_way, self.bump_width, strict=True):
-            square = ((places - place) ** 2).sum(axis=1)
-            bumped += np.exp(-square / (2.0 * width**2))[:, None] * way
+            square = np.square(places - place).sum(axis=1)
+            bumped += exp(-square / (2.0 * (width * width)))[:, None] * way
         u, v = bumped[:, 0], bumped[:, 1]
         k_uu, k_uv, k_vv = self.bend
-        bumped[:, 2] += 0.5 * (k_uu * u**2 + 2.0 * k_uv * u * v + k_vv * v**2)
-        return bumped @ self.frame + self.middle
+        bumped[:, 2] += 0.5 * (k_uu * (u * u) + 2.0 * k_uv * u * v + k_vv * (v * v))
+        return matmul(bumped, self.frame) + self.middle
 
 
 def draw_shape(family: Family, template: Anatomy, rng: np.random.Generator) -> MemberShape:
@@ -85,10 +88,10 @@ def draw_shape(family: Family, template: Anatomy, rng: np.random.Generator) -> M
     points, approach = template.mesh.points, template.face.approach
     frame = np.stack([*tangent_axes(approach), approach])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    places = (points - middle) @ frame.T
+    places = matmul(points - middle, frame.T)
     size, thickness = float(rng.uniform(*family.size)), float(rng.uniform(*family.thickness))
-    aspect = np.exp(rng.uniform(*np.log(family.aspect), size=3))
-    stretch = size * aspect / np.cbrt(aspect.prod())
+    aspect = exp(rng.uniform(*log(family.aspect), size=3))
+    stretch = size * aspect / cbrt(aspect.prod())
     stretch[2] *= thickness
     # Amplitudes of all waves together are at most `edge` where r is 1.
     phase = rng.uniform(0.0, 2.0 * math.pi, len(WAVES))
@@ -96,14 +99,14 @@ def draw_shape(family: Family, template: Anatomy, rng: np.random.Generator) -> M
     surface = template.mesh.boundary_nodes
     chosen = surface[rng.integers(len(surface), size=family.bump_count)]
     way = rng.normal(size=(family.bump_count, 3))
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    way /= norm(way, axis=1, keepdims=True)
     height = rng.uniform(-family.bump_height, family.bump_height, family.bump_count)
     return MemberShape(
         middle=middle,
         frame=frame,
         half_length=np.abs(places).max(axis=0),
         stretch=stretch,
-        wave=np.stack([amplitude * np.cos(phase), amplitude * np.sin(phase)], axis=1),
+        wave=np.stack([amplitude * cos(phase), amplitude * sin(phase)], axis=1),
         bump_place=places[chosen] * stretch,
         bump_way=height[:, None] * way,
         bump_width=rng.uniform(*family.bump_width, size=family.bump_count),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from msdm_core.arithmetic import cos, matmul, norm, sin
 from msdm_core.kernels.structure_kernels import ContactLaw
 from msdm_core.material.regions import Capsule, Damping, Lesion, Material
 from msdm_core.material.stiffness import check_stiffness_rule
@@ -310,12 +311,12 @@ class Port:
 
 def frame_into(into: FloatArray, roll: float = 0.0) -> FloatArray:
     """A right-handed frame whose -z is a direction, its x near world x (else y), turned by roll [rad]; (3, 3)."""
-    z = -into / np.linalg.norm(into)
+    z = -into / norm(into)
     near = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    x = near - (near @ z) * z
-    x /= np.linalg.norm(x)
+    x = near - matmul(near, z) * z
+    x /= norm(x)
     y = np.cross(z, x)
-    c, s = math.cos(roll), math.sin(roll)
+    c, s = float(cos(roll)), float(sin(roll))
     return np.stack([c * x + s * y, c * y - s * x, z], axis=1)
 
 
@@ -651,7 +652,7 @@ class CyclicMotion:
         """How a unit of the signal moves the ground of an organ whose nodes rest at some points [m] (n_node, 3)."""
         if self.side is None:
             return Motion(self.name, self.displacement, self.centre, self.reach)
-        along = points @ (np.array(self.side) / np.linalg.norm(self.side))
+        along = matmul(points, np.array(self.side) / norm(self.side))
         x, y, z = points[along >= along.max() - END_SHARE * np.ptp(along)].mean(axis=0).tolist()
         return Motion(self.name, self.displacement, (x, y, z), self.reach)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from msdm_core.arithmetic import matmul, norm
 from surgsim_env.scene.load import fill, nearest, read_toml, scenes_folder
 from surgsim_env.scene.model import CyclicMotion, Range, Scene, Vector
 
@@ -42,10 +43,10 @@ class PatientMotion:
         Of the approach only what is perpendicular to `cranial` counts; a probe along the patient's axis shows no front,
         and the part towards it is left out.
         """
-        cranial = np.array(scene.cranial) / np.linalg.norm(scene.cranial)
-        approach = np.array(scene.instrument.approach) / np.linalg.norm(scene.instrument.approach)
-        front = (approach @ cranial) * cranial - approach
-        across = float(np.linalg.norm(front))
+        cranial = np.array(scene.cranial) / norm(scene.cranial)
+        approach = np.array(scene.instrument.approach) / norm(scene.instrument.approach)
+        front = matmul(approach, cranial) * cranial - approach
+        across = float(norm(front))
         front = front / across if across > ACROSS_LEAST else np.zeros(3)
         x, y, z = (self.anterior * front - self.caudal * cranial).tolist()
         return CyclicMotion(

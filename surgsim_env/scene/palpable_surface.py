@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import cos, matmul, norm
 from msdm_core.kernels.ray_kernels import nearest_hits
 from msdm_core.material.regions import Material
 from msdm_core.mesh.geodesic import NearestTriangle
@@ -66,32 +67,32 @@ class PalpableFace:
 
     def _at(self, face: int, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         nodes = self.triangles[face]
-        normal = weights @ self.normals[nodes]
-        return weights @ self.points[nodes], normal / np.linalg.norm(normal)
+        normal = matmul(weights, self.normals[nodes])
+        return matmul(weights, self.points[nodes]), normal / norm(normal)
 
     def carried(self, point: ArrayLike, other: "PalpableFace") -> FloatArray:
         """Where a point [m] (3,) of this face is on that of another member of its family, of the same triangles."""
         face, weights = self._nearest(np.asarray(point, dtype=np.float64))
-        return weights @ other.points[other.triangles[face]]
+        return matmul(weights, other.points[other.triangles[face]])
 
     def rim_distance(self, point: FloatArray) -> float:
         """Distance from a point to the face's border [m]."""
         start, span, squared = self._rim_segments
         along = np.clip(((point - start) * span).sum(axis=1) / squared, 0.0, 1.0)
-        return float(np.sqrt((((start + along[:, None] * span) - point) ** 2).sum(axis=1).min()))
+        return float(np.sqrt(np.square((start + along[:, None] * span) - point).sum(axis=1).min()))
 
     @cached_property
     def _rim_segments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Start and span of the border's edges (n_rim, 3) [m], and their squared lengths (n_rim,) [m^2]."""
         start, end = self.points[self.rim[:, 0]], self.points[self.rim[:, 1]]
         span = end - start
-        return start, span, (span**2).sum(axis=1)
+        return start, span, (span * span).sum(axis=1)
 
     @cached_property
     def _cumulative_area(self) -> FloatArray:
         """Twice the area of each triangle and all before it [m^2], shape (n_face,)."""
         corners = self.points[self.triangles]
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         return np.cumsum(area)
 
     def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
@@ -131,7 +132,7 @@ class PalpableFace:
         """The triangles' corners projected across the approach (n_face, 3, 2), and their heights (n_face, 3) [m]."""
         across, along = tangent_axes(self.approach)
         corners = self.points[self.triangles]
-        return np.stack([corners @ across, corners @ along], axis=2), corners @ -self.approach
+        return np.stack([matmul(corners, across), matmul(corners, along)], axis=2), matmul(corners, -self.approach)
 
     def drop(self, u: float, v: float) -> tuple[FloatArray, FloatArray] | None:
         """The uppermost point of the face over a point of the plane of `tangent_axes` [m], and its normal, each (3,).
@@ -143,9 +144,9 @@ class PalpableFace:
 
     def is_open(self, point: FloatArray) -> bool:
         """Whether nothing of the face lies above a point of it [m] (3,), so that a straight tool gets there."""
-        u, v = (float(point @ axis) for axis in tangent_axes(self.approach))
+        u, v = (float(matmul(point, axis)) for axis in tangent_axes(self.approach))
         top = self.drop(u, v)
-        return top is None or float((top[0] - point) @ -self.approach) <= OPEN_GAP
+        return top is None or float(matmul(top[0] - point, -self.approach)) <= OPEN_GAP
 
     def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
         """`drop`, but None also where no tool may press.
@@ -163,9 +164,9 @@ class PalpableFace:
     def is_clear(self, point: FloatArray, normal: FloatArray) -> bool:
         """Whether a tip that touches the face at a point [m] (3,), and its shaft, touch the organ nowhere else."""
         away = self.solid - (point + self.tip_radius * normal)
-        along, square = away @ -self.approach, (away**2).sum(axis=1)
-        in_shaft = (along > 0.0) & (square - along**2 < SHAFT_RADIUS**2)
-        return not (in_shaft | (square < (TIP_FREE * self.tip_radius) ** 2)).any()
+        along, square = matmul(away, -self.approach), (away * away).sum(axis=1)
+        in_shaft = (along > 0.0) & (square - (along * along) < (SHAFT_RADIUS * SHAFT_RADIUS))
+        return not (in_shaft | (square < np.square(TIP_FREE * self.tip_radius))).any()
 
     def raster(self, spacing: float) -> tuple[FloatArray, FloatArray]:
         """Points on a square grid seen along the approach, dropped onto the face, and their normals, each (n_site, 3).
@@ -194,12 +195,12 @@ def find_palpable_face(
         ValueError: no triangle faces the instrument.
     """
     direction = np.asarray(approach, dtype=np.float64)
-    direction = direction / np.linalg.norm(direction)
+    direction = direction / norm(direction)
     triangles = mesh.boundary_triangles
     corners = mesh.points[triangles]
     area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
-    chosen = -unit @ direction >= math.cos(math.radians(palpation.face_angle_deg))
+    unit = area_vector / norm(area_vector, axis=1)[:, None]
+    chosen = matmul(-unit, direction) >= float(cos(math.radians(palpation.face_angle_deg)))
     if not chosen.any():
         raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
     return _face_of(mesh, chosen, direction, palpation, tip_radius)
@@ -223,7 +224,7 @@ def _face_of(
     triangles = mesh.boundary_triangles
     corners = mesh.points[triangles]
     area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area_vector / np.linalg.norm(area_vector, axis=1)[:, None]
+    unit = area_vector / norm(area_vector, axis=1)[:, None]
     face = triangles[chosen]
     normals = node_normals(mesh.points, face)
     sides = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
@@ -255,8 +256,8 @@ def _middles(corners: FloatArray) -> list[FloatArray]:
 def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors across a direction, the first as near to world x (else y) as possible."""
     start = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    first = start - (start @ direction) * direction
-    first /= np.linalg.norm(first)
+    first = start - matmul(start, direction) * direction
+    first /= norm(first)
     return first, np.cross(direction, first) * (-1.0)
 
 
@@ -312,8 +313,8 @@ def share_text(cell: float, tip_radius: float, press_depth: float) -> str:
 
 def hertz_force(material: Material, tip_radius: float, press_depth: float) -> float:
     """Force of a ball on an elastic half space, F = 4/3 E / (1 - nu^2) R^0.5 d^1.5 (Hertz 1881) [N]."""
-    stiffness = material.youngs_modulus / (1.0 - material.poisson_ratio**2)
-    return 4.0 / 3.0 * stiffness * math.sqrt(tip_radius) * press_depth**1.5
+    stiffness = material.youngs_modulus / (1.0 - material.poisson_ratio * material.poisson_ratio)
+    return 4.0 / 3.0 * stiffness * math.sqrt(tip_radius) * press_depth * math.sqrt(press_depth)
 
 
 def hidden_share(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> float:
@@ -324,7 +325,7 @@ def hidden_share(force: float, tip_radius: float, press_depth: float, contact_st
     contact under the tip. The force of a press elsewhere falls in proportion to itself, so that a contrast C loses this
     share of C - 1. Finite elements lose 0.7 to 1.3 of it (`surgsim validate`, rows "hidden by contact").
     """
-    return 2.25 * force / (math.pi * contact_stiffness * tip_radius * press_depth**2)
+    return 2.25 * force / (math.pi * contact_stiffness * tip_radius * (press_depth * press_depth))
 
 
 def hidden_text(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> str:

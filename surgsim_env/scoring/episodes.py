@@ -463,5 +463,5 @@ def _over_lesion(task: PalpateSitesTask, points: NDArray[np.float64]) -> NDArray
     chart = task.charted.chart
     for lesion in task.lesions:
         centre = 0.5 * (chart.place(lesion.centre) + 1.0) * chart.extent  # type: ignore[arg-type]
-        over |= ((points - centre) ** 2).sum(axis=-1) <= lesion.radius**2  # type: ignore[operator]
+        over |= np.square(points - centre).sum(axis=-1) <= lesion.radius * lesion.radius  # type: ignore[operator]
     return over

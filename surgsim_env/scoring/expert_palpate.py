@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import norm
 from surgsim_env.palpation.chart import MAP_SIDE
 
 ROWS_FEWEST = 5
@@ -75,7 +76,7 @@ class PalpateExpert:
         begun, over = seen[:, self.first] > 0.5, seen[:, self.last] > 0.5
         goal = np.where(over[:, None], self.chart.plane_point(stiffest[:, :2]), self.start)
         gap = goal - tip
-        distance = np.linalg.norm(gap, axis=1)
+        distance = norm(gap, axis=1)
         sliding = begun & ~over
         across = np.where(sliding[:, None], self._along_rows(tip), gap / GOAL_NEAR)
         # In the air on the way to the first row.

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import arctan2, norm
 from surgsim_env.tasks.retract import RetractTask
 
 SPEED = 0.02  # [m/s] full scale of an action's velocity
@@ -90,8 +91,8 @@ class RetractExpert:
         waiting = np.array([grasp[0], grasp[1] + GRASP_DEPTH + WAITING_GAP, grasp[2]])
         across = math.hypot(off[0], off[2])
         turning = _levelling(now)
-        closing = now[GAP] < OPEN_GAP and np.linalg.norm(off) < NEAR_GRASP
-        if np.linalg.norm(off) < ARRIVED or closing:
+        closing = now[GAP] < OPEN_GAP and norm(off) < NEAR_GRASP
+        if norm(off) < ARRIVED or closing:
             return 0.2 * off / CONTROL_STEP, turning, -1.0
         if across < ALIGNED or (across < 2.0 * ALIGNED and tip[1] < waiting[1] - 0.002):
             return towards(off, APPROACH_SPEED), turning, 1.0
@@ -136,7 +137,7 @@ class TolerantExpert(RetractExpert):
         nearest = float(np.clip(tip[0], self._grasp_along - ALONG_SLACK, self._grasp_along + ALONG_SLACK))
         off = grasp_place(now, nearest) - tip
         arrived = abs(off[2]) < CLOSES_HIGH and -CLOSES_OUT < off[1] < CLOSES_IN
-        closing = now[GAP] < OPEN_GAP and float(np.linalg.norm(off)) < CLOSING_REACH
+        closing = now[GAP] < OPEN_GAP and float(norm(off)) < CLOSING_REACH
         if arrived or closing:
             return 0.2 * off / CONTROL_STEP, _levelling(now), -1.0
         share = (math.hypot(off[0], off[2]) - HEIGHT_FREE) / (HEIGHT_WAITING - HEIGHT_FREE)
@@ -158,11 +159,11 @@ def grasp_place(now: NDArray[np.float64], along: float | None = None) -> NDArray
 
 def towards(gap: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
     """A velocity along a remaining way [m], slower on its last millimetre, because the tip lags behind its command."""
-    distance = float(np.linalg.norm(gap))
+    distance = float(norm(gap))
     return gap * (min(speed, 0.6 * distance / CONTROL_STEP) / max(distance, 1e-9))
 
 
 def _levelling(now: NDArray[np.float64]) -> float:
     """Angular velocity of the wrist that levels the jaw [rad/s]; above 0 its pads sink."""
     _, y, z = now[POINTS_ALONG]
-    return -0.6 * math.atan2(-z, -y) / CONTROL_STEP
+    return -0.6 * float(arctan2(-z, -y)) / CONTROL_STEP

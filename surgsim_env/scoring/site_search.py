@@ -72,7 +72,7 @@ class SobolSites:
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
         """Begin an episode."""
-        powers = int(np.ceil(np.log2(facts.budget)))
+        powers = (facts.budget - 1).bit_length()
         self.places = iter(qmc.Sobol(2, scramble=True, rng=rng).random_base2(powers))
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -170,7 +170,7 @@ class OracleNear(OracleSites):
         super().see(task)
         facts = self.process.facts
         lesions = 0.5 * (np.array(self.places, dtype=np.float64).reshape(-1, 2) + 1.0) * facts.extent
-        squared = ((facts.sites[:, None] - lesions) ** 2).sum(axis=2).min(axis=1, initial=np.inf)
+        squared = np.square(facts.sites[:, None] - lesions).sum(axis=2).min(axis=1, initial=np.inf)
         far = facts.sites[np.argmax(np.where(self.process.candidates, squared, -np.inf))]
         rings = [lesions + self.distance * facts.lesion_radius * way for way in self.around]
         self.first_places = np.concatenate([lesions, far[None], *rings])

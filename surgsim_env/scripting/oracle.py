@@ -6,6 +6,7 @@ from collections.abc import Callable
 import gymnasium as gym
 import numpy as np
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.coupling.tracking import SurfaceTracker
@@ -183,19 +184,19 @@ def _travel_height(anatomy: Anatomy, start: FloatArray, end: FloatArray) -> floa
     points = anatomy.mesh.points[anatomy.mesh.boundary_nodes]
     span = _level(end - start, upward)
     level = _level(points - start, upward)
-    share = np.clip(level @ span / max(float(span @ span), 1e-12), 0.0, 1.0)
-    near = np.linalg.norm(level - share[:, None] * span, axis=1) <= radius + CORRIDOR
-    tissue = float((points[near] @ upward).max(initial=-np.inf)) + radius + TRAVEL_GAP
-    return max(tissue, float(start @ upward), float(end @ upward))
+    share = np.clip(matmul(level, span) / max(float(matmul(span, span)), 1e-12), 0.0, 1.0)
+    near = norm(level - share[:, None] * span, axis=1) <= radius + CORRIDOR
+    tissue = float(matmul(points[near], upward).max(initial=-np.inf)) + radius + TRAVEL_GAP
+    return max(tissue, float(matmul(start, upward)), float(matmul(end, upward)))
 
 
 def _level(vectors: FloatArray, upward: FloatArray) -> FloatArray:
     """Vectors without their share along a unit direction."""
-    return vectors - (vectors @ upward)[..., None] * upward
+    return vectors - matmul(vectors, upward)[..., None] * upward
 
 
 def _at_height(place: FloatArray, approach: FloatArray, height: float) -> tuple[float, float, float]:
-    x, y, z = (place - approach * (height + float(place @ approach))).tolist()
+    x, y, z = (place - approach * (height + float(matmul(place, approach)))).tolist()
     return x, y, z
 
 
@@ -226,7 +227,7 @@ def flap_steps(
     place, sides = edge_section(simulation.organ_state.node_position, free, along, float(box[0][1]))
     bed = max((float(one.reach(OUTWARD)) for one in scene.supports), default=-math.inf)
     jaw = np.asarray(scene.instrument.tip_direction or (0.0, -1.0, 0.0))
-    jaw = jaw / np.linalg.norm(jaw)
+    jaw = jaw / norm(jaw)
     # Across the jaw, which points along the middle of the edge.
     thick = np.ptp(sides, axis=1) * abs(jaw[1])
     grasped = simulation.grasp

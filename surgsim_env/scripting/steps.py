@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
@@ -130,18 +131,18 @@ class View:
 
     def pressing_force(self, direction: FloatArray, *, sensed: bool = False) -> float:
         """The force with which the tissue pushes back against a unit direction [N], true or sensed."""
-        return -float((self.sensed_force if sensed else self.true_force) @ direction)
+        return -float(matmul(self.sensed_force if sensed else self.true_force, direction))
 
     def depth(self, direction: FloatArray) -> float:
         """How far the tip went along a unit direction since the step's first contact [m]; 0 before it."""
         if self.contact_position is None:
             return 0.0
-        return float((self.tip_position - self.contact_position) @ direction)
+        return float(matmul(self.tip_position - self.contact_position, direction))
 
     def reached(self) -> str:
         """Where the tip is and what it feels, in words."""
         place = ", ".join(f"{value * 1e3:.2f}" for value in self.tip_position)
-        force = float(np.linalg.norm(self.true_force))
+        force = float(norm(self.true_force))
         return f"tip at ({place}) mm, contact force {force:.3f} N, {self.step_time:.2f} s after the step began"
 
 
@@ -223,12 +224,12 @@ class MoveTo(_Checked):
     def actions(self, view: View) -> Plan:
         """Towards the point, slower on the last millimetre."""
         left = np.atleast_1d(np.asarray(self.turn, dtype=np.float64))
-        while np.linalg.norm(gap := np.array(self.point) - view.tip_position) > self.tolerance:
+        while norm(gap := np.array(self.point) - view.tip_position) > self.tolerance:
             velocity = _towards(gap, self.speed, view.control_step)
             if not left.any():
                 view = yield view.action(velocity)
                 continue
-            share = float(np.linalg.norm(velocity) / np.linalg.norm(gap))
+            share = float(norm(velocity) / norm(gap))
             view = yield view.action(velocity, turning=left * share)
             left = left * (1.0 - share * view.control_step)
 
@@ -265,11 +266,11 @@ class Follow(_Checked):
         begun = view.time
         while (now := view.time - begun) < time[-1]:
             there = np.array([np.interp(now, time, column) for column in places.T])
-            if (missed := float(np.linalg.norm(there - view.tip_position))) > self.tolerance:
+            if (missed := float(norm(there - view.tip_position))) > self.tolerance:
                 raise StepFailed(f"was {missed * 1e3:.1f} mm from the path of {self.path.name} at {now:.2f} s of it")
             ahead = np.array([np.interp(now + view.control_step, time, column) for column in places.T])
             way = ahead - view.tip_position
-            distance = float(np.linalg.norm(way))
+            distance = float(norm(way))
             pace = min(self.speed, distance / view.control_step)
             view = yield view.action(way * (pace / distance) if distance > 0.0 else np.zeros(3))
 
@@ -340,7 +341,7 @@ class PressUntil(_Checked):
                 speed = min(speed, (self.force - felt) / (stiffness * view.control_step))
             before, place = felt, view.tip_position
             view = yield view.action(along * speed)
-            travel = float((view.tip_position - place) @ along)
+            travel = float(matmul(view.tip_position - place, along))
             if travel > TRAVEL_READ:
                 stiffness = max(stiffness, (view.pressing_force(along, sensed=self.sensed) - before) / travel)
 
@@ -373,7 +374,7 @@ class Lift(_Checked):
         """Away from the tissue."""
         along = -view.approach if self.direction is None else np.array(self.direction)
         goal = view.tip_position + along * self.height
-        while (left := float((goal - view.tip_position) @ along)) > 0.0:
+        while (left := float(matmul(goal - view.tip_position, along))) > 0.0:
             # A little further than the goal: the tip lags behind its command, and the step has to end.
             view = yield view.action(along * min(self.speed, (left + 0.0002) / view.control_step))
 
@@ -460,7 +461,7 @@ def _over(view: View, duration: float) -> bool:
 
 def _towards(gap: FloatArray, speed: float, control_step: float) -> FloatArray:
     """Velocity along a gap [m] that does not overshoot it [m/s], shape (3,)."""
-    distance = float(np.linalg.norm(gap))
+    distance = float(norm(gap))
     return gap / distance * min(speed, APPROACH_GAIN * distance / control_step)
 
 
@@ -514,7 +515,7 @@ class PressSupport(_Checked):
             missing = self.force - view.support_force
             speed = float(np.clip(GAIN * missing, -self.speed, self.speed))
             aside = np.array(self.point) - view.tip_position
-            aside -= (aside @ along) * along
+            aside -= matmul(aside, along) * along
             view = yield view.action(speed * along + HOMING * aside)
 
 
@@ -662,7 +663,7 @@ def unit_vector(step: Any, field: str, value: ArrayLike) -> tuple[float, float, 
         ValueError: not three finite numbers, or all of them 0.
     """
     vector = np.array(point_of(step, field, value))
-    length = float(np.linalg.norm(vector))
+    length = float(norm(vector))
     if not 0.0 < length < math.inf:
         raise ValueError(f"{type(step).__name__}: {field} is {value!r}; it must point somewhere: (0, 0, -1) is down")
     x, y, z = (vector / length).tolist()

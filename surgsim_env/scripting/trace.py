@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import matmul
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.envs.surgical_env import Observation
 from surgsim_env.scripting.observations import make_read_only, selected_observations
@@ -78,7 +79,7 @@ class Trace:
     @property
     def force_size(self) -> FloatArray:
         """Size of `force` [N], shape (n,)."""
-        return np.sqrt((self.force**2).sum(axis=1))
+        return np.sqrt(np.square(self.force).sum(axis=1))
 
     @property
     def peak_force(self) -> float:
@@ -166,7 +167,7 @@ def contact_depth(wrench: FloatArray, tip_position: FloatArray, approach: FloatA
         approach: unit vector, shape (3,).
     """
     touching = np.asarray(wrench.any(axis=(1, 2)))
-    along = tip_position @ approach
+    along = matmul(tip_position, approach)
     began = touching & ~np.concatenate([[False], touching[:-1]])
     origin = np.maximum.accumulate(np.where(began, np.arange(len(along)), 0))
     return np.where(touching, along - along[origin], 0.0)

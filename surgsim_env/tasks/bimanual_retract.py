@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from msdm_core.arithmetic import norm
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
@@ -239,7 +240,7 @@ class BimanualRetractTask(RetractTask):
 
     def nearness(self, simulation: Simulation) -> float:
         """Nearness of the right tip to the target: 1 on it, 0 from NEAR on."""
-        away = np.linalg.norm(self._from_target(simulation))
+        away = norm(self._from_target(simulation))
         return max(1.0 - float(away) / NEAR, 0.0)
 
     def _from_target(self, simulation: Simulation) -> FloatArray:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from msdm_core.arithmetic import matmul
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -63,7 +64,7 @@ def touch_memory(anatomy: Anatomy) -> TouchMemory:
 
 
 def _site_count(task: "PalpateTask") -> int:
-    return 0 if task.memory is None else MAP_SIDE**2
+    return 0 if task.memory is None else MAP_SIDE * MAP_SIDE
 
 
 def _stiffest_bound(task: "PalpateTask", instrument: Instrument) -> FloatArray:
@@ -362,10 +363,10 @@ class PalpateTask(Task):
             return
         tip = self.resting_place(simulation)
         surface, normal = self.anatomy.face.project(tip)
-        depth = self.charted.tip_radius - float((tip - surface) @ normal)
+        depth = self.charted.tip_radius - float(matmul(tip - surface, normal))
         self.tip_depth, self.surface_normal = depth, normal
         if memory is not None:
-            memory.feel(memory.chart.place(surface), depth, float(self.sensed["contact_force"] @ normal))
+            memory.feel(memory.chart.place(surface), depth, float(matmul(self.sensed["contact_force"], normal)))
 
     def end(self, step: ControlStep) -> str:
         """A fault, the hard limit, or a declaration: "found" or "wrong"."""

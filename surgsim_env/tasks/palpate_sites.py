@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from msdm_core.arithmetic import exp, matmul
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
@@ -40,7 +41,7 @@ CELL_BOUND, LESION_BOUND, NOISE_BOUND = 100.0, 100.0, 100.0
 
 
 def _map_size(task: "PalpateSitesTask") -> int:
-    return MAP_SIDE**2 if task.memory else 0
+    return MAP_SIDE * MAP_SIDE if task.memory else 0
 
 
 def _with_memory(size: int) -> Callable[["PalpateSitesTask"], int]:
@@ -355,7 +356,7 @@ class PalpateSitesTask(Task):
             # Between presses the sensor bears nothing.
             self.reading.follow(np.zeros(3))
             reading, saturated = self.reading.read(result.force, rng, self.felt.seconds)
-            self.felt.add(site, result, float(reading @ site.normal))
+            self.felt.add(site, result, float(matmul(reading, site.normal)))
             self._believe()
         # A press that was looked up has no simulation, and no channel reads it.
         return super().observe(simulation, rng)[0], saturated  # type: ignore[arg-type]
@@ -371,7 +372,7 @@ class PalpateSitesTask(Task):
         """Share of lesions with an estimate near them; without lesions 1 where there is no estimate either."""
         if len(self.truth) == 0:
             return float(len(self.estimated) == 0)
-        distance = np.sqrt(((self.truth[:, None] - self.estimated) ** 2).sum(axis=2))
+        distance = np.sqrt(np.square(self.truth[:, None] - self.estimated).sum(axis=2))
         return float((distance <= FOUND_SHARE * self.cutoff).any(axis=1).mean())
 
     # ---- judgement --------------------------------------------------------------------------------------------------
@@ -391,7 +392,7 @@ class PalpateSitesTask(Task):
             "force": last.force,
             "depth": last.depth,
             "stiffness": last.stiffness,
-            "contrast": math.exp(last.log_contrast),
+            "contrast": float(exp(last.log_contrast)),
             "contrast_cut": last.cut,
             "stopped_by_force": last.stopped,
             "moved_mm": last.moved * 1000.0,

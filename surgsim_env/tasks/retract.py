@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import cbrt, cos, norm, sin
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Capsule, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
@@ -453,7 +454,7 @@ def _nearest_nodes(points: FloatArray, box: tuple[FloatArray, FloatArray]) -> ND
     """The nodes nearest to the TRACKED places of what is lifted, (n_tracked,)."""
     low, high = box
     places = low + np.array(TRACKED) * (high - low)
-    return np.array([int(np.argmin(((points - place) ** 2).sum(axis=1))) for place in places])
+    return np.array([int(np.argmin(np.square(points - place).sum(axis=1))) for place in places])
 
 
 # ---- what an episode draws -------------------------------------------------------------------------------------
@@ -543,13 +544,13 @@ def held_nodes(points: FloatArray, anchors: IntArray, share: float) -> IntArray:
 def _moved(endoscope: Endoscope, camera: RetractionCamera, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """An endoscope moved evenly within a ball, its view turned about an axis across it: where it stands and looks."""
     way = rng.normal(size=3)
-    shift = way / np.linalg.norm(way) * camera.shift * rng.uniform() ** (1.0 / 3.0)
+    shift = way / norm(way) * camera.shift * cbrt(rng.uniform())
     view = np.subtract(endoscope.target, endoscope.position)
     across = np.cross(view, rng.normal(size=3))
-    across /= np.linalg.norm(across)
+    across /= norm(across)
     angle = math.radians(camera.turn_deg) * rng.uniform()
     # The axis lies across the view, so that turning it (Rodrigues) needs no third term.
-    turned = view * math.cos(angle) + np.cross(across, view) * math.sin(angle)
+    turned = view * float(cos(angle)) + np.cross(across, view) * float(sin(angle))
     eye = np.asarray(endoscope.position) + shift
     return eye, eye + turned
 
@@ -622,7 +623,7 @@ class RetractionRecord:
         self.slips += int((slipping and not self.slipping) or lost)
         self.slipping, self.held = slipping, grasp.holds
         if self.tip is not None:
-            self.path += float(np.linalg.norm(tip - self.tip))
+            self.path += float(norm(tip - self.tip))
         self.tip = tip.tolist()
         self.strain = [max(one, other) for one, other in zip(self.strain, strain)]
 
@@ -678,7 +679,7 @@ def region_strains(model: OrganModel, node_position: FloatArray, box: tuple[Floa
         box: corners of the box of what is lifted [m], (3,) each; other edges do not count.
     """
     first, second = model.spring_nodes.T
-    lengths = np.linalg.norm(node_position[first] - node_position[second], axis=1)
+    lengths = norm(node_position[first] - node_position[second], axis=1)
     strain = lengths / model.spring_rest_length - 1.0
     rest = model.node_rest_position
     middle = 0.5 * (rest[first] + rest[second])

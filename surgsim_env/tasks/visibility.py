@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import cos, matmul, norm, sin
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
 from surgsim_env.scene.palpable_surface import tangent_axes
@@ -52,8 +53,8 @@ class Disc:
         index = np.arange(count)
         distance = self.radius * np.sqrt((index + 0.5) / count)
         angle = index * GOLDEN_ANGLE
-        level = np.stack([distance * np.cos(angle), distance * np.sin(angle)])
-        return self.centre + (self.rotation[:, :2] @ level).T
+        level = np.stack([distance * cos(angle), distance * sin(angle)])
+        return self.centre + matmul(self.rotation[:, :2], level).T
 
 
 def hiding_geoms(model: mujoco.MjModel) -> NDArray[np.int64]:
@@ -111,11 +112,11 @@ def _hidden_by(
     """1 where triangles hide a point, (n,), and the cone from the eye around the points as kernels take it."""
     rays = points - eye
     middle = rays.mean(axis=0)
-    distances = np.linalg.norm(rays, axis=1)
-    cosine = float((rays @ middle / (distances * np.linalg.norm(middle))).min()) if distances.all() else -1.0
+    distances = norm(rays, axis=1)
+    cosine = float((matmul(rays, middle) / (distances * norm(middle))).min()) if distances.all() else -1.0
     if not cosine > 0.0:
         raise ValueError(f"the eye at {eye} m stands among the points that it looks at; move it away from them")
-    axis, sine = middle / np.linalg.norm(middle), math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    axis, sine = middle / norm(middle), math.sqrt(max(1.0 - cosine * cosine, 0.0))
     hidden = np.zeros(len(points), dtype=np.uint8)
     cone = (np.asarray(eye, dtype=np.float64), points, axis, cosine, sine, float(distances.max()))
     hide_behind_triangles(*cone, node_position, triangles, hidden)

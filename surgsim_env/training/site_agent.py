@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import matmul
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_SPREAD, contrast_process
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
@@ -23,7 +24,7 @@ FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75), (0.75, 0.25), (0.25, 0.75))
 FIRST_LENGTHS = 6.0
 
 
-SITE_COUNT = MAP_SIDE**2
+SITE_COUNT = MAP_SIDE * MAP_SIDE
 # Entries of the observation with memory, by channel.
 SLICES = PalpateSitesTask.channel_slices(
     **dict.fromkeys(("contrast_map", "pressed_map", "face_map"), SITE_COUNT),
@@ -170,7 +171,7 @@ class SiteProcess:
         """The action of press `number` (from 0) if the first raster has it, on the candidate nearest to its place."""
         if number >= len(FIRST_SHARES) or max(self.facts.extent) > FIRST_LENGTHS * self.process.length:
             return None
-        squared = ((self.facts.sites - np.array(FIRST_SHARES[number]) * self.facts.extent) ** 2).sum(axis=1)
+        squared = np.square(self.facts.sites - np.array(FIRST_SHARES[number]) * self.facts.extent).sum(axis=1)
         return self.facts.action(self.facts.sites[np.argmin(np.where(self.candidates, squared, np.inf))])
 
 
@@ -196,12 +197,14 @@ class GrowingBelief:
         n = self.count
         covariance = self.process.excess_covariance(self._sites, self._sites[[site]])[:, 0]
         row = self._value_rows[:n, site].copy()
-        variance = EXCESS_SPREAD**2 + BACKGROUND_SPREAD**2 + self.process.noise_variance
-        scale = 1.0 / math.sqrt(variance - row @ row)
-        self._excess_rows[n] = (covariance - row @ self._excess_rows[:n]) * scale
-        self._value_rows[n] = (covariance + BACKGROUND_SPREAD**2 - row @ self._value_rows[:n]) * scale
-        self._whitened[n] = (value - row @ self._whitened[:n]) * scale
+        variance = EXCESS_SPREAD * EXCESS_SPREAD + BACKGROUND_SPREAD * BACKGROUND_SPREAD + self.process.noise_variance
+        scale = 1.0 / math.sqrt(variance - matmul(row, row))
+        self._excess_rows[n] = (covariance - matmul(row, self._excess_rows[:n])) * scale
+        self._value_rows[n] = (
+            covariance + BACKGROUND_SPREAD * BACKGROUND_SPREAD - matmul(row, self._value_rows[:n])
+        ) * scale
+        self._whitened[n] = (value - matmul(row, self._whitened[:n])) * scale
         before, added = self.belief, self._excess_rows[n]
-        squared = np.maximum(before.spread**2 - added**2, 0.0)
+        squared = np.maximum(np.square(before.spread) - added * added, 0.0)
         self.belief = Belief(before.excess + added * self._whitened[n], np.sqrt(squared))
         self.count += 1

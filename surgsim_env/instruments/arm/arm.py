@@ -8,12 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import dot, matmul, norm, svd
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
 from surgsim_env.scene.arm_description import ArmDescription, read_description
 from surgsim_env.scene.model import Port
+from surgsim_env.scene.palpable_surface import tangent_axes
 
 
 class Pose(NamedTuple):
@@ -63,7 +65,7 @@ class Arm:
         size, kind = model.geom_size[self.shapes], model.geom_type[self.shapes]
         box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
         thin, middle, long = np.sort(size, axis=1).T
-        self.shape_radius = np.where(box, np.hypot(thin, middle), size[:, 0])
+        self.shape_radius = np.where(box, np.sqrt(thin * thin + middle * middle), size[:, 0])
         half_length = np.where(box, long, np.where(capsule, size[:, 1], 0.0))
         self.shape_half_axis = np.eye(3)[np.where(box, size.argmax(axis=1), 2)] * half_length[:, None]
         self.tip_site = model.site(description.tip.site or TIP_SITE).id
@@ -92,7 +94,7 @@ class Arm:
 
     def tip_direction(self, joints: ArrayLike) -> FloatArray:
         """Unit vector out of the tip at joint values (n,), shape (3,)."""
-        return self._at(joints).site_xmat[self.tip_site].reshape(3, 3) @ self.tip_axis
+        return matmul(self._at(joints).site_xmat[self.tip_site].reshape(3, 3), self.tip_axis)
 
     def tip_jacobian(self, joints: ArrayLike) -> FloatArray:
         """Jacobian from joint speeds to the tip's velocity [m/s] and angular velocity [rad/s], world frame, (6, n)."""
@@ -104,33 +106,33 @@ class Arm:
         """The point of the shaft's axis nearest to the trocar [m] and its direction to the tip, each (3,)."""
         data = self._at(joints)
         rotation = data.xmat[self.shaft].reshape(3, 3)
-        start, along = data.xpos[self.shaft] + rotation @ self.shaft_point, rotation @ self.shaft_axis
-        return start + ((self.trocar - start) @ along) * along, along
+        start, along = data.xpos[self.shaft] + matmul(rotation, self.shaft_point), matmul(rotation, self.shaft_axis)
+        return start + matmul(self.trocar - start, along) * along, along
 
     def trocar_residual(self, joints: ArrayLike) -> float:
         """Distance of the shaft's axis from the trocar at joint values (n,) [m]."""
-        return float(np.linalg.norm(self.trocar - self.shaft_line(joints)[0]))
+        return float(norm(self.trocar - self.shaft_line(joints)[0]))
 
     def trocar_task(self, joints: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Lateral distance of the trocar from the shaft's axis [m] (2,), and the Jacobian of the shaft there (2, n)."""
         near, along = self.shaft_line(joints)
         data = self._at(joints, moving=True)
         mujoco.mj_jac(self.model, data, self._jacobian[:3], None, near, self.shaft)
-        across = np.linalg.svd(along[None])[2][1:]
-        return across @ (self.trocar - near), across @ self._jacobian[:3, self.dof]
+        across = np.stack(tangent_axes(along))
+        return matmul(across, self.trocar - near), matmul(across, self._jacobian[:3, self.dof])
 
     def shape_ends(self, joints: ArrayLike, jaw: float = 0.0) -> FloatArray:
         """Ends of the outer shapes' axes at joint values (n,) and a jaw angle [rad], shape (n_shape, 2, 3) [m]."""
         data = self._at(joints, jaw)
         rotations = data.geom_xmat[self.shapes].reshape(-1, 3, 3)
-        axis = np.einsum("sxy,sy->sx", rotations, self.shape_half_axis)
+        axis = dot(rotations, self.shape_half_axis[:, None])
         centre = data.geom_xpos[self.shapes]
         return np.stack([centre - axis, centre + axis], axis=1)
 
     def manipulability(self, joints: ArrayLike) -> float:
         """Yoshikawa's sqrt(det J J^T) of the tip's velocity over all joints; units follow from those of the joints."""
         linear = self.tip_jacobian(joints)[:3]
-        return float(np.sqrt(max(np.linalg.det(linear @ linear.T), 0.0)))
+        return float(np.prod(svd(linear)[1]))
 
     def write(self, data: mujoco.MjData, joints: ArrayLike, jaw: float = 0.0) -> None:
         """Write joint values (n,) and a jaw angle [rad], shared by its fingers, into MuJoCo's coordinates."""
@@ -188,7 +190,7 @@ def _check_trocar(arm: Arm) -> None:
             f"trocar.tolerance = {trocar.tolerance * 1e3:.3g} mm: change home, trocar.point or trocar.shaft_axis"
         )
     near, along = arm.shaft_line(arm.home)
-    if (arm.tip_pose(arm.home).position - near) @ along <= 0.0:
+    if matmul(arm.tip_pose(arm.home).position - near, along) <= 0.0:
         raise ValueError(
             f"{where}: at home the tip has not passed the trocar: move home further in, or turn trocar.shaft_axis, "
             "which points towards the tip"
@@ -206,4 +208,4 @@ def _check_trocar(arm: Arm) -> None:
 
 def _unit(vector: ArrayLike) -> FloatArray:
     values = np.asarray(vector, dtype=np.float64)
-    return values / np.linalg.norm(values)
+    return values / norm(values)

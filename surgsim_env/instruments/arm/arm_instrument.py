@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import arctan2, cos, matmul, norm, sin
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.instruments.arm.model import position_actuator, speed_actuator
@@ -102,7 +103,7 @@ class ArmInstrument(SteeredArms):
     def direction(self) -> FloatArray:
         """Commanded direction of the tip, (3,)."""
         wanted = self.steered.wanted
-        return wanted.copy() if wanted.ndim == 1 else wanted @ np.asarray(self.arm.description.tip.direction)
+        return wanted.copy() if wanted.ndim == 1 else matmul(wanted, np.asarray(self.arm.description.tip.direction))
 
     @property
     def joint_positions(self) -> FloatArray:
@@ -179,10 +180,10 @@ def load_scene_arm(anatomy: Anatomy, name: str, port: Port) -> Arm:
 def default_port(face: PalpableFace) -> Port:
     """A port above the palpable face: 13 cm from its middle, at 30 degrees from the approach."""
     corners = face.points[face.triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    target = area @ corners.mean(axis=1) / area.sum()
+    area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    target = matmul(area, corners.mean(axis=1)) / area.sum()
     aside, _ = tangent_axes(face.approach)
-    out = math.cos(PORT_TILT) * -face.approach + math.sin(PORT_TILT) * aside
+    out = float(cos(PORT_TILT)) * -face.approach + float(sin(PORT_TILT)) * aside
     x, y, z = (target + PORT_DISTANCE * out).tolist()
     u, v, w = (-out).tolist()
     return Port((x, y, z), (u, v, w))
@@ -191,10 +192,10 @@ def default_port(face: PalpableFace) -> Port:
 def inside_surface(point: ArrayLike, points: FloatArray, triangles: IntArray) -> bool:
     """Whether a point [m] lies within a closed surface, by its solid angle (van Oosterom & Strackee 1983)."""
     a, b, c = (points[triangles[:, corner]] - np.asarray(point, dtype=np.float64) for corner in range(3))
-    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    la, lb, lc = (norm(side, axis=1) for side in (a, b, c))
     triple = (a * np.cross(b, c)).sum(axis=1)
     rest = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-    return bool(abs(2.0 * np.arctan2(triple, rest).sum()) > 2.0 * math.pi)
+    return bool(abs(2.0 * arctan2(triple, rest).sum()) > 2.0 * math.pi)
 
 
 def check_port_outside(
@@ -270,8 +271,8 @@ class WristSensor:
     def read(self, data: mujoco.MjData) -> FloatArray:
         """Load on the distal parts in the last step: force [N], torque about the site [N m], world frame, (6,)."""
         rotation = data.site_xmat[self._site].reshape(3, 3)
-        force = rotation @ data.sensordata[self._force : self._force + 3]
-        torque = rotation @ data.sensordata[self._torque : self._torque + 3]
+        force = matmul(rotation, data.sensordata[self._force : self._force + 3])
+        torque = matmul(rotation, data.sensordata[self._torque : self._torque + 3])
         weight = self._model.body_subtreemass[self._body] * self._model.opt.gravity
         arm = data.subtree_com[self._body] - data.site_xpos[self._site]
         return np.concatenate([-force - weight, -torque - np.cross(arm, weight)])

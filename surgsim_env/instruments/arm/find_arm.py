@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from msdm_core.arithmetic import cos, matmul, norm, sin, svd
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm import Arm
 from surgsim_env.instruments.arm.inverse_kinematics import PoseSolution, solve_pose
@@ -29,6 +30,7 @@ from surgsim_env.instruments.arm.survey import (
 )
 from surgsim_env.scene.arm_description import AddedShape, ArmDescription, JointControl, Tip, Trocar
 from surgsim_env.scene.model import Port, Vector
+from surgsim_env.scene.palpable_surface import tangent_axes
 
 # A palpator's dimensions [m]: an 8 mm shaft, a thinner neck behind the ball, whose radius a scene sets.
 SHAFT_RADIUS, NECK_RADIUS, NECK_LENGTH, BALL_RADIUS = 0.004, 0.003, 0.024, 0.005
@@ -147,7 +149,7 @@ class _Finder:
         self.tool = self._find_tool(body, offset, tool_length)
         self.links, link_shapes = self._find_links()
         self.trocar_given = None if trocar is None else np.array(trocar)
-        if centre is not None and trocar is not None and np.linalg.norm(np.array(trocar) - centre.point) > ONE_MM:
+        if centre is not None and trocar is not None and norm(np.array(trocar) - centre.point) > ONE_MM:
             raise ValueError(
                 f"--trocar is {trocar}, but the mechanism keeps its shaft at {vector(centre.point, 4)}: leave --trocar "
                 "out"
@@ -190,13 +192,13 @@ class _Finder:
     # ---- shaft and tip ---------------------------------------------------------------------------------------
 
     def _world(self, body: int, local: FloatArray) -> FloatArray:
-        return self.survey.data.xpos[body] + self.survey.data.xmat[body].reshape(3, 3) @ local
+        return self.survey.data.xpos[body] + matmul(self.survey.data.xmat[body].reshape(3, 3), local)
 
     def _local(self, body: int, point: FloatArray) -> FloatArray:
-        return self.survey.data.xmat[body].reshape(3, 3).T @ (point - self.survey.data.xpos[body])
+        return matmul(self.survey.data.xmat[body].reshape(3, 3).T, point - self.survey.data.xpos[body])
 
     def _turned(self, body: int, direction: FloatArray) -> FloatArray:
-        return self.survey.data.xmat[body].reshape(3, 3).T @ direction
+        return matmul(self.survey.data.xmat[body].reshape(3, 3).T, direction)
 
     def _find_tool(self, body: int, offset: FloatArray | None, tool_length: float | None) -> _Tool:
         survey = self.survey
@@ -212,7 +214,7 @@ class _Finder:
         point = vector(centre.point, 4)
         self.notes.append(f"remote centre at {point} m: the mechanism keeps the shaft there")
         low, high = self.survey.range_of(centre.joint, 0.0)
-        along = self.survey.data.xmat[centre.body].reshape(3, 3) @ centre.shaft_axis
+        along = matmul(self.survey.data.xmat[centre.body].reshape(3, 3), centre.shaft_axis)
         return self._wristed(centre.body, centre.shaft_point, centre.shaft_axis, along, body, offset, high - low + 0.05)
 
     def _own_shaft(self, carrier: int, body: int, offset: FloatArray | None) -> _Tool:
@@ -221,9 +223,9 @@ class _Finder:
         ends = [self._world(carrier, end) for end in (part.start, part.end)]
         near = self._world(body, offset) if offset is not None else self.survey.data.xpos[body]
         if body == carrier and offset is None:
-            near = max(ends, key=lambda end: float(np.linalg.norm(end - self.survey.data.xpos[body])))
-        start, end = sorted(ends, key=lambda one: -float(np.linalg.norm(one - near)))
-        along = (end - start) / np.linalg.norm(end - start)
+            near = max(ends, key=lambda end: float(norm(end - self.survey.data.xpos[body])))
+        start, end = sorted(ends, key=lambda one: -float(norm(one - near)))
+        along = (end - start) / norm(end - start)
         name = self.survey.body_name(carrier)
         self.notes.append(
             f"straight shaft on {name}: {1e3 * part.length:.0f} mm long, {2e3 * part.radius:.1f} mm thick"
@@ -231,7 +233,7 @@ class _Finder:
         axis = self._turned(carrier, along)
         if body == carrier and offset is None:
             offset = self._local(body, end)
-        length = float(np.linalg.norm(end - start))
+        length = float(norm(end - start))
         return self._wristed(carrier, self._local(carrier, start), axis, along, body, offset, length)
 
     def _wristed(
@@ -254,10 +256,10 @@ class _Finder:
         own = self._own_contact(shaft_body, tip)
         on_axis = self._world(shaft_body, point)
         reach = [*anchors, tip]
-        end = on_axis + ((reach[0] - on_axis) @ along) * along
+        end = on_axis + matmul(reach[0] - on_axis, along) * along
         way = tip - last
-        straight = not anchors or np.linalg.norm(way) < ONE_MM
-        direction = along if straight else way / np.linalg.norm(way)
+        straight = not anchors or norm(way) < ONE_MM
+        direction = along if straight else way / norm(way)
         if own:
             shapes, contact = (), own
         else:
@@ -269,7 +271,7 @@ class _Finder:
             carriers = [shaft_body] if not anchors else bodies[1:]
             parts = [("shaft", shaft_body, end - (length - neck) * along, end, SHAFT_RADIUS)]
             for name, carrier, one, other in zip(names, carriers, corners, corners[1:], strict=False):
-                if np.linalg.norm(other - one) >= ONE_MM:
+                if norm(other - one) >= ONE_MM:
                     parts.append((name, carrier, one, other, NECK_RADIUS))
             shapes = tuple(self._shape(*part) for part in parts)
             shapes = (AddedShape("tip_ball", survey.body_name(body), vector(offset), BALL_RADIUS), *shapes)
@@ -286,16 +288,17 @@ class _Finder:
         survey = self.survey
         near = [part for part in range(1, self.model.nbody) if body in survey.parents(part)]
         clouds = [
-            survey.data.xpos[part] + survey.body_points(part) @ survey.data.xmat[part].reshape(3, 3).T for part in near
+            survey.data.xpos[part] + matmul(survey.body_points(part), survey.data.xmat[part].reshape(3, 3).T)
+            for part in near
         ]
         points = np.concatenate(clouds)
         if not len(points):
             self.chosen.append(f"link {survey.body_name(body)!r} has no shape: its origin is the tip")
             return survey.data.xpos[body].copy()
         mean = points.mean(axis=0) - last
-        out = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > ONE_MM else along
+        out = mean / norm(mean) if norm(mean) > ONE_MM else along
         self.chosen.append(f"no frame marks the tip: it is the farthest point of the links beyond {self.names[-1]!r}")
-        return last + max(float(((points - last) @ out).max()), 0.0) * out
+        return last + max(float(matmul(points - last, out).max()), 0.0) * out
 
     def _own_contact(self, shaft_body: int, tip: FloatArray) -> tuple[str, ...]:
         """Names of the model's spheres and capsules from the tip to the shaft, if a sphere is at the tip."""
@@ -303,7 +306,7 @@ class _Finder:
         bodies = [part for part in range(1, model.nbody) if shaft_body in survey.parents(part)]
         geoms = [geom for part in bodies for geom in survey.round_geoms(part)]
         # The geom's place: the data hold no geoms before `mj_kinematics`, which `place` calls.
-        far = {geom: float(np.linalg.norm(survey.data.geom_xpos[geom] - tip)) for geom in geoms}
+        far = {geom: float(norm(survey.data.geom_xpos[geom] - tip)) for geom in geoms}
         balls = [g for g in geoms if model.geom_type[g] == SPHERE and far[g] <= ONE_MM]
         if not balls:
             return ()
@@ -315,10 +318,10 @@ class _Finder:
         survey, joint = self.survey, self.chain[-1]
         anchor, axis = survey.data.xanchor[joint].copy(), survey.data.xaxis[joint].copy()
         link = int(self.model.jnt_bodyid[joint])
-        cloud = survey.data.xpos[link] + survey.body_points(link) @ survey.data.xmat[link].reshape(3, 3).T
+        cloud = survey.data.xpos[link] + matmul(survey.body_points(link), survey.data.xmat[link].reshape(3, 3).T)
         marked = self._world(body, offset) if offset is not None else None
-        heights = (cloud - anchor) @ axis
-        mark = 0.0 if marked is None else float((marked - anchor) @ axis)
+        heights = matmul(cloud - anchor, axis)
+        mark = 0.0 if marked is None else float(matmul(marked - anchor, axis))
         if abs(mark) > ONE_MM:
             side = np.sign(mark)
         elif len(heights):
@@ -449,7 +452,7 @@ class _Finder:
         self.survey.place(self.chain, start)
         anchor, axis = self.survey.data.xanchor[self.chain[0]], self.survey.data.xaxis[self.chain[0]]
         crossing = meeting_point(np.stack([point, anchor]), np.stack([into, axis]))
-        behind = point + ((tip - point) @ into - HOME_DEPTH) * into
+        behind = point + (matmul(tip - point, into) - HOME_DEPTH) * into
         return [behind] if crossing is None else [crossing, behind]
 
     def _required(
@@ -488,7 +491,7 @@ class _Finder:
     def _worth(self, arm: Arm, pose: FloatArray) -> float:
         margin = np.minimum(pose - self.lower, self.upper - pose) / (self.upper - self.lower)
         jacobian = arm.tip_jacobian(pose)
-        least = float(np.linalg.svd(jacobian[:3], compute_uv=False)[-1])
+        least = float(svd(jacobian[:3])[1][-1])
         return (1.0 - arm.tip_direction(pose)[2]) * min(float(margin.min()) / 0.1, 1.0) * least
 
     def _blocked(self, arm: Arm, joints: FloatArray) -> bool:
@@ -529,13 +532,13 @@ class _Finder:
         else:
             self.chosen.append("the model has no actuators: servos are added")
         inertia, own = joint_inertia(arm, home), model.dof_armature[model.jnt_dofadr[self.chain]]
-        lever = np.linalg.norm(arm.tip_jacobian(home)[:3], axis=0)
+        lever = norm(arm.tip_jacobian(home)[:3], axis=0)
         slides = model.jnt_type[self.chain] == SLIDE
         lever = np.where(slides, 1.0, np.maximum(lever, LEVER_LEAST))
-        least = TIP_STIFFNESS * lever**2 / NATURAL_FREQUENCY**2
+        least = TIP_STIFFNESS * (lever * lever) / (NATURAL_FREQUENCY * NATURAL_FREQUENCY)
         armature = np.maximum(own, least - (inertia - own))
         total = inertia - own + armature
-        stiffness, damping = total * NATURAL_FREQUENCY**2, 2.0 * total * NATURAL_FREQUENCY
+        stiffness, damping = total * (NATURAL_FREQUENCY * NATURAL_FREQUENCY), 2.0 * total * NATURAL_FREQUENCY
         effort = TIP_FORCE * lever + total * np.array(speed) / 0.1
         stated = model.jnt_actfrcrange[self.chain, 1]
         effort = np.where(model.jnt_actfrclimited[self.chain].astype(bool) & (stated > 0.0), stated, effort)
@@ -641,8 +644,8 @@ class _Finder:
 
 def reach_share(arm: Arm, home: FloatArray, into: FloatArray) -> float:
     """Share of the places at DEPTHS past the trocar, straight on and tilted by TILT to four sides, that are reached."""
-    sides = np.linalg.svd(into[None])[2][1:]
-    ways = [into, *(math.cos(TILT) * into + math.sin(TILT) * side for one in sides for side in (one, -one))]
+    sides = np.stack(tangent_axes(into))
+    ways = [into, *(float(cos(TILT)) * into + float(sin(TILT)) * side for one in sides for side in (one, -one))]
     places = [arm.trocar + depth * way for way in ways for depth in DEPTHS]
     kept = FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6
     found = [solve_pose(arm, place, start=home, iterations=60) for place in places]
@@ -666,9 +669,9 @@ def joint_inertia(arm: Arm, joints: Sequence[float] | FloatArray) -> FloatArray:
 def _distance_to_segment(points: FloatArray, ends: FloatArray) -> FloatArray:
     """Distances of points (n, 3) from a segment (2, 3) [m], (n,)."""
     way = ends[1] - ends[0]
-    square = float(way @ way)
-    share = np.clip((points - ends[0]) @ way / square, 0.0, 1.0) if square > 0.0 else np.zeros(len(points))
-    return np.linalg.norm(points - ends[0] - share[:, None] * way, axis=1)
+    square = float(matmul(way, way))
+    share = np.clip(matmul(points - ends[0], way) / square, 0.0, 1.0) if square > 0.0 else np.zeros(len(points))
+    return norm(points - ends[0] - share[:, None] * way, axis=1)
 
 
 def _added(name: str, body: str, capsule: Capsule) -> AddedShape:

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import arctan2, cos, eigh, matmul, norm, sin, svd
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm import Arm
+from surgsim_env.scene.palpable_surface import tangent_axes
 
 # Singular values below this share of the largest one do not take part of the null space; damping limits them.
 RANK_SHARE = 1e-6
@@ -71,7 +73,8 @@ def prioritised_step(tasks: list[KinematicTask], lower: FloatArray, upper: Float
     free = np.ones(len(scale), dtype=bool)
     while free.any():
         held = [
-            KinematicTask(task.jacobian[:, free], task.error - task.jacobian[:, ~free] @ step[~free]) for task in tasks
+            KinematicTask(task.jacobian[:, free], task.error - matmul(task.jacobian[:, ~free], step[~free]))
+            for task in tasks
         ]
         step[free] = _cascade(held, scale[free])
         beyond = np.maximum(lower - step, step - upper) / scale
@@ -93,12 +96,12 @@ def _cascade(tasks: list[KinematicTask], scale: FloatArray) -> FloatArray:
     idle = np.eye(len(scale))
     for task in tasks:
         jacobian = task.jacobian * scale
-        left, size, right = np.linalg.svd(jacobian @ idle, full_matrices=False)
-        missing = task.error - jacobian @ step
-        damping = float(missing @ missing) + DAMPING_LEAST
-        step = step + right.T @ (size / (size**2 + damping) * (left.T @ missing))
+        left, size, right = svd(matmul(jacobian, idle))
+        missing = task.error - matmul(jacobian, step)
+        damping = float(matmul(missing, missing)) + DAMPING_LEAST
+        step = step + matmul(right.T, size / (size * size + damping) * matmul(left.T, missing))
         moved = right[size > RANK_SHARE * max(float(size.max(initial=0.0)), 1e-9)]
-        idle = idle - moved.T @ moved
+        idle = idle - matmul(moved.T, moved)
     return step * scale
 
 
@@ -114,39 +117,39 @@ def tip_tasks(arm: Arm, joints: FloatArray, target: Target) -> list[KinematicTas
         tasks.append(KinematicTask(jacobian[3:], _turn_between(arm.tip_pose(joints).rotation, target.rotation)))
     elif target.direction is not None:
         now = arm.tip_direction(joints)
-        across = np.linalg.svd(now[None])[2][1:]
-        tasks.append(KinematicTask(across @ jacobian[3:], across @ turn_towards(now, target.direction)))
+        across = np.stack(tangent_axes(now))
+        tasks.append(KinematicTask(matmul(across, jacobian[3:]), matmul(across, turn_towards(now, target.direction))))
     return tasks
 
 
 def turn_towards(now: FloatArray, wanted: FloatArray) -> FloatArray:
     """Smallest rotation vector from one unit vector to another, (3,) [rad]."""
     axis = np.cross(now, wanted)
-    sine, cosine = float(np.linalg.norm(axis)), float(now @ wanted)
+    sine, cosine = float(norm(axis)), float(matmul(now, wanted))
     if sine < 1e-12:
         # Opposite vectors: any perpendicular axis.
-        return np.zeros(3) if cosine > 0.0 else np.pi * np.linalg.svd(now[None])[2][1]
-    return axis / sine * np.arctan2(sine, cosine)
+        return np.zeros(3) if cosine > 0.0 else np.pi * tangent_axes(now)[0]
+    return axis / sine * arctan2(sine, cosine)
 
 
 def _turn_between(now: FloatArray, wanted: FloatArray) -> FloatArray:
     """Rotation vector from one frame (3, 3) to another, (3,) [rad]."""
-    turn = wanted @ now.T
+    turn = matmul(wanted, now.T)
     axis = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (float(np.trace(turn)) - 1.0)
+    sine, cosine = float(norm(axis)), 0.5 * (float(np.trace(turn)) - 1.0)
     if sine < 1e-9 and cosine < 0.0:
-        return np.pi * np.linalg.eigh(0.5 * (turn + turn.T))[1][:, -1]
-    return axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
+        return np.pi * eigh(0.5 * (turn + turn.T))[1][:, -1]
+    return axis * (arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
 
 
 def _judge(arm: Arm, joints: FloatArray, target: Target) -> PoseSolution:
     pose = arm.tip_pose(joints)
-    position = float(np.linalg.norm(target.position - pose.position))
+    position = float(norm(target.position - pose.position))
     angle = 0.0
     if target.rotation is not None:
-        angle = float(np.linalg.norm(_turn_between(pose.rotation, target.rotation)))
+        angle = float(norm(_turn_between(pose.rotation, target.rotation)))
     elif target.direction is not None:
-        angle = float(np.linalg.norm(turn_towards(arm.tip_direction(joints), target.direction)))
+        angle = float(norm(turn_towards(arm.tip_direction(joints), target.direction)))
     trocar = arm.trocar_residual(joints)
     kept = arm.description.trocar.tolerance if arm.remote_centre_fixed else POSITION_TOLERANCE
     reached = position <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE and trocar <= kept
@@ -165,7 +168,7 @@ def _target(position: ArrayLike, direction: ArrayLike | None, rotation: ArrayLik
             raise ValueError(f"the tip's {what} is {value}; it must be finite and of shape {shape}")
     unit = None if direction is None else np.asarray(direction, dtype=np.float64)
     if unit is not None:
-        unit = unit / np.linalg.norm(unit)
+        unit = unit / norm(unit)
     frame = None if rotation is None else np.asarray(rotation, dtype=np.float64)
     return Target(np.asarray(position, dtype=np.float64), unit, frame)
 
@@ -271,28 +274,28 @@ def follow(
 def _turned(now: FloatArray, wanted: FloatArray, most: float) -> FloatArray:
     """A unit vector turned towards another by an angle at most [rad], (3,)."""
     turn = turn_towards(now, wanted)
-    angle = float(np.linalg.norm(turn))
+    angle = float(norm(turn))
     if angle <= most:
         return wanted
     across = np.cross(turn / angle, now)
-    return np.cos(most) * now + np.sin(most) * across
+    return cos(most) * now + sin(most) * across
 
 
 def frame_towards(now: FloatArray, wanted: FloatArray, most: float) -> FloatArray:
     """A frame turned towards another by an angle at most [rad], (3, 3)."""
     turn = _turn_between(now, wanted)
-    angle = float(np.linalg.norm(turn))
-    return wanted if angle <= most else turn_matrix(turn * (most / angle)) @ now
+    angle = float(norm(turn))
+    return wanted if angle <= most else matmul(turn_matrix(turn * (most / angle)), now)
 
 
 def turn_matrix(turn: FloatArray) -> FloatArray:
     """The rotation by a rotation vector [rad] (3,), as a matrix (3, 3): Rodrigues."""
-    angle = float(np.linalg.norm(turn))
+    angle = float(norm(turn))
     if angle == 0.0:
         return np.eye(3)
     x, y, z = turn / angle
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * matmul(cross, cross)
 
 
 def _newton(arm: Arm, start: FloatArray, target: Target, lower: FloatArray, upper: FloatArray) -> FloatArray | None:
@@ -301,7 +304,7 @@ def _newton(arm: Arm, start: FloatArray, target: Target, lower: FloatArray, uppe
     for iteration in range(NEWTON_STEPS):
         turning = iteration < TURNING_STEPS and (target.direction is not None or target.rotation is not None)
         tasks = tip_tasks(arm, joints, target if turning else placed)
-        if not turning and all(np.linalg.norm(task.error) <= POSITION_TOLERANCE for task in tasks):
+        if not turning and all(norm(task.error) <= POSITION_TOLERANCE for task in tasks):
             return joints
         step = prioritised_step(tasks, lower - joints, upper - joints, arm.speed_limit)
         joints = (joints + step).clip(lower, upper)

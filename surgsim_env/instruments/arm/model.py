@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.model_limits import check_model, read_spec, read_xml
 from surgsim_env.instruments.arm.urdf import prepare_urdf
@@ -245,7 +246,7 @@ def hold_joints(spec: mujoco.MjSpec, held: Mapping[str, float]) -> None:
 
 def _move_body(body: Any, joint: Any, way: float) -> None:
     """Place a body as if its joint were moved by a way [rad or m] from where the model has it."""
-    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    axis = np.array(joint.axis) / norm(joint.axis)
     turned = np.zeros(3)
     if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
         mujoco.mju_rotVecQuat(turned, way * axis, body.quat)
@@ -292,13 +293,13 @@ def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
 def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
     """Move everything in the model's world so that its trocar coincides with the port."""
     trocar = arm.trocar
-    rotation = port.rotation @ frame_into(np.array(trocar.into)).T
+    rotation = matmul(port.rotation, frame_into(np.array(trocar.into)).T)
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
     world = spec.worldbody
     rooted = [part for kind in (world.bodies, world.geoms, world.sites, world.frames) for part in kind]
     rooted = [part for part in rooted if part.frame is None]
-    frame = world.add_frame(pos=np.array(port.point) - rotation @ np.array(trocar.point), quat=quaternion)
+    frame = world.add_frame(pos=np.array(port.point) - matmul(rotation, np.array(trocar.point)), quat=quaternion)
     for part in rooted:
         part.set_frame(frame)
 

@@ -365,7 +365,7 @@ def _bytes(text: str) -> float:
     """The size "16M" [bytes]."""
     units = "KMGTPE"
     place = units.find(text[-1:].upper()) if text else -1
-    return _number(text[:-1]) * 1024.0 ** (place + 1) if place >= 0 else _number(text)
+    return _number(text[:-1]) * 1024 ** (place + 1) if place >= 0 else _number(text)
 
 
 def _png_size(file: Path) -> tuple[int, int]:

@@ -6,6 +6,7 @@ from itertools import product
 import mujoco
 import numpy as np
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.instruments.arm.arm import Arm
 from surgsim_env.instruments.arm.arm_instrument import (
@@ -89,7 +90,7 @@ class Pair(SteeredArms):
         self.jaws = np.array([jaw.tools for jaw in jaws], dtype=np.int32).reshape(-1, 2)
         self._geoms_of = {side: _outside(model, side) for side in SIDES}
         aside = np.array(scene.ports[1].point) - np.array(scene.ports[0].point)
-        aside *= PARKED_ASIDE / np.linalg.norm(aside)
+        aside *= PARKED_ASIDE / norm(aside)
         middle = parked_place(anatomy)
         self.parked = np.stack([middle - aside, middle + aside])
         for side, place in zip(SIDES, self.parked, strict=True):
@@ -158,8 +159,8 @@ class Pair(SteeredArms):
             sign = 1.0 if first in some and second in others else -1.0 if first in others and second in some else 0.0
             if sign:
                 mujoco.mj_contactForce(self.model, self.data, index, force)
-                total += sign * (contact.frame.reshape(3, 3).T @ force[:3])
-        return float(np.linalg.norm(total))
+                total += sign * matmul(contact.frame.reshape(3, 3).T, force[:3])
+        return float(norm(total))
 
     def _where(self) -> str:
         return f"the pair of {self.arms['left'].where} and {self.arms['right'].where}"

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msdm_core.arithmetic import cos, matmul, sin
 from msdm_core.mesh.tet_mesh import FloatArray
 
 RIGHT = 0.5 * math.pi
@@ -44,7 +45,7 @@ class Link:
     def transform(self, value: float) -> FloatArray:
         """Pose of the link in the one before it at a joint value [rad or m], (4, 4)."""
         theta, d = (self.theta, self.d + value) if self.prismatic else (self.theta + value, self.d)
-        ca, sa, ct, st = math.cos(self.alpha), math.sin(self.alpha), math.cos(theta), math.sin(theta)
+        ca, sa, ct, st = float(cos(self.alpha)), float(sin(self.alpha)), float(cos(theta)), float(sin(theta))
         return np.array(
             [
                 [ct, -st, 0.0, self.a],
@@ -84,7 +85,7 @@ def psm_frames(joints: ArrayLike) -> FloatArray:
     pose = np.eye(4)
     frames = []
     for link, value in zip(PSM_LINKS, np.asarray(joints, dtype=np.float64).tolist(), strict=True):
-        pose = pose @ link.transform(value)
+        pose = matmul(pose, link.transform(value))
         frames.append(pose)
     return np.array(frames)
 
@@ -94,7 +95,7 @@ def psm_tip(joints: ArrayLike, tip_length: float) -> FloatArray:
     tip = np.eye(4)
     tip[:3, :3] = TIP_ROTATION
     tip[:3, 3] = tip_length * TIP_ROTATION[:, 2]
-    return psm_frames(joints)[-1] @ tip
+    return matmul(psm_frames(joints)[-1], tip)
 
 
 def shaft_depth(insertion: float) -> float:
@@ -109,4 +110,4 @@ def psm_manipulability(joints: ArrayLike) -> float:
     perpendicular and have the lengths l cos(q2), l and 1. (T. Yoshikawa, Manipulability of robotic mechanisms, 1985.)
     """
     values = np.asarray(joints, dtype=np.float64)
-    return shaft_depth(float(values[2])) ** 2 * math.cos(values[1])
+    return np.square(shaft_depth(float(values[2]))) * float(cos(values[1]))

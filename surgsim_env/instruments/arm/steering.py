@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import matmul, norm, svd
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm import Arm
 from surgsim_env.instruments.arm.inverse_kinematics import (
@@ -69,12 +70,12 @@ class SteeredArm:
         self._qpos = np.array([int(model.joint(prefix + name).qposadr[0]) for name in arm.joints])
         self._tip = model.site(prefix + arm.model.site(arm.tip_site).name).id
         self._velocity = np.zeros(6)
-        self._starts = [direction / np.linalg.norm(direction)]
+        self._starts = [direction / norm(direction)]
         if jaw is not None and jaw.has_pads:
             # Either pad may be the upper one.
-            frame = frame_along(direction) @ _jaw_frame(arm).T
+            frame = matmul(frame_along(direction), _jaw_frame(arm).T)
             half_turn = turn_matrix(np.pi * self._starts[0])
-            self._starts = [frame, half_turn @ frame]
+            self._starts = [frame, matmul(half_turn, frame)]
         self.wanted = self._starts[0].copy()
         self.short = False
 
@@ -190,18 +191,18 @@ class SteeredArm:
     def _turn_wanted(self, turn: FloatArray, rotation: FloatArray) -> None:
         if self.wanted.ndim == 2:
             near = frame_towards(rotation, self.wanted, TURN_AHEAD)
-            left, _, right = np.linalg.svd(turn_matrix(turn) @ near)
-            self.wanted = left @ right
+            left, _, right = svd(matmul(turn_matrix(turn), near))
+            self.wanted = matmul(left, right)
         else:
-            quaternion, turned, angle = np.zeros(4), np.zeros(3), float(np.linalg.norm(turn))
+            quaternion, turned, angle = np.zeros(4), np.zeros(3), float(norm(turn))
             mujoco.mju_axisAngle2Quat(quaternion, turn / angle, angle)
             mujoco.mju_rotVecQuat(turned, self.wanted, quaternion)
-            self.wanted = turned / np.linalg.norm(turned)
+            self.wanted = turned / norm(turned)
 
     def _points_well(self, joints: FloatArray, rotation: FloatArray) -> bool:
         if self.wanted.ndim == 2:
             return bool(np.abs(rotation - self.wanted).max() < 1e-6)
-        return bool(np.linalg.norm(turn_towards(self.arm.tip_direction(joints), self.wanted)) < 1e-6)
+        return bool(norm(turn_towards(self.arm.tip_direction(joints), self.wanted)) < 1e-6)
 
     def _reach(self, position: FloatArray) -> tuple[PoseSolution, FloatArray]:
         """Joint values that reach a position [m], and the direction or frame that was sought."""
@@ -224,11 +225,11 @@ def _jaw_frame(arm: Arm) -> FloatArray:
     mujoco.mj_kinematics(arm.model, data)
     first, second = (data.xipos[arm.model.body(arm.model.joint(name).bodyid[0]).id] for name in arm.description.jaw)
     rotation = data.site_xmat[arm.tip_site].reshape(3, 3)
-    direction = rotation @ np.asarray(arm.description.tip.direction)
-    z = -direction / np.linalg.norm(direction)
-    y = (first - second) - ((first - second) @ z) * z
-    y /= np.linalg.norm(y)
-    return rotation.T @ np.stack([np.cross(y, z), y, z], axis=1)
+    direction = matmul(rotation, np.asarray(arm.description.tip.direction))
+    z = -direction / norm(direction)
+    y = (first - second) - matmul(first - second, z) * z
+    y /= norm(y)
+    return matmul(rotation.T, np.stack([np.cross(y, z), y, z], axis=1))
 
 
 def placed(found: PoseSolution) -> bool:

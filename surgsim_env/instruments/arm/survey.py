@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.model import read_model
 from surgsim_env.instruments.arm.model_limits import read_xml
@@ -52,7 +53,7 @@ class Capsule:
     @property
     def length(self) -> float:
         """Overall length [m]."""
-        return float(np.linalg.norm(self.end - self.start)) + 2.0 * self.radius
+        return float(norm(self.end - self.start)) + 2.0 * self.radius
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,8 @@ class ModelSurvey:
                 mass, centre = SHAPE_DENSITY * float(size.prod()), 0.5 * (points.min(axis=0) + points.max(axis=0))
         else:
             mass = mass or BARE_MASS
-            size = np.full(3, (mass / BARE_DENSITY) ** (1.0 / 3.0))
-        square = size**2
+            size = np.full(3, cbrt(mass / BARE_DENSITY))
+        square = size * size
         moments = mass / 12.0 * (square.sum() - square)
         return LinkInertia(name, mass, vector(centre), vector(moments, digits=None))
 
@@ -256,7 +257,7 @@ class ModelSurvey:
             points = _hull(kind, size)
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        return points @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+        return matmul(points, rotation.reshape(3, 3).T) + model.geom_pos[geom]
 
     def body_geoms(self, body: int) -> list[int]:
         """Geoms of a body."""
@@ -302,10 +303,10 @@ class ModelSurvey:
                 return None
             body = self._shaft_body(chain, slides[0])
             rotation = self.data.xmat[body].reshape(3, 3)
-            axis = rotation.T @ self.data.xaxis[slide]
+            axis = matmul(rotation.T, self.data.xaxis[slide])
             # The point of the line that is nearest to the body's origin, which the insertion does not move.
-            local = rotation.T @ (point - self.data.xpos[body])
-            found.append((point, local - (local @ axis) * axis, axis))
+            local = matmul(rotation.T, point - self.data.xpos[body])
+            found.append((point, local - matmul(local, axis) * axis, axis))
         first = found[0]
         if any(np.abs(np.array(one) - np.array(first)).max() > MEETING_TOLERANCE for one in found):
             return None
@@ -314,9 +315,9 @@ class ModelSurvey:
         reach = []
         for value in (low, high):
             self.place([slide], np.array([value]))
-            along = self.data.xmat[body].reshape(3, 3) @ axis
-            tip_now = self.data.xpos[tip] + self.data.xmat[tip].reshape(3, 3) @ offset
-            reach.append(float((tip_now - point) @ along))
+            along = matmul(self.data.xmat[body].reshape(3, 3), axis)
+            tip_now = self.data.xpos[tip] + matmul(self.data.xmat[tip].reshape(3, 3), offset)
+            reach.append(float(matmul(tip_now - point, along)))
         sign = np.sign(max(reach, key=abs))
         return RemoteCentre(point, body, local, sign * axis, slide)
 
@@ -326,8 +327,8 @@ class ModelSurvey:
         axis = self.data.xaxis[chain[slide]]
         line = self.data.xanchor[chain[slide + 1]] if slide + 1 < len(chain) else None
         for joint in chain[slide + 1 :]:
-            turned = np.linalg.norm(np.cross(self.data.xaxis[joint], axis))
-            aside = np.linalg.norm(np.cross(self.data.xanchor[joint] - line, axis))
+            turned = norm(np.cross(self.data.xaxis[joint], axis))
+            aside = norm(np.cross(self.data.xanchor[joint] - line, axis))
             if self.model.jnt_type[joint] != HINGE or turned > 1e-6 or aside > MEETING_TOLERANCE:
                 break
             body = int(self.model.jnt_bodyid[joint])
@@ -338,10 +339,10 @@ def meeting_point(points: FloatArray, axes: FloatArray) -> FloatArray | None:
     """The point (3,) that lines with points and unit axes (n, 3) have in common; None if there is no single one."""
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     total = across.sum(axis=0)
-    if np.linalg.eigvalsh(total).min() < 1e-3:
+    if eigh(total)[0][0] < 1e-3:
         return None
-    point = np.linalg.solve(total, np.einsum("nij,nj->i", across, points))
-    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, point - points), axis=1).max()
+    point = solve(total, dot(across, points[:, None]).sum(axis=0))
+    missed = norm(dot(across, (point - points)[:, None]), axis=1).max()
     return point if missed <= MEETING_TOLERANCE else None
 
 
@@ -349,18 +350,18 @@ def fit_capsule(points: FloatArray) -> Capsule:
     """A capsule along the longest principal axis of points (n, 3) that contains them."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     around = points - middle
-    axis = np.linalg.eigh(around.T @ around)[1][:, -1]
-    height = around @ axis
+    axis = eigh(matmul(around.T, around))[1][:, -1]
+    height = matmul(around, axis)
     beside = around - height[:, None] * axis
     aside = 0.5 * (beside.min(axis=0) + beside.max(axis=0))
-    aside = aside - (aside @ axis) * axis
-    radius = max(float(np.linalg.norm(beside - aside, axis=1).max()), 1e-4)
+    aside = aside - matmul(aside, axis) * axis
+    radius = max(float(norm(beside - aside, axis=1).max()), 1e-4)
     centre = middle + aside
     # The ends of the capsule are round: the cylinder's corners are inside up to the axis' ends.
     low, high = float(height.min()), float(height.max())
     if high - low <= 2.0 * radius:
         centre = centre + 0.5 * (low + high) * axis
-        return Capsule(centre, centre, float(np.linalg.norm(points - centre, axis=1).max()))
+        return Capsule(centre, centre, float(norm(points - centre, axis=1).max()))
     return Capsule(centre + low * axis, centre + high * axis, radius)
 
 
@@ -382,7 +383,7 @@ def _has_tip_word(name: str) -> bool:
 def _hull(kind: int, size: FloatArray) -> FloatArray:
     """Points around a sphere, capsule, cylinder, ellipsoid or box in its own frame [m], (n, 3)."""
     angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)
+    ring = np.stack([cos(angle), sin(angle), np.zeros(16)], axis=1)
     if kind == BOX or kind == ELLIPSOID:
         corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
         return corners * size if kind == BOX else np.vstack([np.eye(3), -np.eye(3)]) * size

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from msdm_core.arithmetic import eigh
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.arm_description import LinkInertia
 from surgsim_env.scene.load import nearest
@@ -156,7 +157,7 @@ def faulty_links(root: ElementTree.Element) -> dict[str, tuple[float, FloatArray
                 found[name] = (0.0, np.zeros(3))
             continue
         mass, centre, matrix = _inertial(inertial)
-        least = float(np.linalg.eigvalsh(matrix).min()) if np.isfinite(matrix).all() else -1.0
+        least = float(eigh(matrix)[0][0]) if np.isfinite(matrix).all() else -1.0
         wrong = least < 0.0 or (matrix.any() and not mass > INERTIA_LEAST)
         if wrong or (name in moved and not (mass > INERTIA_LEAST and least > INERTIA_LEAST)):
             found[name] = (mass if mass > INERTIA_LEAST else 0.0, centre)

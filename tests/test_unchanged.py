@@ -1,27 +1,26 @@
-"""Fixed-seed episodes and organs whose numbers must not change by one bit, compared with recorded hashes.
+"""Fixed-seed episodes, presses and organs: the same bits on every x86-64 processor, compared with recorded hashes.
 
-The hashes are in `unchanged_hashes.json`, one set for each family of machines: compilers and libraries round
-differently on another processor or in another version. What changes on purpose is recorded where it is changed and
-dropped from other families: a case without a hash of a family skips there. From the repository's root:
+What decides an episode uses only operations whose rounding IEEE 754 fixes, in an order that the source fixes
+(`msdm_core/arithmetic.py`), so that one record holds for all processors, BLAS kernels, versions of Python and numbers
+of threads. MuJoCo's results are its own: they are recorded for each of its minor versions. After a deliberate change,
+from the repository's root:
 
-    python -m tests.test_unchanged --record                adds (or replaces) the hashes of this machine's family
-    python -m tests.test_unchanged --record CASE ...       those of the named cases alone, after a deliberate change
+    python -m tests.test_unchanged --record                records all cases anew, for the MuJoCo that is installed
     python -m tests.test_unchanged --print CASE > a.txt    everything that is hashed, to be compared between two commits
 """
 
 import argparse
 import atexit
 import contextlib
-import csv
 import functools
 import hashlib
-import importlib
 import io
 import json
 import os
 import platform
+import subprocess
+import sys
 import tempfile
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -29,23 +28,31 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-import scipy.linalg  # noqa: F401  (loads scipy's BLAS)
 from llvmlite.binding import get_host_cpu_features
-from threadpoolctl import threadpool_info
 
 import msdm_core
-import surgsim_env  # noqa: F401  (registers the ids)
+import surgsim_env
+from surgsim_env.palpation.contrast_map import contrast_with_neighbours, feel_lesions
+from surgsim_env.palpation.press import scan
+from surgsim_env.scene.anatomy import MemberName
+from surgsim_env.scene.family import make_member
+from surgsim_env.scoring.site_search import AGENTS
 from surgsim_env.scripting import ScriptError, Trace, oracle_script, run_script
+from surgsim_env.training.site_agent import site_facts
 
 ROOT = Path(__file__).resolve().parents[1]
 HASHES = Path(__file__).with_name("unchanged_hashes.json")
 RECORD = "python -m tests.test_unchanged --record"
+MUJOCO = "MuJoCo " + ".".join(version("mujoco").split(".")[:2])
+NO_MUJOCO = "without MuJoCo"
+# Number of threads of lanes in a child process (`VARIATIONS`).
+THREADS = "UNCHANGED_THREADS"
 
 # What a case gives: by part (observation, reward, ...) anything that `lines` can write down.
 Parts = dict[str, list]
 
 # Where random actions lead: towards the tissue, so that contact, friction and force limits are in play.
-PRESS = {"phantom": (0.0, 0.0, -0.3, 0.0), "phantom_small": (0.0, 0.0, -0.3, 0.0), "liver": (0.0, 0.25, -0.25, 0.0)}
+PRESS = (0.0, 0.0, -0.3, 0.0)
 
 
 def lines(value: object, path: str = "") -> Iterator[str]:
@@ -119,27 +126,27 @@ def keep_state(parts: Parts, env: gym.Env) -> None:
 # ---- cases -----------------------------------------------------------------------------------------------------------
 
 CASES: dict[str, Callable[[], Parts]] = {}
-SLOW: set[str] = set()
+WITHOUT_MUJOCO: set[str] = set()
 
 
-def case(name: str, play: Callable[..., Parts], *given: object, slow: bool = False, **settings: object) -> None:
+def case(name: str, play: Callable[..., Parts], *given: object, mujoco: bool = True, **settings: object) -> None:
     assert name not in CASES
     CASES[name] = lambda: play(*given, **settings)
-    if slow:
-        SLOW.add(name)
+    if not mujoco:
+        WITHOUT_MUJOCO.add(name)
 
 
 @contextlib.contextmanager
-def variable(name: str, value: str) -> Iterator[None]:
-    """An environment variable for a while."""
-    before = os.environ.get(name)
-    os.environ[name] = value
+def fresh_maps() -> Iterator[None]:
+    """An empty folder for maps of healthy stiffness, so that these are pressed anew, once a process."""
+    before = os.environ.get("SURGSIM_CACHE")
+    os.environ["SURGSIM_CACHE"] = fresh_folder()
     try:
         yield
     finally:
-        os.environ.pop(name)
+        os.environ.pop("SURGSIM_CACHE")
         if before is not None:
-            os.environ[name] = before
+            os.environ["SURGSIM_CACHE"] = before
 
 
 @functools.cache
@@ -150,25 +157,16 @@ def fresh_folder() -> str:
     return folder.name
 
 
-def make(env_id: str, scene: str, **settings: object) -> gym.Env | gym.vector.VectorEnv:
-    """An environment, or many of them if given `num_envs`; the small scene's map of healthy stiffness is made anew."""
-    maker = (
-        functools.partial(gym.make_vec, vectorization_mode="vector_entry_point") if "num_envs" in settings else gym.make
-    )
-    # Others take from half a minute on, so that they may come from the user's cache.
-    fresh = scene == "phantom_small" and "Sites" in env_id
-    with variable("SURGSIM_CACHE", fresh_folder()) if fresh else contextlib.nullcontext():
-        return maker(f"SurgSim/{env_id}", scene=scene, scaled=False, **settings)  # type: ignore[arg-type, operator, return-value]
+def make(env_id: str, scene: str, **settings: object) -> gym.Env:
+    return gym.make(f"SurgSim/{env_id}", scene=scene, scaled=False, **settings)  # type: ignore[arg-type]
 
 
-def random_actions(env_id: str, space: gym.spaces.Box, scene: str, count: int) -> np.ndarray:
-    """Random actions towards the tissue, the same on every machine, shape (count, n) or (count, n_env, n)."""
+def random_actions(env_id: str, space: gym.spaces.Box, count: int) -> np.ndarray:
+    """Random actions towards the tissue, shape (count, n) or (count, n_env, n)."""
     size = space.shape[-1]
     scale, shift = np.full(size, 0.5), np.zeros(size)
-    if "Sites" in env_id:
-        scale[:] = 1.0
-    elif "Palpate" in env_id:
-        shift[:] = PRESS[scene]
+    if "Palpate" in env_id:
+        shift[:] = PRESS
         scale[3] = 1.0  # declares now and then
     else:
         # The jaw nearly closed and towards the free edge.
@@ -177,16 +175,13 @@ def random_actions(env_id: str, space: gym.spaces.Box, scene: str, count: int) -
     return np.clip(spread + shift, -1.0, 1.0).astype(np.float32)
 
 
-def play_random(
-    env_id: str, scene: str, steps: int, loop: str = "compiled", seed: int = 3, **settings: object
-) -> Parts:
+def play_random(env_id: str, scene: str, steps: int, seed: int = 3, **settings: object) -> Parts:
     """Random actions from a seed; an episode that ends is followed by the next one."""
-    with variable("SURGSIM_LOOP", loop):
-        env = make(env_id, scene, **settings)
+    env = make(env_id, scene, **settings)
     parts = blank()
     observation, info = env.reset(seed=seed)
     keep(parts, observation, None, None, None, info)
-    for action in random_actions(env_id, env.action_space, scene, steps):
+    for action in random_actions(env_id, env.action_space, steps):
         record = env.step(action)
         keep(parts, *record)
         if record[2] or record[3]:
@@ -198,13 +193,21 @@ def play_random(
     return parts
 
 
-def play_vector(env_id: str, scene: str, steps: int, count: int = 3, seed: int = 3, **settings: object) -> Parts:
-    """The same side by side; ends, resets and what they tell included."""
-    envs = make(env_id, scene, num_envs=count, **settings)
+def play_lanes(env_id: str, scene: str, steps: int, seed: int = 3, **settings: object) -> Parts:
+    """The same side by side; ends, resets and their infos included."""
+    envs = gym.make_vec(
+        f"SurgSim/{env_id}",
+        num_envs=3,
+        vectorization_mode="vector_entry_point",
+        scene=scene,
+        scaled=False,
+        threads=int(os.environ.get(THREADS, "2")),
+        **settings,
+    )
     parts = blank()
     observation, info = envs.reset(seed=seed)
     keep(parts, observation, None, None, None, info)
-    for actions in random_actions(env_id, envs.action_space, scene, steps):
+    for actions in random_actions(env_id, envs.action_space, steps):
         keep(parts, *envs.step(actions))
     for env in envs.envs:  # type: ignore[attr-defined]
         keep_state(parts, env)
@@ -212,7 +215,7 @@ def play_vector(env_id: str, scene: str, steps: int, count: int = 3, seed: int =
     return parts
 
 
-def play_oracle(env_id: str, scene: str, script_steps: int | None = None, seed: int = 3, **settings: object) -> Parts:
+def play_script(env_id: str, scene: str, script_steps: int | None = None, seed: int = 3, **settings: object) -> Parts:
     """The package's own oracle; `script_steps`: only the first steps of its script."""
     env = make(env_id, scene, **settings)
     env.reset(seed=seed)
@@ -235,52 +238,38 @@ def play_oracle(env_id: str, scene: str, script_steps: int | None = None, seed: 
     return parts
 
 
-def play_greedy(scene: str, presses: int, seed: int = 3, **settings: object) -> Parts:
-    """Press half of the time at random and half near the largest contrast that the observation shows."""
-    env = make("PalpateSites-v0", scene, **settings)
+def play_search(scene: str, search: str, seed: int = 3, **settings: object) -> Parts:
+    """A site search, with the presses of the healthy map and the estimates of lesions."""
+    with fresh_maps():
+        env = make("PalpateSites-v0", scene, **settings)
     parts = blank()
     observation, info = env.reset(seed=seed)
     keep(parts, observation, None, None, None, info)
-    actions = random_actions("PalpateSites-v0", env.action_space, scene, presses)
-    sites = env.unwrapped.task.charted.touch_map.places  # type: ignore[union-attr]
-    for number, action in enumerate(actions):
-        if number % 2:
-            place = sites[int(np.argmax(observation[: len(sites)]))]
-            action = np.clip(place + 0.1 * action, -1.0, 1.0).astype(np.float32)
-        observation, *rest = env.step(action)
+    agent, over = AGENTS[search](), False
+    agent.reset(np.random.default_rng(seed), site_facts(env))
+    while not over:
+        observation, *rest = env.step(agent.act(observation))
         keep(parts, observation, *rest)
+        over = bool(rest[1] or rest[2])
     keep_state(parts, env)
     env.close()
     return parts
 
 
-def constants(organ: msdm_core.OrganModel) -> dict[str, object]:
-    """The arrays of an organ, without those of motions, which these do not have."""
-    assert not len(organ.motion_node_shift)
-    return {name: value for name, value in organ._asdict().items() if not name.startswith("motion_")}
+def press_liver() -> Parts:
+    """A press of the liver at a place of its palpable face, as `surgsim palpate` does it."""
+    anatomy = surgsim_env.load_anatomy(surgsim_env.make_scene("liver"))
+    site, normal = anatomy.face.random_point(np.random.default_rng(3), 0.01)
+    (pressed,) = scan(anatomy, anatomy.organ(), site[None], normal[None], workers=1)
+    return {"press": [vars(pressed)]}
 
 
-def scene_organ(env_id: str, scene: str, **settings: object) -> Parts:
-    """The arrays of a scene's organ, healthy and as an episode draws it, with its stable step."""
-    env = make(env_id, scene, **settings)
-    simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
-    parts: Parts = {
-        "organ": [constants(simulation.organ_model)],
-        "stable_dt": [msdm_core.stable_dt(simulation.organ_model)],
-    }
-    env.reset(seed=3)
-    parts["organ"].append(constants(simulation.organ_model))
-    parts["stable_dt"].append(msdm_core.stable_dt(simulation.organ_model))
-    env.close()
-    return parts
-
-
-def block_organ() -> Parts:
-    """A block with capsule, lesions and volume term by every rule, set swinging."""
+def organs() -> Parts:
+    """Blocks with capsule, lesions and volume term by every rule, set swinging; one settled under gravity."""
     mesh = msdm_core.box_mesh((0.06, 0.05, 0.04), (6, 5, 4))
     tissue = msdm_core.Material(5000.0, 1060.0, 0.45)
     stiff = msdm_core.Material(20000.0, 1100.0, 0.3)
-    parts: Parts = {"mesh": [mesh.points, mesh.tets, mesh.boundary_triangles]}
+    parts: Parts = {"mesh": [mesh.points, mesh.tets, mesh.boundary_triangles], "organ": [], "motion": []}
     for rule, scheme, capsule in (
         ("lloyd", "barycentric", None),
         ("fitted", "voronoi", msdm_core.Capsule(1.0e6, 2.0e-5)),
@@ -300,212 +289,74 @@ def block_organ() -> Parts:
             damping=msdm_core.Damping(alpha=10.0, beta=1e-4),
         )
         organ = msdm_core.compile_organ(specification)
-        step = msdm_core.stable_dt(organ)
         state = msdm_core.rest_state(organ)
         free = organ.node_inverse_mass > 0.0
         state.node_velocity[free] = np.random.default_rng(5).uniform(-0.1, 0.1, (int(free.sum()), 3))
-        msdm_core.advance(organ, state, dt=0.5 * step, substep_count=200)
-        parts.setdefault("organ", []).append(constants(organ))
-        parts.setdefault("stable_dt", []).append(step)
-        parts.setdefault("motion", []).extend([state.node_position, state.node_velocity])
+        msdm_core.advance(organ, state, dt=0.5 * msdm_core.stable_dt(organ), substep_count=200)
+        parts["organ"].append(organ._asdict())
+        parts["motion"] += [state.node_position, state.node_velocity]
+    hanging = msdm_core.box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
+    top = np.flatnonzero(hanging.points[:, 2] > 0.03 - 1e-6)
+    material = msdm_core.Material(3000.0, 1060.0, 0.4)
+    settled = msdm_core.OrganSpec(hanging, material, anchors=top, gravity=(0.0, 0.0, -9.81))
+    parts["motion"].append(msdm_core.rest_state(msdm_core.compile_organ(settled)).node_position)
     return parts
-
-
-def heavy_block() -> Parts:
-    """Static equilibrium of a hanging block."""
-    mesh = msdm_core.box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
-    organ = msdm_core.compile_organ(
-        msdm_core.OrganSpec(
-            mesh,
-            msdm_core.Material(3000.0, 1060.0, 0.4),
-            anchors=np.flatnonzero(mesh.points[:, 2] > 0.03 - 1e-6),
-            gravity=(0.0, 0.0, -9.81),
-        )
-    )
-    state = msdm_core.rest_state(organ)
-    return {"motion": [state.node_position, state.node_velocity]}
 
 
 def meshes() -> Parts:
-    """Lattices in a closed surface and in a label image."""
+    """Lattices in a closed surface and in a label image, and a member of a family."""
     corners = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]) * 0.04
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     places = (np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), axis=-1) - 11.5) * 0.002
-    labels = (np.linalg.norm(places, axis=-1) < 0.02).astype(np.int64)
-    labels[np.linalg.norm(places - 0.006, axis=-1) < 0.007] = 2
+    labels = ((places * places).sum(axis=-1) < 0.0004).astype(np.int64)
+    labels[np.square(places - 0.006).sum(axis=-1) < 0.000049] = 2
     names = {1: "organ", 2: "lesion"}
+    template = surgsim_env.load_anatomy(surgsim_env.make_scene("liver_family"))
     made = {
         "surface": msdm_core.mesh_surface(corners, faces, cell_size=0.01),
         "labels": msdm_core.mesh_segmentation(labels, (0.002, 0.002, 0.002), cell_size=0.006, region_names=names),
+        "member": make_member(template, MemberName("test", 1)).mesh,
     }
-    parts: Parts = {}
-    for name, mesh in made.items():
-        quality = msdm_core.mesh_quality(mesh)
-        parts[name] = [mesh.points, mesh.tets, mesh.region, mesh.volumes, mesh.boundary_triangles]
-        parts[name].append(vars(quality) if hasattr(quality, "__dict__") else quality)
-    return parts
-
-
-def scan(scene: str, around: str) -> Parts:
-    """Numbers that `surgsim palpate` writes."""
-    module, function = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]["surgsim"].split(":")
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        arguments = ["palpate", "--scene", scene, "--around", around, "--out", folder, "--seed", "3", "--workers", "2"]
-        status = getattr(importlib.import_module(module), function)(arguments)
-        with open(Path(folder, "palpation.csv"), newline="") as file:
-            rows = list(csv.reader(file))
-        summary = json.loads(Path(folder, "summary.json").read_text())
     return {
-        "status": [status],
-        "csv": [[cell for cell in map(_number, row) if cell is not None] for row in rows],
-        "summary": [{key: summary[key] for key in ("organ", "press", "sites", "model", "truth")}],
+        name: [
+            mesh.points,
+            mesh.tets,
+            mesh.region,
+            mesh.volumes,
+            mesh.boundary_triangles,
+            vars(msdm_core.mesh_quality(mesh)),
+        ]
+        for name, mesh in made.items()
     }
 
 
-def _number(cell: str) -> float | None:
-    try:
-        return float(cell)
-    except ValueError:
-        return None
+def maps() -> Parts:
+    """Contrast over a fitted baseline, lesions felt on it, and a bell fitted to touches, of made-up stiffness."""
+    rng = np.random.default_rng(11)
+    plane = np.stack(np.meshgrid(*[np.arange(12) * 0.008] * 2), axis=-1).reshape(-1, 2)
+    bell = np.square(plane - (0.04, 0.05)).sum(axis=1) < 0.00015
+    stiffness = 300.0 * (1.0 + 0.5 * bell + 2.0 * plane[:, 0]) * rng.uniform(0.97, 1.03, len(plane))
+    contrast = contrast_with_neighbours(stiffness, plane, 1.0 / (0.02 + plane[:, :1]))
+    sites = np.column_stack([plane, 0.1 * plane[:, 0]])
+    felt = [vars(estimate) for estimate in feel_lesions(sites, contrast, spacing=0.008)]
+    return {"contrast": [contrast], "lesions": felt}
 
 
-for _scene, _steps in (("phantom", 40), ("phantom_small", 80), ("liver", 40)):
-    case(f"Palpate-v0 {_scene} random", play_random, "Palpate-v0", _scene, _steps, slow=_scene == "liver")
-    case(f"Palpate-v0 {_scene} oracle", play_oracle, "Palpate-v0", _scene, slow=_scene != "phantom_small")
-case("Palpate-v0 phantom_small random, plain loop", play_random, "Palpate-v0", "phantom_small", 80, loop="python")
-case("Palpate-v0 phantom_small random, memory", play_random, "Palpate-v0", "phantom_small", 40, memory=True)
-case(
-    "Palpate-v0 phantom random, memory, level hard",
-    *(play_random, "Palpate-v0", "phantom", 30),
-    memory=True,
-    level="hard",
-    slow=True,
-)
-case("Palpate-v0 phantom_small oracle, level standard", play_oracle, "Palpate-v0", "phantom_small", level="standard")
-case("Palpate-v0 phantom random, psm_palpator", play_random, "Palpate-v0", "phantom", 30, instrument="psm_palpator")
-case(
-    "Palpate-v0 phantom oracle, psm_palpator",
-    play_oracle,
-    "Palpate-v0",
-    "phantom",
-    instrument="psm_palpator",
-    slow=True,
-)
-for _scene in ("phantom_small", "phantom", "liver"):
-    # Maps of healthy stiffness take long: that of the liver a minute after each change of the kernels.
-    _slow = _scene != "phantom_small"
-    case(f"PalpateSites-v0 {_scene} random", play_random, "PalpateSites-v0", _scene, 10, budget=8, slow=_slow)
-    case(f"PalpateSites-v0 {_scene} greedy", play_greedy, _scene, 10, slow=_slow)
-case(
-    "PalpateSites-v0 phantom_small random, no memory", play_random, "PalpateSites-v0", "phantom_small", 8, memory=False
-)
-case("PalpateSites-v0 phantom_small greedy, level hard", play_greedy, "phantom_small", 10, level="hard")
-case(
-    "PalpateSites-v0 phantom_small random, level easy", play_random, "PalpateSites-v0", "phantom_small", 5, level="easy"
-)
-case(
-    "PalpateSites-v0 phantom random, psm_palpator",
-    *(play_random, "PalpateSites-v0", "phantom", 3),
-    instrument="psm_palpator",
-    slow=True,
-)
-case("Retract-v0 lobe random", play_random, "Retract-v0", "lobe", 40)
-case("Retract-v0 lobe random, plain loop", play_random, "Retract-v0", "lobe", 40, loop="python", slow=True)
-case(
-    "Retract-v0 lobe random, psm_retractor",
-    play_random,
-    "Retract-v0",
-    "lobe",
-    40,
-    instrument="psm_retractor",
-    slow=True,
-)
-case("Retract-v0 lobe oracle", play_oracle, "Retract-v0", "lobe", slow=True)
-case("Retract-v0 lobe oracle, psm_retractor", play_oracle, "Retract-v0", "lobe", instrument="psm_retractor", slow=True)
-case("BimanualRetract-v0 lobe random", play_random, "BimanualRetract-v0", "lobe", 40)
-case("BimanualRetract-v0 lobe oracle, first steps", play_oracle, "BimanualRetract-v0", "lobe", 4, slow=True)
-case("BimanualRetract-v0 lobe oracle", play_oracle, "BimanualRetract-v0", "lobe", slow=True)
-
-case("Palpate-v0 phantom vector", play_vector, "Palpate-v0", "phantom", 30, slow=True)
-case(
-    "Palpate-v0 phantom_small vector, SameStep",
-    play_vector,
-    "Palpate-v0",
-    "phantom_small",
-    60,
-    autoreset_mode="SameStep",
-)
-case("Palpate-v0 phantom_small vector, float32", play_vector, "Palpate-v0", "phantom_small", 60, dtype="float32")
-case(
-    "Palpate-v0 phantom_small vector, memory, level standard",
-    *(play_vector, "Palpate-v0", "phantom_small", 30),
-    memory=True,
-    level="standard",
-)
-case(
-    "Palpate-v0 phantom vector, psm_palpator",
-    play_vector,
-    "Palpate-v0",
-    "phantom",
-    12,
-    instrument="psm_palpator",
-    slow=True,
-)
-case("Palpate-v0 liver vector", play_vector, "Palpate-v0", "liver", 12, slow=True)
-case("PalpateSites-v0 phantom_small vector", play_vector, "PalpateSites-v0", "phantom_small", 7, budget=4)
-case(
-    "PalpateSites-v0 phantom vector, SameStep, float32",
-    *(play_vector, "PalpateSites-v0", "phantom", 4),
-    budget=3,
-    autoreset_mode="SameStep",
-    dtype="float32",
-    slow=True,
-)
-case("Retract-v0 lobe vector", play_vector, "Retract-v0", "lobe", 32, max_episode_steps=29, slow=True)
-case(
-    "Retract-v0 lobe vector, psm_retractor",
-    play_vector,
-    "Retract-v0",
-    "lobe",
-    25,
-    instrument="psm_retractor",
-    slow=True,
-)
-# It alone compiles float32 for rest shapes of their own.
-case("Retract-v0 lobe vector, float32", play_vector, "Retract-v0", "lobe", 25, dtype="float32", slow=True)
-
-for _id, _scene in (
-    ("Palpate-v0", "phantom"), ("Palpate-v0", "phantom_small"), ("Palpate-v0", "liver"), ("Retract-v0", "lobe")
-):  # fmt: skip
-    case(f"organ of {_scene}", scene_organ, _id, _scene)
-case("organ of phantom, level hard", scene_organ, "Palpate-v0", "phantom", level="hard")
-case("organ, block", block_organ)
-case("organ, hanging block", heavy_block)
-case("meshes", meshes)
-case("surgsim palpate phantom_small", scan, "phantom_small", "0.02,0.02,0.02,0.012", slow=True)
-case("surgsim palpate liver", scan, "liver", "-0.07,-0.02,0.04,0.02", slow=True)
+case("Palpate-v0", play_random, "Palpate-v0", "phantom", 40)
+case("PalpateSites-v0, GP-UCB", play_search, "phantom_small", "gp_ucb", level="standard", budget=16)
+case("Retract-v0", play_random, "Retract-v0", "lobe", 30)
+case("BimanualRetract-v0", play_random, "BimanualRetract-v0", "lobe", 25)
+case("lanes", play_lanes, "Palpate-v0", "phantom_small", 30, memory=True, level="standard", autoreset_mode="SameStep")
+case("lanes, float32", play_lanes, "Palpate-v0", "phantom_small", 30, dtype="float32")
+case("liver press", press_liver)
+case("retraction, script", play_script, "Retract-v0", "lobe", 3)
+case("arm, script", play_script, "Palpate-v0", "phantom_small", instrument="psm_palpator")
+case("organs", organs, mujoco=False)
+case("meshes", meshes, mujoco=False)
+case("maps", maps, mujoco=False)
 
 
 # ---- hashes ----------------------------------------------------------------------------------------------------------
-
-
-def family() -> str:
-    """What decides how numbers are rounded: instruction set, kernels of OpenBLAS, versions of compilers and libraries.
-
-    OpenBLAS picks its kernels by the processor: on one machine those of Haswell and of SkylakeX give other bits of a
-    stable step. The number of its threads makes no difference.
-    """
-    features = get_host_cpu_features()
-    if platform.machine().lower() in ("x86_64", "amd64"):
-        vectors = next((name for name in ("avx512f", "avx2", "avx") if features.get(name)), "sse2")
-        vectors += "+fma" if features.get("fma") else ""
-    else:
-        vectors = "sve" if features.get("sve") else "neon"
-    blas = {str(library["architecture"]) for library in threadpool_info() if library.get("internal_api") == "openblas"}
-    python = ".".join(platform.python_version_tuple()[:2])
-    versions = [f"{name} {'.'.join(version(name).split('.')[:2])}" for name in ("numpy", "scipy", "numba", "mujoco")]
-    machine = [platform.system(), platform.machine(), vectors, "+".join(sorted(blas)) or "another BLAS"]
-    return ", ".join([*machine, f"python {python}", *versions])
 
 
 def hashes(parts: Parts) -> dict[str, str]:
@@ -516,31 +367,73 @@ def hashes(parts: Parts) -> dict[str, str]:
     }
 
 
-def recorded() -> dict[str, dict[str, dict[str, str]]]:
-    return json.loads(HASHES.read_text()) if HASHES.exists() else {}
+def recorded() -> dict[str, dict[str, str]]:
+    """The hashes of each case with the MuJoCo that is installed."""
+    record = json.loads(HASHES.read_text())
+    return {name: hashed for key in (NO_MUJOCO, MUJOCO) for name, hashed in record.get(key, {}).items()}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CASES])
-def test_numbers_are_what_they_were(name: str):
-    everything = recorded()
-    assert any(name in one for one in everything.values()), f"{name!r} was recorded nowhere: {RECORD} {name!r}"
-    known = everything.get(family(), {})
+def changed(name: str, found: dict[str, str]) -> list[str]:
+    """The parts of a case that differ from the record."""
+    known = recorded()
     if name not in known:
-        pytest.skip(f"no hash of {name!r} for machines like this one ({family()}); to record it: {RECORD} {name!r}")
-    found = hashes(CASES[name]())
-    changed = sorted(part for part in found.keys() | known[name].keys() if found.get(part) != known[name].get(part))
-    assert not changed, (
-        f"{name}: changed: {', '.join(changed)}. To see what: python -m tests.test_unchanged --print {name!r}, here "
+        pytest.skip(f"{name!r} is not recorded for {MUJOCO}, whose results are its own: {RECORD}")
+    return sorted(part for part in found.keys() | known[name].keys() if found.get(part) != known[name].get(part))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_numbers_are_what_they_were(name: str):
+    differing = changed(name, hashes(CASES[name]()))
+    assert not differing, (
+        f"{name}: changed: {', '.join(differing)}. To see what: python -m tests.test_unchanged --print {name!r}, here "
         "and at the commit before"
     )
 
 
-@pytest.mark.parametrize("name", ["Palpate-v0 phantom_small random", "Retract-v0 lobe random"])
-def test_plain_and_compiled_loop_gave_the_same(name: str):
-    both = [known for known in recorded().values() if name in known and f"{name}, plain loop" in known]
-    assert both
-    for known in both:
-        assert known[f"{name}, plain loop"] == known[name]
+# ---- variations of the machine ---------------------------------------------------------------------------------------
+
+NO_AVX512 = "X86_V4 AVX512_ICL AVX512_SPR"
+# Variables of a child process that stand for another machine, and the features that the processor must have.
+VARIATIONS: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
+    "BLAS of Prescott": ({"OPENBLAS_CORETYPE": "Prescott"}, ()),
+    "BLAS of Haswell": ({"OPENBLAS_CORETYPE": "Haswell"}, ("avx2", "fma")),
+    "BLAS of SkylakeX": ({"OPENBLAS_CORETYPE": "SkylakeX"}, ("avx512f", "avx512vl")),
+    "BLAS of Zen": ({"OPENBLAS_CORETYPE": "Zen"}, ("avx2", "fma")),
+    "numpy without AVX-512": ({"NPY_DISABLE_CPU_FEATURES": NO_AVX512}, ("avx512f",)),
+    "numpy without AVX2": ({"NPY_DISABLE_CPU_FEATURES": f"X86_V3 {NO_AVX512}"}, ("avx512f",)),
+    "one thread": ({THREADS: "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}, ()),
+    "two threads": ({THREADS: "2", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}, ()),
+    "kernels for Haswell": ({"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma"}, ("avx2", "fma")),
+    "kernels for x86-64-v2": ({"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": "+sse4.2"}, ()),
+}
+# Run by `make test`: an AVX2 machine without AVX-512 differs from one with it by these.
+USUAL = ("BLAS of Haswell", "numpy without AVX-512")
+
+
+@pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="the variables are those of x86-64")
+@pytest.mark.parametrize(
+    "variation", [pytest.param(name, marks=() if name in USUAL else pytest.mark.slow) for name in VARIATIONS]
+)
+def test_another_machine_gives_the_same(variation: str, tmp_path: Path):
+    variables, needed = VARIATIONS[variation]
+    features = get_host_cpu_features()
+    if absent := [name for name in needed if not features.get(name)]:
+        pytest.skip(f"this processor has no {', '.join(absent)}, which {variation!r} needs")
+    # Numba's cache knows no NUMBA_CPU_FEATURES.
+    own_cache = {"NUMBA_CACHE_DIR": str(tmp_path)} if "NUMBA_CPU_NAME" in variables else {}
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.test_unchanged", "--hashes"],
+        env={**os.environ, **variables, **own_cache},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=1800,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert set(found) == set(CASES)
+    differing = {name: parts for name, hashed in found.items() if (parts := changed(name, hashed))}
+    assert not differing, f"{variation}: changed: {differing}"
 
 
 def test_hashes_see_one_bit():
@@ -556,38 +449,33 @@ def test_hashes_see_one_bit():
     assert a["state"] != c["state"] and a["info"] == c["info"]
 
 
-def record(names: list[str]) -> None:
-    """Write the hashes of this machine's family: all of them, or those of named cases."""
-    everything = recorded()
-    own = dict(everything.get(family(), {}))
-    for name in names or list(CASES):
-        new = hashes(CASES[name]())
-        same = "new" if name not in own else "as before" if own[name] == new else "CHANGED"
-        print(f"{same:>10}  {name}", flush=True)
-        own[name] = new
-    everything[family()] = {name: own[name] for name in CASES if name in own}
-    rows = []
-    for machine in sorted(everything):
-        cases = ",\n".join(
-            f"    {json.dumps(name)}: {json.dumps(value)}" for name, value in everything[machine].items()
+def record() -> None:
+    """Write the hashes of all cases."""
+    known = json.loads(HASHES.read_text()) if HASHES.exists() else {}
+    before = {**known.get(NO_MUJOCO, {}), **known.get(MUJOCO, {})}
+    known[NO_MUJOCO], known[MUJOCO] = {}, {}
+    for name, play in CASES.items():
+        new = hashes(play())
+        print(
+            f"{'new' if name not in before else 'as before' if before[name] == new else 'CHANGED':>10}  {name}",
+            flush=True,
         )
-        rows.append(f"  {json.dumps(machine)}: {{\n{cases}\n  }}")
-    HASHES.write_text("{\n" + ",\n".join(rows) + "\n}\n")
+        known[NO_MUJOCO if name in WITHOUT_MUJOCO else MUJOCO][name] = new
+    HASHES.write_text(json.dumps(known, indent=1) + "\n")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--record", nargs="*", metavar="CASE", help="record this machine's family; all cases by default"
-    )
+    parser.add_argument("--record", action="store_true", help="record all cases")
+    parser.add_argument("--hashes", action="store_true", help="print the hashes of all cases as one line of JSON")
     parser.add_argument("--print", choices=list(CASES), metavar="CASE", help="print all that is hashed of a case")
     chosen = parser.parse_args()
     if chosen.print:
         for part, value in CASES[chosen.print]().items():
             print("\n".join(lines(value, part)))
-    elif chosen.record is not None:
-        if unknown := [name for name in chosen.record if name not in CASES]:
-            parser.error(f"unknown: {', '.join(unknown)}; the cases are:\n" + "\n".join(CASES))
-        record(chosen.record)
+    elif chosen.hashes:
+        print(json.dumps({name: hashes(play()) for name, play in CASES.items()}))
+    elif chosen.record:
+        record()
     else:
         parser.print_help()

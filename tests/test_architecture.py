@@ -48,6 +48,54 @@ TOPS = {
     "cli": set(),
 }
 
+# What decides an episode or what it shows: organs, motion, draws, observations, presses, estimates, scripts, scores.
+DECIDING = (
+    "msdm_core/",
+    *(f"surgsim_env/{room}/" for room in ("scene", "instruments", "coupling", "tasks", "envs", "palpation")),
+    *("surgsim_env/scripting/", "surgsim_env/scoring/", "surgsim_env/training/site_agent.py"),
+)
+# numpy picks these by processor (its own code for AVX-512, BLAS), the C library's differ by version. `math.hypot` and
+# `math.dist` are Python's own, of + * and square roots.
+ROUNDED_BY_LIBRARY = {
+    *("exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "logaddexp", "cbrt", "power", "float_power", "pow"),
+    *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "arctan2", "asin", "acos", "atan", "atan2", "sinc", "angle"),
+    *("sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh", "asinh", "acosh", "atanh", "erf", "erfc", "gamma"),
+    *("dot", "vdot", "inner", "matmul", "tensordot", "einsum", "convolve", "correlate", "cov", "corrcoef", "polyfit"),
+    *("logspace", "geomspace", "linalg", "lgamma", "sumprod"),
+}
+# Compiled once for all processors, without BLAS.
+SCIPY_FIXED = {"scipy", "scipy.sparse", "scipy.sparse.csgraph", "scipy.spatial", "scipy.ndimage"}
+# Deliberate exceptions: what they may use, and why.
+UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
+    "msdm_core/arithmetic.py": (("**",), "powers of -1"),
+    "msdm_core/material/continuum.py": (
+        ("**", "np.einsum", "np.exp", "np.sin", "np.cos", "np.linalg.svd", "scipy.optimize", "np.linalg"),
+        "the continuum's stress, for validation and identification",
+    ),
+    "msdm_core/material/fitting.py": (("@",), "sparse matrices, whose products are plain loops"),
+    "msdm_core/material/tissue_law.py": (("sum",), "arrays"),
+    "msdm_core/meshing/segmentation_meshing.py": (("sum",), "whole numbers"),
+    "surgsim_env/envs/surgical_env.py": (("sum",), "whole numbers"),
+    "surgsim_env/instruments/arm/arm_instrument.py": (("sum",), "whole numbers"),
+    "surgsim_env/palpation/contrast_map.py": (("sum", "scipy.optimize"), "counts; the assignment only compares"),
+    "surgsim_env/palpation/figures.py": (("np.sin", "np.cos", "np.linalg.norm", "np.linalg"), "pictures"),
+    "surgsim_env/palpation/scores.py": (("scipy.optimize",), "the assignment only adds and compares"),
+    "surgsim_env/palpation/surface_drawing.py": (
+        (
+            *("@", "**", "np.einsum", "np.sin", "np.cos", "np.linalg", "np.linalg.norm"),
+            "np.linalg.svd",
+            "scipy.interpolate",
+        ),
+        "pictures",
+    ),
+    "surgsim_env/scene/model.py": (("sum",), "counts"),
+    "surgsim_env/scoring/evaluate.py": (("sum",), "counts"),
+    "surgsim_env/scoring/origin.py": (("sum",), "counts"),
+    "surgsim_env/scoring/policy_video.py": (("np.sin", "np.cos"), "pictures"),
+    "surgsim_env/scoring/site_search.py": (("scipy.stats",), "Sobol's sequence, of whole numbers"),
+    "surgsim_env/scripting/run.py": (("sum",), "counts"),
+}
+
 EMPTY_NAMES = {"util", "utils", "helper", "helpers", "manager", "managers", "misc", "common"}
 ADVANCING = re.compile(r"mj_step\w*|step|haptic_steps?|control_step|begin_step|end_step|advance\w*")
 JIT = {"jit", "njit", "register_jitable", "vectorize", "guvectorize", "cfunc", "stencil", "generated_jit"}
@@ -197,6 +245,41 @@ def kernels_repeat_to_the_bit(source: Source) -> Iterator[str]:
                 yield f"line {node.lineno}: {function}"
 
 
+def rounding_is_fixed(source: Source) -> Iterator[str]:
+    """What decides an episode calls no function whose rounding or order of sums differs by processor or by library."""
+    if not source.path.startswith(DECIDING) or source.path in KERNEL_FILES:
+        return
+    allowed = UNFIXED_ROUNDING.get(source.path, ((), ""))[0]
+    for node in ast.walk(source.tree):
+        if (name := unfixed(node)) and name not in allowed:
+            yield f"line {node.lineno}: {name}; msdm_core.arithmetic has what is allowed"
+
+
+def unfixed(node: ast.AST) -> str:
+    """The name of an operation whose rounding is not fixed, else nothing."""
+    if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
+        return "@"
+    if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.Pow):
+        base = node.left if isinstance(node, ast.BinOp) else node.target
+        # Powers of 2 are exact, which numpy's and the C library's `pow` is not.
+        return "" if isinstance(base, ast.Constant) and base.value in (2, 2.0, 1024) else "**"
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("sum", "pow"):
+        return node.func.id
+    if isinstance(node, ast.Attribute):
+        owner = ast.unparse(node.value)
+        whole_module = owner in {"np.linalg", "numpy.linalg", "np.fft", "scipy.linalg", "scipy.special", "linalg"}
+        if whole_module or (owner in {"np", "numpy", "math"} and node.attr in ROUNDED_BY_LIBRARY):
+            return ast.unparse(node)
+        if node.attr in {"dot", "gaussian_filter", "lognormal"}:
+            return f".{node.attr}"
+    if isinstance(node, ast.ImportFrom) and node.module:
+        if node.module.split(".")[0] == "scipy" and node.module not in SCIPY_FIXED:
+            return node.module
+        if node.module in {"math", "numpy"}:
+            return next((alias.name for alias in node.names if alias.name in ROUNDED_BY_LIBRARY), "")
+    return ""
+
+
 def tasks_do_not_advance(source: Source) -> Iterator[str]:
     """A task, and what draws, reads the simulation and never advances it."""
     if source.path.startswith(("surgsim_env/tasks/", "surgsim_env/rendering/")):
@@ -246,6 +329,7 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     kernels_import_little,
     kernels_allocate_nothing,
     kernels_repeat_to_the_bit,
+    rounding_is_fixed,
     tasks_do_not_advance,
     gymnasium_stays_above,
     patients_are_data,
@@ -258,6 +342,12 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
 def test_rule(rule):
     broken = [f"{source.path}: {fault}" for source in sources() for fault in rule(source)]
     assert not broken, f"{rule.__doc__}\n" + "\n".join(broken)
+
+
+@pytest.mark.parametrize("path", UNFIXED_ROUNDING)
+def test_exceptions_of_rounding_are_used(path):
+    (source,) = (source for source in sources() if source.path == path)
+    assert set(UNFIXED_ROUNDING[path][0]) == {name for node in ast.walk(source.tree) if (name := unfixed(node))}
 
 
 HOT = "from numba import njit\nimport numpy as np\n@njit(cache=True)\ndef _move(x):\n    "
@@ -299,6 +389,19 @@ PLANTED = [
     (kernels_repeat_to_the_bit, "msdm_core/kernels/substep_kernels.py", "def f(x):\n    return math.exp(x)"),
     (kernels_repeat_to_the_bit, "msdm_core/kernels/substep_kernels.py", "def f(x):\n    return np.arctan2(x, x)"),
     (kernels_repeat_to_the_bit, "msdm_core/kernels/substep_kernels.py", "def f(x):\n    return np.linalg.det(x)"),
+    (rounding_is_fixed, "msdm_core/organ/compile.py", "a = b @ c"),
+    (rounding_is_fixed, "msdm_core/organ/compile.py", "a = b**c"),
+    (rounding_is_fixed, "msdm_core/organ/compile.py", "a **= 2"),
+    (rounding_is_fixed, "msdm_core/organ/compile.py", "from scipy.sparse.linalg import eigsh"),
+    (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "a = np.cbrt(b)"),
+    (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "f = math.exp"),
+    (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "from math import sin"),
+    (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "a = numpy.linalg.norm(b)"),
+    (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "from numpy import linalg"),
+    (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "a = b.dot(c)"),
+    (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "a = sum(rewards)"),
+    (rounding_is_fixed, "surgsim_env/instruments/arm/steering.py", "a = np.einsum('ij,j->i', b, c)"),
+    (rounding_is_fixed, "surgsim_env/scoring/site_search.py", "a = np.exp(b)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "def judge(simulation):\n    simulation.haptic_step()"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "env.step(action)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "simulation.control_step(50)"),
@@ -335,6 +438,8 @@ ALLOWED = [
         "msdm_core/kernels/substep_kernels.py",
         "@njit(fastmath=False)\ndef f(x): return math.sqrt(x)",
     ),
+    (rounding_is_fixed, "msdm_core/organ/compile.py", "a = np.sqrt(b * b).sum() + math.fsum(c) + 2**d"),
+    (rounding_is_fixed, "surgsim_env/arm_study/reach.py", "a = b @ c"),
     (tasks_do_not_advance, "surgsim_env/envs/ids.py", "simulation.haptic_step()"),
     (gymnasium_stays_above, "surgsim_env/envs/vector_env.py", "import gymnasium"),
     (patients_are_data, "surgsim_env/cli/organ.py", "from surgsim_env.coupling.simulation import Simulation"),

@@ -67,7 +67,7 @@ LARGEST_RESIDUAL = 0.18
 # nodes loose: at the seams of graded lattices (0.19), E across them fell by 7 to 34 %.
 LARGEST_IMBALANCE = 0.05
 
-_H = 0.5**0.5
+_H = math.sqrt(0.5)
 # Orthonormal basis of the symmetric tensors: three stretches, three shears, shape (6, 3, 3).
 UNIT_STRAINS = np.array(
     [

@@ -75,7 +75,8 @@ def radius_ratios(mesh: TetMesh) -> FloatArray:
     area = norm(_face_area_vectors(mesh.points, mesh.tets), axis=2).sum(axis=1)
     corners = mesh.points[mesh.tets]
     a, b, c = (corners[:, corner] - corners[:, 0] for corner in (1, 2, 3))
-    sums = sum((p * p).sum(axis=1, keepdims=True) * np.cross(q, r) for p, q, r in ((a, b, c), (b, c, a), (c, a, b)))
+    parts = [(p * p).sum(axis=1, keepdims=True) * np.cross(q, r) for p, q, r in ((a, b, c), (b, c, a), (c, a, b))]
+    sums = parts[0] + parts[1] + parts[2]
     circumradius = norm(sums, axis=1) / (12 * mesh.volumes)
     return 3 * (3 * mesh.volumes / area) / circumradius
 

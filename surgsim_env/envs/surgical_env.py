@@ -3,6 +3,7 @@
 import inspect
 import io
 import json
+import math
 import zipfile
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -209,7 +210,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
         self._show()
-        return self._observed(), sum(verdict.rewards.values()), verdict.terminated, verdict.truncated, info
+        # Not `sum`, which rounds once from Python 3.12 on and at each term before.
+        reward = math.fsum(verdict.rewards.values())
+        return self._observed(), reward, verdict.terminated, verdict.truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The picture of this moment in mode "rgb_array", shape (height, width, 3); a window shows each step by itself.

@@ -99,7 +99,7 @@ class PalpationResult:
     @property
     def simulated_time(self) -> float:
         """Duration of the presses of the organ and of its model [s]."""
-        return sum(press.duration for press in (*self.presses, *self.model_presses))
+        return math.fsum(press.duration for press in (*self.presses, *self.model_presses))
 
 
 def run_palpation(

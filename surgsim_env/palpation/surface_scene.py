@@ -159,7 +159,7 @@ def with_substeps(
 
 
 def _direction(vector: Vector) -> Vector:
-    length = math.sqrt(sum(part * part for part in vector))
+    length = math.hypot(*vector)
     if not 0.0 < length < float("inf"):
         raise ValueError(f"approach is {vector}; give a direction such as 0,0,-1")
     x, y, z = (part / length for part in vector)

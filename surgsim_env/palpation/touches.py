@@ -161,7 +161,7 @@ class SiteTouches:
 def felt_lesion_radius(scene: Scene) -> float:
     """Mean radius of the lesions that a scene hides [m]; those smaller than the tip are felt as wide as the tip."""
     assert scene.lesion is not None
-    return max(scene.instrument.tip_radius, 0.5 * sum(scene.lesion.radius))
+    return max(scene.instrument.tip_radius, 0.5 * (scene.lesion.radius[0] + scene.lesion.radius[1]))
 
 
 @dataclass(frozen=True)

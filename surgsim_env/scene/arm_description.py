@@ -148,7 +148,7 @@ class LinkInertia:
         _require_finite(f"centre {what}", self.centre)
         for one in self.moments:
             require_number(f"moment {what}", one, 0.0, "kg m^2", above=True)
-        if 2.0 * max(self.moments) > sum(self.moments) * (1.0 + 1e-9):
+        if 2.0 * max(self.moments) > math.fsum(self.moments) * (1.0 + 1e-9):
             raise ValueError(f"moments {what} are {self.moments}; in a body none exceeds the sum of the others")
 
 

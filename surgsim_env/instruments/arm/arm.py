@@ -1,5 +1,6 @@
 """Kinematics of an arm: tip, shaft, shapes and Jacobians at given joint values."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -57,7 +58,7 @@ class Arm:
         self.speed_limit = np.array(description.control.speed_limit)
         self.home = np.array([description.home[name] for name in self.joints])
         jaw = [model.joint(name).range for name in description.jaw]
-        self.jaw_range = (float(sum(low for low, _ in jaw)), float(sum(high for _, high in jaw)))
+        self.jaw_range = (math.fsum(low for low, _ in jaw), math.fsum(high for _, high in jaw))
         groups = [np.flatnonzero(model.geom_group == group) for group in (CONTACT_GROUP, LINK_GROUP)]
         self.shapes = np.concatenate(groups)
         self.felt = np.arange(len(self.shapes)) < len(groups[0])

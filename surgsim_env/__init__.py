@@ -19,7 +19,6 @@ from msdm_core.organ.support import Support
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.envs.ids import register, register_task
 from surgsim_env.envs.surgical_env import SurgicalEnv
-from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import (
     list_arms,
@@ -49,6 +48,7 @@ if TYPE_CHECKING:
     from surgsim_env import scripting
     from surgsim_env.envs.bimanual_parallel import BimanualRetractParallelEnv
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.instruments.arm.arm import load_arm
     from surgsim_env.rendering.gl import NoGLError
     from surgsim_env.rendering.options import RenderOptions
 
@@ -99,6 +99,7 @@ _LAZY = {
     "NoGLError": "surgsim_env.rendering.gl",
     "RenderOptions": "surgsim_env.rendering.options",
     "VectorEnvForStableBaselines": "surgsim_env.envs.stable_baselines",
+    "load_arm": "surgsim_env.instruments.arm.arm",
 }
 _EXTRAS = {"BimanualRetractParallelEnv": "pettingzoo", "VectorEnvForStableBaselines": "agents"}
 

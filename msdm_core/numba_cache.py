@@ -11,13 +11,11 @@ Kernels decorated in `kernel_cache` have a cache that heals (`HealingCache`): a 
 warning, and its function compiled again; where there is no room to write, functions are compiled and not kept. Files
 carry a checksum, as a flipped bit in machine code would run unnoticed.
 
-While they compile, functions have a `KernelLibrary`: one that compiled code alone calls becomes machine code in its
-callers only.
+numba's settings are those of the whole process: they are changed under a lock (`SETTINGS_LOCK`).
 """
 
 import atexit
 import functools
-import gc
 import hashlib
 import io
 import logging
@@ -25,23 +23,20 @@ import os
 import shutil
 import stat
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-import llvmlite.binding as llvm
 from numba.core import config
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
-from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
-from numba.core.compiler import Flags
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.core.target_extension import dispatcher_registry, target_registry
-from numba.core.targetconfig import ConfigStack
 from numba.misc.appdirs import AppDirs
 
 LOGGER = logging.getLogger("msdm_core")
@@ -50,11 +45,9 @@ FOLDER_PREFIX = "surgsim-kernels-"
 STALE_AGE = 7 * 24 * 3600.0  # [s]
 # The last bytes of a file of the cache, followed by the SHA-256 of those before; unpickling does not read them.
 CHECKSUM_MARK = b"surgsim-sha256:"
-# How a `KernelLibrary` without machine code is marked on disk.
-INNER_KIND = "inner"
 CHECKSUM_LENGTH = len(CHECKSUM_MARK) + hashlib.sha256().digest_size
-# As the third threshold of `gc`: the oldest generation is left alone.
-NEVER = 2**31 - 1
+# Held by who changes numba's settings until they are restored; reentrant, as a package may import another inside.
+SETTINGS_LOCK = threading.RLock()
 
 
 def provide_cache_folder(source_folder: Path) -> Path | None:
@@ -64,22 +57,23 @@ def provide_cache_folder(source_folder: Path) -> Path | None:
         The temporary folder that numba was given, None where numba finds a place by itself, or where no folder at all
         can be written, which is warned of: compiled functions are not kept then.
     """
-    places = _places(source_folder)
-    if any(_can_write(place) for place in places):
-        return None
-    try:
-        folder = _private_temporary_folder()
-    except OSError as error:
-        tried = ", ".join(str(place) for place in places)
-        warnings.warn(
-            f"no folder can be written for numba's compiled code: tried {tried} and the temporary folder ({error}); "
-            "every start compiles for minutes: set NUMBA_CACHE_DIR to one that can",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return None
-    config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
-    return folder
+    with SETTINGS_LOCK:
+        places = _places(source_folder)
+        if any(_can_write(place) for place in places):
+            return None
+        try:
+            folder = _private_temporary_folder()
+        except OSError as error:
+            tried = ", ".join(str(place) for place in places)
+            warnings.warn(
+                f"no folder can be written for numba's compiled code: tried {tried} and the temporary folder "
+                f"({error}); every start compiles for minutes: set NUMBA_CACHE_DIR to one that can",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            return None
+        config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
+        return folder
 
 
 @contextmanager
@@ -91,25 +85,28 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
     """
     files = sorted(file for folder in source_folders for file in folder.rglob(KERNEL_FILES))
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
-    before: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
-    folder = _kernel_folder(source_folders[0], f"{FOLDER_PREFIX}{digest}")
-    if folder is not None:
-        _remove_stale(folder.parent, keep=folder.name)
-        config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
-    cpu = target_registry["cpu"]
-    dispatcher = dispatcher_registry[cpu]
-    _register(cpu, UncachedDispatcher if folder is None else HealingDispatcher)
-    try:
-        yield
-    finally:
-        _register(cpu, dispatcher)
-        config.CACHE_DIR = before  # pyright: ignore[reportAttributeAccessIssue]
+    with SETTINGS_LOCK:
+        before: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
+        folder = _kernel_folder(source_folders[0], f"{FOLDER_PREFIX}{digest}")
+        if folder is not None:
+            _remove_stale(folder.parent, keep=folder.name)
+            config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
+        cpu = target_registry["cpu"]
+        dispatcher = dispatcher_registry[cpu]
+        _register(cpu, UncachedDispatcher if folder is None else HealingDispatcher)
+        try:
+            yield
+        finally:
+            _register(cpu, dispatcher)
+            config.CACHE_DIR = before  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _register(target: Any, dispatcher: Any) -> None:
-    """Let numba's decorators make dispatchers of this class; the registry takes a new one only when it has none."""
-    del dispatcher_registry[target]
-    dispatcher_registry[target] = dispatcher
+    """Let numba's decorators make dispatchers of this class.
+
+    The registry by itself takes a class only where it has none, and without one a decorator in another thread fails.
+    """
+    dict.__setitem__(dispatcher_registry, target, dispatcher)
 
 
 def _kernel_folder(source_folder: Path, name: str) -> Path | None:
@@ -331,100 +328,35 @@ class InnerUncached(_Inner, UncachedDispatcher):
     """`UncachedDispatcher` of a function that compiled code alone calls."""
 
 
-class KernelLibrary(JITCodeLibrary):
-    """LLVM's code of a function; one without any wrapper becomes machine code as a part of its callers alone.
-
-    A function is linked into its callers before they are optimised. numba optimises it by itself as well and makes
-    machine code of it, which nothing calls where there is no wrapper: a sixth of the time that compiling takes.
-    """
-
-    # numba's environments of functions without machine code, by symbol, for those that they are linked into.
-    _environments: ClassVar[dict[str, Any]] = {}
-
-    def __init__(self, codegen: Any, name: str) -> None:
-        super().__init__(codegen, name)
-        flags = ConfigStack.top_or_none()
-        self._is_inner = flags is not None and flags.no_cpython_wrapper and flags.no_cfunc_wrapper
-
-    @property
-    def codegen(self) -> Any:
-        """Where numba sets the environment of a function that it has compiled or loaded."""
-        return self if self._is_inner else self._codegen
-
-    def set_env(self, name: str, environment: Any) -> None:
-        """Keep the environment until a caller has machine code."""
-        self._environments[name] = environment
-
-    def serialize_using_object_code(self) -> Any:
-        """What is kept on disk."""
-        if self._is_inner:
-            return self.name, INNER_KIND, self._get_module_for_linking().as_bitcode()
-        return super().serialize_using_object_code()
-
-    @classmethod
-    def _unserialize(cls, codegen: Any, state: tuple[str, str, Any]) -> Any:
-        name, kind, data = state
-        # The flags are those of the function that compiles, which may have no wrapper where this one has.
-        with ConfigStack().enter(Flags()):
-            if kind != INNER_KIND:
-                return super()._unserialize(codegen, state)
-            library = codegen.create_library(name)
-        library._is_inner = True
-        library._final_module = llvm.parse_bitcode(data)
-        library._finalize_final_module()
-        return library
-
-    def _optimize_final_module(self) -> None:
-        if not self._is_inner:
-            super()._optimize_final_module()
-
-    def _finalize_final_module(self) -> None:
-        if self._is_inner:
-            self._finalize_dynamic_globals()
-            self._verify_declare_only_symbols()
-            self._finalized = True
-            return
-        super()._finalize_final_module()
-        machine: Any = self._codegen
-        for variable in self._final_module.global_variables:
-            if variable.name in self._environments:
-                machine.set_env(variable.name, self._environments[variable.name])
-
-
 class Compiling:
-    """Functions that are being compiled.
+    """Functions that are being compiled, by any thread.
 
-    Logs once that they are, when that has taken longer than `patience` [s], and when it is over. Meanwhile Python
-    collects no garbage of its oldest generation: each such collection visits all that numba has built so far, and
-    together they take a sixth of the time.
+    Logs once that they are, when that has taken longer than `patience` [s], and when it is over.
     """
 
     def __init__(self, patience: float) -> None:
         self._patience = patience
+        # Held to count, not while compiling: a thread may hold numba's lock when it comes here, or take it afterwards.
+        self._lock = threading.RLock()
         self._depth, self._begin, self._said = 0, 0.0, False
-        self._gc_thresholds = gc.get_threshold()
 
     @contextmanager
     def one(self) -> Iterator[None]:
         """Around the compiling of one function, with all that it calls."""
-        if self._depth == 0:
-            self._begin, self._said = time.monotonic(), False
-            self._gc_thresholds = gc.get_threshold()
-            gc.set_threshold(*self._gc_thresholds[:2], NEVER)
-            JITCPUCodegen._library_class = KernelLibrary
-        self._depth += 1
+        with self._lock:
+            if self._depth == 0:
+                self._begin, self._said = time.monotonic(), False
+            self._depth += 1
         try:
             yield
         finally:
-            self._depth -= 1
-            spent = time.monotonic() - self._begin
-            if spent > self._patience and not self._said:
-                self._said = True
-                LOGGER.warning("surgsim: compiling for this processor, once: up to a minute ...")
-            if self._depth == 0:
-                gc.set_threshold(*self._gc_thresholds)
-                JITCPUCodegen._library_class = JITCodeLibrary
-                if self._said:
+            with self._lock:
+                self._depth -= 1
+                spent = time.monotonic() - self._begin
+                if spent > self._patience and not self._said:
+                    self._said = True
+                    LOGGER.warning("surgsim: compiling for this processor, once: up to a minute ...")
+                if self._depth == 0 and self._said:
                     LOGGER.warning("surgsim: compiled in %.0f s", spent)
 
 

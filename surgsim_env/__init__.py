@@ -1,63 +1,54 @@
 """surgsim_env: soft organs and robotic instruments as Gymnasium environments; importing it registers their ids."""
 
-import gc
 import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-# No garbage collection while modules are imported, and none of what they made afterwards (`gc.freeze` below): it frees
-# nothing, and takes a tenth of a second of a process of one second.
-_collects = gc.isenabled()
-gc.disable()
-try:
-    import msdm_core
-    from msdm_core import numba_cache
-    from surgsim_env.rendering.gl import import_mujoco
+import msdm_core
+from msdm_core import numba_cache
+from surgsim_env.rendering.gl import import_mujoco
 
+with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
     import_mujoco()
-    with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
-        # Before anything else imports them: compiled code is cached where it was when it was decorated.
-        from surgsim_env.coupling import haptic_kernels  # noqa: F401
-        from surgsim_env.instruments import mujoco_kernels, tool_kernels  # noqa: F401
-        from surgsim_env.tasks import visibility_kernels  # noqa: F401
-    from msdm_core.errors import MeshError, OrganDivergedError, OrganError
-    from msdm_core.organ.support import Support
-    from surgsim_env.coupling.simulation import Simulation
-    from surgsim_env.envs.ids import register, register_task
-    from surgsim_env.envs.surgical_env import SurgicalEnv
-    from surgsim_env.instruments.arm.arm import load_arm
-    from surgsim_env.scene.anatomy import load_anatomy
-    from surgsim_env.scene.load import (
-        list_arms,
-        list_materials,
-        list_scenes,
-        load_scene,
-        make_material,
-        make_scene,
-    )
-    from surgsim_env.scene.model import Port, Scene
-    from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
-    from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
-    from surgsim_env.tasks.palpate import PalpateTask
-    from surgsim_env.tasks.palpate_sites import PalpateSitesTask
-    from surgsim_env.tasks.retract import RetractTask
-    from surgsim_env.tasks.task import (
-        CONTACT_FORCE,
-        TIME_LEFT,
-        TIP_POSITION,
-        TIP_VELOCITY,
-        Start,
-        Task,
-        Verdict,
-    )
-finally:
-    if _collects:
-        gc.enable()
+    # Before anything else imports them: compiled code is cached where it was when it was decorated.
+    from surgsim_env.coupling import haptic_kernels  # noqa: F401
+    from surgsim_env.instruments import mujoco_kernels, tool_kernels  # noqa: F401
+    from surgsim_env.tasks import visibility_kernels  # noqa: F401
+from msdm_core.errors import MeshError, OrganDivergedError, OrganError
+from msdm_core.organ.support import Support
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.envs.ids import register, register_task
+from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import (
+    list_arms,
+    list_materials,
+    list_scenes,
+    load_scene,
+    make_material,
+    make_scene,
+)
+from surgsim_env.scene.model import Port, Scene
+from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.palpate import PalpateTask
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.tasks.task import (
+    CONTACT_FORCE,
+    TIME_LEFT,
+    TIP_POSITION,
+    TIP_VELOCITY,
+    Start,
+    Task,
+    Verdict,
+)
 
 if TYPE_CHECKING:
     from surgsim_env import scripting
     from surgsim_env.envs.bimanual_parallel import BimanualRetractParallelEnv
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.instruments.arm.arm import load_arm
     from surgsim_env.rendering.gl import NoGLError
     from surgsim_env.rendering.options import RenderOptions
 
@@ -108,6 +99,7 @@ _LAZY = {
     "NoGLError": "surgsim_env.rendering.gl",
     "RenderOptions": "surgsim_env.rendering.options",
     "VectorEnvForStableBaselines": "surgsim_env.envs.stable_baselines",
+    "load_arm": "surgsim_env.instruments.arm.arm",
 }
 _EXTRAS = {"BimanualRetractParallelEnv": "pettingzoo", "VectorEnvForStableBaselines": "agents"}
 
@@ -129,4 +121,3 @@ def __getattr__(name: str) -> Any:
 
 
 register()
-gc.freeze()

@@ -3,7 +3,8 @@
 Division by zero gives infinity and nan, as in numpy, and no function is wrapped for C. No memory is taken and no
 references are counted (`_nrt`, numba's runtime): a kernel that makes an array does not compile, and all compile in 0.8
 of the time. A wrapper for Python takes as long to compile as a small function: those that compiled code alone calls
-have none. Calling one of them from Python raises TypeError (`msdm_core.numba_cache`).
+have none; numba makes machine code of them all the same, and links them into their callers. Calling one of them from
+Python raises TypeError (`msdm_core.numba_cache`).
 """
 
 from typing import Any

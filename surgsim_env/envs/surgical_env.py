@@ -7,7 +7,7 @@ import math
 import zipfile
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -17,11 +17,13 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import check_entries
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
-from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scene.digest import content_digest, instrument_files, scene_digest, source_files
 from surgsim_env.scene.load import fill_json
 from surgsim_env.tasks.declaration import documentation
 from surgsim_env.tasks.task import Task
+
+if TYPE_CHECKING:
+    from surgsim_env.rendering.renderer import OrganRenderer
 
 # Numbers as float32, a picture as uint8, or a table of both.
 Observation = Any
@@ -233,7 +235,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         return self._view.frame(self._shown())
 
     @property
-    def renderer(self) -> OrganRenderer:
+    def renderer(self) -> "OrganRenderer":
         """Draws the episode in any render_mode: `rgb(camera)`, `depth(camera)` [m], `segmentation(camera)`.
 
         Raises:

@@ -1,14 +1,13 @@
 """Instruments that a scene names: one arm, two, or a Cartesian tip on slides, a ball (probe) or a jaw (grasper)."""
 
 import math
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from msdm_core.arithmetic import arctan2, cos, matmul, norm, sin
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.arm.arm_instrument import ArmInstrument, is_arm
-from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
 from surgsim_env.instruments.tool_bodies import add_supports, make_servo
 from surgsim_env.scene.anatomy import Anatomy
@@ -195,8 +194,12 @@ def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> I
     """
     scene = anatomy.scene
     if pair_names(scene.instrument.model) is not None:
+        from surgsim_env.instruments.arm.pair import Pair
+
         return Pair(anatomy, lower, upper)
-    if is_arm(scene.instrument.model):
+    if Path(scene.instrument.model).suffix != ".xml":
+        from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
+
         return ArmInstrument(anatomy, lower, upper)
     made = Grasper if read_model(scene.instrument.model).body("jaw") is not None else Probe
     return made(scene, lower, upper)

@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,11 @@ from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, placed_endoscope
 from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import CAMERAS, render_options
-from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.scene.model import Endoscope
 from surgsim_env.tasks.visibility import Disc
+
+if TYPE_CHECKING:
+    from surgsim_env.rendering.renderer import OrganRenderer
 
 RENDER_MODES = ("human", "rgb_array")
 # Rotation of the view for each pixel of a drag [rad], and factor of the distance for each notch of the wheel.
@@ -77,7 +79,7 @@ class WindowContext:
 class Window:
     """A window with a renderer's pictures at the rate of control steps; once closed, it stays closed."""
 
-    def __init__(self, renderer: OrganRenderer, context: WindowContext, period: float) -> None:
+    def __init__(self, renderer: "OrganRenderer", context: WindowContext, period: float) -> None:
         """Attach to an open window; a period [s] at least lies between two pictures."""
         self._renderer, self._context, self._period = renderer, context, period
         self._camera_name = renderer.options.camera
@@ -205,10 +207,10 @@ class EpisodeView:
         modes = [mode for mode in RENDER_MODES if mode == self.mode or mode in offered_modes()]
         return {"render_modes": modes, "render_fps": round(1.0 / self._simulation.anatomy.scene.timing.control_step)}
 
-    def renderer(self, shown: Shown) -> OrganRenderer:
+    def renderer(self, shown: Shown) -> "OrganRenderer":
         """The renderer, with the lesions, target and endoscope of an episode."""
         if self._renderer is None:
-            self._renderer = OrganRenderer(self._simulation, self.options)
+            self._renderer = self._new_renderer()
         self._renderer.follow_anatomy()
         self._renderer.lesions = shown.lesions
         self._renderer.target = shown.target
@@ -225,11 +227,17 @@ class EpisodeView:
         """Show the current state in the window, which opens at the first call."""
         if self.window is None:
             context = WindowContext("surgsim", self.options.width, self.options.height)
-            self._renderer = OrganRenderer(self._simulation, self.options, gl_context=context)
+            self._renderer = self._new_renderer(context)
             period = self._simulation.anatomy.scene.timing.control_step
             self.window = Window(self._renderer, context, period)
         self.renderer(shown)
         self.window.show()
+
+    def _new_renderer(self, context: WindowContext | None = None) -> "OrganRenderer":
+        """A renderer, into a window's context or off screen; an episode without pictures does not import it."""
+        from surgsim_env.rendering.renderer import OrganRenderer
+
+        return OrganRenderer(self._simulation, self.options, gl_context=context)
 
     def close(self) -> None:
         """Close window and renderer; may be called more than once."""

@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from msdm_core.arithmetic import norm
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import fill_json
@@ -29,6 +28,9 @@ from surgsim_env.tasks.task import (
     force_scale,
     soft_force_share,
 )
+
+if TYPE_CHECKING:
+    from surgsim_env.instruments.arm.pair import Pair
 
 # Force of the right tip on the target [N].
 TOUCH_FORCE = (0.3, 1.0)
@@ -176,6 +178,8 @@ class BimanualRetractTask(RetractTask):
             ValueError: what RetractTask refuses, an instrument that is no pair of a jaw with pads and a ball, a scene
                 without a place for the right tip to start from or without supports that can be touched.
         """
+        from surgsim_env.instruments.arm.pair import Pair
+
         if not isinstance(instrument, Pair):
             raise ValueError(
                 f"scene {anatomy.scene.name!r}: instrument {anatomy.scene.instrument.model!r} is one arm, and two are "
@@ -291,7 +295,7 @@ class _SavedBimanual:
     felt: tuple[float, float]
 
 
-def _check_tips(pair: Pair) -> None:
+def _check_tips(pair: "Pair") -> None:
     """The left arm can hold tissue, the right one can touch."""
     left, right = pair.arms["left"], pair.arms["right"]
     if left.jaw is None or not left.jaw.has_pads:
@@ -305,7 +309,9 @@ def _check_tips(pair: Pair) -> None:
         )
 
 
-def _pair(simulation: Simulation) -> Pair:
+def _pair(simulation: Simulation) -> "Pair":
+    from surgsim_env.instruments.arm.pair import Pair
+
     instrument = simulation.instrument
     assert isinstance(instrument, Pair)
     return instrument

@@ -14,7 +14,6 @@ from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Capsule, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Grasp, Instrument
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.levels import SAVED_MOST
@@ -232,6 +231,8 @@ class RetractTask(Task):
                 f"scene {scene.name!r} is a family of organs, and retractions draw their lobe themselves: leave out "
                 "its [family], or palpate it"
             )
+        from surgsim_env.instruments.arm.pair import Pair
+
         if isinstance(instrument, Pair) and not self.takes_pair:
             raise ValueError(
                 f"scene {scene.name!r}: instrument {scene.instrument.model!r} is two arms, and one is needed: take one "

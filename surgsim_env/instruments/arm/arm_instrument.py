@@ -1,7 +1,6 @@
 """One arm as the instrument of a scene, and the parts that two arms share: ports, servos, wrist sensor."""
 
 import math
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -235,11 +234,6 @@ def parked_place(anatomy: Anatomy) -> FloatArray:
     corners = anatomy.face.points[anatomy.face.triangles]
     middle = anatomy.face.project(corners.mean(axis=(0, 1)))[0]
     return middle - (anatomy.scene.instrument.tip_radius + PARKED_GAP) * anatomy.face.approach
-
-
-def is_arm(model: str) -> bool:
-    """Whether a scene's instrument is an arm (a TOML file or a shipped arm's name), not an MJCF probe."""
-    return Path(model).suffix != ".xml"
 
 
 FORCE, TORQUE = "wrist_force", "wrist_torque"

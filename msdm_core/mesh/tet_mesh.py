@@ -238,7 +238,7 @@ def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
         volumes = tet_volumes(points, tets)
         edge_lengths = norm(points[tets[:, TET_EDGES[:, 0]]] - points[tets[:, TET_EDGES[:, 1]]], axis=2)
         longest = edge_lengths.max(axis=1)
-    ratios = np.abs(volumes) / (longest * longest * longest)
+        ratios = np.abs(volumes) / (longest * longest * longest)
     flat = np.flatnonzero(~(ratios > DEGENERATE_VOLUME_RATIO))
     if flat.size:
         tet = int(flat[0])

@@ -7,6 +7,11 @@ PY := $(VENV)/bin/python
 CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python3.14)
 SUITABLE := $(if $(PYTHON),sys.version_info >= (3, 11),(3, 11) <= sys.version_info[:2] <= (3, 14))
 
+# The versions that make installs, for Python 3.11 to 3.13; `make lock` renews them.
+CONSTRAINTS := constraints.txt
+LOCKED := dev agents demonstrations video distributed bench
+UV := uv==0.13.9
+
 # Asked for before the `agents` extra, so that a CPU build of just this version is taken where pip is shown one.
 TORCH := torch==2.13.0
 WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
@@ -21,7 +26,8 @@ WITH_LEROBOT := --editable=.[dev,demonstrations] huggingface_hub~=0.34 datasets=
 # A file's tests run in one worker, which makes what they share once.
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: help demo test test-all test-agents test-agents-all test-distributed with-ray test-lerobot with-lerobot bench soak docs lint dist test-dist committed release clean distclean
+.PHONY: help demo test test-all test-agents test-agents-all test-distributed with-ray test-lerobot with-lerobot \
+    test-newest with-newest test-oldest with-oldest lock with-uv bench soak docs lint dist test-dist committed release clean distclean
 .NOTPARALLEL:
 
 help:
@@ -31,6 +37,9 @@ help:
 	@echo "make test-agents  those that need stable-baselines3 (installs torch); make test-agents-all the slow ones too"
 	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
 	@echo "make test-lerobot  those that read data sets with LeRobot, in $(VENV)-lerobot (Python 3.11; installs 2.2 GB)"
+	@echo "make test-newest  the core's and the environments' with the newest versions that are allowed, in $(VENV)-newest"
+	@echo "make test-oldest  the same with the lowest ones, in $(VENV)-oldest (Python 3.11)"
+	@echo "make lock         renew $(CONSTRAINTS), the versions that make installs"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
 	@echo "make soak         play all environments for an hour with random, corner and adversarial actions"
 	@echo "make docs         the documentation site, in site/; warnings are errors"
@@ -45,8 +54,8 @@ demo: $(VENV)/.ready-demo
 	$(VENV)/bin/surgsim palpate --scene liver --out runs/demo
 
 # Tests run side by side: threads that wait for their parts of a small matrix cost more than they save.
-test test-all test-agents test-agents-all: export OMP_NUM_THREADS := 1
-test test-all test-agents test-agents-all: export OPENBLAS_NUM_THREADS := 1
+test test-all test-agents test-agents-all with-newest with-oldest: export OMP_NUM_THREADS := 1
+test test-all test-agents test-agents-all with-newest with-oldest: export OPENBLAS_NUM_THREADS := 1
 
 test: $(VENV)/.ready-dev
 	$(PY) -m tests.compile_kernels
@@ -75,6 +84,45 @@ test-lerobot:
 
 with-lerobot: $(VENV)/.ready-lerobot
 	$(PY) -m pytest tests/agents/test_lerobot.py -m lerobot
+
+# Both ends of what pyproject.toml allows. No stamp files: what is newest changes from day to day. numba's cache is apart,
+# as one version overwrites what another compiled.
+BOUNDS_TESTS := tests/core tests/envs
+with-newest with-oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba_cache
+
+test-newest:
+	@$(MAKE) --no-print-directory VENV=$(VENV)-newest with-newest
+
+with-newest: $(VENV)/.made
+	@echo "surgsim: installing into $(VENV): the newest versions"
+	@$(PY) -m pip install -qq --disable-pip-version-check --upgrade --upgrade-strategy eager --editable=.[dev]
+	$(PY) -m tests.compile_kernels
+	$(PY) -m pytest $(PYTEST_ARGS) $(BOUNDS_TESTS)
+
+test-oldest: with-uv
+	@$(VENV)-uv/bin/uv pip compile --quiet --python-version 3.11 --resolution lowest-direct --extra dev \
+	    --no-annotate --output-file $(VENV)-uv/oldest.txt pyproject.toml
+	@$(MAKE) --no-print-directory VENV=$(VENV)-oldest CONSTRAINTS=$(VENV)-uv/oldest.txt with-oldest
+
+# The lowest versions have wheels for Python 3.11.
+with-oldest: CANDIDATES = $(or $(PYTHON),$(PYTHONS))
+with-oldest: SUITABLE = sys.version_info[:2] == (3, 11)
+with-oldest: $(VENV)/.made
+	@echo "surgsim: installing into $(VENV): the lowest versions"
+	@$(PY) -m pip install -qq --disable-pip-version-check -c $(CONSTRAINTS) --editable=.[dev]
+	$(PY) -m tests.compile_kernels
+	$(PY) -m pytest $(PYTEST_ARGS) $(BOUNDS_TESTS)
+
+# torch is pinned above. Without it go what its CUDA build alone asks for.
+lock: with-uv
+	@echo "$(TORCH)" | $(VENV)-uv/bin/uv pip compile --quiet --universal --python-version 3.11 --only-binary :all: --upgrade \
+	    --constraint - $(LOCKED:%=--extra %) --no-header --no-annotate --output-file $(VENV)-uv/lock.txt pyproject.toml
+	@{ echo "# What make installs with, renewed by \`make lock\`. The Makefile pins torch and LeRobot."; \
+	    grep -vE '^(torch|triton|nvidia-[a-z0-9-]*|cuda-[a-z-]*)==' $(VENV)-uv/lock.txt; } >$(CONSTRAINTS)
+
+with-uv:
+	@$(MAKE) -s --no-print-directory VENV=$(VENV)-uv $(VENV)-uv/.made
+	@$(VENV)-uv/bin/python -m pip install -qq --disable-pip-version-check $(UV)
 
 bench: $(VENV)/.ready-bench
 	$(VENV)/bin/surgsim bench --out docs
@@ -141,32 +189,37 @@ clean:
 
 distclean: clean
 	rm -rf $(VENV) $(VENV)-virtualenv $(VENV)-distributed $(VENV)-distributed-virtualenv
-	rm -rf $(VENV)-lerobot $(VENV)-lerobot-virtualenv
+	rm -rf $(VENV)-lerobot $(VENV)-lerobot-virtualenv $(VENV)-newest $(VENV)-newest-virtualenv
+	rm -rf $(VENV)-oldest $(VENV)-oldest-virtualenv $(VENV)-uv $(VENV)-uv-virtualenv
 
 # ---- set-up -------------------------------------------------------------------------------------------------------
 # Stamp files, not the folder, say what is done. `.made` holds the folder that .venv was made for; `.installing` lies
 # there while pip works. A set-up that was interrupted, or a checkout that has moved, begins again from nothing.
 
+CONSTRAINED = -c $(CONSTRAINTS)
+# It asks for versions of its own.
+$(VENV)/.ready-lerobot: CONSTRAINED =
+
 define install
 @echo "surgsim: installing into $(VENV): $(1)"
 @touch $(VENV)/.installing
-@for set in $(1); do $(PY) -m pip install -qq --disable-pip-version-check $$set || exit 1; done
+@for set in $(1); do $(PY) -m pip install -qq --disable-pip-version-check $(CONSTRAINED) $$set || exit 1; done
 @rm -f $(VENV)/.installing
 @touch $@
 endef
 
-$(VENV)/.ready-demo: pyproject.toml $(VENV)/.made
+$(VENV)/.ready-demo: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,--editable=.)
 
-$(VENV)/.ready-dev: pyproject.toml $(VENV)/.made
+$(VENV)/.ready-dev: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,--editable=.[dev])
 	@touch $(VENV)/.ready-demo
 
-$(VENV)/.ready-agents: pyproject.toml $(VENV)/.made
+$(VENV)/.ready-agents: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,$(TORCH) $(WITH_AGENTS))
 	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
 
-$(VENV)/.ready-distributed: pyproject.toml $(VENV)/.made
+$(VENV)/.ready-distributed: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,$(TORCH) $(WITH_RAY))
 
 $(VENV)/.ready-lerobot: pyproject.toml $(VENV)/.made
@@ -175,7 +228,7 @@ $(VENV)/.ready-lerobot: pyproject.toml $(VENV)/.made
 	$(PY) -m pip install -qq --disable-pip-version-check --no-deps $(LEROBOT)
 	@touch $@
 
-$(VENV)/.ready-bench: pyproject.toml $(VENV)/.made
+$(VENV)/.ready-bench: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,--editable=.[bench])
 	@touch $(VENV)/.ready-demo
 

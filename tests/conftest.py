@@ -22,9 +22,9 @@ ANATOMY = Path(__file__).resolve().parents[2] / "shared" / "data" / "anatomy"
 
 @pytest.fixture(scope="session")
 def anatomy_folder() -> Path:
-    """The folder of real organ files, which lies beside the repository and is no part of it."""
+    """The folder of organs from CT, which lies beside the repository and is no part of it."""
     if not ANATOMY.is_dir():
-        pytest.skip(f"the anatomy files are not at {ANATOMY}")
+        pytest.skip(f"the surfaces of OpenHELP (doi 10.1007/s00464-015-4094-0) are not in {ANATOMY}")
     return ANATOMY
 
 

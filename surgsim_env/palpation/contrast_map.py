@@ -24,8 +24,8 @@ RIDGE = 0.03
 SMALLEST_SCALE = 1e-3
 
 # A maximum is felt where the smoothed contrast exceeds its surroundings by the floor, and by this many times the
-# scatter from site to site. The floor was set by trial on 15 lesions in the shipped and the CT liver, none of
-# them at the places of tests/palpation/places.json; no model map without a lesion came near it.
+# scatter from site to site. The floor was set by trial on 15 lesions in the shipped and a CT liver, none of
+# them one that a test presses; no model map without a lesion came near it.
 SCATTERS_ABOVE = 5.0
 CONTRAST_FLOOR = 0.17
 # Its surroundings: the lower quartile between these distances, in site spacings; lesions only raise contrast.

@@ -1,15 +1,11 @@
 """Closed surfaces: what is refused and with which words, what is repaired, and where lines cross."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.surface import check_surface, line_hits, merge_vertices, surface_volume
-
-ANATOMY = Path(__file__).parents[4] / "shared" / "data" / "anatomy"
 
 
 def box(size=(0.1, 0.08, 0.06)):
@@ -188,11 +184,8 @@ def test_regular_coplanar_tiles_do_not_count_as_crossing():
     check_surface(tube.vertices, tube.faces)
 
 
-def test_real_kidney_is_one_sound_body():
-    path = ANATOMY / "openhelp_kidney_left.stl"
-    if not path.exists():
-        pytest.skip(f"{path} is not here: anatomy is not shipped with the project")
-    solid = trimesh.load(path, process=False)
+def test_real_kidney_is_one_sound_body(anatomy_folder):
+    solid = trimesh.load(anatomy_folder / "openhelp_kidney_left.stl", process=False)
     points, corners = check_surface(np.array(solid.vertices) * 1e-3, solid.faces)
     assert surface_volume(points, corners) == pytest.approx(192e-6, rel=0.01)
 

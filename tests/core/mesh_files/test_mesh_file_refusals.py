@@ -221,16 +221,6 @@ def test_regions_that_a_format_would_lose_are_refused(tmp_path):
         assert read_mesh(tmp_path / name).region.tolist() == [-4, 2]
 
 
-def test_a_mesh_of_loose_bad_tets_is_refused(anatomy_folder):
-    with pytest.raises(MeshError, match=r"6_tetra_bad.msh: .* 6 disconnected parts, .* of 1, 1, 1, 1, 1, 1 tets"):
-        read_mesh(anatomy_folder / "6_tetra_bad.msh", length_unit="cm")
-
-
-def test_the_gmsh_1_liver_is_told_how_to_convert(anatomy_folder):
-    with pytest.raises(MeshError, match=r"sofa_liver_gmsh1.msh: is a gmsh 1 file .*-format msh22"):
-        read_mesh(anatomy_folder / "sofa_liver_gmsh1.msh", length_unit="cm")
-
-
 def test_a_number_that_does_not_fit_its_type_is_refused(tmp_path):
     """numpy would make another one of it, here -2147483648 of a vertex's number in a medit file."""
     write_mesh(tmp_path / "a.mesh", box_mesh((0.02, 0.01, 0.01), (2, 1, 1)))

@@ -20,7 +20,6 @@ from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 from msdm_core.meshing.stuffing import SurfaceBody, lattice_around, stuff
 
 ROOT = Path(__file__).parents[3]
-CT_LIVER = ROOT.parent / "shared" / "data" / "anatomy" / "openhelp_liver.stl"
 APPROACH = (0.0, 0.5**0.5, -(0.5**0.5))  # of scenes/organs/liver.toml, with its angle of the palpable face:
 FACE_ANGLE_DEG = 60.0
 
@@ -192,10 +191,8 @@ def test_shipped_liver_with_a_fine_palpable_face():
 
 
 @pytest.mark.slow
-def test_ct_liver_with_a_fine_palpable_face():
-    if not CT_LIVER.exists():
-        pytest.skip(f"{CT_LIVER} is not here: anatomy is not shipped with the project")
-    solid = trimesh.load(CT_LIVER, process=False)
+def test_ct_liver_with_a_fine_palpable_face(anatomy_folder):
+    solid = trimesh.load(anatomy_folder / "openhelp_liver.stl", process=False)
     assert_meets_the_targets(np.array(solid.vertices) * 1e-3, solid.faces, 0.008, 2, 0.015)
 
 

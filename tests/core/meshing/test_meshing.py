@@ -1,7 +1,6 @@
 """Blocks and stuffed surfaces: counts, exact faces, shapes, fit, conformity, determinism and refusals."""
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from msdm_core.mesh.quality import dihedral_angles, mesh_quality, radius_ratios
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing import stuffing
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
-
-ANATOMY = Path(__file__).parents[4] / "shared" / "data" / "anatomy"
 
 SOLIDS = {
     "sphere": trimesh.creation.icosphere(4, 0.05),
@@ -254,11 +251,8 @@ def test_quality_of_a_regular_and_a_corner_tet():
     assert "4 nodes, 1 tets" in str(mesh_quality(corner))
 
 
-def test_real_liver_is_meshed():
-    path = ANATOMY / "openhelp_liver.stl"
-    if not path.exists():
-        pytest.skip(f"{path} is not here: anatomy is not shipped with the project")
-    solid = trimesh.load(path, process=False)
+def test_real_liver_is_meshed(anatomy_folder):
+    solid = trimesh.load(anatomy_folder / "openhelp_liver.stl", process=False)
     vertices = np.array(solid.vertices) * 1e-3
     mesh = mesh_surface(vertices, solid.faces, cell_size=0.012)
     quality = mesh_quality(mesh, (vertices, solid.faces))

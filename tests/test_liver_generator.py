@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-trimesh = pytest.importorskip("trimesh")
+import trimesh
 
 MESHES = Path(__file__).resolve().parents[1] / "scenes" / "meshes"
 COMMITTED = MESHES / "liver.ply"

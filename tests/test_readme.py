@@ -29,6 +29,7 @@ def test_retraction_example_runs(capsys):
     assert 0.3 < float(grip) < 0.6 and 0.1 < float(pull) < 1.0 and float(seen) >= 80
 
 
+@pytest.mark.agents
 def test_video_example_runs_and_writes_a_video(tmp_path, monkeypatch):
     (code,) = (example for example in examples("docs/rendering.md") if "RecordVideo" in example)
     pytest.importorskip("moviepy", reason="needs the `video` extra")

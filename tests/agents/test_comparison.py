@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents.leaderboard_tables import over_training_seeds, student_interval
 from surgsim_env.palpation.scores import ScoreEstimate
 from surgsim_env.scoring.comparison import compare, describe

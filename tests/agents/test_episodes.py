@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from surgsim_env.palpation.scores import MapScore, press_errors
 from surgsim_env.rendering import gl
 from surgsim_env.scoring.episodes import (

@@ -17,7 +17,6 @@ import pytest
 from matplotlib.image import imread
 from PIL import Image
 
-pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from agents import leaderboard, leaderboard_tables
 from surgsim_env.palpation.scores import ScoreEstimate
 from surgsim_env.scene.load import scenes_folder

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("sklearn", reason="needs the `agents` extra")
 from surgsim_env.scoring.results import load_result
 from tests.agents.commands import surgsim
 from tests.docs.test_tutorials import blocks

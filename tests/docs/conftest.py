@@ -23,8 +23,6 @@ def run_mkdocs(folder: Path, configuration: Path = ROOT / "mkdocs.yml") -> subpr
 
 @pytest.fixture(scope="session")
 def build() -> Build:
-    for module in ("material", "mkdocstrings", "latex2mathml"):
-        pytest.importorskip(module, reason="needs the `docs` extra")
     return run_mkdocs
 
 

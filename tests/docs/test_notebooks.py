@@ -31,14 +31,11 @@ def script(path: Path):
 
 @pytest.fixture(scope="module")
 def maker():
-    for module in ("nbclient", "nbformat", "ipykernel"):
-        pytest.importorskip(module, reason="needs the `dev` extra")
     return script(ROOT / "docs" / "make_notebooks.py")
 
 
 @pytest.fixture(scope="module")
 def pages():
-    pytest.importorskip("mkdocs", reason="needs the `docs` extra")
     return script(ROOT / "docs" / "hooks" / "notebook_pages.py")
 
 

@@ -20,7 +20,6 @@ HOOKS = ROOT / "docs" / "hooks"
 
 def hook(name: str):
     """A hook as mkdocs loads it."""
-    pytest.importorskip("mkdocs", reason="needs the `docs` extra")
     specification = importlib.util.spec_from_file_location(name, HOOKS / f"{name}.py")
     assert specification is not None and specification.loader is not None
     module = importlib.util.module_from_spec(specification)
@@ -84,9 +83,9 @@ def test_the_reference_has_every_public_name(page, names):
         assert re.search(rf"`(surgsim_env\.)?{name}`", text), name
 
 
+@pytest.mark.agents
 def test_every_public_name_can_be_imported():
     pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
-    pytest.importorskip("pettingzoo", reason="needs the `pettingzoo` extra")
     for package in (msdm_core, surgsim_env, surgsim_env.scripting):
         assert sorted(package.__all__, key=str.lower) == sorted(set(package.__all__), key=str.lower)
         assert all(getattr(package, name) is not None for name in package.__all__)

@@ -3,12 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-pettingzoo = pytest.importorskip("pettingzoo", reason="needs the `pettingzoo` extra")
-from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
-
-from surgsim_env.envs.bimanual_parallel import BimanualRetractParallelEnv  # noqa: E402
-from surgsim_env.envs.ids import BimanualRetractEnv  # noqa: E402
+from surgsim_env.envs.bimanual_parallel import BimanualRetractParallelEnv
+from surgsim_env.envs.ids import BimanualRetractEnv
 
 
 @pytest.fixture(scope="module")

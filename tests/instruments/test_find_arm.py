@@ -411,7 +411,6 @@ def test_entries_for_urdf_are_refused_with_mjcf():
 
 
 def test_the_command_writes_a_commented_file_and_a_picture(scope, capsys):
-    pytest.importorskip("mujoco.egl", reason="needs EGL")
     assert main(["arm", "check", str(scope)]) == 0
     said = capsys.readouterr().out
     path = scope.parent / "scope.toml"

@@ -54,7 +54,6 @@ def test_posterior_is_that_of_the_joint_normal() -> None:
 
 
 def test_posterior_is_that_of_scikit_learn() -> None:
-    pytest.importorskip("sklearn", reason="compares with scikit-learn's Gaussian process")
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 

@@ -54,7 +54,6 @@ def disc(centre: np.ndarray, radius: float = 0.008) -> np.ndarray:
 
 
 def test_who_sees_the_truth_has_all_of_it() -> None:
-    pytest.importorskip("sklearn", reason="needs the `agents` extra")
     rng = np.random.default_rng(0)
     records = []
     for count in (0, 1, 2, 3, 1, 1):
@@ -72,7 +71,6 @@ def test_who_sees_the_truth_has_all_of_it() -> None:
 @pytest.mark.slow
 def test_who_guesses_the_middle_has_what_chance_predicts() -> None:
     """Mean distance from a square's middle: side (sqrt 2 + asinh 1) / 6; share within r of it: pi r^2 / side^2."""
-    pytest.importorskip("sklearn", reason="needs the `agents` extra")
     rng = np.random.default_rng(1)
     middle = np.array([[0.5 * SIDE, 0.5 * SIDE, 0.0]])
     records = []

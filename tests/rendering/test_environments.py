@@ -216,6 +216,7 @@ def test_drawn_environment_can_be_pickled_with_its_renderer(env_id):
     env.close()
 
 
+@pytest.mark.agents
 @needs_opengl
 def test_videos_are_recorded(env_id, tmp_path):
     pytest.importorskip("moviepy", reason="needs the `video` extra")

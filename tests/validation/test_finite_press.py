@@ -5,10 +5,7 @@ import pytest
 
 from msdm_core.material.regions import Material
 from surgsim_env.scene.palpable_surface import hertz_force, hidden_share
-from surgsim_env.validation.elements import has_fem
 from surgsim_env.validation.finite_press import RIGID, PressedLayer, layer_mesh, neo_hookean
-
-needs_fem = pytest.mark.skipif(not has_fem(), reason="scikit-fem is not installed")
 
 
 def test_the_stress_and_its_slope_are_those_of_the_energy():
@@ -31,7 +28,6 @@ def test_the_stress_and_its_slope_are_those_of_the_energy():
         np.testing.assert_allclose(slope[:, part], (at(gradient + step)[0] - at(gradient - step)[0]) / 2e-6, rtol=1e-6)
 
 
-@needs_fem
 def test_a_shallow_press_is_hertz():
     """Rigid ball of 20 mm, 0.4 mm deep, on 12 cm of tissue: F = 4/3 E / (1 - nu^2) sqrt(R d^3) to 3 %.
 
@@ -42,7 +38,6 @@ def test_a_shallow_press_is_hertz():
     assert force == pytest.approx(hertz_force(Material(5000.0, 1060.0, 0.45), 0.02, 4e-4), rel=0.03)
 
 
-@needs_fem
 def test_a_softer_contact_takes_what_is_said():
     """The share of a healthy press that contact takes: the formula of the reports, half of it for Hertz
 
@@ -54,7 +49,6 @@ def test_a_softer_contact_takes_what_is_said():
     assert 0.35 * said < 1.0 - soft / rigid < 0.65 * said
 
 
-@needs_fem
 def test_a_membrane_makes_the_press_stiffer_by_little():
     """20 N/m on tissue of 5 kPa under a tip of 12 mm: 2 to 6 % more force at 3 to 7 mm."""
     mesh = layer_mesh(0.08, 0.08, 1.5e-3, (0.015, 0.012))

@@ -32,7 +32,6 @@ STIFF = SpringSolid(1000.0, 8000.0, Cubic(), lattice_directions())
 
 @pytest.mark.parametrize("solid", [SOLID, STIFF], ids=["linear", "stiffening"])
 def test_hexahedra_with_free_sides_are_the_closed_form(solid):
-    pytest.importorskip("skfem")
     block = QuadraticBlock.of(SIZE, (2, 2, 2))
     for strains in ((0.1, 0.3), (-0.1, -0.3)):
         expected = uniaxial_stress(solid, 1.0 + np.array(strains)) * SIZE[0] * SIZE[1]
@@ -40,7 +39,6 @@ def test_hexahedra_with_free_sides_are_the_closed_form(solid):
 
 
 def test_bonded_ends_converge_with_the_elements():
-    pytest.importorskip("skfem")
     coarse, fine, finest = (QuadraticBlock.of(SIZE, (n,) * 3).forces(STIFF, "pull", (0.1, 0.2))[-1] for n in (2, 3, 4))
     assert coarse > fine > finest
     assert fine - finest < 0.6 * (coarse - fine)
@@ -49,7 +47,6 @@ def test_bonded_ends_converge_with_the_elements():
 
 
 def test_small_shear_of_hexahedra_and_organ_is_linear():
-    pytest.importorskip("skfem")
     mesh = box_mesh(SIZE, (2, 2, 2))
     organ = OrganBlock(mesh, linear_organ(mesh, 2900.0, 0.45))
     for forces in (

@@ -121,7 +121,7 @@ class PressLibrary:
         """Press linear tissue of some thicknesses, and shapes spread over the whole range."""
         places = [0.0] if self.space.thickness is not None else np.linspace(0.0, 1.0, LINEAR_COUNT).tolist()
         count = self.start_count - len(places)
-        # scipy 1.13 knows `seed` alone, the stubs of later ones `rng` alone.
+        # `rng`, which the stubs know alone, gives other points for the same number.
         spread = qmc.Sobol(self.space.dimension, seed=1).random(64)[:count]  # pyright: ignore[reportCallIssue]
         for place, found in zip(places, self.press([self.space.linear(one) for one in places], progress)):
             if isinstance(found, PressCurve):

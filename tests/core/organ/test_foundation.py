@@ -60,7 +60,8 @@ def test_a_stiff_block_sways_with_the_period_of_its_mass():
     assert advance_organ(model, state, NO_SHAPES, NO_CONTACT, dt, steps, np.zeros((0, 6))) == FAULT_NONE
     middle = model.node_mass @ (state.node_position - model.node_rest_position) / model.node_mass.sum()
     assert middle[2] == pytest.approx(1e-3 / omega, rel=2e-3)
-    assert abs(model.node_mass @ state.node_velocity[:, 2]) < 5e-3 * 1e-3 * model.node_mass.sum()
+    # The steps are rounded by half of one, and speeds are half a step behind.
+    assert abs(model.node_mass @ state.node_velocity[:, 2]) < 1.2 * omega * dt * 1e-3 * model.node_mass.sum()
 
 
 def test_energy_is_kept():

@@ -93,6 +93,8 @@ with-newest with-oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba_cache
 test-newest:
 	@$(MAKE) --no-print-directory VENV=$(VENV)-newest with-newest
 
+# numpy and scipy leave Pythons behind sooner than this project does.
+with-newest: CANDIDATES = $(or $(PYTHON),python3.13 $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.13.*/bin/python3 python3.12 python3)
 with-newest: $(VENV)/.made
 	@echo "surgsim: installing into $(VENV): the newest versions"
 	@$(PY) -m pip install -qq --disable-pip-version-check --upgrade --upgrade-strategy eager --editable=.[dev]

@@ -132,7 +132,8 @@ def test_tetwild_makes_conforming_regions_and_leaves_nothing_behind(tmp_path, mo
     out.mkdir()
     given = ["organ", str(file), *LABELS, "--cell-size", "0.01", "--mesher", "tetwild", "--no-healthy-map"]
     assert main([*given, "--out", str(out / "a.vtu")]) == 0
-    assert {path.name for path in tmp_path.rglob("*")} == {"ct.nii.gz", "out", "a.vtu", "a.toml", "report.html"}
+    written = {"a.vtu", "a.toml", "a_surface.ply", "report.html"}
+    assert {path.name for path in tmp_path.rglob("*")} == {"ct.nii.gz", "out", *written}
     mesh = read_mesh(out / "a.vtu")
     assert mesh.volumes.sum() == pytest.approx(ORGAN_VOLUME, rel=0.02)
     # Tets follow the lesion's surface to its smoothing, in cells as wide as it is; whole ones would reach mm further.

@@ -87,7 +87,7 @@ with-lerobot: $(VENV)/.ready-lerobot
 
 # Both ends of what pyproject.toml allows. No stamp files: what is newest changes from day to day. numba's cache is apart,
 # as one version overwrites what another compiled.
-BOUNDS_TESTS := tests/core tests/envs
+BOUNDS_TESTS := tests/core tests/envs tests/test_unchanged.py
 with-newest with-oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba_cache
 
 test-newest:

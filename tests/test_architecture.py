@@ -51,7 +51,7 @@ TOPS = {
 # What decides an episode or what it shows: organs, motion, draws, observations, presses, estimates, scripts, scores.
 DECIDING = (
     "msdm_core/",
-    *(f"surgsim_env/{room}/" for room in ("scene", "instruments", "coupling", "tasks", "envs", "palpation")),
+    *(f"surgsim_env/{room}/" for room in ("scene", "patient", "instruments", "coupling", "tasks", "envs", "palpation")),
     *("surgsim_env/scripting/", "surgsim_env/scoring/", "surgsim_env/training/site_agent.py"),
 )
 # numpy picks these by processor (its own code for AVX-512, BLAS), the C library's differ by version. `math.hypot` and
@@ -88,6 +88,8 @@ UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
         ),
         "pictures",
     ),
+    "surgsim_env/patient/label_image.py": (("sum",), "counts"),
+    "surgsim_env/patient/lesion_room.py": (("sum",), "counts"),
     "surgsim_env/scene/model.py": (("sum",), "counts"),
     "surgsim_env/scoring/evaluate.py": (("sum",), "counts"),
     "surgsim_env/scoring/origin.py": (("sum",), "counts"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from msdm_core.arithmetic import cos, matmul, norm, sin
 from msdm_core.material.regions import Lesion, Material, lesion_extent
 from msdm_core.mesh.geodesic import NearestTriangle
 from msdm_core.mesh.surface import node_normals
@@ -27,28 +28,28 @@ def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) 
         usual: the approach without lesions, of any length.
         face_angle_deg: of the palpable face [degrees].
     """
-    first = np.array(usual) / np.linalg.norm(usual)
+    first = np.array(usual) / norm(usual)
     inward = _inward_normals(patient)
     if len(inward) == 0:
         return usual
-    least = np.cos(np.radians(face_angle_deg - MARGIN_DEG)) - ROUNDING
+    least = cos(np.radians(face_angle_deg - MARGIN_DEG)) - ROUNDING
     # Between two lesions a direction may face both that no direction of the lattice does.
     between = (inward[:, None] + inward[None]).reshape(-1, 3)
-    length = np.linalg.norm(between, axis=1)
+    length = norm(between, axis=1)
     between = between[length > ROUNDING] / length[length > ROUNDING, None]
     tried = np.concatenate([first[None], between, _sphere()])
-    faced = (tried @ inward.T >= least).sum(axis=1)
+    faced = (matmul(tried, inward.T) >= least).sum(axis=1)
     best = np.flatnonzero(faced == faced.max())
-    chosen = tried[best[int(np.argmax(tried[best] @ first))]]
+    chosen = tried[best[int(np.argmax(matmul(tried[best], first)))]]
     x, y, z = chosen.tolist()
     return x, y, z
 
 
 def faced_note(patient: PatientMesh, scene: Scene) -> list[str]:
     """A remark on the lesions that the scene's approach does not face, if there are any."""
-    cosines = _inward_normals(patient) @ np.asarray(scene.instrument.approach)
+    cosines = matmul(_inward_normals(patient), np.asarray(scene.instrument.approach))
     angle = scene.palpation.face_angle_deg
-    hidden = [name for name, cosine in zip(patient.lesions, cosines) if cosine < np.cos(np.radians(angle))]
+    hidden = [name for name, cosine in zip(patient.lesions, cosines) if cosine < cos(np.radians(angle))]
     if not hidden:
         return []
     given = ", ".join(f"{part:.2f}" for part in scene.instrument.approach)
@@ -67,8 +68,8 @@ def _inward_normals(patient: PatientMesh) -> FloatArray:
     for row, name in zip(found, patient.lesions, strict=True):
         centre, _ = lesion_extent(mesh, Lesion(region=name, material=Material(1.0, 1.0), name=name))
         triangle, weights = nearest(centre)
-        outward = weights @ normals[triangles[triangle]]
-        row[:] = -outward / np.linalg.norm(outward)
+        outward = matmul(weights, normals[triangles[triangle]])
+        row[:] = -outward / norm(outward)
     return found
 
 
@@ -77,4 +78,4 @@ def _sphere() -> FloatArray:
     turn = np.arange(DIRECTIONS) * np.pi * (3.0 - np.sqrt(5.0))
     z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
     radius = np.sqrt(1.0 - z * z)
-    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
+    return np.column_stack([radius * cos(turn), radius * sin(turn), z])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import cos, dot, matmul, norm
 from msdm_core.mesh.carriers import find_carriers
 from msdm_core.mesh.surface import merge_vertices, surface_volume
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
@@ -20,7 +21,7 @@ TRIANGLES_MOST = 40_000
 # Longest edge over that of the smallest cells: as with the smoothed boundary of a mesh.
 EDGE_PER_CELL = 0.5
 # Bending stops at vertices with a triangle that is turned by more than this from their normal: 30 degrees.
-CREASE_COSINE = np.cos(np.radians(30.0))
+CREASE_COSINE = cos(np.radians(30.0))
 # Growth of a grid, or of the longest edge, from one try to the next.
 GROWTH = 1.1
 # Area of a triangle over its edge squared.
@@ -57,7 +58,7 @@ class SurfaceFit:
 
     def turned(self, origin: FloatArray, frame: FloatArray) -> "SurfaceFit":
         """The surface with each point p at (p - origin) frame, for an origin [m] (3,) and axes as columns (3, 3)."""
-        return replace(self, vertices=(self.vertices - origin) @ frame)
+        return replace(self, vertices=matmul(self.vertices - origin, frame))
 
     def write(self, path: Path) -> None:
         """Write it as a PLY file in metres."""
@@ -138,7 +139,7 @@ def surface_area(vertices: FloatArray, triangles: NDArray[np.integer]) -> float:
     """Area of a surface with vertices [m] (n_vertex, 3) and triangles (n_triangle, 3) [m^2]."""
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return 0.5 * float(np.linalg.norm(normals, axis=1).sum())
+    return 0.5 * float(norm(normals, axis=1).sum())
 
 
 def split_edges(vertices: FloatArray, triangles: Triangles, longest: float) -> tuple[FloatArray, Triangles]:
@@ -152,7 +153,7 @@ def split_edges(vertices: FloatArray, triangles: Triangles, longest: float) -> t
         # As one number each, which is sorted faster than two.
         keys, side_edge = np.unique(sides[:, 0] * len(vertices) + sides[:, 1], return_inverse=True)
         edges = np.column_stack([keys // len(vertices), keys % len(vertices)])
-        long = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > longest
+        long = norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > longest
         if not long.any():
             return vertices, triangles
         halves = len(vertices) - 1 + np.cumsum(long)
@@ -166,14 +167,14 @@ def _halves(vertices: FloatArray, triangles: Triangles, edges: Triangles) -> Flo
     normals = smooth_normals(vertices, triangles.astype(np.int32))
     corners = vertices[triangles]
     facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    along = np.einsum("tj,tij->ti", facing, normals[triangles])
-    turned = along < CREASE_COSINE * np.linalg.norm(facing, axis=1)[:, None]
+    along = dot(normals[triangles], facing[:, None])
+    turned = along < CREASE_COSINE * norm(facing, axis=1)[:, None]
     smooth = np.ones(len(vertices))
     smooth[triangles[turned]] = 0.0
     ends = vertices[edges]
     middle = ends.mean(axis=1)
-    height = np.einsum("eij,eij->ei", middle[:, None] - ends, normals[edges]) * smooth[edges]
-    return middle - BEND * 0.5 * np.einsum("ei,eij->ej", height, normals[edges])
+    height = dot(middle[:, None] - ends, normals[edges]) * smooth[edges]
+    return middle - BEND * 0.5 * (height[:, :, None] * normals[edges]).sum(axis=1)
 
 
 def _parts(triangles: Triangles, middle: Triangles) -> list[Triangles]:
@@ -267,15 +268,15 @@ def _towards_level(field: SmoothedShare, level: float, places: FloatArray, step:
     """Newton's step along the slope to the level, of at most `step` [m], (n, 3)."""
     slope = np.column_stack([(field.at(places + one) - field.at(places - one)) for one in step * np.eye(3)])
     slope /= 2.0 * step
-    move = slope * ((level - field.at(places)) / np.maximum((slope**2).sum(axis=1), 1e-300))[:, None]
-    size = np.linalg.norm(move, axis=1, keepdims=True)
+    move = slope * ((level - field.at(places)) / np.maximum((slope * slope).sum(axis=1), 1e-300))[:, None]
+    size = norm(move, axis=1, keepdims=True)
     return move * np.minimum(1.0, step / np.maximum(size, 1e-300))
 
 
 def _triangles_of(vertices: FloatArray, quads: Triangles) -> Triangles:
     """Two triangles of each quadrangle, divided along the shorter diagonal."""
     a, b, c, d = quads.T
-    short = np.linalg.norm(vertices[a] - vertices[c], axis=1) <= np.linalg.norm(vertices[b] - vertices[d], axis=1)
+    short = norm(vertices[a] - vertices[c], axis=1) <= norm(vertices[b] - vertices[d], axis=1)
     one, other = quads[short], quads[~short]
     parts = [one[:, [0, 1, 2]], one[:, [0, 2, 3]], other[:, [0, 1, 3]], other[:, [1, 2, 3]]]
     return np.concatenate(parts)

@@ -212,7 +212,7 @@ def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLab
     notes += [*_at_border(tags, image), *more]
     names = [image.names[0]]
     result, lesions = np.where(filled > 0, np.uint8(1), np.uint8(0)), list[str]()
-    smallest = SMALLEST_SHARE_OF_CELL * cell_size**3
+    smallest = SMALLEST_SHARE_OF_CELL * (cell_size * cell_size * cell_size)
     for tag, name in enumerate(image.names[1:], start=2):
         chosen = filled == tag
         if not chosen.any():

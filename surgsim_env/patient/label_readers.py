@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import arccos, matmul, norm, svd
 from msdm_core.errors import MeshError
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.mesh_files.mesh_file import parsed
@@ -89,7 +90,7 @@ class ImageGeometry:
             raise MeshError(f"{file}: the header's affine has numbers that are not finite: export the image again")
         # Of numbers above 1e154 it is infinite, and refused.
         with np.errstate(over="ignore"):
-            spacing = np.linalg.norm(matrix, axis=0)
+            spacing = norm(matrix, axis=0)
         low, high = SPACING_RANGE
         if not ((spacing >= low) & (spacing <= high)).all():
             shown = " x ".join(f"{one * 1e3:.4g}" for one in spacing)
@@ -98,17 +99,17 @@ class ImageGeometry:
                 "is the header's length unit right?"
             )
         direction = matrix / spacing
-        cosines = np.abs(direction.T @ direction - np.eye(3))
+        cosines = np.abs(matmul(direction.T, direction) - np.eye(3))
         if cosines.max() > COSINE_LARGEST:
             first, second = np.unravel_index(int(np.argmax(cosines)), (3, 3))
-            angle = np.degrees(np.arccos(np.clip(direction[:, first] @ direction[:, second], -1, 1)))
+            angle = np.degrees(arccos(np.clip(matmul(direction[:, first], direction[:, second]), -1, 1)))
             raise MeshError(
                 f"{file}: axes {first} and {second} of the header's affine stand at {angle:.2f} degrees; sheared "
                 "images (non-orthogonal affine, as of a tilted gantry) are refused: resample it onto right-angled axes"
             )
         # The nearest orthogonal matrix removes the header's rounding.
-        left, _, right = np.linalg.svd(direction)
-        return cls(spacing, left @ right, np.asarray(origin, dtype=np.float64))
+        left, _, right = svd(direction)
+        return cls(spacing, matmul(left, right), np.asarray(origin, dtype=np.float64))
 
     def moved(self, corner: FloatArray) -> "ImageGeometry":
         """The geometry of a part of the image that begins at voxel `corner` (3,)."""
@@ -116,7 +117,7 @@ class ImageGeometry:
 
     def places(self, points: FloatArray) -> FloatArray:
         """LPS positions (..., 3) [m] of points given along the image's axes from voxel (0, 0, 0), (..., 3) [m]."""
-        return self.origin + points @ self.direction.T
+        return self.origin + matmul(points, self.direction.T)
 
     def side(self, axis: int, *, high: bool) -> str:
         """The patient's side to which an axis of the image begins or ends, such as "head"."""
@@ -224,7 +225,7 @@ def open_nifti(file: Path) -> LabelSource:
     affine = np.asarray(parsed(file, lambda _: header.get_best_affine(), ADVICE), dtype=np.float64)
     # What is or becomes infinite is refused with the geometry.
     with np.errstate(over="ignore", invalid="ignore"):
-        matrix, origin = np.hsplit(RAS_TO_LPS @ (affine[:3] * METRES.get(unit, 1e-3)), [3])
+        matrix, origin = np.hsplit(matmul(RAS_TO_LPS, affine[:3] * METRES.get(unit, 1e-3)), [3])
     geometry = ImageGeometry.from_matrix(matrix, origin[:, 0], file)
 
     runs = partial(_runs, file, shape, dtype, offset, scaling)
@@ -516,11 +517,11 @@ def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeomet
     turn = np.array(turns.pop()).reshape(2, 3)
     normal = np.cross(turn[0], turn[1])
     places = np.array([_group(data, one, "PlanePositionSequence").ImagePositionPatient for one in frames], dtype=float)
-    along = places @ normal
+    along = matmul(places, normal)
     step = _slice_step(file, along, measures)
     slices = np.rint((along - along.min()) / step).astype(np.int64)
     first = places[int(np.argmin(along))]
-    off = np.linalg.norm(places - first - slices[:, None] * step * normal, axis=1)
+    off = norm(places - first - slices[:, None] * step * normal, axis=1)
     if off.max() > SLACK * max(step, 1.0):
         raise MeshError(
             f"{file}: a frame lies {off.max():.3g} mm off an even stack of {step:.4g} mm slices: sheared or uneven "

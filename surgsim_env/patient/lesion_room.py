@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msdm_core.arithmetic import norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import LESION_GAP, LEVELS, REFERENCE_TIP
@@ -99,5 +100,5 @@ def _placed(centres: FloatArray, count: int, apart: float) -> int:
     free, placed = centres, 0
     while len(free) and placed < count:
         placed += 1
-        free = free[np.linalg.norm(free - free[0], axis=1) >= apart]
+        free = free[norm(free - free[0], axis=1) >= apart]
     return placed

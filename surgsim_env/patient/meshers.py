@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.errors import MeshError
 from msdm_core.mesh.quality import dihedral_angles
 from msdm_core.mesh.surface import check_surface, outward_facing, surface_volume
@@ -189,7 +190,7 @@ def _mesh_labels(
     labels = clean_labels(image, cell_size=cell_size, mend=mend)
     if mesher == "tetwild":
         placed, volumes, smoothed = _conforming(labels, cell_size)
-        whole = sum(volumes.values())
+        whole = math.fsum(volumes.values())
         smoothing, change = smoothed.smoothing, smoothed.volume_above(0.5) / whole - 1.0
     else:
         names = list(enumerate(labels.names, start=1))
@@ -232,7 +233,7 @@ def _fine_face(cells: Cells, axes: FloatArray) -> FineFace | None:
     """The face at which cells are fine, in an image whose axes are the columns of (3, 3); None for one size."""
     if cells.coarsening == 1:
         return None
-    x, y, z = (np.asarray(cells.approach) @ axes).tolist()
+    x, y, z = matmul(np.asarray(cells.approach), axes).tolist()
     return FineFace((x, y, z), cells.face_angle_deg, cells.fine_depth, cells.coarsening)
 
 
@@ -375,7 +376,7 @@ def _share_inside(mesh: TetMesh, surface: ClosedSurface, cell_size: float) -> tu
     step = min(cell_size, float(extent.min())) / CELL_VOXELS
     inside, first = voxels_inside(surface.vertices, surface.triangles, step)
     share = label_share(mesh, inside, first, np.full(3, step))
-    volume = float(share @ mesh.volumes)
+    volume = float(matmul(share, mesh.volumes))
     if volume < SHARE_INSIDE * surface.volume:
         raise MeshError(
             f"region {surface.name!r}: only {volume / surface.volume:.0%} of it lies inside the organ; at least "
@@ -399,7 +400,7 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
     starts = np.cumsum([0, *(len(one.vertices) for one in surfaces)])
     vertices = np.concatenate([one.vertices for one in surfaces])
     triangles = np.concatenate([one.triangles + start for one, start in zip(surfaces, starts, strict=False)])
-    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    diagonal = float(norm(np.ptp(vertices, axis=0)))
     share = EDGE_PER_CELL * cell_size / diagonal
     # fTetWild leaves a file, __tracked_surface.stl, in the current folder.
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
@@ -426,7 +427,7 @@ def _conforming(labels: CleanLabels, cell_size: float) -> tuple[TetMesh, dict[in
     tags, voxel = range(1, len(labels.names) + 1), labels.image.voxel_volume
     volumes = {tag: float(np.count_nonzero(labels.tags == tag)) * voxel for tag in tags}
     organ = _smoothed(labels, 1, cell_size)
-    surfaces = [ClosedSurface(labels.names[0], *_level_surface(organ, sum(volumes.values())))]
+    surfaces = [ClosedSurface(labels.names[0], *_level_surface(organ, math.fsum(volumes.values())))]
     for tag in tags[1:]:
         surface = _level_surface(_smoothed(labels, tag, cell_size), volumes[tag])
         surfaces.append(ClosedSurface(labels.names[tag - 1], *surface))

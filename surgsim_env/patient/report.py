@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from msdm_core.arithmetic import matmul
 from msdm_core.material.regions import Lesion, lesion_extent
 from msdm_core.mesh.quality import dihedral_angles, mesh_quality, radius_ratios
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
@@ -252,7 +253,7 @@ def _through(found: PatientScene) -> FloatArray:
     mesh = found.anatomy.mesh
     inner = found.patient.volumes[1:]
     if not inner:
-        return mesh.volumes @ mesh.points[mesh.tets].mean(axis=1) / mesh.volumes.sum()
+        return matmul(mesh.volumes, mesh.points[mesh.tets].mean(axis=1)) / mesh.volumes.sum()
     largest = max(inner, key=lambda one: (one.name in found.patient.lesions, one.mesh)).name
     return lesion_extent(mesh, Lesion(region=largest, material=found.organ.material, name=largest))[0]
 
@@ -263,7 +264,7 @@ def _draw_cut(
     """Draw the part behind the plane through a point that faces the viewer, and the section in its regions' colours."""
     from matplotlib.collections import PolyCollection
 
-    behind = (patches.corners.mean(axis=1) - through) @ view.towards < 0.0
+    behind = matmul(patches.corners.mean(axis=1) - through, view.towards) < 0.0
     kept = Patches(patches.corners[behind], patches.normals[behind], patches.origin[behind])
     draw_patches(axes, [(kept, colours[behind], 0.12)], view)
     polygons, tags = section(mesh, through, view.towards)
@@ -276,7 +277,7 @@ def _draw_cut(
 
 def section(mesh: TetMesh, through: FloatArray, normal: FloatArray) -> tuple[list[FloatArray], IntArray]:
     """Sections of tets with a plane: polygons of 3 or 4 points [m] and the tets' region tags."""
-    height = (mesh.points - through) @ normal
+    height = matmul(mesh.points - through, normal)
     polygons: list[FloatArray] = []
     cut = []
     for tets, edges in cut_edges(mesh.tets, height):

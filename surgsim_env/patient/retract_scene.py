@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from msdm_core.arithmetic import arctan2, cos, eigh, lstsq, matmul, norm, sin
 from msdm_core.mesh.ordering import in_sweep_order
 from msdm_core.mesh.quality import surface_cell
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
@@ -148,7 +149,8 @@ class OrganVoxels:
     def filled_share(self, places: FloatArray, radius: float) -> FloatArray:
         """Share of a ball of a radius [m] around each point (n, 3) that the organ fills (n,)."""
         count = self._tree.query_ball_point(places, radius, return_length=True)
-        return np.asarray(count) * self.step**3 / (4.0 / 3.0 * np.pi * radius**3)
+        share = self.step / radius
+        return np.asarray(count) * (share * share * share) / (4.0 / 3.0 * np.pi)
 
     def columns(
         self, origin: FloatArray, frame: FloatArray, x: FloatArray, depth: FloatArray, height: FloatArray
@@ -200,7 +202,7 @@ def find_rim(mesh: TetMesh, up: FloatArray) -> Rim | NoRim:
         found += [rim for rim in sides if rim is not None]
     if not found:
         return NoRim(thinnest)
-    upright = [rim for rim in found if rim.frame[:, 2] @ up >= math.cos(TURN_MOST)]
+    upright = [rim for rim in found if matmul(rim.frame[:, 2], up) >= float(cos(TURN_MOST))]
     return min(upright or found, key=lambda rim: rim.stiffness)
 
 
@@ -214,10 +216,11 @@ def _edges(mesh: TetMesh, voxels: OrganVoxels, up: FloatArray) -> Iterator[tuple
         if len(near) < 10:
             continue
         outward = -near.mean(axis=0)
-        outward /= np.linalg.norm(outward)
-        thin = np.linalg.eigh(np.cov(near.T))[1][:, 0]
-        across = thin - (thin @ outward) * outward
-        across *= np.copysign(1.0, across @ up) / np.linalg.norm(across)
+        outward /= norm(outward)
+        centred = near - near.mean(axis=0)
+        thin = eigh(matmul(centred.T, centred))[1][:, 0]
+        across = thin - matmul(thin, outward) * outward
+        across *= np.copysign(1.0, matmul(across, up)) / norm(across)
         yield place, np.stack([np.cross(outward, across), outward, across], axis=1)
 
 
@@ -243,23 +246,24 @@ def _rim(voxels: OrganVoxels, place: FloatArray, frame: FloatArray, thickness: f
         bottom, top = (side[:, hiding].ravel() for side in voxels.columns(place, turned, ALONG, DEPTHS, HEIGHTS))
         if not np.isfinite(bottom).all():
             return None
-        _, along, inward = np.linalg.lstsq(np.stack([np.ones_like(x), x, depth], axis=1), bottom, rcond=None)[0]
-        level, turned = turned, _levelled(turned, turned @ np.array([-along, inward, 1.0]))
+        _, along, inward = lstsq(np.stack([np.ones_like(x), x, depth], axis=1), bottom)
+        level, turned = turned, _levelled(turned, matmul(turned, np.array([-along, inward, 1.0])))
     if np.ptp(bottom) > UNEVEN_MOST:
         return None
-    jaw = level.T @ -frame[:, 1]
+    jaw = matmul(level.T, -frame[:, 1])
     jaw[0] = 0.0
     # The bending stiffness of a plate grows with its thickness cubed.
-    stiffness = float(((top - bottom) ** 3).mean())
+    thick = top - bottom
+    stiffness = float((thick * thick * thick).mean())
     underside = (float(bottom.min()), float(bottom.max()))
-    return Rim(place, level, thickness, underside, jaw / np.linalg.norm(jaw), stiffness)
+    return Rim(place, level, thickness, underside, jaw / norm(jaw), stiffness)
 
 
 def _levelled(frame: FloatArray, up: FloatArray) -> FloatArray:
     """The frame with another z, turned by the smallest angle."""
-    up = up / np.linalg.norm(up)
-    outward = frame[:, 1] - (frame[:, 1] @ up) * up
-    outward /= np.linalg.norm(outward)
+    up = up / norm(up)
+    outward = frame[:, 1] - matmul(frame[:, 1], up) * up
+    outward /= norm(outward)
     return np.stack([np.cross(outward, up), outward, up], axis=1)
 
 
@@ -288,7 +292,7 @@ def find_retraction(found: PatientScene, out: Path) -> RetractScene | str:
         return rim.reason
     # Cells may be coarse away from the face that the probe presses.
     triangles = mesh.boundary_triangles
-    near = np.linalg.norm(mesh.points[triangles].mean(axis=1) - rim.place, axis=1) < FLAP_DEPTH
+    near = norm(mesh.points[triangles].mean(axis=1) - rim.place, axis=1) < FLAP_DEPTH
     cell = surface_cell(mesh, triangles[near])
     return _too_coarse(cell) if cell > CELL_MOST else retract_scene(found, rim, out)
 
@@ -303,9 +307,9 @@ def _too_coarse(cell: float) -> str:
 def retract_scene(found: PatientScene, rim: Rim, out: Path) -> RetractScene | str:
     """The scene in which a given edge is lifted; or the reason why it cannot be lifted."""
     bed_top = rim.underside[0] - BED_GAP
-    origin = rim.place - rim.frame @ np.array([0.5 * FLAP_WIDTH, FLAP_DEPTH, -bed_top])
+    origin = rim.place - matmul(rim.frame, np.array([0.5 * FLAP_WIDTH, FLAP_DEPTH, -bed_top]))
     mesh = found.patient.mesh
-    turned = in_sweep_order(TetMesh((mesh.points - origin) @ rim.frame, mesh.tets, mesh.region, mesh.region_names))
+    turned = in_sweep_order(TetMesh(matmul(mesh.points - origin, rim.frame), mesh.tets, mesh.region, mesh.region_names))
     if not (turned.points[:, 1] < 0.0).any():
         return (
             f"the organ ends {(FLAP_DEPTH - turned.points[:, 1].min()) * 1e3:.0f} mm behind its thin edge: nothing "
@@ -339,7 +343,7 @@ def told(made: RetractScene | str) -> str:
 
 def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
     lobe, patient = make_scene(PATTERN), found.scene
-    tilt = math.atan2(rim.jaw[2], -rim.jaw[1])
+    tilt = float(arctan2(rim.jaw[2], -rim.jaw[1]))
     bed_end, half = FLAP_DEPTH - BED_INSIDE, 0.5 * (HIDING[1] - HIDING[0]) + 0.003
     return replace(
         lobe,
@@ -366,7 +370,7 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
         instrument=replace(
             lobe.instrument,
             tip_radius=RIGHT_TIP_RADIUS,
-            approach=_vector(0.0, -math.sin(tilt), -math.cos(tilt)),
+            approach=_vector(0.0, -float(sin(tilt)), -float(cos(tilt))),
             tip_direction=_vector(*rim.jaw),
         ),
         port=_port(lobe.port),
@@ -374,7 +378,7 @@ def _scene(found: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
         palpation=PalpationSettings(press_depth=0.003, face_angle_deg=60.0),
         retract=_retract(found, bed_end),
         regions=tuple(replace(region, lesion=False) for region in patient.regions),
-        cranial=_vector(*(np.array(patient.cranial) @ rim.frame)),
+        cranial=_vector(*matmul(np.array(patient.cranial), rim.frame)),
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from surgsim_env.palpation.surface_scene import FAT_NAME, FAT_SOURCE, SurfaceOptions, anchors_of, soft_bed
 from surgsim_env.scene.model import Anchor, Ball, Vector
@@ -78,10 +79,10 @@ def organ_anchors(
 
 def _surface_point(mesh: TetMesh, direction: FloatArray) -> FloatArray:
     """The surface node that lies best in a direction from the organ's centroid [m], (3,)."""
-    centre = mesh.volumes @ mesh.points[mesh.tets].mean(axis=1) / mesh.volumes.sum()
+    centre = matmul(mesh.volumes, mesh.points[mesh.tets].mean(axis=1)) / mesh.volumes.sum()
     surface = mesh.points[mesh.boundary_nodes]
     away = surface - centre
-    return surface[int(np.argmax(away @ direction / np.linalg.norm(away, axis=1)))]
+    return surface[int(np.argmax(matmul(away, direction) / norm(away, axis=1)))]
 
 
 def held_text(anchor: Anchor) -> str:

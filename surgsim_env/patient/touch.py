@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from msdm_core.arithmetic import cbrt, power
 from msdm_core.material.regions import Material
 from surgsim_env.palpation.surface_scene import SurfaceOptions
 from surgsim_env.scene.model import Vector
@@ -65,9 +66,10 @@ class TouchPlan:
         """Number of nodes; for a mesh that is to be made an estimate, to two digits."""
         if self.known_node_count is not None:
             return self.known_node_count
-        count = NODES_PER_CELL * self.volume / (self.coarsening * self.cell_size) ** 3
+        cell = self.coarsening * self.cell_size
+        count = NODES_PER_CELL * self.volume / (cell * cell * cell)
         if self.coarsening > 1:
-            count += FACE_NODES * FACE_SHARE * self.volume ** (2.0 / 3.0) / self.cell_size**2
+            count += FACE_NODES * FACE_SHARE * float(power(self.volume, 2.0 / 3.0)) / (self.cell_size * self.cell_size)
         # A broken surface may enclose nothing, which its mesher finds.
         return max(int(float(f"{count:.2g}")), 1)
 
@@ -96,7 +98,7 @@ def plan_touch(volume: float, options: SurfaceOptions, *, cell_size: float | Non
     tip = options.tip_radius or next(radius for largest, radius in TIPS if volume <= largest)
     depth = options.press_depth or depth_for_tip(tip)
     cell = round(math.floor(CELL_PER_CONTACT_RADIUS * contact_radius(tip, depth) / CELL_STEP) * CELL_STEP, 7)
-    across = max(volume, 0.0) ** (1.0 / 3.0) / CELLS_ACROSS
+    across = float(cbrt(max(volume, 0.0))) / CELLS_ACROSS
     coarsening = next((one for one in COARSENINGS if one * cell <= across), 1) if graded else 1
     return TouchPlan(tip, depth, cell, coarsening, volume, is_given=False)
 

@@ -226,7 +226,7 @@ def eigh(matrices: ArrayLike) -> tuple[FloatArray, FloatArray]:
     values = np.diagonal(flat, axis1=1, axis2=2)
     order = np.argsort(values, axis=1, kind="stable")
     values = np.take_along_axis(values, order, axis=1)
-    vectors = np.take_along_axis(vectors, order[:, None], axis=2)
+    vectors = np.take_along_axis(np.swapaxes(vectors, 1, 2), order[:, None], axis=2)
     return values.reshape(a.shape[:-1]), vectors.reshape(a.shape)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from msdm_core.kernels.option_kernels import KERNEL
+from msdm_core.kernels.option_kernels import INLINED, KERNEL
 
 # Elements beside the diagonal below this share of the norm, and angles between rows below it, count as zero.
 ZERO_SHARE = 1e-17
@@ -65,12 +65,32 @@ def eliminate(matrices, right):
     return -1
 
 
+@njit(**INLINED)
+def _rotation(first, second, between):
+    """Cosine and sine of Jacobi's rotation, by which [[first, between], [between, second]] becomes diagonal."""
+    tau = (second - first) / (2.0 * between)
+    tangent = 1.0 / (abs(tau) + np.sqrt(1.0 + tau * tau))
+    if tau < 0.0:
+        tangent = -tangent
+    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
+    return cosine, tangent * cosine
+
+
+@njit(**INLINED)
+def _rotate(rows, p, q, cosine, sine):
+    """Rotate two rows of an array (m, n) in their plane."""
+    for k in range(rows.shape[1]):
+        first, second = rows[p, k], rows[q, k]
+        rows[p, k] = cosine * first - sine * second
+        rows[q, k] = sine * first + cosine * second
+
+
 @njit(**KERNEL)
 def diagonalise(matrices, vectors):
     """Make a stack of symmetric matrices diagonal by cyclic rotations (Jacobi 1846), in place.
 
     In, out: matrices (s, n, n), then their eigenvalues on the diagonal
-    Out:     vectors: the eigenvectors as columns (s, n, n)
+    Out:     vectors: the eigenvectors as rows (s, n, n)
     """
     count, size = matrices.shape[0], matrices.shape[1]
     for system in range(count):
@@ -89,23 +109,13 @@ def diagonalise(matrices, vectors):
                     if not abs(a[p, q]) > least:
                         continue
                     rotated = True
-                    tau = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
-                    tangent = 1.0 / (abs(tau) + np.sqrt(1.0 + tau * tau))
-                    if tau < 0.0:
-                        tangent = -tangent
-                    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
-                    sine = tangent * cosine
+                    cosine, sine = _rotation(a[p, p], a[q, q], a[p, q])
                     for k in range(size):
                         first, second = a[k, p], a[k, q]
                         a[k, p] = cosine * first - sine * second
                         a[k, q] = sine * first + cosine * second
-                    for k in range(size):
-                        first, second = a[p, k], a[q, k]
-                        a[p, k] = cosine * first - sine * second
-                        a[q, k] = sine * first + cosine * second
-                        first, second = v[k, p], v[k, q]
-                        v[k, p] = cosine * first - sine * second
-                        v[k, q] = sine * first + cosine * second
+                    _rotate(a, p, q, cosine, sine)
+                    _rotate(v, p, q, cosine, sine)
             if not rotated:
                 break
 
@@ -133,19 +143,8 @@ def orthogonalise(rows, turns):
                 if not abs(gamma) > ANGLE_LEAST * np.sqrt(alpha) * np.sqrt(beta):
                     continue
                 rotated = True
-                tau = (beta - alpha) / (2.0 * gamma)
-                tangent = 1.0 / (abs(tau) + np.sqrt(1.0 + tau * tau))
-                if tau < 0.0:
-                    tangent = -tangent
-                cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
-                sine = tangent * cosine
-                for k in range(width):
-                    first, second = rows[p, k], rows[q, k]
-                    rows[p, k] = cosine * first - sine * second
-                    rows[q, k] = sine * first + cosine * second
-                for k in range(count):
-                    first, second = turns[p, k], turns[q, k]
-                    turns[p, k] = cosine * first - sine * second
-                    turns[q, k] = sine * first + cosine * second
+                cosine, sine = _rotation(alpha, beta, gamma)
+                _rotate(rows, p, q, cosine, sine)
+                _rotate(turns, p, q, cosine, sine)
         if not rotated:
             break

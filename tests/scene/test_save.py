@@ -84,7 +84,13 @@ def read(text, like):
     return scene_from_table(tomllib.loads(text), name=like.name, folder=like.folder)
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+# The same examples in each run: of those drawn so few are scenes that a search from an unlucky seed finds none.
+@settings(
+    max_examples=30,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
 @given(instances(Scene))
 def test_a_scene_that_is_written_is_read_as_an_equal_one(scene):
     assert read(scene_toml(scene), scene) == scene

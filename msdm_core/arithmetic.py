@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.kernels.matrix_kernels import diagonalise, eliminate, multiply, orthogonalise
-
-FloatArray = NDArray[np.float64]
+from msdm_core.kernels.structure_kernels import FloatArray
 
 # ln 2 and pi / 2 in parts; a small whole number times any but the last part is exact.
 LN2 = (0.693147180369123816490, 1.90821492927058770002e-10)
@@ -76,7 +75,7 @@ def expm1(x: ArrayLike) -> FloatArray:
 
 
 def power(x: ArrayLike, exponent: ArrayLike) -> FloatArray:
-    """x^exponent of numbers that are not negative, as e^(exponent ln x)."""
+    """x^exponent of numbers from 0 on, as e^(exponent ln x); a number below 0 gives nan."""
     exponent = np.asarray(exponent, dtype=np.float64)
     return exp(np.where(exponent == 0.0, 0.0, exponent * log(np.where(exponent == 0.0, 1.0, x))))
 
@@ -95,12 +94,20 @@ def cbrt(x: ArrayLike) -> FloatArray:
 
 
 def sin(angle: ArrayLike) -> FloatArray:
-    """Sine of each angle [rad] of at most ANGLE_MOST."""
+    """Sine of each angle [rad].
+
+    Raises:
+        ValueError: an angle beyond ANGLE_MOST; names it.
+    """
     return _circular(angle, 0)
 
 
 def cos(angle: ArrayLike) -> FloatArray:
-    """Cosine of each angle [rad] of at most ANGLE_MOST."""
+    """Cosine of each angle [rad].
+
+    Raises:
+        ValueError: an angle beyond ANGLE_MOST; names it.
+    """
     return _circular(angle, 1)
 
 

@@ -38,6 +38,46 @@ PLACE_WIDTH = 5
 SWEEPS = (1.0, 2.0, 2.0)
 
 
+@njit(**INLINED)
+def reach_margin(shapes, shape, duration):
+    """How far tissue and a shape may come nearer to each other within a duration [m]."""
+    tool = shapes.shape_tool[shape]
+    speed = shapes.shape_radius[shape] * 0.0
+    for part in range(6):
+        # An angular part moves a point by at most its lever, taken as one metre: generous for a hand-held tool.
+        speed += abs(shapes.tool_twist[tool, part])
+    return CANDIDATE_MARGIN + 2.0 * speed * duration
+
+
+@njit(**INLINED)
+def core_box(ends, spans, shape, around):
+    """Lowest and highest x, y and z of the core of a shape, widened by `around` [m]: six numbers."""
+    low_x, high_x = _extent(ends, spans, shape, 0, around)
+    low_y, high_y = _extent(ends, spans, shape, 1, around)
+    low_z, high_z = _extent(ends, spans, shape, 2, around)
+    return low_x, high_x, low_y, high_y, low_z, high_z
+
+
+@njit(**INLINED)
+def is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius, margin, box):
+    """Whether a shape may touch a triangle, by `core_box` and spheres, or holds it already."""
+    a = surface[triangle, 0]
+    b = surface[triangle, 1]
+    c = surface[triangle, 2]
+    # Cheap first: box against box; then the sphere around the triangle against the axis.
+    near = (
+        _overlap(position, 0, a, b, c, box[0], box[1])
+        and _overlap(position, 1, a, b, c, box[2], box[3])
+        and _overlap(position, 2, a, b, c, box[4], box[5])
+    )
+    if near:
+        x, y, z, size_squared = _middle(position, a, b, c)
+        px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
+        limit = math.sqrt(size_squared) + radius + margin
+        near = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 <= limit * limit
+    return near or _is_held(engaged, shape, triangle)
+
+
 @njit(**INNER)
 def find_candidates(model, state, shapes, duration):
     """Broad phase of one call: the triangles that a shape may touch within a duration, by bounding boxes and spheres.
@@ -52,36 +92,14 @@ def find_candidates(model, state, shapes, duration):
     """
     # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
     position, ends, spans, surface = state.node_position, shapes.shape_ends, shapes.shape_span, model.surface_triangles
-    engaged, candidates, twist = state.contact_engaged, state.contact_candidates, shapes.tool_twist
+    engaged, candidates = state.contact_engaged, state.contact_candidates
     most = 0
     for shape in range(shapes.shape_radius.shape[0]):
-        tool = shapes.shape_tool[shape]
-        radius = shapes.shape_radius[shape]
-        speed = 0.0
-        for part in range(6):
-            # An angular part moves a point by at most its lever, taken as one metre: generous for a hand-held tool.
-            speed += abs(twist[tool, part])
-        margin = CANDIDATE_MARGIN + 2.0 * speed * duration
-        low_x, high_x = _extent(ends, spans, shape, 0, radius + margin)
-        low_y, high_y = _extent(ends, spans, shape, 1, radius + margin)
-        low_z, high_z = _extent(ends, spans, shape, 2, radius + margin)
+        radius, margin = shapes.shape_radius[shape], reach_margin(shapes, shape, duration)
+        box = core_box(ends, spans, shape, radius + margin)
         count = 0
         for triangle in range(surface.shape[0]):
-            a = surface[triangle, 0]
-            b = surface[triangle, 1]
-            c = surface[triangle, 2]
-            # Cheap first: box against box; then the sphere around the triangle against the axis.
-            near = (
-                _overlap(position, 0, a, b, c, low_x, high_x)
-                and _overlap(position, 1, a, b, c, low_y, high_y)
-                and _overlap(position, 2, a, b, c, low_z, high_z)
-            )
-            if near:
-                x, y, z, size_squared = _middle(position, a, b, c)
-                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
-                limit = math.sqrt(size_squared) + radius + margin
-                near = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 <= limit * limit
-            if near or _is_held(engaged, shape, triangle):
+            if is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius, margin, box):
                 candidates[shape, count] = triangle
                 count += 1
         if count < candidates.shape[1]:
@@ -119,6 +137,140 @@ def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
     return kept * ux, kept * uy, kept * uz
 
 
+@njit(**INLINED)
+def may_meet(position, surface, engaged, ends, spans, shape, triangle, radius):
+    """Whether a shape holds a triangle, or could meet one of its points now."""
+    if _is_held(engaged, shape, triangle):
+        return True
+    # Only points inside the shape can be met, and they lie within half of that radius around the middle.
+    a, b, c = surface[triangle, 0], surface[triangle, 1], surface[triangle, 2]
+    x, y, z, size_squared = _middle(position, a, b, c)
+    px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
+    limit = 0.5 * math.sqrt(size_squared) + radius
+    return not (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 > limit * limit
+
+
+@njit(**INLINED)
+def facet_of(position, surface, triangle):
+    """Nodes of a triangle, edges from its first corner [m], unit normal, twice its area [m^2]: 13 numbers."""
+    a = surface[triangle, 0]
+    b = surface[triangle, 1]
+    c = surface[triangle, 2]
+    bx, by, bz = _span(position, a, b)
+    cx, cy, cz = _span(position, a, c)
+    nx = by * cz - bz * cy
+    ny = bz * cx - bx * cz
+    nz = bx * cy - by * cx
+    twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
+    nx /= twice_area
+    ny /= twice_area
+    nz /= twice_area
+    return a, b, c, bx, by, bz, cx, cy, cz, nx, ny, nz, twice_area
+
+
+@njit(**INLINED)
+def press_point(
+    position, velocity, rest_area, engaged, stretch_memory, rows, places, shapes, law, dt, shape, triangle, facet,
+    point, row,
+):  # fmt: skip
+    """Contact of one quadrature point with one shape, see `add_contact_forces`.
+
+    Out: engaged, stretch_memory: of the point; `row` of rows and places, if it is engaged
+    Returns whether it is.
+    """
+    a, b, c, bx, by, bz, cx, cy, cz, nx, ny, nz, twice_area = facet
+    ends, spans, centre, twist = shapes.shape_ends, shapes.shape_span, shapes.tool_centre, shapes.tool_twist
+    tool, radius = shapes.shape_tool[shape], shapes.shape_radius[shape]
+    friction = law.friction * shapes.shape_friction[shape]
+    weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
+    item = triangle * QUADRATURE_COUNT + point
+    wa = QUADRATURE_BARYCENTRIC[point, 0]
+    wb = QUADRATURE_BARYCENTRIC[point, 1]
+    wc = QUADRATURE_BARYCENTRIC[point, 2]
+    x, y, z = _mean(position, a, b, c, wa, wb, wc)
+    px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
+    t = (x - px) * nx + (y - py) * ny + (z - pz) * nz
+    rx = x - px - t * nx
+    ry = y - py - t * ny
+    rz = z - pz - t * nz
+    chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
+    if chord_squared <= 0.0:
+        _release(engaged, stretch_memory, shape, item)
+        return False
+    s = math.sqrt(chord_squared)
+    depth = s + t
+    if depth <= 0.0 or (not engaged[shape, item] and t > 0.0):
+        _release(engaged, stretch_memory, shape, item)
+        return False
+    engaged[shape, item] = 1
+    # e: unit vector against the ball's own normal where the line along n leaves the ball.
+    ex = (s * nx - rx) / radius
+    ey = (s * ny - ry) / radius
+    ez = (s * nz - rz) / radius
+    pressure = law.stiffness * s * depth / radius
+
+    # Slope of g at the point: (s^2 n - (2 s + t) rho) / (s r), without the directions in which the nearest
+    # point of the core follows.
+    scale = 1.0 / (s * radius)
+    gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
+    gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
+    gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
+    gx, gy, gz = _without_core(ends, spans, shape, px, py, pz, gx, gy, gz)
+
+    # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the slope
+    # is along n. rho . grad(lambda_b) = rho . (c x n) / (2 A), for the corner c rho . (n x b) / (2 A).
+    turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
+    turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
+    turn = -scale * depth * depth
+    tb = turn * turn_b
+    tc = turn * turn_c
+
+    # Friction: a tangential spring that follows the surface and turns with the tool.
+    ux = stretch_memory[shape, item, 0]
+    uy = stretch_memory[shape, item, 1]
+    uz = stretch_memory[shape, item, 2]
+    vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
+    ox, oy, oz = _tool_velocity(twist, centre, tool, x, y, z)
+    vx += twist[tool, 4] * uz - twist[tool, 5] * uy - ox
+    vy += twist[tool, 5] * ux - twist[tool, 3] * uz - oy
+    vz += twist[tool, 3] * uy - twist[tool, 4] * ux - oz
+    longest = friction * pressure / law.tangential_stiffness
+    ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, ex, ey, ez, longest)
+    stretch_memory[shape, item, 0] = ux
+    stretch_memory[shape, item, 1] = uy
+    stretch_memory[shape, item, 2] = uz
+
+    places[row, 0] = shape
+    places[row, 1] = item
+    places[row, 2] = a
+    places[row, 3] = b
+    places[row, 4] = c
+    _put_slope(rows, row, 0, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
+    _put_slope(rows, row, 1, wb, tb, gx, gy, gz, nx, ny, nz)
+    _put_slope(rows, row, 2, wc, tc, gx, gy, gz, nx, ny, nz)
+    steepness = math.sqrt(gx * gx + gy * gy + gz * gz)
+    rows[row, ROW_NORM] = wa * steepness + abs(tb + tc)
+    rows[row, ROW_NORM + 1] = wb * steepness + abs(tb)
+    rows[row, ROW_NORM + 2] = wc * steepness + abs(tc)
+    rows[row, ROW_AREA] = weighted_area
+    rows[row, ROW_PRESSURE] = pressure
+    rows[row, ROW_OUT] = ex
+    rows[row, ROW_OUT + 1] = ey
+    rows[row, ROW_OUT + 2] = ez
+    rows[row, ROW_STRETCH] = ux
+    rows[row, ROW_STRETCH + 1] = uy
+    rows[row, ROW_STRETCH + 2] = uz
+    return True
+
+
+@njit(**INLINED)
+def first_push(rows, row, law):
+    """Pressure times area of a point [N], and the force of its friction [N], as `press_point` left them."""
+    drag = rows[row, ROW_AREA] * law.tangential_stiffness
+    ux, uy, uz = rows[row, ROW_STRETCH] * drag, rows[row, ROW_STRETCH + 1] * drag, rows[row, ROW_STRETCH + 2] * drag
+    return rows[row, ROW_AREA] * rows[row, ROW_PRESSURE], ux, uy, uz
+
+
 @njit(**INNER)
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
     """Contact forces of every shape on its candidate triangles as they are now, and the reaction on the tools.
@@ -140,125 +292,28 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
            (n_shape, n_surface * 4, 3), contact_rows, contact_places; wrench, added to [N, N m] (n_tool, 6)
     Returns how many points are engaged: rows of contact_rows and contact_places.
     """
-    # All branches are in this one body: a function with branches that takes arrays counts references at each call,
-    # which took three times as long as the rest.
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
     rows, places = state.contact_rows, state.contact_places
     surface, rest_area = model.surface_triangles, model.surface_rest_area
-    ends, spans, centre, twist = shapes.shape_ends, shapes.shape_span, shapes.tool_centre, shapes.tool_twist
+    ends, spans = shapes.shape_ends, shapes.shape_span
     count = 0
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
-        radius = shapes.shape_radius[shape]
-        friction = law.friction * shapes.shape_friction[shape]
         for entry in range(candidate_count):
             triangle = candidates[shape, entry]
             if triangle < 0:
                 break
-            a = surface[triangle, 0]
-            b = surface[triangle, 1]
-            c = surface[triangle, 2]
-            if not _is_held(engaged, shape, triangle):
-                # Only points inside the shape can be met, and they lie within half of that radius around the middle.
-                x, y, z, size_squared = _middle(position, a, b, c)
-                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
-                limit = 0.5 * math.sqrt(size_squared) + radius
-                if (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 > limit * limit:
-                    continue
-            bx, by, bz = _span(position, a, b)
-            cx, cy, cz = _span(position, a, c)
-            nx = by * cz - bz * cy
-            ny = bz * cx - bx * cz
-            nz = bx * cy - by * cx
-            twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
-            nx /= twice_area
-            ny /= twice_area
-            nz /= twice_area
-            weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
+            if not may_meet(position, surface, engaged, ends, spans, shape, triangle, shapes.shape_radius[shape]):
+                continue
+            facet = facet_of(position, surface, triangle)
             for point in range(QUADRATURE_COUNT):
-                item = triangle * QUADRATURE_COUNT + point
-                wa = QUADRATURE_BARYCENTRIC[point, 0]
-                wb = QUADRATURE_BARYCENTRIC[point, 1]
-                wc = QUADRATURE_BARYCENTRIC[point, 2]
-                x, y, z = _mean(position, a, b, c, wa, wb, wc)
-                px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
-                t = (x - px) * nx + (y - py) * ny + (z - pz) * nz
-                rx = x - px - t * nx
-                ry = y - py - t * ny
-                rz = z - pz - t * nz
-                chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
-                if chord_squared <= 0.0:
-                    _release(engaged, stretch_memory, shape, item)
+                if not press_point(
+                    position, velocity, rest_area, engaged, stretch_memory, rows, places, shapes, law, dt, shape,
+                    triangle, facet, point, count,
+                ):  # fmt: skip
                     continue
-                s = math.sqrt(chord_squared)
-                depth = s + t
-                if depth <= 0.0 or (not engaged[shape, item] and t > 0.0):
-                    _release(engaged, stretch_memory, shape, item)
-                    continue
-                engaged[shape, item] = 1
-                # e: unit vector against the ball's own normal where the line along n leaves the ball.
-                ex = (s * nx - rx) / radius
-                ey = (s * ny - ry) / radius
-                ez = (s * nz - rz) / radius
-                pressure = law.stiffness * s * depth / radius
-
-                # Slope of g at the point: (s^2 n - (2 s + t) rho) / (s r), without the directions in which the nearest
-                # point of the core follows.
-                scale = 1.0 / (s * radius)
-                gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
-                gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
-                gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
-                gx, gy, gz = _without_core(ends, spans, shape, px, py, pz, gx, gy, gz)
-
-                # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the slope
-                # is along n. rho . grad(lambda_b) = rho . (c x n) / (2 A), for the corner c rho . (n x b) / (2 A).
-                turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
-                turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
-                turn = -scale * depth * depth
-                tb = turn * turn_b
-                tc = turn * turn_c
-
-                # Friction: a tangential spring that follows the surface and turns with the tool.
-                ux = stretch_memory[shape, item, 0]
-                uy = stretch_memory[shape, item, 1]
-                uz = stretch_memory[shape, item, 2]
-                vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
-                ox, oy, oz = _tool_velocity(twist, centre, tool, x, y, z)
-                vx += twist[tool, 4] * uz - twist[tool, 5] * uy - ox
-                vy += twist[tool, 5] * ux - twist[tool, 3] * uz - oy
-                vz += twist[tool, 3] * uy - twist[tool, 4] * ux - oz
-                longest = friction * pressure / law.tangential_stiffness
-                ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, ex, ey, ez, longest)
-                stretch_memory[shape, item, 0] = ux
-                stretch_memory[shape, item, 1] = uy
-                stretch_memory[shape, item, 2] = uz
-
-                places[count, 0] = shape
-                places[count, 1] = item
-                places[count, 2] = a
-                places[count, 3] = b
-                places[count, 4] = c
-                _put_slope(rows, count, 0, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
-                _put_slope(rows, count, 1, wb, tb, gx, gy, gz, nx, ny, nz)
-                _put_slope(rows, count, 2, wc, tc, gx, gy, gz, nx, ny, nz)
-                steepness = math.sqrt(gx * gx + gy * gy + gz * gz)
-                rows[count, ROW_NORM] = wa * steepness + abs(tb + tc)
-                rows[count, ROW_NORM + 1] = wb * steepness + abs(tb)
-                rows[count, ROW_NORM + 2] = wc * steepness + abs(tc)
-                rows[count, ROW_AREA] = weighted_area
-                rows[count, ROW_PRESSURE] = pressure
-                rows[count, ROW_OUT] = ex
-                rows[count, ROW_OUT + 1] = ey
-                rows[count, ROW_OUT + 2] = ez
-                rows[count, ROW_STRETCH] = ux
-                rows[count, ROW_STRETCH + 1] = uy
-                rows[count, ROW_STRETCH + 2] = uz
-                push = weighted_area * pressure
-                drag = weighted_area * law.tangential_stiffness
-                ux *= drag
-                uy *= drag
-                uz *= drag
+                push, ux, uy, uz = first_push(rows, count, law)
                 # A loop: written out, each constant number of a corner would be compiled for itself.
                 for corner in range(3):
                     node, weight = places[count, 2 + corner], QUADRATURE_BARYCENTRIC[point, corner]
@@ -267,6 +322,136 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                     )
                 count += 1
     return count
+
+
+@njit(**INLINED)
+def hold_rates(law, dt):
+    """Pressure per rate of the penetration, and traction per rate of the stretch, within a substep [N s/m^3]."""
+    along = law.stiffness * dt + law.damping
+    across = law.tangential_stiffness * dt
+    if not law.friction > 0.0:
+        across = along * 0.0
+    return along, across
+
+
+@njit(**INLINED)
+def hold_share(rows, number, corner, weight, along, across, dt):
+    """What a point holds one of its corners with, times dt^2 [kg]."""
+    total = rows[number, ROW_NORM] + rows[number, ROW_NORM + 1] + rows[number, ROW_NORM + 2]
+    share = max(along * total * rows[number, ROW_NORM + corner], across * weight)
+    return dt * rows[number, ROW_AREA] * share
+
+
+@njit(**INLINED)
+def begin_hold(position, shapes, rows, places, number):
+    """Speed of the tool along a point's slopes and at the point, and nothing added to pressure and stretch yet."""
+    centre, twist = shapes.tool_centre, shapes.tool_twist
+    point = places[number, 1] % QUADRATURE_COUNT
+    tool = shapes.shape_tool[places[number, 0]]
+    ux = rows[number, ROW_STRETCH]
+    uy = rows[number, ROW_STRETCH + 1]
+    uz = rows[number, ROW_STRETCH + 2]
+    # The stretch turns with the tool.
+    vx = twist[tool, 5] * uy - twist[tool, 4] * uz
+    vy = twist[tool, 3] * uz - twist[tool, 5] * ux
+    vz = twist[tool, 4] * ux - twist[tool, 3] * uy
+    rate = ux * 0.0
+    for corner in range(3):
+        node = places[number, 2 + corner]
+        weight = QUADRATURE_BARYCENTRIC[point, corner]
+        ox, oy, oz = _tool_velocity(twist, centre, tool, position[node, 0], position[node, 1], position[node, 2])
+        slope = ROW_SLOPE + 3 * corner
+        rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
+        vx += weight * ox
+        vy += weight * oy
+        vz += weight * oz
+    rows[number, ROW_TOOL] = rate
+    rows[number, ROW_TOOL + 1] = vx
+    rows[number, ROW_TOOL + 2] = vy
+    rows[number, ROW_TOOL + 3] = vz
+    for part in range(4):
+        rows[number, ROW_MORE + part] = 0.0
+
+
+@njit(**INLINED)
+def set_give(rows, places, hold, inverse_mass, number):
+    """1 / (1 + h) of a point, along its slopes and across them."""
+    point = places[number, 1] % QUADRATURE_COUNT
+    held = 0.0
+    stuck = 0.0
+    total = 0.0
+    for corner in range(3):
+        node = places[number, 2 + corner]
+        share = hold[node] * inverse_mass[node]
+        held += rows[number, ROW_NORM + corner] * share
+        stuck += QUADRATURE_BARYCENTRIC[point, corner] * share
+        total += rows[number, ROW_NORM + corner]
+    # A point whose force has no direction (in the core of a shape) has no rate either.
+    rows[number, ROW_GIVE] = total / (total + held) if total > 0.0 else 0.0
+    rows[number, ROW_GIVE + 1] = 1.0 / (1.0 + stuck)
+
+
+@njit(**INLINED)
+def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, decay, rows, places, number, sweep):
+    """What one sweep adds to pressure and stretch of a point; the last one writes the stretch of a point that slips."""
+    along = law.stiffness * dt + law.damping
+    shape = places[number, 0]
+    item = places[number, 1]
+    point = item % QUADRATURE_COUNT
+    rate = -rows[number, ROW_TOOL]
+    vx = -rows[number, ROW_TOOL + 1]
+    vy = -rows[number, ROW_TOOL + 2]
+    vz = -rows[number, ROW_TOOL + 3]
+    for corner in range(3):
+        node = places[number, 2 + corner]
+        weight = QUADRATURE_BARYCENTRIC[point, corner]
+        gain = dt * inverse_mass[node]
+        ox = decay * velocity[node, 0] + gain * force[node, 0]
+        oy = decay * velocity[node, 1] + gain * force[node, 1]
+        oz = decay * velocity[node, 2] + gain * force[node, 2]
+        slope = ROW_SLOPE + 3 * corner
+        rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
+        vx += weight * ox
+        vy += weight * oy
+        vz += weight * oz
+    pressure = rows[number, ROW_PRESSURE]
+    before = rows[number, ROW_MORE]
+    more = before + SWEEPS[sweep] * rows[number, ROW_GIVE] * (along * rate - before)
+    more = max(more, -pressure)
+    rows[number, ROW_MORE] = more
+    rows[number, ROW_STEP] = more - before
+    # The stretch of the last sweep, and from there on to that of the velocities.
+    ux = rows[number, ROW_STRETCH] + rows[number, ROW_MORE + 1]
+    uy = rows[number, ROW_STRETCH + 1] + rows[number, ROW_MORE + 2]
+    uz = rows[number, ROW_STRETCH + 2] + rows[number, ROW_MORE + 3]
+    give = SWEEPS[sweep] * rows[number, ROW_GIVE + 1]
+    qx, qy, qz = stretched(
+        ux, uy, uz, dt * vx - rows[number, ROW_MORE + 1], dt * vy - rows[number, ROW_MORE + 2],
+        dt * vz - rows[number, ROW_MORE + 3], give,
+        rows[number, ROW_OUT], rows[number, ROW_OUT + 1], rows[number, ROW_OUT + 2],
+    )  # fmt: skip
+    longest = law.friction * shapes.shape_friction[shape] * (pressure + more) / law.tangential_stiffness
+    kept = slipped(qx, qy, qz, longest)
+    qx *= kept
+    qy *= kept
+    qz *= kept
+    rows[number, ROW_STEP + 1] = qx - ux
+    rows[number, ROW_STEP + 2] = qy - uy
+    rows[number, ROW_STEP + 3] = qz - uz
+    for part in range(1, 4):
+        rows[number, ROW_MORE + part] += rows[number, ROW_STEP + part]
+    if kept < 1.0 and sweep == len(SWEEPS) - 1:
+        stretch_memory[shape, item, 0] = qx
+        stretch_memory[shape, item, 1] = qy
+        stretch_memory[shape, item, 2] = qz
+
+
+@njit(**INLINED)
+def more_push(rows, number, law):
+    """What the last sweep added: pressure times area [N], and the force of friction [N]."""
+    push = rows[number, ROW_AREA] * rows[number, ROW_STEP]
+    drag = rows[number, ROW_AREA] * law.tangential_stiffness
+    return push, drag * rows[number, ROW_STEP + 1], drag * rows[number, ROW_STEP + 2], drag * rows[number, ROW_STEP + 3]
 
 
 @njit(**INNER)
@@ -295,113 +480,24 @@ def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wre
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     inverse_mass, hold, stretch_memory = model.node_inverse_mass, state.contact_hold, state.contact_stretch
     rows, places = state.contact_rows, state.contact_places
-    centre, twist = shapes.tool_centre, shapes.tool_twist
-    along = law.stiffness * dt + law.damping
-    across = 0.0
-    if law.friction > 0.0:
-        across = law.tangential_stiffness * dt
+    along, across = hold_rates(law, dt)
     for number in range(row_count):
         point = places[number, 1] % QUADRATURE_COUNT
-        tool = shapes.shape_tool[places[number, 0]]
-        ux = rows[number, ROW_STRETCH]
-        uy = rows[number, ROW_STRETCH + 1]
-        uz = rows[number, ROW_STRETCH + 2]
-        # The stretch turns with the tool.
-        vx = twist[tool, 5] * uy - twist[tool, 4] * uz
-        vy = twist[tool, 3] * uz - twist[tool, 5] * ux
-        vz = twist[tool, 4] * ux - twist[tool, 3] * uy
-        rate = 0.0
-        total = rows[number, ROW_NORM] + rows[number, ROW_NORM + 1] + rows[number, ROW_NORM + 2]
         for corner in range(3):
-            node = places[number, 2 + corner]
             weight = QUADRATURE_BARYCENTRIC[point, corner]
-            share = max(along * total * rows[number, ROW_NORM + corner], across * weight)
-            hold[node] += dt * rows[number, ROW_AREA] * share
-            ox, oy, oz = _tool_velocity(twist, centre, tool, position[node, 0], position[node, 1], position[node, 2])
-            slope = ROW_SLOPE + 3 * corner
-            rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
-            vx += weight * ox
-            vy += weight * oy
-            vz += weight * oz
-        rows[number, ROW_TOOL] = rate
-        rows[number, ROW_TOOL + 1] = vx
-        rows[number, ROW_TOOL + 2] = vy
-        rows[number, ROW_TOOL + 3] = vz
-        for part in range(4):
-            rows[number, ROW_MORE + part] = 0.0
+            hold[places[number, 2 + corner]] += hold_share(rows, number, corner, weight, along, across, dt)
+        begin_hold(position, shapes, rows, places, number)
     for number in range(row_count):
-        point = places[number, 1] % QUADRATURE_COUNT
-        held = 0.0
-        stuck = 0.0
-        total = 0.0
-        for corner in range(3):
-            node = places[number, 2 + corner]
-            share = hold[node] * inverse_mass[node]
-            held += rows[number, ROW_NORM + corner] * share
-            stuck += QUADRATURE_BARYCENTRIC[point, corner] * share
-            total += rows[number, ROW_NORM + corner]
-        # A point whose force has no direction (in the core of a shape) has no rate either.
-        rows[number, ROW_GIVE] = total / (total + held) if total > 0.0 else 0.0
-        rows[number, ROW_GIVE + 1] = 1.0 / (1.0 + stuck)
+        set_give(rows, places, hold, inverse_mass, number)
     for sweep in range(len(SWEEPS)):
         for number in range(row_count):
-            shape = places[number, 0]
-            item = places[number, 1]
-            point = item % QUADRATURE_COUNT
-            rate = -rows[number, ROW_TOOL]
-            vx = -rows[number, ROW_TOOL + 1]
-            vy = -rows[number, ROW_TOOL + 2]
-            vz = -rows[number, ROW_TOOL + 3]
-            for corner in range(3):
-                node = places[number, 2 + corner]
-                weight = QUADRATURE_BARYCENTRIC[point, corner]
-                gain = dt * inverse_mass[node]
-                ox = decay * velocity[node, 0] + gain * force[node, 0]
-                oy = decay * velocity[node, 1] + gain * force[node, 1]
-                oz = decay * velocity[node, 2] + gain * force[node, 2]
-                slope = ROW_SLOPE + 3 * corner
-                rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
-                vx += weight * ox
-                vy += weight * oy
-                vz += weight * oz
-            pressure = rows[number, ROW_PRESSURE]
-            before = rows[number, ROW_MORE]
-            more = before + SWEEPS[sweep] * rows[number, ROW_GIVE] * (along * rate - before)
-            more = max(more, -pressure)
-            rows[number, ROW_MORE] = more
-            rows[number, ROW_STEP] = more - before
-            # The stretch of the last sweep, and from there on to that of the velocities.
-            ux = rows[number, ROW_STRETCH] + rows[number, ROW_MORE + 1]
-            uy = rows[number, ROW_STRETCH + 1] + rows[number, ROW_MORE + 2]
-            uz = rows[number, ROW_STRETCH + 2] + rows[number, ROW_MORE + 3]
-            give = SWEEPS[sweep] * rows[number, ROW_GIVE + 1]
-            qx, qy, qz = stretched(
-                ux, uy, uz, dt * vx - rows[number, ROW_MORE + 1], dt * vy - rows[number, ROW_MORE + 2],
-                dt * vz - rows[number, ROW_MORE + 3], give,
-                rows[number, ROW_OUT], rows[number, ROW_OUT + 1], rows[number, ROW_OUT + 2],
-            )  # fmt: skip
-            longest = law.friction * shapes.shape_friction[shape] * (pressure + more) / law.tangential_stiffness
-            kept = slipped(qx, qy, qz, longest)
-            qx *= kept
-            qy *= kept
-            qz *= kept
-            rows[number, ROW_STEP + 1] = qx - ux
-            rows[number, ROW_STEP + 2] = qy - uy
-            rows[number, ROW_STEP + 3] = qz - uz
-            for part in range(1, 4):
-                rows[number, ROW_MORE + part] += rows[number, ROW_STEP + part]
-            if kept < 1.0 and sweep == len(SWEEPS) - 1:
-                stretch_memory[shape, item, 0] = qx
-                stretch_memory[shape, item, 1] = qy
-                stretch_memory[shape, item, 2] = qz
+            sweep_point(
+                velocity, force, inverse_mass, stretch_memory, shapes, law, dt, decay, rows, places, number, sweep
+            )
         for number in range(row_count):
             point = places[number, 1] % QUADRATURE_COUNT
             tool = shapes.shape_tool[places[number, 0]]
-            push = rows[number, ROW_AREA] * rows[number, ROW_STEP]
-            drag = rows[number, ROW_AREA] * law.tangential_stiffness
-            ux = drag * rows[number, ROW_STEP + 1]
-            uy = drag * rows[number, ROW_STEP + 2]
-            uz = drag * rows[number, ROW_STEP + 3]
+            push, ux, uy, uz = more_push(rows, number, law)
             for corner in range(3):
                 node = places[number, 2 + corner]
                 weight = QUADRATURE_BARYCENTRIC[point, corner]
@@ -533,11 +629,19 @@ def _put_slope(rows, number, corner, weight, along_n, gx, gy, gz, nx, ny, nz):
 
 
 @njit(**INLINED)
+def corner_force(rows, number, corner, push, weight, ux, uy, uz):
+    """One corner's share of a point's force, -push dg/dx - weight u [N]."""
+    return (
+        -push * rows[number, ROW_SLOPE + 3 * corner] - weight * ux,
+        -push * rows[number, ROW_SLOPE + 3 * corner + 1] - weight * uy,
+        -push * rows[number, ROW_SLOPE + 3 * corner + 2] - weight * uz,
+    )
+
+
+@njit(**INLINED)
 def _push_corner(position, force, reference, wrench, tool, node, rows, number, corner, push, weight, ux, uy, uz):
-    """One corner's share of a point's force, -push dg/dx - weight u [N], and the reaction to it."""
-    fx = -push * rows[number, ROW_SLOPE + 3 * corner] - weight * ux
-    fy = -push * rows[number, ROW_SLOPE + 3 * corner + 1] - weight * uy
-    fz = -push * rows[number, ROW_SLOPE + 3 * corner + 2] - weight * uz
+    """One corner's share of a point's force, and the reaction to it."""
+    fx, fy, fz = corner_force(rows, number, corner, push, weight, ux, uy, uz)
     force[node, 0] += fx
     force[node, 1] += fy
     force[node, 2] += fz
@@ -581,6 +685,24 @@ def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
     return gx, gy, gz
 
 
+@njit(**INLINED)
+def lag_point(position, surface, stretch, shapes, response, shape, triangle, point):
+    """Shift the stretch of one point by its tool's lag."""
+    tool, item = shapes.shape_tool[shape], triangle * QUADRATURE_COUNT + point
+    centre, lag = shapes.tool_centre, response.tool_lag
+    ox = -centre[tool, 0]
+    oy = -centre[tool, 1]
+    oz = -centre[tool, 2]
+    for corner in range(3):
+        weight = QUADRATURE_BARYCENTRIC[point, corner]
+        ox += weight * position[surface[triangle, corner], 0]
+        oy += weight * position[surface[triangle, corner], 1]
+        oz += weight * position[surface[triangle, corner], 2]
+    stretch[shape, item, 0] -= lag[tool, 0] + lag[tool, 4] * oz - lag[tool, 5] * oy
+    stretch[shape, item, 1] -= lag[tool, 1] + lag[tool, 5] * ox - lag[tool, 3] * oz
+    stretch[shape, item, 2] -= lag[tool, 2] + lag[tool, 3] * oy - lag[tool, 4] * ox
+
+
 @njit(**INNER)
 def stretch_by_lag(model, state, shapes, response, candidate_count):
     """Shift the stretch of sticking friction by each tool's lag, to where MuJoCo puts the tool at the end of the step.
@@ -592,25 +714,11 @@ def stretch_by_lag(model, state, shapes, response, candidate_count):
     """
     position, surface = state.node_position, model.surface_triangles
     engaged, stretch, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
-    centre, lag = shapes.tool_centre, response.tool_lag
     for shape in range(shapes.shape_radius.shape[0]):
-        tool = shapes.shape_tool[shape]
         for entry in range(candidate_count):
             triangle = candidates[shape, entry]
             if triangle < 0:
                 break
             for point in range(QUADRATURE_COUNT):
-                item = triangle * QUADRATURE_COUNT + point
-                if not engaged[shape, item]:
-                    continue
-                ox = -centre[tool, 0]
-                oy = -centre[tool, 1]
-                oz = -centre[tool, 2]
-                for corner in range(3):
-                    weight = QUADRATURE_BARYCENTRIC[point, corner]
-                    ox += weight * position[surface[triangle, corner], 0]
-                    oy += weight * position[surface[triangle, corner], 1]
-                    oz += weight * position[surface[triangle, corner], 2]
-                stretch[shape, item, 0] -= lag[tool, 0] + lag[tool, 4] * oz - lag[tool, 5] * oy
-                stretch[shape, item, 1] -= lag[tool, 1] + lag[tool, 5] * ox - lag[tool, 3] * oz
-                stretch[shape, item, 2] -= lag[tool, 2] + lag[tool, 3] * oy - lag[tool, 4] * ox
+                if engaged[shape, triangle * QUADRATURE_COUNT + point]:
+                    lag_point(position, surface, stretch, shapes, response, shape, triangle, point)

@@ -12,6 +12,9 @@ from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
 GUARD_SHARE = 0.6
 # Half a thousandth of a triangle is taken for its edge, so that nothing slips through between two.
 EDGE_WIDTH = 5e-4
+# Where a triangle is to the axis of a shape.
+FAR, NEAR, PASSED = 0, 1, 2
+PI = math.pi
 
 
 class _NearPoint(NamedTuple):
@@ -53,68 +56,89 @@ def guard_axes(model, state, shapes, law, response, dt, candidate_count, referen
     """
     position, velocity = state.node_position, state.node_velocity
     candidates, surface = state.contact_candidates, model.surface_triangles
-    ends, twist = shapes.shape_ends, shapes.tool_twist
     kept = True
     for shape in range(shapes.shape_radius.shape[0]):
-        tool = shapes.shape_tool[shape]
-        radius = shapes.shape_radius[shape]
-        reach = GUARD_SHARE * radius
-        # What an axis may pass in one substep, with the broad phase's bound on its speed.
-        watched = reach
-        for part in range(6):
-            watched += dt * abs(twist[tool, part])
+        watched = watched_distance(shapes, dt, shape)
         for entry in range(candidate_count):
             triangle = candidates[shape, entry]
             if triangle < 0:
                 break
-            a = surface[triangle, 0]
-            b = surface[triangle, 1]
-            c = surface[triangle, 2]
-            bx = position[b, 0] - position[a, 0]
-            by = position[b, 1] - position[a, 1]
-            bz = position[b, 2] - position[a, 2]
-            cx = position[c, 0] - position[a, 0]
-            cy = position[c, 1] - position[a, 1]
-            cz = position[c, 2] - position[a, 2]
-            nx = by * cz - bz * cy
-            ny = bz * cx - bx * cz
-            nz = bx * cy - by * cx
-            twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
-            first = 0.0
-            second = 0.0
-            for axis, part in ((0, nx), (1, ny), (2, nz)):
-                first += (ends[shape, 0, axis] - position[a, axis]) * part
-                second += (ends[shape, 1, axis] - position[a, axis]) * part
-            low = 0 if first < second else 1
-            if min(first, second) > watched * twice_area or max(first, second) < -watched * twice_area:
-                continue
-            if min(first, second) <= 0.0 and _passed(shapes, shape, position, velocity, dt, a, b, c):
+            place, near = near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, watched)
+            if place == PASSED:
                 state.contact_passed[0] = shape
                 state.contact_passed[1] = triangle
                 kept = False
-                continue
-            # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, near for a shaft.
-            wb, wc = closest_in_triangle(
-                bx, by, bz, cx, cy, cz,
-                ends[shape, low, 0] - position[a, 0], ends[shape, low, 1] - position[a, 1],
-                ends[shape, low, 2] - position[a, 2],
-            )  # fmt: skip
-            x = position[a, 0] + wb * bx + wc * cx
-            y = position[a, 1] + wb * by + wc * cy
-            z = position[a, 2] + wb * bz + wc * cz
-            px, py, pz = closest_on_axis(ends, shape, x, y, z)
-            ex = x - px
-            ey = y - py
-            ez = z - pz
-            distance = math.sqrt(ex * ex + ey * ey + ez * ez)
-            # Behind the triangle, beyond one of its edges: another one stands between.
-            if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
-                continue
-            direction = (ex / distance, ey / distance, ez / distance)
-            stiffness = math.pi * radius * radius * law.stiffness
-            near = _NearPoint((a, b, c), (1.0 - wb - wc, wb, wc), (x, y, z), direction, distance, reach, stiffness)
-            _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
+            elif place == NEAR:
+                _hold_off(model, state, shapes, response, dt, reference, wrench, shapes.shape_tool[shape], near)
     return kept
+
+
+@njit(**INLINED)
+def watched_distance(shapes, dt, shape):
+    """How near to an axis the surface is watched [m]: the guard's reach, and what the axis may pass in a substep."""
+    tool = shapes.shape_tool[shape]
+    watched = GUARD_SHARE * shapes.shape_radius[shape]
+    for part in range(6):
+        # The broad phase's bound on its speed.
+        watched += dt * abs(shapes.tool_twist[tool, part])
+    return watched
+
+
+@njit(**INLINED)
+def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, watched):
+    """Where a triangle is to the axis of a shape: FAR, NEAR or PASSED, and if it is near, its point next to the axis.
+
+    In: position [m], velocity [m/s] (n_node, 3), surface (n_surface, 3), shapes, law, dt [s], watched [m]
+    """
+    ends = shapes.shape_ends
+    radius = shapes.shape_radius[shape]
+    reach = GUARD_SHARE * radius
+    a = surface[triangle, 0]
+    b = surface[triangle, 1]
+    c = surface[triangle, 2]
+    none = radius * 0.0
+    far = _NearPoint((a, b, c), (none, none, none), (none, none, none), (none, none, none), none, none, none)
+    bx = position[b, 0] - position[a, 0]
+    by = position[b, 1] - position[a, 1]
+    bz = position[b, 2] - position[a, 2]
+    cx = position[c, 0] - position[a, 0]
+    cy = position[c, 1] - position[a, 1]
+    cz = position[c, 2] - position[a, 2]
+    nx = by * cz - bz * cy
+    ny = bz * cx - bx * cz
+    nz = bx * cy - by * cx
+    twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
+    first = 0.0
+    second = 0.0
+    for axis, part in ((0, nx), (1, ny), (2, nz)):
+        first += (ends[shape, 0, axis] - position[a, axis]) * part
+        second += (ends[shape, 1, axis] - position[a, axis]) * part
+    low = 0 if first < second else 1
+    if min(first, second) > watched * twice_area or max(first, second) < -watched * twice_area:
+        return FAR, far
+    if min(first, second) <= 0.0 and _passed(shapes, shape, position, velocity, dt, a, b, c):
+        return PASSED, far
+    # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, near for a shaft.
+    wb, wc = closest_in_triangle(
+        bx, by, bz, cx, cy, cz,
+        ends[shape, low, 0] - position[a, 0], ends[shape, low, 1] - position[a, 1],
+        ends[shape, low, 2] - position[a, 2],
+    )  # fmt: skip
+    x = position[a, 0] + wb * bx + wc * cx
+    y = position[a, 1] + wb * by + wc * cy
+    z = position[a, 2] + wb * bz + wc * cz
+    px, py, pz = closest_on_axis(ends, shape, x, y, z)
+    ex = x - px
+    ey = y - py
+    ez = z - pz
+    distance = math.sqrt(ex * ex + ey * ey + ez * ez)
+    # Behind the triangle, beyond one of its edges: another one stands between.
+    if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
+        return FAR, far
+    direction = (ex / distance, ey / distance, ez / distance)
+    stiffness = PI * radius * radius * law.stiffness
+    weights = (1.0 - wb - wc, wb, wc)
+    return NEAR, _NearPoint((a, b, c), weights, (x, y, z), direction, distance, reach, stiffness)
 
 
 @njit(**INLINED)

@@ -498,7 +498,7 @@ class SpringLaw(NamedTuple):
     fade: tuple[float, float, float]
 
 
-class _Surface(NamedTuple):
+class SurfaceView(NamedTuple):
     """What contact reads of one lane's model."""
 
     surface_triangles: NDArray[np.int32]
@@ -534,7 +534,7 @@ class _Ground(NamedTuple):
     motion_support_shift: FloatArray
 
 
-class _Touched(NamedTuple):
+class TouchedView(NamedTuple):
     """What contact reads and writes of one lane's state."""
 
     node_position: LaneArray
@@ -613,9 +613,9 @@ def _numbers_of(values, lane, count):
 def surface_of(lanes, model, lane):
     """One lane's surface, as contact reads it."""
     if len(lanes) == 0:
-        return _Surface(model.surface_triangles, model.surface_rest_area, model.node_inverse_mass)
+        return SurfaceView(model.surface_triangles, model.surface_rest_area, model.node_inverse_mass)
     count = model.surface_count[lane]
-    return _Surface(
+    return SurfaceView(
         _triangles_of(model.surface_triangles, lane, count), _numbers_of(model.surface_rest_area, lane, count),
         model.node_inverse_mass[:, lane],
     )  # fmt: skip
@@ -676,13 +676,13 @@ def ground_of(lanes, model, lane):
 def touched_of(lanes, state, lane):
     """One lane's state, as contact reads and writes it."""
     if len(lanes) == 0:
-        return _Touched(
+        return TouchedView(
             state.node_position, state.node_velocity, state.node_force,
             state.contact_engaged, state.contact_stretch, state.contact_candidates,
             state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
         )  # fmt: skip
     room = lane if state.contact_rows.shape[0] > 1 else 0
-    return _Touched(
+    return TouchedView(
         state.node_position[:, :, lane], state.node_velocity[:, :, lane], state.node_force[:, :, lane],
         state.contact_engaged[lane], state.contact_stretch[lane], state.contact_candidates[lane],
         state.contact_rows[room], state.contact_places[room], state.contact_hold, state.contact_passed[lane],

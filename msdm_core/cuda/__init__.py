@@ -1,0 +1,1 @@
+"""Organs on a CUDA device; needs the `cuda` extra."""

@@ -1,0 +1,795 @@
+"""Haptic steps of many organs on a CUDA device: a block of threads advances an organ; or all blocks advance one.
+
+`device_functions` makes this text for a floating-point type. Forces are gathered node by node, in the order of a list:
+no two threads add to one number, so that runs repeat to the bit on one device. Threads wait for each other between the
+passes (`_wait`); one thread does what has an order: tools, the guard, squeezed tets.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+from numba import cuda
+
+from msdm_core.cuda.device_functions import REAL, REAL_TYPE
+from msdm_core.kernels.contact_kernels import (
+    QUADRATURE_BARYCENTRIC,
+    QUADRATURE_COUNT,
+    ROW_AREA,
+    ROW_MORE,
+    ROW_PRESSURE,
+    ROW_STRETCH,
+    SWEEPS,
+    begin_hold,
+    core_box,
+    corner_force,
+    facet_of,
+    first_push,
+    hold_rates,
+    hold_share,
+    is_in_reach,
+    lag_point,
+    may_meet,
+    more_push,
+    press_point,
+    reach_margin,
+    set_give,
+    sweep_point,
+)
+from msdm_core.kernels.element_kernels import (
+    SQUEEZED_RATIO,
+    corner_gradient,
+    node_tension,
+    spring_length,
+    spring_scale,
+    tet_scale,
+    tet_shape,
+    volume_ratio,
+)
+from msdm_core.kernels.guard_kernels import FAR, guard_axes, near_axis, watched_distance
+from msdm_core.kernels.squeeze_kernels import hold_squeezed
+from msdm_core.kernels.structure_kernels import (
+    FAULT_CONTACT_LOST,
+    FAULT_INVERTED_TET,
+    FAULT_NONE,
+    FAULT_NOT_FINITE,
+    ContactShapes,
+    SurfaceView,
+    ToolResponse,
+    TouchedView,
+)
+from msdm_core.kernels.substep_kernels import move_shapes, push_tools
+
+# What threads tell each other within a substep: entries of `Scratch.flags`.
+INVERTED, SQUEEZED, GUARDED, NOT_FINITE, PASSED, ENTRY_COUNT, NODE_COUNT, SQUEEZED_COUNT = range(8)
+FLAG_COUNT = 8
+# Whether `Working` is in shared memory.
+SHARED = True
+
+
+class DeviceModel(NamedTuple):
+    """The constants of organs on a device, SI units; what each lane has of its own has the lane as first index.
+
+    Fields:
+        tet_nodes, tet_inverse_volume, spring_nodes, spring_rest_length, node_inverse_volume, surface_triangles,
+            surface_rest_area, foundation_position, foundation_stiffness, gravity: as in `OrganModel`
+        node_tet_count: how many tets a node has                                 (n_node,)
+        node_tets: each with its other corners, so that they turn outwards       (most, n_node, 4)
+        node_spring_count, node_springs: each with its other end                 (n_node,), (most, n_node, 2)
+        node_foundation: row of foundation_position; -1 for none                 (n_node,)
+        surface_nodes: nodes of the surface                                      (n_surface_node,)
+        facet_count, facets: triangles around each, times 3, plus the corner     (n_surface_node,), (.., most)
+        node_mass, node_inverse_mass, node_bulk: own                             (n_lane, n_node)
+        spring_stiffness: own                                                    (n_lane, n_spring)
+        tet_bulk, tet_averaged_bulk: own                                         (n_lane, n_tet)
+    """
+
+    tet_nodes: Any
+    tet_inverse_volume: Any
+    spring_nodes: Any
+    spring_rest_length: Any
+    node_inverse_volume: Any
+    surface_triangles: Any
+    surface_rest_area: Any
+    foundation_position: Any
+    foundation_stiffness: Any
+    gravity: Any
+    node_tet_count: Any
+    node_tets: Any
+    node_spring_count: Any
+    node_springs: Any
+    node_foundation: Any
+    surface_nodes: Any
+    facet_count: Any
+    facets: Any
+    node_mass: Any
+    node_inverse_mass: Any
+    node_bulk: Any
+    spring_stiffness: Any
+    tet_bulk: Any
+    tet_averaged_bulk: Any
+
+
+class DeviceState(NamedTuple):
+    """What changes while organs on a device move; as in `OrganState`, with the lane as first index."""
+
+    node_position: Any
+    node_velocity: Any
+    contact_engaged: Any
+    contact_stretch: Any
+    contact_passed: Any
+    volume_ratio_smallest: Any
+    fault: Any
+
+
+class Scratch(NamedTuple):
+    """What a block needs while it advances an organ; the block is the first index.
+
+    Fields:
+        flags: see INVERTED and on                                               (n_block, FLAG_COUNT)
+        counts: of each thread                                                   (n_block, n_thread)
+        candidates: triangles in reach of each shape, as in `OrganState`         (n_block, n_shape, n_surface)
+        entry: place of a triangle in `listed`, or -1                            (n_block, n_shape, n_surface)
+        listed: shape and triangle of each candidate                             (n_block, n_shape * n_surface, 2)
+        rows, places: as in `OrganState`                                         (n_block, n_slot, ...)
+        touched: places in surface_nodes of nodes in reach                       (n_block, n_surface_node)
+        hold: as contact_hold in `OrganState`                                    (n_block, n_node)
+        squeezed: tets that are squeezed                                         (n_block, n_tet)
+        pool: numbers of the organ, where shared memory has no room for them     (n_block, n_number)
+    """
+
+    flags: Any
+    counts: Any
+    candidates: Any
+    entry: Any
+    listed: Any
+    rows: Any
+    places: Any
+    touched: Any
+    hold: Any
+    squeezed: Any
+    pool: Any
+
+
+class Tools(NamedTuple):
+    """Tools of all lanes: `ContactShapes`, `ToolResponse` and the results, with the lane as first index.
+
+    Fields:
+        radius, tool, friction: of each shape, for all lanes                     (n_shape,)
+        ends, span, centre, twist: see ContactShapes                             (n_lane, ...)
+        acceleration, mobility, pushed, lag: see ToolResponse                    (n_lane, ...)
+        reference: centres of mass at the start of a haptic step [m]             (n_lane, n_tool, 3)
+        mean: wrench of the last haptic step [N, N m]                            (n_lane, n_tool, 6)
+    """
+
+    radius: Any
+    tool: Any
+    friction: Any
+    ends: Any
+    span: Any
+    centre: Any
+    twist: Any
+    acceleration: Any
+    mobility: Any
+    pushed: Any
+    lag: Any
+    reference: Any
+    mean: Any
+
+
+class StepNumbers(NamedTuple):
+    """Numbers of a substep: duration [s], decay exp(-alpha dt); substeps in a haptic step; haptic steps."""
+
+    dt: Any
+    decay: Any
+    substep_count: int
+    step_count: int
+
+
+class Working(NamedTuple):
+    """Numbers of the organ that a block advances: positions, velocities and forces (n_node, 3), then one per item."""
+
+    position: Any
+    velocity: Any
+    force: Any
+    tension: Any
+    tet: Any
+    spring: Any
+
+
+def working_size(nodes: int, tets: int, springs: int) -> int:
+    """How many numbers `Working` has."""
+    return 10 * nodes + tets + springs
+
+
+def _working(pool, nodes, tets, springs):
+    return Working(
+        pool[: 3 * nodes].reshape((nodes, 3)),
+        pool[3 * nodes : 6 * nodes].reshape((nodes, 3)),
+        pool[6 * nodes : 9 * nodes].reshape((nodes, 3)),
+        pool[9 * nodes : 10 * nodes],
+        pool[10 * nodes : 10 * nodes + tets],
+        pool[10 * nodes + tets : 10 * nodes + tets + springs],
+    )
+
+
+def _wait(grid):
+    """Wait for all threads that advance the organ: of the block, or of the grid."""
+    if grid is None:
+        cuda.syncthreads()
+    else:
+        grid.sync()
+
+
+def _edge(position, a, b):
+    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
+
+
+# ---- tissue -------------------------------------------------------------------------------------------------------
+
+
+def _set_volumes(first, stride, model, work):
+    """Six times the volume of each tet."""
+    for tet in range(first, model.tet_nodes.shape[0], stride):
+        a, b = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1]
+        c, d = model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
+        _, six = tet_shape(_edge(work.position, a, b), _edge(work.position, a, c), _edge(work.position, a, d))
+        work.tet[tet] = six
+
+
+def _set_tensions(first, stride, model, lane, work):
+    """Tension of the volumes averaged at nodes."""
+    for node in range(first, model.node_inverse_volume.shape[0], stride):
+        total = REAL(0.0)
+        for slot in range(model.node_tet_count[node]):
+            total += work.tet[model.node_tets[slot, node, 0]]
+        work.tension[node] = node_tension(total, model.node_inverse_volume[node], model.node_bulk[lane, node])
+
+
+def _set_scales(first, stride, model, lane, work, flags, lowest):
+    """From volumes to factors on gradients, and of each spring the factor on its edge; returns the smallest ratio."""
+    tension = work.tension
+    for tet in range(first, model.tet_nodes.shape[0], stride):
+        ratio = volume_ratio(work.tet[tet], model.tet_inverse_volume[tet])
+        if not ratio > 0.0:
+            flags[INVERTED] = 1
+        if ratio < SQUEEZED_RATIO:
+            flags[SQUEEZED] = 1
+        if not ratio >= lowest:
+            lowest = ratio
+        averaged = 0.25 * (
+            tension[model.tet_nodes[tet, 0]] + tension[model.tet_nodes[tet, 1]]
+            + tension[model.tet_nodes[tet, 2]] + tension[model.tet_nodes[tet, 3]]
+        )  # fmt: skip
+        work.tet[tet] = tet_scale(ratio, model.tet_bulk[lane, tet], model.tet_averaged_bulk[lane, tet], averaged)
+    for spring in range(first, model.spring_nodes.shape[0], stride):
+        x, y, z = _edge(work.position, model.spring_nodes[spring, 0], model.spring_nodes[spring, 1])
+        share = model.spring_rest_length[spring] / spring_length(x, y, z)
+        work.spring[spring] = spring_scale(share, model.spring_stiffness[lane, spring])
+    return lowest
+
+
+def _set_forces(first, stride, model, lane, work):
+    """Gravity, volume terms, springs and foundations, node by node."""
+    position = work.position
+    for node in range(first, position.shape[0], stride):
+        fx, fy, fz = REAL(0.0), REAL(0.0), REAL(0.0)
+        for slot in range(model.node_tet_count[node]):
+            p = model.node_tets[slot, node, 1]
+            # At any corner the gradient is the product of two edges of the face opposite.
+            g = corner_gradient(
+                _edge(position, p, model.node_tets[slot, node, 2]), _edge(position, p, model.node_tets[slot, node, 3])
+            )
+            scale = work.tet[model.node_tets[slot, node, 0]]
+            fx += scale * g[0]
+            fy += scale * g[1]
+            fz += scale * g[2]
+        for slot in range(model.node_spring_count[node]):
+            x, y, z = _edge(position, node, model.node_springs[slot, node, 1])
+            scale = work.spring[model.node_springs[slot, node, 0]]
+            fx += scale * x
+            fy += scale * y
+            fz += scale * z
+        mass = model.node_mass[lane, node]
+        fx += mass * model.gravity[0]
+        fy += mass * model.gravity[1]
+        fz += mass * model.gravity[2]
+        held = model.node_foundation[node]
+        if held >= 0:
+            stiffness = model.foundation_stiffness
+            x = position[node, 0] - model.foundation_position[held, 0]
+            y = position[node, 1] - model.foundation_position[held, 1]
+            z = position[node, 2] - model.foundation_position[held, 2]
+            fx -= stiffness[held, 0, 0] * x + stiffness[held, 0, 1] * y + stiffness[held, 0, 2] * z
+            fy -= stiffness[held, 1, 0] * x + stiffness[held, 1, 1] * y + stiffness[held, 1, 2] * z
+            fz -= stiffness[held, 2, 0] * x + stiffness[held, 2, 1] * y + stiffness[held, 2, 2] * z
+        work.force[node, 0] = fx
+        work.force[node, 1] = fy
+        work.force[node, 2] = fz
+
+
+def _integrate(first, stride, model, lane, work, numbers, flags):
+    """Symplectic Euler: v = decay v + dt f / m, x = x + dt v."""
+    for node in range(first, work.position.shape[0], stride):
+        rate = model.node_inverse_mass[lane, node] * numbers.dt
+        for axis in range(3):
+            speed = work.velocity[node, axis] * numbers.decay + work.force[node, axis] * rate
+            place = work.position[node, axis] + speed * numbers.dt
+            work.velocity[node, axis] = speed
+            work.position[node, axis] = place
+            if not math.isfinite(place + speed):
+                flags[NOT_FINITE] = 1
+
+
+# ---- lists and sums in one block ----------------------------------------------------------------------------------
+
+
+def _places(counts, own):
+    """The place of a thread's first item in a list of all threads' items in order, and the length of the list."""
+    thread, threads = cuda.threadIdx.x, cuda.blockDim.x
+    counts[thread] = own
+    cuda.syncthreads()
+    step = 1
+    while step < threads:
+        before = counts[thread - step] if thread >= step else 0
+        cuda.syncthreads()
+        counts[thread] += before
+        cuda.syncthreads()
+        step *= 2
+    end, total = counts[thread], counts[threads - 1]
+    cuda.syncthreads()
+    return end - own, total
+
+
+def _share(count):
+    """The items of a list that a thread looks at, one after the other: the first, and the one after the last."""
+    width = (count + cuda.blockDim.x - 1) // cuda.blockDim.x
+    begin = min(cuda.threadIdx.x * width, count)
+    return begin, min(begin + width, count)
+
+
+def _add_up(sums):
+    """Add up each row of `sums` over the threads of a block, in a fixed order, into its first column."""
+    thread, threads = cuda.threadIdx.x, cuda.blockDim.x
+    cuda.syncthreads()
+    step = 1
+    while step < threads:
+        if thread % (2 * step) == 0 and thread + step < threads:
+            for part in range(sums.shape[0]):
+                sums[part, thread] += sums[part, thread + step]
+        cuda.syncthreads()
+        step *= 2
+
+
+# ---- contact: one block -------------------------------------------------------------------------------------------
+
+
+def _find_candidates(model, engaged, shapes, position, duration, block, scratch):
+    """Broad phase of a haptic step: triangles in reach of each shape, in order, and the nodes around them."""
+    candidates, entry, listed = scratch.candidates[block], scratch.entry[block], scratch.listed[block]
+    counts, touched, flags = scratch.counts[block], scratch.touched[block], scratch.flags[block]
+    surface, ends, spans = model.surface_triangles, shapes.shape_ends, shapes.shape_span
+    begin, end = _share(surface.shape[0])
+    base = 0
+    for shape in range(shapes.shape_radius.shape[0]):
+        radius, margin = shapes.shape_radius[shape], reach_margin(shapes, shape, duration)
+        box = core_box(ends, spans, shape, radius + margin)
+        own = 0
+        for triangle in range(begin, end):
+            entry[shape, triangle] = -1
+            if is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius, margin, box):
+                entry[shape, triangle] = own
+                own += 1
+        before, total = _places(counts, own)
+        for triangle in range(begin, end):
+            if entry[shape, triangle] >= 0:
+                place = before + entry[shape, triangle]
+                candidates[shape, place] = triangle
+                listed[base + place, 0] = shape
+                listed[base + place, 1] = triangle
+                entry[shape, triangle] = base + place
+        if cuda.threadIdx.x == 0 and total < surface.shape[0]:
+            candidates[shape, total] = -1
+        base += total
+    cuda.syncthreads()
+    begin, end = _share(model.surface_nodes.shape[0])
+    own = 0
+    for item in range(begin, end):
+        if _is_touched(model, entry, item):
+            own += 1
+    place, total = _places(counts, own)
+    for item in range(begin, end):
+        if _is_touched(model, entry, item):
+            touched[place] = item
+            place += 1
+    if cuda.threadIdx.x == 0:
+        flags[ENTRY_COUNT] = base
+        flags[NODE_COUNT] = total
+    cuda.syncthreads()
+
+
+def _is_touched(model, entry, item):
+    """Whether a node of the surface belongs to a candidate."""
+    for place in range(model.facet_count[item]):
+        for shape in range(entry.shape[0]):
+            if entry[shape, model.facets[item, place] // 3] >= 0:
+                return True
+    return False
+
+
+def _press(model, work, engaged, stretch, shapes, law, dt, block, scratch):
+    """Pressure and friction of each point of the candidates, see `contact_kernels.add_contact_forces`."""
+    listed, rows, places = scratch.listed[block], scratch.rows[block], scratch.places[block]
+    surface, ends, spans = model.surface_triangles, shapes.shape_ends, shapes.shape_span
+    for slot in range(cuda.threadIdx.x, QUADRATURE_COUNT * scratch.flags[block, ENTRY_COUNT], cuda.blockDim.x):
+        shape, triangle = listed[slot // QUADRATURE_COUNT, 0], listed[slot // QUADRATURE_COUNT, 1]
+        places[slot, 0] = -1
+        radius = shapes.shape_radius[shape]
+        if not may_meet(work.position, surface, engaged, ends, spans, shape, triangle, radius):
+            continue
+        facet = facet_of(work.position, surface, triangle)
+        if press_point(
+            work.position, work.velocity, model.surface_rest_area, engaged, stretch, rows, places, shapes, law, dt,
+            shape, triangle, facet, slot % QUADRATURE_COUNT, slot,
+        ):  # fmt: skip
+            begin_hold(work.position, shapes, rows, places, slot)
+
+
+def _push_nodes(model, work, law, dt, sweep, block, scratch):
+    """Add to each node what its points push it with: at first (sweep -1), or what a sweep has added.
+
+    At first also what contact holds the node with.
+    """
+    entry, rows, places = scratch.entry[block], scratch.rows[block], scratch.places[block]
+    hold, touched = scratch.hold[block], scratch.touched[block]
+    along, across = hold_rates(law, dt)
+    for number in range(cuda.threadIdx.x, scratch.flags[block, NODE_COUNT], cuda.blockDim.x):
+        item = touched[number]
+        node = model.surface_nodes[item]
+        fx, fy, fz, held = REAL(0.0), REAL(0.0), REAL(0.0), REAL(0.0)
+        for place in range(model.facet_count[item]):
+            triangle, corner = model.facets[item, place] // 3, model.facets[item, place] % 3
+            for shape in range(entry.shape[0]):
+                if entry[shape, triangle] < 0:
+                    continue
+                for point in range(QUADRATURE_COUNT):
+                    slot = QUADRATURE_COUNT * entry[shape, triangle] + point
+                    if places[slot, 0] < 0:
+                        continue
+                    weight = QUADRATURE_BARYCENTRIC[point, corner]
+                    if sweep < 0:
+                        push, ux, uy, uz = first_push(rows, slot, law)
+                        held += hold_share(rows, slot, corner, weight, along, across, dt)
+                    else:
+                        push, ux, uy, uz = more_push(rows, slot, law)
+                    x, y, z = corner_force(rows, slot, corner, push, weight, ux, uy, uz)
+                    fx += x
+                    fy += y
+                    fz += z
+        work.force[node, 0] += fx
+        work.force[node, 1] += fy
+        work.force[node, 2] += fz
+        if sweep < 0:
+            hold[node] = held
+    cuda.syncthreads()
+
+
+def _guard(model, lane, work, state, shapes, response, law, dt, reference, wrench, block, scratch):
+    """The guard of the axes: each candidate is looked at, and where one is near, all are in order."""
+    listed, flags, surface = scratch.listed[block], scratch.flags[block], model.surface_triangles
+    for number in range(cuda.threadIdx.x, flags[ENTRY_COUNT], cuda.blockDim.x):
+        shape, triangle = listed[number, 0], listed[number, 1]
+        watched = watched_distance(shapes, dt, shape)
+        where, _ = near_axis(work.position, work.velocity, surface, shapes, law, dt, shape, triangle, watched)
+        if where != FAR:
+            flags[GUARDED] = 1
+    cuda.syncthreads()
+    if flags[GUARDED] != 0:
+        if cuda.threadIdx.x == 0:
+            face = SurfaceView(surface, model.surface_rest_area, model.node_inverse_mass[lane])
+            touched = TouchedView(
+                work.position, work.velocity, work.force, state.contact_engaged[lane], state.contact_stretch[lane],
+                scratch.candidates[block], scratch.rows[block], scratch.places[block], scratch.hold[block],
+                state.contact_passed[lane],
+            )  # fmt: skip
+            if not guard_axes(face, touched, shapes, law, response, dt, scratch.candidates.shape[2], reference, wrench):
+                flags[PASSED] = 1
+        cuda.syncthreads()
+
+
+def _hold(model, lane, work, stretch, shapes, law, numbers, block, scratch):
+    """Pressure and friction at the end of the substep, see `contact_kernels.hold_contact`."""
+    rows, places = scratch.rows[block], scratch.places[block]
+    slots = QUADRATURE_COUNT * scratch.flags[block, ENTRY_COUNT]
+    inverse_mass = model.node_inverse_mass[lane]
+    for slot in range(cuda.threadIdx.x, slots, cuda.blockDim.x):
+        if places[slot, 0] >= 0:
+            set_give(rows, places, scratch.hold[block], inverse_mass, slot)
+    for sweep in range(len(SWEEPS)):
+        for slot in range(cuda.threadIdx.x, slots, cuda.blockDim.x):
+            if places[slot, 0] >= 0:
+                sweep_point(
+                    work.velocity, work.force, inverse_mass, stretch, shapes, law, numbers.dt, numbers.decay, rows,
+                    places, slot, sweep,
+                )  # fmt: skip
+        cuda.syncthreads()
+        _push_nodes(model, work, law, numbers.dt, sweep, block, scratch)
+
+
+def _add_wrench(work, shapes, law, reference, wrench, block, scratch, sums):
+    """Add the reaction of all points to the wrench on their tools."""
+    thread, threads = cuda.threadIdx.x, cuda.blockDim.x
+    rows, places = scratch.rows[block], scratch.places[block]
+    for tool in range(wrench.shape[0]):
+        for part in range(6):
+            sums[part, thread] = 0.0
+        for slot in range(thread, QUADRATURE_COUNT * scratch.flags[block, ENTRY_COUNT], threads):
+            if places[slot, 0] < 0 or shapes.shape_tool[places[slot, 0]] != tool:
+                continue
+            push = rows[slot, ROW_AREA] * (rows[slot, ROW_PRESSURE] + rows[slot, ROW_MORE])
+            drag = rows[slot, ROW_AREA] * law.tangential_stiffness
+            ux = drag * (rows[slot, ROW_STRETCH] + rows[slot, ROW_MORE + 1])
+            uy = drag * (rows[slot, ROW_STRETCH + 1] + rows[slot, ROW_MORE + 2])
+            uz = drag * (rows[slot, ROW_STRETCH + 2] + rows[slot, ROW_MORE + 3])
+            for corner in range(3):
+                node = places[slot, 2 + corner]
+                weight = QUADRATURE_BARYCENTRIC[places[slot, 1] % QUADRATURE_COUNT, corner]
+                fx, fy, fz = corner_force(rows, slot, corner, push, weight, ux, uy, uz)
+                x = work.position[node, 0] - reference[tool, 0]
+                y = work.position[node, 1] - reference[tool, 1]
+                z = work.position[node, 2] - reference[tool, 2]
+                sums[0, thread] -= fx
+                sums[1, thread] -= fy
+                sums[2, thread] -= fz
+                sums[3, thread] -= y * fz - z * fy
+                sums[4, thread] -= z * fx - x * fz
+                sums[5, thread] -= x * fy - y * fx
+        _add_up(sums)
+        if thread == 0:
+            for part in range(6):
+                wrench[tool, part] += sums[part, 0]
+        cuda.syncthreads()
+
+
+def _hold_squeezed(model, lane, work, dt, block, scratch):
+    """Squeezed tets, listed in order and held one after the other, see `squeeze_kernels.hold_squeezed`."""
+    squeezed, flags = scratch.squeezed[block], scratch.flags[block]
+    begin, end = _share(model.tet_nodes.shape[0])
+    own = 0
+    for tet in range(begin, end):
+        if _is_squeezed(model, work, tet):
+            own += 1
+    place, total = _places(scratch.counts[block], own)
+    for tet in range(begin, end):
+        if _is_squeezed(model, work, tet):
+            squeezed[place] = tet
+            place += 1
+    cuda.syncthreads()
+    if cuda.threadIdx.x == 0:
+        flags[SQUEEZED_COUNT] = total
+        hold_squeezed(
+            work.position, work.velocity, work.force, model.node_inverse_mass[lane], model.tet_nodes,
+            model.tet_inverse_volume, model.tet_averaged_bulk[lane], squeezed, total, 1, dt,
+        )  # fmt: skip
+    cuda.syncthreads()
+
+
+def _is_squeezed(model, work, tet):
+    a, b, c, d = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1], model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
+    _, six = tet_shape(_edge(work.position, a, b), _edge(work.position, a, c), _edge(work.position, a, d))
+    return volume_ratio(six, model.tet_inverse_volume[tet]) < SQUEEZED_RATIO
+
+
+def _touch(model, lane, work, state, shapes, response, law, numbers, reference, wrench, block, scratch, sums):
+    """Contact, guard and squeezed tets of a substep."""
+    flags, dt = scratch.flags[block], numbers.dt
+    if flags[ENTRY_COUNT] > 0:
+        engaged, stretch = state.contact_engaged[lane], state.contact_stretch[lane]
+        _press(model, work, engaged, stretch, shapes, law, dt, block, scratch)
+        cuda.syncthreads()
+        _push_nodes(model, work, law, dt, -1, block, scratch)
+        _guard(model, lane, work, state, shapes, response, law, dt, reference, wrench, block, scratch)
+        _hold(model, lane, work, stretch, shapes, law, numbers, block, scratch)
+        _add_wrench(work, shapes, law, reference, wrench, block, scratch, sums)
+    if flags[SQUEEZED] != 0:
+        _hold_squeezed(model, lane, work, dt, block, scratch)
+
+
+# ---- haptic steps -------------------------------------------------------------------------------------------------
+
+
+def begin_tools(drive, tools, lane):
+    """What moves tools on a device does at the start of a haptic step; without it they are where the host put them."""
+
+
+def end_tools(drive, tools, state, lane):
+    """What moves tools on a device does at the end of a haptic step."""
+
+
+def _haptic_step(
+    grid, leads, first, stride, model, lane, work, state, shapes, response, law, numbers, reference, wrench, block,
+    scratch, sums, lowest,
+):  # fmt: skip
+    """The substeps of one haptic step; returns the smallest volume ratio that a thread has seen."""
+    flags, dt = scratch.flags[block], numbers.dt
+    if leads:
+        if first == 0:
+            for tool in range(wrench.shape[0]):
+                for part in range(6):
+                    wrench[tool, part] = 0.0
+                    response.tool_wrench[tool, part] = 0.0
+                    response.tool_lag[tool, part] = 0.0
+        duration = dt * REAL(numbers.substep_count)
+        _find_candidates(model, state.contact_engaged[lane], shapes, work.position, duration, block, scratch)
+    moves = True
+    for substep in range(numbers.substep_count):
+        _set_volumes(first, stride, model, work)
+        _wait(grid)
+        if first == 0:
+            # Between two waits in which no thread reads them.
+            for flag in range(PASSED + 1):
+                flags[flag] = 0
+        _set_tensions(first, stride, model, lane, work)
+        _wait(grid)
+        lowest = _set_scales(first, stride, model, lane, work, flags, lowest)
+        _wait(grid)
+        if flags[INVERTED] != 0:
+            if first == 0:
+                state.fault[lane] = FAULT_INVERTED_TET
+            moves = False
+            break
+        _set_forces(first, stride, model, lane, work)
+        _wait(grid)
+        if leads:
+            _touch(model, lane, work, state, shapes, response, law, numbers, reference, wrench, block, scratch, sums)
+        _wait(grid)
+        _integrate(first, stride, model, lane, work, numbers, flags)
+        if first == 0:
+            push_tools(shapes, response, dt, REAL(substep), wrench)
+            move_shapes(shapes, dt)
+        _wait(grid)
+        if flags[NOT_FINITE] != 0 or flags[PASSED] != 0:
+            if first == 0:
+                state.fault[lane] = FAULT_NOT_FINITE if flags[NOT_FINITE] != 0 else FAULT_CONTACT_LOST
+            moves = False
+            break
+    if leads and moves:
+        _end_step(model, lane, work, state, shapes, response, law, numbers, wrench, block, scratch)
+    _wait(grid)
+    return lowest
+
+
+def _end_step(model, lane, work, state, shapes, response, law, numbers, wrench, block, scratch):
+    """The lag of friction, and the mean wrench."""
+    listed, stretch = scratch.listed[block], state.contact_stretch[lane]
+    if law.friction > 0.0:
+        for slot in range(cuda.threadIdx.x, QUADRATURE_COUNT * scratch.flags[block, ENTRY_COUNT], cuda.blockDim.x):
+            shape, triangle = listed[slot // QUADRATURE_COUNT, 0], listed[slot // QUADRATURE_COUNT, 1]
+            point = slot % QUADRATURE_COUNT
+            if state.contact_engaged[lane, shape, triangle * QUADRATURE_COUNT + point] != 0:
+                lag_point(work.position, model.surface_triangles, stretch, shapes, response, shape, triangle, point)
+    if cuda.threadIdx.x == 0:
+        for tool in range(wrench.shape[0]):
+            for part in range(6):
+                wrench[tool, part] /= REAL(numbers.substep_count)
+
+
+def _advance(
+    grid, leads, first, stride, model, lane, work, state, tools, drive, law, numbers, block, scratch, sums
+):  # fmt: skip
+    """The haptic steps of one organ."""
+    nodes = work.position.shape[0]
+    for item in range(first, nodes, stride):
+        for axis in range(3):
+            work.position[item, axis] = state.node_position[lane, item, axis]
+            work.velocity[item, axis] = state.node_velocity[lane, item, axis]
+    shapes = ContactShapes(
+        tools.ends[lane], tools.radius, tools.tool, tools.centre[lane], tools.twist[lane], tools.span[lane],
+        tools.friction,
+    )  # fmt: skip
+    response = ToolResponse(tools.acceleration[lane], tools.mobility[lane], tools.pushed[lane], tools.lag[lane])
+    reference, wrench = tools.reference[lane], tools.mean[lane]
+    lowest = state.volume_ratio_smallest[lane]
+    for _ in range(numbers.step_count):
+        if first == 0:
+            begin_tools(drive, tools, lane)
+            for tool in range(reference.shape[0]):
+                for axis in range(3):
+                    reference[tool, axis] = shapes.tool_centre[tool, axis]
+        _wait(grid)
+        lowest = _haptic_step(
+            grid, leads, first, stride, model, lane, work, state, shapes, response, law, numbers, reference, wrench,
+            block, scratch, sums, lowest,
+        )  # fmt: skip
+        if first == 0:
+            end_tools(drive, tools, state, lane)
+        _wait(grid)
+        if state.fault[lane] != FAULT_NONE:
+            break
+    for item in range(first, nodes, stride):
+        for axis in range(3):
+            state.node_position[lane, item, axis] = work.position[item, axis]
+            state.node_velocity[lane, item, axis] = work.velocity[item, axis]
+    _keep_lowest(state, lane, lowest)
+
+
+def _keep_lowest(state, lane, lowest):
+    """The smallest of what all threads have seen: a minimum is the same in any order."""
+    if not lowest >= state.volume_ratio_smallest[lane]:
+        cuda.atomic.min(state.volume_ratio_smallest, lane, lowest)
+
+
+def advance_lanes(model, state, scratch, tools, drive, law, numbers):
+    """Advance each organ that has no fault; a block takes one after the other."""
+    block, thread, threads = cuda.blockIdx.x, cuda.threadIdx.x, cuda.blockDim.x
+    pool = cuda.shared.array(0, REAL_TYPE)
+    sums = pool[: 6 * threads].reshape((6, threads))
+    nodes, tets, springs = state.node_position.shape[1], model.tet_nodes.shape[0], model.spring_nodes.shape[0]
+    if SHARED:
+        work = _working(pool[6 * threads :], nodes, tets, springs)
+    else:
+        work = _working(scratch.pool[block], nodes, tets, springs)
+    for lane in range(block, state.fault.shape[0], cuda.gridDim.x):
+        if state.fault[lane] == FAULT_NONE:
+            _advance(
+                None, True, thread, threads, model, lane, work, state, tools, drive, law, numbers, block, scratch, sums
+            )
+        cuda.syncthreads()
+
+
+def advance_organ(model, state, scratch, tools, drive, law, numbers):
+    """Advance one organ by all blocks together, whose first does contact."""
+    threads = cuda.blockDim.x
+    pool = cuda.shared.array(0, REAL_TYPE)
+    sums = pool[: 6 * threads].reshape((6, threads))
+    nodes, tets, springs = state.node_position.shape[1], model.tet_nodes.shape[0], model.spring_nodes.shape[0]
+    work = _working(scratch.pool[0], nodes, tets, springs)
+    if state.fault[0] == FAULT_NONE:
+        _advance(
+            cuda.cg.this_grid(), cuda.blockIdx.x == 0, cuda.grid(1), cuda.gridsize(1), model, 0, work, state, tools,
+            drive, law, numbers, 0, scratch, sums,
+        )  # fmt: skip
+
+
+# ---- what a control step shows ------------------------------------------------------------------------------------
+
+
+def look(model, state, rest_position, centre, inverted):
+    """Of each organ the area and the centre of its contact patch at rest, and whether a tet is inverted now.
+
+    Out: centre: area [m^2], and area times place [m^3] (n_lane, 4), inverted (n_lane,)
+    """
+    block, thread, threads = cuda.blockIdx.x, cuda.threadIdx.x, cuda.blockDim.x
+    pool = cuda.shared.array(0, REAL_TYPE)
+    sums = pool[: 4 * threads].reshape((4, threads))
+    for lane in range(block, state.fault.shape[0], cuda.gridDim.x):
+        if thread == 0:
+            inverted[lane] = 0
+        for part in range(4):
+            sums[part, thread] = 0.0
+        cuda.syncthreads()
+        position = state.node_position[lane]
+        for tet in range(thread, model.tet_nodes.shape[0], threads):
+            a, b = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1]
+            c, d = model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
+            _, six = tet_shape(_edge(position, a, b), _edge(position, a, c), _edge(position, a, d))
+            if not six > 0.0:
+                inverted[lane] = 1
+        for item in range(thread, QUADRATURE_COUNT * model.surface_triangles.shape[0], threads):
+            held = False
+            for shape in range(state.contact_engaged.shape[1]):
+                if state.contact_engaged[lane, shape, item] != 0:
+                    held = True
+            if held:
+                triangle, point = item // QUADRATURE_COUNT, item % QUADRATURE_COUNT
+                area = model.surface_rest_area[triangle]
+                sums[0, thread] += area
+                for corner in range(3):
+                    node = model.surface_triangles[triangle, corner]
+                    weight = area * QUADRATURE_BARYCENTRIC[point, corner]
+                    for axis in range(3):
+                        sums[1 + axis, thread] += weight * rest_position[node, axis]
+        _add_up(sums)
+        if thread == 0:
+            for part in range(4):
+                centre[lane, part] = sums[part, 0]
+        cuda.syncthreads()

@@ -1,0 +1,321 @@
+"""Organs of one mesh side by side on a CUDA device: their arrays there, and the calls that advance them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from cuda.bindings import driver
+from numba import config, cuda
+from numpy.typing import NDArray
+
+from msdm_core.arithmetic import exp
+from msdm_core.cuda.device_functions import DeviceFunctions
+from msdm_core.cuda.organ_kernels import (
+    FLAG_COUNT,
+    DeviceModel,
+    DeviceState,
+    Scratch,
+    StepNumbers,
+    Tools,
+    advance_lanes,
+    advance_organ,
+    look,
+    working_size,
+)
+from msdm_core.errors import OrganError
+from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
+from msdm_core.kernels.structure_kernels import (
+    FAULT_NONE,
+    LANE_EMPTY,
+    ContactLaw,
+    ContactShapes,
+    OrganModel,
+    OrganState,
+)
+from msdm_core.organ.compile import rest_state
+
+# Fields of a model that each lane has of its own.
+OWN = ("node_mass", "node_inverse_mass", "node_bulk", "spring_stiffness", "tet_bulk", "tet_averaged_bulk")
+KEPT = ("node_position", "node_velocity", "contact_engaged", "contact_stretch", "contact_passed")
+# Threads of a block.
+THREADS = 512
+
+
+def check_device() -> None:
+    """Refuse to go on without a CUDA device.
+
+    Raises:
+        RuntimeError: there is none, or no driver or compiler for it.
+    """
+    if not cuda.is_available():
+        raise RuntimeError(
+            "no CUDA device can be used: `nvidia-smi` must list one, and CUDA's compiler must be there, such as by "
+            'pip install "numba-cuda[cu13]"; device="cpu" needs neither'
+        )
+
+
+def shared_memory() -> int:
+    """Largest shared memory of a block [bytes]; of the simulator, that of most devices."""
+    if config.ENABLE_CUDASIM:
+        return 2**16
+    return cuda.get_current_device().MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
+
+
+def multiprocessors() -> int:
+    """How many multiprocessors the device has; the simulator has one."""
+    return 1 if config.ENABLE_CUDASIM else cuda.get_current_device().MULTIPROCESSOR_COUNT
+
+
+def with_shared_memory(kernel: Any, given: tuple[Any, ...], size: int) -> Any:
+    """A kernel compiled for some arguments, which may take more shared memory than 48 KiB."""
+    if config.ENABLE_CUDASIM:
+        return kernel
+    special = kernel.specialize(*given)
+    compiled = next(iter(special.overloads.values()))._codelibrary.get_cufunc()
+    attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+    handle, device = driver.CUkernel(int(compiled.handle)), cuda.get_current_device().id
+    (code,) = driver.cuKernelSetAttribute(attribute, size, handle, device)
+    if code != driver.CUresult.CUDA_SUCCESS:
+        raise RuntimeError(f"the device refuses {size} bytes of shared memory for a block: {code!r}")
+    return special
+
+
+def incidence(items: NDArray[np.integer], count: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """How many items (n, m) have each node, and which entries of `items.ravel()` they are: (count,), (count, most)."""
+    nodes = items.ravel()
+    order = np.argsort(nodes, kind="stable")
+    number = np.bincount(nodes, minlength=count)
+    places = np.arange(len(nodes)) - np.repeat(np.cumsum(number) - number, number)
+    entries = np.zeros((count, number.max()), dtype=np.int64)
+    entries[nodes[order], places] = order
+    return number.astype(np.int32), entries
+
+
+def topology(organ: OrganModel, dtype: Any) -> dict[str, NDArray]:
+    """The fields of `DeviceModel` that lanes share."""
+    nodes, tets, springs = len(organ.node_mass), organ.tet_nodes, organ.spring_nodes
+    index = np.uint16 if max(nodes, len(tets), len(springs)) < 2**16 else np.int32
+    tet_count, tet_entries = incidence(tets, nodes)
+    # The face opposite to each corner, which its gradient turns around: of a, b, c, d.
+    opposite = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]])
+    which, corner = tet_entries // 4, tet_entries % 4
+    node_tets = np.concatenate([which[..., None], tets[which[..., None], opposite[corner]]], axis=2)
+    spring_count, spring_entries = incidence(springs, nodes)
+    which, end = spring_entries // 2, spring_entries % 2
+    node_springs = np.stack([which, springs[which, 1 - end]], axis=2)
+    facet_count, facets = incidence(organ.surface_triangles, nodes)
+    outer = np.flatnonzero(facet_count)
+    foundation = np.full(nodes, -1, dtype=np.int32)
+    foundation[organ.foundation_nodes] = np.arange(len(organ.foundation_nodes))
+    return {
+        "tet_nodes": tets.astype(index),
+        "tet_inverse_volume": organ.tet_inverse_volume.astype(dtype),
+        "spring_nodes": springs.astype(index),
+        "spring_rest_length": organ.spring_rest_length.astype(dtype),
+        "node_inverse_volume": organ.node_inverse_volume.astype(dtype),
+        "surface_triangles": organ.surface_triangles.astype(np.int32),
+        "surface_rest_area": organ.surface_rest_area.astype(dtype),
+        "foundation_position": organ.foundation_position.astype(dtype),
+        "foundation_stiffness": organ.foundation_stiffness.astype(dtype),
+        "gravity": organ.gravity.astype(dtype),
+        "node_tet_count": tet_count,
+        "node_tets": np.ascontiguousarray(node_tets.transpose(1, 0, 2).astype(index)),
+        "node_spring_count": spring_count,
+        "node_springs": np.ascontiguousarray(node_springs.transpose(1, 0, 2).astype(index)),
+        "node_foundation": foundation,
+        "surface_nodes": outer.astype(np.int32),
+        "facet_count": facet_count[outer],
+        "facets": facets[outer].astype(np.int32),
+    }
+
+
+def check_organ(organ: OrganModel) -> None:
+    """Refuse an organ with parts that a device does not compute.
+
+    Raises:
+        OrganError: names the part.
+    """
+    parts = {
+        "springs that stiffen": organ.stiffens,
+        "springs that relax": organ.relaxes,
+        "supports": len(organ.support_kind) > 0,
+        "a ground that moves": len(organ.motion_node_shift) > 0,
+        "Rayleigh's beta": organ.beta > 0.0,
+    }
+    if there := [name for name, value in parts.items() if value]:
+        raise OrganError(f'a CUDA device does not compute {there[0]}: advance this organ with device="cpu"')
+
+
+class DeviceOrgans:
+    """Organs of one mesh on a device, each with its moduli, masses, state and tools.
+
+    One haptic step or several are one launch: a block of threads advances an organ, or all blocks one organ.
+    """
+
+    def __init__(
+        self,
+        organ: OrganModel,
+        lane_count: int,
+        shapes: ContactShapes,
+        contact: ContactLaw,
+        dt: float,
+        substep_count: int,
+        *,
+        dtype: Any = np.float32,
+        threads: int = THREADS,
+        block_count: int | None = None,
+        tool_functions: tuple[Callable[..., None], Callable[..., None]] | None = None,
+        share: "DeviceOrgans | None" = None,
+    ) -> None:
+        """Take arrays on the device; all lanes are empty until `put`.
+
+        Args:
+            organ: with the mesh, anchors and foundations of all lanes.
+            lane_count: how many organs.
+            shapes: of the tools of one lane.
+            contact: law of all lanes.
+            dt: substep [s].
+            substep_count: substeps in a haptic step.
+            dtype: np.float32 or np.float64.
+            threads: of a block, a power of 2.
+            block_count: blocks; by default as many as the device runs at a time, at most one for each lane.
+            tool_functions: `begin_tools` and `end_tools` of organ_kernels, for tools that move on the device.
+            share: other organs of the same mesh, whose shared arrays and kernels these take.
+
+        Raises:
+            RuntimeError: there is no CUDA device.
+            OrganError: parts of an organ that a device does not compute.
+        """
+        check_device()
+        check_organ(organ)
+        self.organ, self.dtype, self.threads = organ, np.dtype(dtype).type, threads
+        real = self.dtype
+        nodes, tets, springs = len(organ.node_mass), len(organ.tet_nodes), len(organ.spring_nodes)
+        self._shape_count, tools = len(shapes.shape_radius), len(shapes.tool_centre)
+        surface, shape_count = len(organ.surface_triangles), self._shape_count
+        size = np.dtype(real).itemsize
+        self._room = working_size(nodes, tets, springs)
+        sums = 6 * threads * size
+        limit = shared_memory()
+        self.is_shared = lane_count > 1 and sums + self._room * size <= limit
+        self.shared_bytes = sums + (self._room * size if self.is_shared else 0)
+        if block_count is None:
+            block_count = multiprocessors() * (max(1, limit // (self.shared_bytes + 1024)) if lane_count > 1 else 1)
+        self.block_count = min(block_count, lane_count) if lane_count > 1 else block_count
+        blocks = self.block_count if lane_count > 1 else 1
+
+        def zeros(*shape: int, dtype: Any = real) -> Any:
+            return cuda.to_device(np.zeros(shape, dtype=dtype))
+
+        common = topology(organ, real) if share is None else None
+        shared = {name: cuda.to_device(array) for name, array in common.items()} if common is not None else {}
+        if share is not None:
+            shared = {name: getattr(share.model, name) for name in DeviceModel._fields if name not in OWN}
+        own = {name: zeros(lane_count, len(getattr(organ, name))) for name in OWN}
+        self.model = DeviceModel(**shared, **own)
+        self.state = DeviceState(
+            node_position=zeros(lane_count, nodes, 3),
+            node_velocity=zeros(lane_count, nodes, 3),
+            contact_engaged=zeros(lane_count, shape_count, surface * QUADRATURE_COUNT, dtype=np.uint8),
+            contact_stretch=zeros(lane_count, shape_count, surface * QUADRATURE_COUNT, 3),
+            contact_passed=zeros(lane_count, 2, dtype=np.int32),
+            volume_ratio_smallest=zeros(lane_count),
+            fault=cuda.to_device(np.full(lane_count, LANE_EMPTY, dtype=np.int32)),
+        )
+        slots = shape_count * surface
+        self.scratch = Scratch(
+            flags=zeros(blocks, FLAG_COUNT, dtype=np.int32),
+            counts=zeros(blocks, threads, dtype=np.int32),
+            candidates=zeros(blocks, shape_count, surface, dtype=np.int32),
+            entry=zeros(blocks, shape_count, surface, dtype=np.int32),
+            listed=zeros(blocks, slots, 2, dtype=np.int32),
+            rows=zeros(blocks, QUADRATURE_COUNT * slots, ROW_WIDTH),
+            places=zeros(blocks, QUADRATURE_COUNT * slots, PLACE_WIDTH, dtype=np.int32),
+            touched=zeros(blocks, len(self.model.surface_nodes), dtype=np.int32),
+            hold=zeros(blocks, nodes),
+            squeezed=zeros(blocks, tets, dtype=np.int32),
+            pool=zeros(blocks, 1 if self.is_shared else self._room),
+        )
+        self.tools = Tools(
+            radius=cuda.to_device(shapes.shape_radius.astype(real)),
+            tool=cuda.to_device(shapes.shape_tool.astype(np.int32)),
+            friction=cuda.to_device(shapes.shape_friction.astype(real)),
+            ends=zeros(lane_count, shape_count, 2, 3),
+            span=zeros(lane_count, shape_count, 3),
+            centre=zeros(lane_count, tools, 3),
+            twist=zeros(lane_count, tools, 6),
+            acceleration=zeros(lane_count, tools, 6),
+            mobility=zeros(lane_count, tools, tools, 6, 6),
+            pushed=zeros(lane_count, tools, 6),
+            lag=zeros(lane_count, tools, 6),
+            reference=zeros(lane_count, tools, 3),
+            mean=zeros(lane_count, tools, 6),
+        )
+        self.centre, self.inverted = zeros(lane_count, 4), zeros(lane_count, dtype=np.int32)
+        self._rest = cuda.to_device(organ.node_rest_position.astype(real))
+        self.law = ContactLaw(*(real(value) for value in contact))
+        self._numbers = (real(dt), real(exp(-organ.alpha * dt)), substep_count)
+        self.lane_count = lane_count
+        self._ready: Any = None
+        if share is not None:
+            self._kernel, self._look, self._ready = share._kernel, share._look, share._ready
+        else:
+            names = {"SHARED": self.is_shared}
+            if tool_functions is not None:
+                names |= dict(zip(("begin_tools", "end_tools"), tool_functions, strict=True))
+            functions = DeviceFunctions(real, **names)
+            self._kernel = cuda.jit(functions.typed(advance_organ if lane_count == 1 else advance_lanes))
+            self._look = cuda.jit(functions.typed(look))
+
+    def put(self, lane: int, organ: OrganModel, state: OrganState | None = None, stream: Any = 0) -> None:
+        """Put an organ of the same mesh into a lane, in a state; at rest by default."""
+        if state is None:
+            state = rest_state(organ, shape_count=self._shape_count)
+        for name in OWN:
+            self._write(getattr(self.model, name), lane, getattr(organ, name), stream)
+        for name in KEPT:
+            self._write(getattr(self.state, name), lane, getattr(state, name), stream)
+        self._write(self.state.volume_ratio_smallest, slice(lane, lane + 1), state.volume_ratio_smallest, stream)
+        self._write(self.state.fault, slice(lane, lane + 1), np.array([FAULT_NONE]), stream)
+
+    @staticmethod
+    def _write(array: Any, place: Any, values: NDArray, stream: Any = 0) -> None:
+        array[place].copy_to_device(np.ascontiguousarray(values.astype(array.dtype)), stream=stream)
+
+    def get(self, lane: int, state: OrganState) -> OrganState:
+        """The state of a lane as that of an organ alone; `state` has its arrays."""
+        read = {name: getattr(self.state, name)[lane].copy_to_host() for name in KEPT}
+        read = {name: array.astype(getattr(state, name).dtype) for name, array in read.items()}
+        lowest = self.state.volume_ratio_smallest.copy_to_host()[lane : lane + 1].astype(np.float64)
+        fault = self.state.fault.copy_to_host()[lane : lane + 1]
+        return state._replace(**read, volume_ratio_smallest=lowest, lane_fault=fault)
+
+    def put_tools(self, lane_shapes: ContactShapes, response: Any, stream: Any = 0) -> None:
+        """Where the tools of all lanes are, and how they yield: as of `advance_lanes`, the lane as first index."""
+        pairs = {
+            "ends": lane_shapes.shape_ends,
+            "span": lane_shapes.shape_span,
+            "centre": lane_shapes.tool_centre,
+            "twist": lane_shapes.tool_twist,
+            "acceleration": response.tool_acceleration,
+            "mobility": response.tool_mobility,
+        }
+        for name, values in pairs.items():
+            getattr(self.tools, name).copy_to_device(values.astype(self.dtype), stream=stream)
+
+    def advance(self, step_count: int = 1, drive: Any = None, stream: Any = 0) -> None:
+        """Advance all lanes that have no fault by some haptic steps; returns before they are done."""
+        dt, decay, substeps = self._numbers
+        given = (
+            self.model, self.state, self.scratch, self.tools, drive, self.law,
+            StepNumbers(dt, decay, substeps, step_count),
+        )  # fmt: skip
+        if self._ready is None:
+            self._ready = with_shared_memory(self._kernel, given, self.shared_bytes)
+        self._ready[self.block_count, self.threads, stream, self.shared_bytes](*given)
+
+    def look(self, stream: Any = 0) -> None:
+        """Compute `centre` and `inverted` of all lanes."""
+        shared = 4 * self.threads * np.dtype(self.dtype).itemsize
+        blocks = min(self.lane_count, 4 * multiprocessors())
+        self._look[blocks, self.threads, stream, shared](self.model, self.state, self._rest, self.centre, self.inverted)

@@ -50,7 +50,7 @@ class DeviceFunctions:
     def __call__(self, function: Any) -> Any:
         """The device function of a kernel's function: a plain one, or one that is compiled for the processor."""
         if function not in self._made:
-            self._made[function] = cuda.jit(device=True)(self.typed(function))
+            self._made[function] = cuda.jit(device=True, forceinline=True)(self.typed(function))
         return self._made[function]
 
     def typed(self, function: Any) -> FunctionType:

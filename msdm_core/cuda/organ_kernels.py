@@ -201,17 +201,6 @@ def working_size(nodes: int, tets: int, springs: int) -> int:
     return 10 * nodes + tets + springs
 
 
-def _working(pool, nodes, tets, springs):
-    return Working(
-        pool[: 3 * nodes].reshape((nodes, 3)),
-        pool[3 * nodes : 6 * nodes].reshape((nodes, 3)),
-        pool[6 * nodes : 9 * nodes].reshape((nodes, 3)),
-        pool[9 * nodes : 10 * nodes],
-        pool[10 * nodes : 10 * nodes + tets],
-        pool[10 * nodes + tets : 10 * nodes + tets + springs],
-    )
-
-
 def _wait(grid):
     """Wait for all threads that advance the organ: of the block, or of the grid."""
     if grid is None:
@@ -674,10 +663,20 @@ def _end_step(model, lane, work, state, shapes, response, law, numbers, wrench, 
 
 
 def _advance(
-    grid, leads, first, stride, model, lane, work, state, tools, drive, law, numbers, block, scratch, sums
+    grid, leads, first, stride, model, lane, pool, state, tools, drive, law, numbers, block, scratch, shared
 ):  # fmt: skip
-    """The haptic steps of one organ."""
-    nodes = work.position.shape[0]
+    """The haptic steps of one organ; its numbers are in `pool`, sums of threads in `shared`."""
+    nodes, tets, springs = state.node_position.shape[1], model.tet_nodes.shape[0], model.spring_nodes.shape[0]
+    # A device function cannot return a view of an array.
+    work = Working(
+        pool[: 3 * nodes].reshape((nodes, 3)),
+        pool[3 * nodes : 6 * nodes].reshape((nodes, 3)),
+        pool[6 * nodes : 9 * nodes].reshape((nodes, 3)),
+        pool[9 * nodes : 10 * nodes],
+        pool[10 * nodes : 10 * nodes + tets],
+        pool[10 * nodes + tets : 10 * nodes + tets + springs],
+    )
+    sums = shared.reshape((6, shared.shape[0] // 6))
     for item in range(first, nodes, stride):
         for axis in range(3):
             work.position[item, axis] = state.node_position[lane, item, axis]
@@ -721,32 +720,24 @@ def _keep_lowest(state, lane, lowest):
 def advance_lanes(model, state, scratch, tools, drive, law, numbers):
     """Advance each organ that has no fault; a block takes one after the other."""
     block, thread, threads = cuda.blockIdx.x, cuda.threadIdx.x, cuda.blockDim.x
-    pool = cuda.shared.array(0, REAL_TYPE)
-    sums = pool[: 6 * threads].reshape((6, threads))
-    nodes, tets, springs = state.node_position.shape[1], model.tet_nodes.shape[0], model.spring_nodes.shape[0]
-    if SHARED:
-        work = _working(pool[6 * threads :], nodes, tets, springs)
-    else:
-        work = _working(scratch.pool[block], nodes, tets, springs)
+    shared = cuda.shared.array(0, REAL_TYPE)
+    pool = shared[6 * threads :] if SHARED else scratch.pool[block]
     for lane in range(block, state.fault.shape[0], cuda.gridDim.x):
         if state.fault[lane] == FAULT_NONE:
             _advance(
-                None, True, thread, threads, model, lane, work, state, tools, drive, law, numbers, block, scratch, sums
-            )
+                None, True, thread, threads, model, lane, pool, state, tools, drive, law, numbers, block, scratch,
+                shared[: 6 * threads],
+            )  # fmt: skip
         cuda.syncthreads()
 
 
 def advance_organ(model, state, scratch, tools, drive, law, numbers):
     """Advance one organ by all blocks together, whose first does contact."""
-    threads = cuda.blockDim.x
-    pool = cuda.shared.array(0, REAL_TYPE)
-    sums = pool[: 6 * threads].reshape((6, threads))
-    nodes, tets, springs = state.node_position.shape[1], model.tet_nodes.shape[0], model.spring_nodes.shape[0]
-    work = _working(scratch.pool[0], nodes, tets, springs)
+    shared = cuda.shared.array(0, REAL_TYPE)
     if state.fault[0] == FAULT_NONE:
         _advance(
-            cuda.cg.this_grid(), cuda.blockIdx.x == 0, cuda.grid(1), cuda.gridsize(1), model, 0, work, state, tools,
-            drive, law, numbers, 0, scratch, sums,
+            cuda.cg.this_grid(), cuda.blockIdx.x == 0, cuda.grid(1), cuda.gridsize(1), model, 0, scratch.pool[0],
+            state, tools, drive, law, numbers, 0, scratch, shared[: 6 * cuda.blockDim.x],
         )  # fmt: skip
 
 
@@ -759,8 +750,8 @@ def look(model, state, rest_position, centre, inverted):
     Out: centre: area [m^2], and area times place [m^3] (n_lane, 4), inverted (n_lane,)
     """
     block, thread, threads = cuda.blockIdx.x, cuda.threadIdx.x, cuda.blockDim.x
-    pool = cuda.shared.array(0, REAL_TYPE)
-    sums = pool[: 4 * threads].reshape((4, threads))
+    shared = cuda.shared.array(0, REAL_TYPE)[: 4 * threads]
+    sums = shared.reshape((4, shared.shape[0] // 4))
     for lane in range(block, state.fault.shape[0], cuda.gridDim.x):
         if thread == 0:
             inverted[lane] = 0

@@ -37,8 +37,8 @@ from msdm_core.organ.compile import rest_state
 # Fields of a model that each lane has of its own.
 OWN = ("node_mass", "node_inverse_mass", "node_bulk", "spring_stiffness", "tet_bulk", "tet_averaged_bulk")
 KEPT = ("node_position", "node_velocity", "contact_engaged", "contact_stretch", "contact_passed")
-# Threads of a block.
-THREADS = 512
+# Threads of a block, and registers of a multiprocessor.
+THREADS, REGISTERS = 512, 2**16
 
 
 def check_device() -> None:
@@ -163,6 +163,7 @@ class DeviceOrgans:
         *,
         dtype: Any = np.float32,
         threads: int = THREADS,
+        registers: int | None = None,
         block_count: int | None = None,
         tool_functions: tuple[Callable[..., None], Callable[..., None]] | None = None,
         share: "DeviceOrgans | None" = None,
@@ -178,6 +179,7 @@ class DeviceOrgans:
             substep_count: substeps in a haptic step.
             dtype: np.float32 or np.float64.
             threads: of a block, a power of 2.
+            registers: of a thread; as many as a multiprocessor has for one block by default.
             block_count: blocks; by default as many as the device runs at a time, at most one for each lane.
             tool_functions: `begin_tools` and `end_tools` of organ_kernels, for tools that move on the device.
             share: other organs of the same mesh, whose shared arrays and kernels these take.
@@ -264,7 +266,8 @@ class DeviceOrgans:
             if tool_functions is not None:
                 names |= dict(zip(("begin_tools", "end_tools"), tool_functions, strict=True))
             functions = DeviceFunctions(real, **names)
-            self._kernel = cuda.jit(functions.typed(advance_organ if lane_count == 1 else advance_lanes))
+            options = {"max_registers": registers or min(255, REGISTERS // threads)}
+            self._kernel = cuda.jit(functions.typed(advance_organ if lane_count == 1 else advance_lanes), **options)
             self._look = cuda.jit(functions.typed(look))
 
     def put(self, lane: int, organ: OrganModel, state: OrganState | None = None, stream: Any = 0) -> None:

@@ -34,6 +34,7 @@ ORDER = {
             "meshing",
             "organ",
             "lanes",
+            "cuda",
         ),
         "__init__",
     ),

@@ -9,7 +9,7 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
-from numba import cuda, from_dtype, types
+from numba import config, cuda, from_dtype, types
 
 from msdm_core.kernels import vector_kernels
 
@@ -29,6 +29,9 @@ def _any_below(value, limit):
     return value < limit
 
 
+# Whether numba simulates devices, NUMBA_ENABLE_CUDASIM.
+SIMULATED = bool(config.ENABLE_CUDASIM)  # pyright: ignore[reportAttributeAccessIssue]
+
 # Functions of vector registers for one number.
 SCALAR: dict[Any, Any] = {
     vector_kernels.root: math.sqrt,
@@ -36,6 +39,11 @@ SCALAR: dict[Any, Any] = {
     vector_kernels.below_zero: _below_zero,
     vector_kernels.any_below: _any_below,
 }
+
+
+def _known(**options: Any) -> dict[str, Any]:
+    """Options of `cuda.jit`; the simulator knows none of these."""
+    return {} if SIMULATED else options
 
 
 class DeviceFunctions:
@@ -50,8 +58,12 @@ class DeviceFunctions:
     def __call__(self, function: Any) -> Any:
         """The device function of a kernel's function: a plain one, or one that is compiled for the processor."""
         if function not in self._made:
-            self._made[function] = cuda.jit(device=True, forceinline=True)(self.typed(function))
+            self._made[function] = cuda.jit(device=True, **_known(forceinline=True))(self.typed(function))
         return self._made[function]
+
+    def kernel(self, function: Any, registers: int | None = None) -> Any:
+        """The kernel of a plain function, whose threads have at most so many registers."""
+        return cuda.jit(**_known(max_registers=registers))(self.typed(function))
 
     def typed(self, function: Any) -> FunctionType:
         """A plain function whose constants are of the type, and whose callees are device functions."""

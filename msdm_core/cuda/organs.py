@@ -1,16 +1,15 @@
 """Organs of one mesh side by side on a CUDA device: their arrays there, and the calls that advance them."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from cuda.bindings import driver
-from numba import config, cuda
+from numba import cuda
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import exp
-from msdm_core.cuda.device_functions import DeviceFunctions
-from msdm_core.cuda.organ_kernels import (
+from msdm_core.cuda.device_functions import SIMULATED, DeviceFunctions
+from msdm_core.cuda.organ_steps import (
     FLAG_COUNT,
     DeviceModel,
     DeviceState,
@@ -56,19 +55,19 @@ def check_device() -> None:
 
 def shared_memory() -> int:
     """Largest shared memory of a block [bytes]; of the simulator, that of most devices."""
-    if config.ENABLE_CUDASIM:
+    if SIMULATED:
         return 2**16
     return cuda.get_current_device().MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
 
 
 def multiprocessors() -> int:
     """How many multiprocessors the device has; the simulator has one."""
-    return 1 if config.ENABLE_CUDASIM else cuda.get_current_device().MULTIPROCESSOR_COUNT
+    return 1 if SIMULATED else cuda.get_current_device().MULTIPROCESSOR_COUNT
 
 
 def with_shared_memory(kernel: Any, given: tuple[Any, ...], size: int) -> Any:
     """A kernel compiled for some arguments, which may take more shared memory than 48 KiB."""
-    if config.ENABLE_CUDASIM:
+    if SIMULATED:
         return kernel
     special = kernel.specialize(*given)
     compiled = next(iter(special.overloads.values()))._codelibrary.get_cufunc()
@@ -146,6 +145,80 @@ def check_organ(organ: OrganModel) -> None:
         raise OrganError(f'a CUDA device does not compute {there[0]}: advance this organ with device="cpu"')
 
 
+class DeviceArrays(NamedTuple):
+    """The arrays of organs on a device, as they are made on the host: no organ is in any lane."""
+
+    model: DeviceModel
+    state: DeviceState
+    scratch: Scratch
+    tools: Tools
+
+    @classmethod
+    def of(
+        cls, organ: OrganModel, lanes: int, shapes: ContactShapes, dtype: Any, *, blocks: int, threads: int, room: int
+    ) -> "DeviceArrays":
+        """Arrays for organs with the mesh of one; `room` numbers of each block are outside of shared memory."""
+        nodes, tets = len(organ.node_mass), len(organ.tet_nodes)
+        surface, shape_count, tools = len(organ.surface_triangles), len(shapes.shape_radius), len(shapes.tool_centre)
+        slots = shape_count * surface
+        points = QUADRATURE_COUNT * slots
+
+        def zeros(*shape: int, dtype: Any = dtype) -> NDArray:
+            return np.zeros(shape, dtype=dtype)
+
+        def whole(*shape: int) -> NDArray:
+            return zeros(*shape, dtype=np.int32)
+
+        model = DeviceModel(**topology(organ, dtype), **{name: zeros(lanes, len(getattr(organ, name))) for name in OWN})
+        state = DeviceState(
+            node_position=zeros(lanes, nodes, 3),
+            node_velocity=zeros(lanes, nodes, 3),
+            contact_engaged=zeros(lanes, shape_count, surface * QUADRATURE_COUNT, dtype=np.uint8),
+            contact_stretch=zeros(lanes, shape_count, surface * QUADRATURE_COUNT, 3),
+            contact_passed=whole(lanes, 2),
+            volume_ratio_smallest=zeros(lanes),
+            fault=np.full(lanes, LANE_EMPTY, dtype=np.int32),
+        )
+        scratch = Scratch(
+            flags=whole(blocks, FLAG_COUNT),
+            counts=whole(blocks, threads),
+            candidates=whole(blocks, shape_count, surface),
+            entry=whole(blocks, shape_count, surface),
+            listed=whole(blocks, slots, 2),
+            rows=zeros(blocks, points, ROW_WIDTH),
+            places=whole(blocks, points, PLACE_WIDTH),
+            touched=whole(blocks, len(model.surface_nodes)),
+            hold=zeros(blocks, nodes),
+            squeezed=whole(blocks, tets),
+            pool=zeros(blocks, room),
+        )
+        return cls(
+            model,
+            state,
+            scratch,
+            Tools(
+                radius=shapes.shape_radius.astype(dtype),
+                tool=shapes.shape_tool.astype(np.int32),
+                friction=shapes.shape_friction.astype(dtype),
+                ends=zeros(lanes, shape_count, 2, 3),
+                span=zeros(lanes, shape_count, 3),
+                centre=zeros(lanes, tools, 3),
+                twist=zeros(lanes, tools, 6),
+                acceleration=zeros(lanes, tools, 6),
+                mobility=zeros(lanes, tools, tools, 6, 6),
+                pushed=zeros(lanes, tools, 6),
+                lag=zeros(lanes, tools, 6),
+                reference=zeros(lanes, tools, 3),
+                mean=zeros(lanes, tools, 6),
+            ),
+        )
+
+
+def _on_device(record: Any) -> Any:
+    """A record of arrays with copies of them on the device."""
+    return type(record)(*(cuda.to_device(array) for array in record))
+
+
 class DeviceOrgans:
     """Organs of one mesh on a device, each with its moduli, masses, state and tools.
 
@@ -165,8 +238,6 @@ class DeviceOrgans:
         threads: int = THREADS,
         registers: int | None = None,
         block_count: int | None = None,
-        tool_functions: tuple[Callable[..., None], Callable[..., None]] | None = None,
-        share: "DeviceOrgans | None" = None,
     ) -> None:
         """Take arrays on the device; all lanes are empty until `put`.
 
@@ -181,8 +252,6 @@ class DeviceOrgans:
             threads: of a block, a power of 2.
             registers: of a thread; as many as a multiprocessor has for one block by default.
             block_count: blocks; by default as many as the device runs at a time, at most one for each lane.
-            tool_functions: `begin_tools` and `end_tools` of organ_kernels, for tools that move on the device.
-            share: other organs of the same mesh, whose shared arrays and kernels these take.
 
         Raises:
             RuntimeError: there is no CUDA device.
@@ -193,8 +262,7 @@ class DeviceOrgans:
         self.organ, self.dtype, self.threads = organ, np.dtype(dtype).type, threads
         real = self.dtype
         nodes, tets, springs = len(organ.node_mass), len(organ.tet_nodes), len(organ.spring_nodes)
-        self._shape_count, tools = len(shapes.shape_radius), len(shapes.tool_centre)
-        surface, shape_count = len(organ.surface_triangles), self._shape_count
+        self._shape_count = len(shapes.shape_radius)
         size = np.dtype(real).itemsize
         self._room = working_size(nodes, tets, springs)
         sums = 6 * threads * size
@@ -206,84 +274,38 @@ class DeviceOrgans:
         self.block_count = min(block_count, lane_count) if lane_count > 1 else block_count
         blocks = self.block_count if lane_count > 1 else 1
 
-        def zeros(*shape: int, dtype: Any = real) -> Any:
-            return cuda.to_device(np.zeros(shape, dtype=dtype))
-
-        common = topology(organ, real) if share is None else None
-        shared = {name: cuda.to_device(array) for name, array in common.items()} if common is not None else {}
-        if share is not None:
-            shared = {name: getattr(share.model, name) for name in DeviceModel._fields if name not in OWN}
-        own = {name: zeros(lane_count, len(getattr(organ, name))) for name in OWN}
-        self.model = DeviceModel(**shared, **own)
-        self.state = DeviceState(
-            node_position=zeros(lane_count, nodes, 3),
-            node_velocity=zeros(lane_count, nodes, 3),
-            contact_engaged=zeros(lane_count, shape_count, surface * QUADRATURE_COUNT, dtype=np.uint8),
-            contact_stretch=zeros(lane_count, shape_count, surface * QUADRATURE_COUNT, 3),
-            contact_passed=zeros(lane_count, 2, dtype=np.int32),
-            volume_ratio_smallest=zeros(lane_count),
-            fault=cuda.to_device(np.full(lane_count, LANE_EMPTY, dtype=np.int32)),
+        arrays = DeviceArrays.of(
+            organ, lane_count, shapes, real, blocks=blocks, threads=threads, room=1 if self.is_shared else self._room
         )
-        slots = shape_count * surface
-        self.scratch = Scratch(
-            flags=zeros(blocks, FLAG_COUNT, dtype=np.int32),
-            counts=zeros(blocks, threads, dtype=np.int32),
-            candidates=zeros(blocks, shape_count, surface, dtype=np.int32),
-            entry=zeros(blocks, shape_count, surface, dtype=np.int32),
-            listed=zeros(blocks, slots, 2, dtype=np.int32),
-            rows=zeros(blocks, QUADRATURE_COUNT * slots, ROW_WIDTH),
-            places=zeros(blocks, QUADRATURE_COUNT * slots, PLACE_WIDTH, dtype=np.int32),
-            touched=zeros(blocks, len(self.model.surface_nodes), dtype=np.int32),
-            hold=zeros(blocks, nodes),
-            squeezed=zeros(blocks, tets, dtype=np.int32),
-            pool=zeros(blocks, 1 if self.is_shared else self._room),
-        )
-        self.tools = Tools(
-            radius=cuda.to_device(shapes.shape_radius.astype(real)),
-            tool=cuda.to_device(shapes.shape_tool.astype(np.int32)),
-            friction=cuda.to_device(shapes.shape_friction.astype(real)),
-            ends=zeros(lane_count, shape_count, 2, 3),
-            span=zeros(lane_count, shape_count, 3),
-            centre=zeros(lane_count, tools, 3),
-            twist=zeros(lane_count, tools, 6),
-            acceleration=zeros(lane_count, tools, 6),
-            mobility=zeros(lane_count, tools, tools, 6, 6),
-            pushed=zeros(lane_count, tools, 6),
-            lag=zeros(lane_count, tools, 6),
-            reference=zeros(lane_count, tools, 3),
-            mean=zeros(lane_count, tools, 6),
-        )
-        self.centre, self.inverted = zeros(lane_count, 4), zeros(lane_count, dtype=np.int32)
+        self.model, self.state = _on_device(arrays.model), _on_device(arrays.state)
+        self.scratch, self.tools = _on_device(arrays.scratch), _on_device(arrays.tools)
+        self.centre = cuda.to_device(np.zeros((lane_count, 4), dtype=real))
+        self.inverted = cuda.to_device(np.zeros(lane_count, dtype=np.int32))
         self._rest = cuda.to_device(organ.node_rest_position.astype(real))
         self.law = ContactLaw(*(real(value) for value in contact))
         self._numbers = (real(dt), real(exp(-organ.alpha * dt)), substep_count)
         self.lane_count = lane_count
         self._ready: Any = None
-        if share is not None:
-            self._kernel, self._look, self._ready = share._kernel, share._look, share._ready
-        else:
-            names = {"SHARED": self.is_shared}
-            if tool_functions is not None:
-                names |= dict(zip(("begin_tools", "end_tools"), tool_functions, strict=True))
-            functions = DeviceFunctions(real, **names)
-            options = {"max_registers": registers or min(255, REGISTERS // threads)}
-            self._kernel = cuda.jit(functions.typed(advance_organ if lane_count == 1 else advance_lanes), **options)
-            self._look = cuda.jit(functions.typed(look))
+        functions = DeviceFunctions(real, SHARED=self.is_shared)
+        self._kernel = functions.kernel(
+            advance_organ if lane_count == 1 else advance_lanes, registers or min(255, REGISTERS // threads)
+        )
+        self._look = functions.kernel(look)
 
-    def put(self, lane: int, organ: OrganModel, state: OrganState | None = None, stream: Any = 0) -> None:
+    def put(self, lane: int, organ: OrganModel, state: OrganState | None = None) -> None:
         """Put an organ of the same mesh into a lane, in a state; at rest by default."""
         if state is None:
             state = rest_state(organ, shape_count=self._shape_count)
         for name in OWN:
-            self._write(getattr(self.model, name), lane, getattr(organ, name), stream)
+            self._write(getattr(self.model, name), lane, getattr(organ, name))
         for name in KEPT:
-            self._write(getattr(self.state, name), lane, getattr(state, name), stream)
-        self._write(self.state.volume_ratio_smallest, slice(lane, lane + 1), state.volume_ratio_smallest, stream)
-        self._write(self.state.fault, slice(lane, lane + 1), np.array([FAULT_NONE]), stream)
+            self._write(getattr(self.state, name), lane, getattr(state, name))
+        self._write(self.state.volume_ratio_smallest, slice(lane, lane + 1), state.volume_ratio_smallest)
+        self._write(self.state.fault, slice(lane, lane + 1), np.array([FAULT_NONE]))
 
     @staticmethod
-    def _write(array: Any, place: Any, values: NDArray, stream: Any = 0) -> None:
-        array[place].copy_to_device(np.ascontiguousarray(values.astype(array.dtype)), stream=stream)
+    def _write(array: Any, place: Any, values: NDArray) -> None:
+        array[place].copy_to_device(np.ascontiguousarray(values.astype(array.dtype)))
 
     def get(self, lane: int, state: OrganState) -> OrganState:
         """The state of a lane as that of an organ alone; `state` has its arrays."""
@@ -293,7 +315,7 @@ class DeviceOrgans:
         fault = self.state.fault.copy_to_host()[lane : lane + 1]
         return state._replace(**read, volume_ratio_smallest=lowest, lane_fault=fault)
 
-    def put_tools(self, lane_shapes: ContactShapes, response: Any, stream: Any = 0) -> None:
+    def put_tools(self, lane_shapes: ContactShapes, response: Any) -> None:
         """Where the tools of all lanes are, and how they yield: as of `advance_lanes`, the lane as first index."""
         pairs = {
             "ends": lane_shapes.shape_ends,
@@ -304,21 +326,21 @@ class DeviceOrgans:
             "mobility": response.tool_mobility,
         }
         for name, values in pairs.items():
-            getattr(self.tools, name).copy_to_device(values.astype(self.dtype), stream=stream)
+            getattr(self.tools, name).copy_to_device(values.astype(self.dtype))
 
-    def advance(self, step_count: int = 1, drive: Any = None, stream: Any = 0) -> None:
+    def advance(self, step_count: int = 1) -> None:
         """Advance all lanes that have no fault by some haptic steps; returns before they are done."""
         dt, decay, substeps = self._numbers
         given = (
-            self.model, self.state, self.scratch, self.tools, drive, self.law,
+            self.model, self.state, self.scratch, self.tools, self.law,
             StepNumbers(dt, decay, substeps, step_count),
         )  # fmt: skip
         if self._ready is None:
             self._ready = with_shared_memory(self._kernel, given, self.shared_bytes)
-        self._ready[self.block_count, self.threads, stream, self.shared_bytes](*given)
+        self._ready[self.block_count, self.threads, 0, self.shared_bytes](*given)
 
-    def look(self, stream: Any = 0) -> None:
+    def look(self) -> None:
         """Compute `centre` and `inverted` of all lanes."""
         shared = 4 * self.threads * np.dtype(self.dtype).itemsize
         blocks = min(self.lane_count, 4 * multiprocessors())
-        self._look[blocks, self.threads, stream, shared](self.model, self.state, self._rest, self.centre, self.inverted)
+        self._look[blocks, self.threads, 0, shared](self.model, self.state, self._rest, self.centre, self.inverted)

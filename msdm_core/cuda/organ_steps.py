@@ -34,7 +34,7 @@ from msdm_core.kernels.contact_kernels import (
     reach_margin,
     set_give,
     sweep_point,
-)
+)  # fmt: skip
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     corner_gradient,
@@ -44,7 +44,7 @@ from msdm_core.kernels.element_kernels import (
     tet_scale,
     tet_shape,
     volume_ratio,
-)
+)  # fmt: skip
 from msdm_core.kernels.guard_kernels import FAR, guard_axes, near_axis, watched_distance
 from msdm_core.kernels.squeeze_kernels import hold_squeezed
 from msdm_core.kernels.structure_kernels import (
@@ -56,7 +56,7 @@ from msdm_core.kernels.structure_kernels import (
     SurfaceView,
     ToolResponse,
     TouchedView,
-)
+)  # fmt: skip
 from msdm_core.kernels.substep_kernels import move_shapes, push_tools
 
 # What threads tell each other within a substep: entries of `Scratch.flags`.
@@ -586,14 +586,6 @@ def _touch(model, lane, work, state, shapes, response, law, numbers, reference, 
 # ---- haptic steps -------------------------------------------------------------------------------------------------
 
 
-def begin_tools(drive, tools, lane):
-    """What moves tools on a device does at the start of a haptic step; without it they are where the host put them."""
-
-
-def end_tools(drive, tools, state, lane):
-    """What moves tools on a device does at the end of a haptic step."""
-
-
 def _haptic_step(
     grid, leads, first, stride, model, lane, work, state, shapes, response, law, numbers, reference, wrench, block,
     scratch, sums, lowest,
@@ -663,7 +655,7 @@ def _end_step(model, lane, work, state, shapes, response, law, numbers, wrench, 
 
 
 def _advance(
-    grid, leads, first, stride, model, lane, pool, state, tools, drive, law, numbers, block, scratch, shared
+    grid, leads, first, stride, model, lane, pool, state, tools, law, numbers, block, scratch, shared
 ):  # fmt: skip
     """The haptic steps of one organ; its numbers are in `pool`, sums of threads in `shared`."""
     nodes, tets, springs = state.node_position.shape[1], model.tet_nodes.shape[0], model.spring_nodes.shape[0]
@@ -690,7 +682,6 @@ def _advance(
     lowest = state.volume_ratio_smallest[lane]
     for _ in range(numbers.step_count):
         if first == 0:
-            begin_tools(drive, tools, lane)
             for tool in range(reference.shape[0]):
                 for axis in range(3):
                     reference[tool, axis] = shapes.tool_centre[tool, axis]
@@ -699,9 +690,6 @@ def _advance(
             grid, leads, first, stride, model, lane, work, state, shapes, response, law, numbers, reference, wrench,
             block, scratch, sums, lowest,
         )  # fmt: skip
-        if first == 0:
-            end_tools(drive, tools, state, lane)
-        _wait(grid)
         if state.fault[lane] != FAULT_NONE:
             break
     for item in range(first, nodes, stride):
@@ -717,7 +705,7 @@ def _keep_lowest(state, lane, lowest):
         cuda.atomic.min(state.volume_ratio_smallest, lane, lowest)
 
 
-def advance_lanes(model, state, scratch, tools, drive, law, numbers):
+def advance_lanes(model, state, scratch, tools, law, numbers):
     """Advance each organ that has no fault; a block takes one after the other."""
     block, thread, threads = cuda.blockIdx.x, cuda.threadIdx.x, cuda.blockDim.x
     shared = cuda.shared.array(0, REAL_TYPE)
@@ -725,19 +713,19 @@ def advance_lanes(model, state, scratch, tools, drive, law, numbers):
     for lane in range(block, state.fault.shape[0], cuda.gridDim.x):
         if state.fault[lane] == FAULT_NONE:
             _advance(
-                None, True, thread, threads, model, lane, pool, state, tools, drive, law, numbers, block, scratch,
+                None, True, thread, threads, model, lane, pool, state, tools, law, numbers, block, scratch,
                 shared[: 6 * threads],
             )  # fmt: skip
         cuda.syncthreads()
 
 
-def advance_organ(model, state, scratch, tools, drive, law, numbers):
+def advance_organ(model, state, scratch, tools, law, numbers):
     """Advance one organ by all blocks together, whose first does contact."""
     shared = cuda.shared.array(0, REAL_TYPE)
     if state.fault[0] == FAULT_NONE:
         _advance(
             cuda.cg.this_grid(), cuda.blockIdx.x == 0, cuda.grid(1), cuda.gridsize(1), model, 0, scratch.pool[0],
-            state, tools, drive, law, numbers, 0, scratch, shared[: 6 * cuda.blockDim.x],
+            state, tools, law, numbers, 0, scratch, shared[: 6 * cuda.blockDim.x],
         )  # fmt: skip
 
 

@@ -66,7 +66,7 @@ def without_extras(monkeypatch) -> Iterator[None]:
 def test_the_scripts_that_need_extras_declare_them():
     names = {Path(name).stem for name in SCRIPTS}
     assert names >= {"behaviour_cloning", "convert_policy", "learn_palpate", "learn_palpate_recurrent"}
-    assert names >= {"learn_retract", "live_browser", "palpation_figures", "record_demonstrations"}
+    assert names >= {"learn_retract", "record_demonstrations"}
     for extras in SCRIPTS.values():
         assert all(extra.strip('"') in EXTRAS for extra in extras.split(", "))
 

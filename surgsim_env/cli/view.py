@@ -29,7 +29,7 @@ RATE_SHARE, LATENESS_MOST, UPDATES_LEAST = 0.995, 0.002, 20.0
 class View:
     """Serve a scene live to a browser: press the organ with mouse, keys or gamepad, a thousand steps a second.
 
-    Prints the address to open. Other machines can connect with --allow-remote only. See docs/live.md.
+    Prints the address to open on this machine; other machines use an SSH tunnel. See docs/live.md.
     """
 
     scene: str | None = None
@@ -40,12 +40,8 @@ class View:
     """Two arms: a jaw to lift, a ball to touch."""
     motion: MaybeText = None
     """How the patient breathes: calm, free, or none (holds still); default: as the scene has it."""
-    host: str = "127.0.0.1"
-    """Address to listen on."""
     port: int = 8080
-    """Port to listen on; 0 for a free one."""
-    allow_remote: bool = False
-    """Let other machines connect to --host; nothing is encrypted."""
+    """Port of 127.0.0.1 to listen on, or the next free one; 0 for any free one."""
     replay: Path | None = None
     """A recording (CSV) to play first."""
     out: Path = Path("runs/live")
@@ -61,7 +57,7 @@ class View:
         """Serve until interrupted, or for some seconds; exit status 0, or 1 where `measure` found a target missed.
 
         Raises:
-            ValueError: a scene, an instrument or an address that is not to be had; viser is not installed.
+            ValueError: a scene, an instrument or an option that is invalid; viser is not installed.
             LiveError: the physics died, or viser cannot be guarded.
         """
         with missing_packages("view", "live"):
@@ -83,12 +79,10 @@ class View:
         page = None
         try:
             session.wait()
-            page = Page(session, host=self.host, port=self.port, remote=self.allow_remote, out=self.out)
+            page = Page(session, port=self.port, out=self.out)
             if self.plain:
                 page.show_plain(True)
             console.print(f"open {page.server.address}", highlight=False, soft_wrap=True)
-            if self.allow_remote:
-                console.print("other machines may connect; nothing on the way is encrypted", highlight=False)
             if self.replay is not None:
                 steps = read_recording(self.replay, session.arm_count, session.scene.timing.haptic_step)
                 session.exchange.recorded.fill(steps)

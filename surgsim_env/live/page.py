@@ -14,7 +14,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.pacing import timeliness
 from surgsim_env.live.exchange_records import Change, LiveError, Pause, Phase, Record, Replay, Reset
 from surgsim_env.live.guarded_server import GuardedServer
-from surgsim_env.live.messages import InvalidMessageError, MessageFilter, read_hand, read_report
+from surgsim_env.live.messages import InvalidMessageError, read_hand, read_report
 from surgsim_env.live.organ_choice import chosen_lesions
 from surgsim_env.live.panel import Panel, status_rows
 from surgsim_env.live.recording import write_recording
@@ -80,9 +80,9 @@ class HandSockets:
         software: whether a tab without a graphics card was opened
     """
 
-    def __init__(self, session: Session, message_filter: MessageFilter) -> None:
-        """Push a session's hands; the filter counts disconnected clients."""
-        self._session, self._message_filter = session, message_filter
+    def __init__(self, session: Session) -> None:
+        """Push a session's hands."""
+        self._session = session
         self.rate = PictureRate()
         self.software = False
 
@@ -101,7 +101,6 @@ class HandSockets:
                     if report.rate is not None:
                         self.rate.report(tab, report.rate)
                 except InvalidMessageError as error:
-                    self._message_filter.dropped += 1
                     await connection.close(1008, str(error)[:100])
         self.rate.forget(tab)
 
@@ -115,25 +114,20 @@ class Page:
         pictures: number of pictures sent
     """
 
-    def __init__(self, session: Session, *, host: str, port: int, remote: bool, out: Path) -> None:
+    def __init__(self, session: Session, *, port: int, out: Path) -> None:
         """Serve.
 
         Args:
             session: a running one.
-            host: see `GuardedServer`.
             port: see `GuardedServer`.
-            remote: see `GuardedServer`.
             out: folder that recordings are written to.
 
         Raises:
-            ValueError: the address cannot be bound.
+            LiveError: see `GuardedServer`.
         """
         self.session, self._out = session, out
-        self._message_filter = MessageFilter()
-        self._tabs = HandSockets(session, self._message_filter)
-        self.server = GuardedServer(
-            host, port, remote=remote, message_filter=self._message_filter, serve_hand=self._tabs.serve
-        )
+        self._tabs = HandSockets(session)
+        self.server = GuardedServer(port, self._tabs.serve)
         self.felt = FeltMap(session.anatomy)
         self.pictures = 0
         self._organ_number, self._traced = 1, 0
@@ -154,7 +148,6 @@ class Page:
             self._add_instrument()
             self._panel = Panel(
                 viser.gui,
-                self._message_filter,
                 session.scene,
                 session.arm_count,
                 session.instrument.jaw is not None,
@@ -165,13 +158,12 @@ class Page:
         """The instrument, a handle at each hand, an arrow of force at each tip."""
         session, scene = self.session, self.server.viser.scene
         self._instrument = InstrumentView(scene, session.instrument.model, session.geoms, session.arm_count)
-        self._message_filter.nodes.update(self._instrument.on_drag(self._dragged))
+        self._instrument.on_drag(self._dragged)
         size = float(np.ptp(session.anatomy.mesh.points, axis=0).max())
         self._handles = [
             add_handle(scene, arm, place, size, session.directions, self._pulled)
             for arm, place in enumerate(session.parked)
         ]
-        self._message_filter.nodes.update(handle.name for handle in self._handles)
         self._arrows = [ForceArrow(scene, arm, size) for arm in range(session.arm_count)]
 
     def _calls(self) -> dict[str, Callable[..., None]]:

@@ -3,15 +3,13 @@
 import html
 import time
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_env.haptics.pacing import Timeliness
 from surgsim_env.live.exchange_records import Phase
-from surgsim_env.live.messages import MessageFilter
 from surgsim_env.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
 from surgsim_env.live.stage import COLOURS, CONTRASTS
 from surgsim_env.scene.model import Scene
@@ -53,7 +51,6 @@ class Panel:
     def __init__(
         self,
         gui: Any,
-        message_filter: MessageFilter,
         scene: Scene,
         arm_count: int,
         has_jaw: bool,
@@ -63,14 +60,13 @@ class Panel:
 
         Args:
             gui: viser's.
-            message_filter: receives the allowed values of each element.
             scene: of the session.
             arm_count: 1 or 2.
             has_jaw: whether the first arm has a jaw.
             calls: callbacks by name: pause(), record() and replay(), which toggle;
                 reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), hold_breath(on), plain(on).
         """
-        self._gui, self._message_filter, self._scene, self._calls = gui, message_filter, scene, calls
+        self._gui, self._scene, self._calls = gui, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
         self._changed: float | None = None
         self._status = gui.add_html(_status_html("starting", []))
@@ -150,7 +146,6 @@ class Panel:
         self._damping = self._slider("Damping [1/s]", 0.25, 4.0, 0.05, 1.0, max(scene.damping.alpha, 1e-3))
         kinds = lesion_kinds(scene)
         self._lesions = gui.add_dropdown("Lesions", kinds, initial_value=kinds[0])
-        self._allow(self._lesions, Literal[tuple(kinds)])
         ratio = max(
             (one.modulus_ratio for one in scene.demonstration),
             default=scene.lesion.modulus_ratio[1] if scene.lesion else 8.0,
@@ -183,25 +178,18 @@ class Panel:
 
     def _slider(self, label: str, low: float, high: float, step: float, start: float, unit: float = 1.0) -> Any:
         values = [round(value * unit, 6) for value in (low, high, step, start)]
-        slider = self._gui.add_slider(label, min=values[0], max=values[1], step=values[2], initial_value=values[3])
-        self._allow(slider, Annotated[float, msgspec.Meta(ge=values[0] - 1e-9, le=values[1] + 1e-9)])
-        return slider
+        return self._gui.add_slider(label, min=values[0], max=values[1], step=values[2], initial_value=values[3])
 
     def _button(self, label: str, hint: str, clicked: Callable[..., None]) -> Any:
         button = self._gui.add_button(label, hint=hint, color=BUTTON_COLOUR)
-        self._allow(button, bool)
         button.on_click(lambda _: clicked())
         return button
 
     def _checkbox(self, label: str, name: str, *, initial_value: bool = False, **given: Any) -> Any:
         """A check box that calls the callback of some name with its value."""
         box = self._gui.add_checkbox(label, initial_value=initial_value, **given)
-        self._allow(box, bool)
         box.on_update(lambda _: self._calls[name](box.value))
         return box
-
-    def _allow(self, handle: Any, values: Any) -> None:
-        self._message_filter.values[handle._impl.uuid] = values
 
 
 def _set(handle: Any, name: str, value: object) -> None:

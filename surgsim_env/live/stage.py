@@ -351,15 +351,11 @@ class InstrumentView:
         self._shown = now if self._shown is None else np.where(moved[:, None], now, self._shown)
         return moved
 
-    def on_drag(self, moved: Callable[[int, str, FloatArray], None]) -> list[str]:
-        """Call `moved` with an arm, the phase of a drag and the pointer's position [m]; returns the nodes' names."""
-        names = []
+    def on_drag(self, moved: Callable[[int, str, FloatArray], None]) -> None:
+        """Call `moved` with an arm, the phase of a drag and the pointer's position [m]."""
         for node, arm in zip(self.nodes, self.arms, strict=True):
-            if arm is None:
-                continue
-            node.on_drag("left")(_caller(moved, arm))
-            names.append(node.name)
-        return names
+            if arm is not None:
+                node.on_drag("left")(_caller(moved, arm))
 
 
 def _caller(moved: Callable[[int, str, FloatArray], None], arm: int) -> Callable[[Any], Any]:

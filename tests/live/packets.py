@@ -1,11 +1,13 @@
 """The packets that `hand.js` sends."""
 
-from surgsim_env.live import messages
+import struct
+
+from surgsim_env.live.messages import DrawingReport, HandMotion
 
 
-def write_report(report: messages.DrawingReport) -> bytes:
-    return messages._DRAWING.pack(report.rate or 0.0, report.rate is not None, report.software)
+def write_report(report: DrawingReport) -> bytes:
+    return struct.pack("<fHH", report.rate or 0.0, report.rate is not None, report.software)
 
 
-def write_hand(motion: messages.HandMotion) -> bytes:
-    return messages._HAND.pack(*motion.axes, motion.arm, motion.turns_jaw)
+def write_hand(motion: HandMotion) -> bytes:
+    return struct.pack("<3fHH", *motion.axes, motion.arm, motion.turns_jaw)

@@ -1,18 +1,14 @@
 """A whole session behind a page, for tests that meet it at the level of its protocol."""
 
-import asyncio
 import threading
 import time
 from pathlib import Path
 
-import msgspec.msgpack
 import numpy as np
-import viser
 from websockets.asyncio.client import connect
 
 from surgsim_env.haptics.pacing import PaceSettings
 from surgsim_env.live.page import Page
-from surgsim_env.live.protocol_client import CAMERA
 from surgsim_env.live.session import Session
 from surgsim_env.scene.load import make_scene
 
@@ -39,7 +35,7 @@ class Served:
         self.hand_clock = Clock()
         self.session = Session(make_scene("phantom_small"), pace=PACE, clock=self.hand_clock)
         self.session.wait()
-        self.page = Page(self.session, host="127.0.0.1", port=0, remote=False, out=out)
+        self.page = Page(self.session, port=0, out=out)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.page.run, args=(self._stop.is_set,))
         self._thread.start()
@@ -58,17 +54,10 @@ class Served:
     def force(self) -> float:
         return float(np.linalg.norm(self.session.frame()["force"][0]))
 
-    def socket(self, path="/"):
-        gate = self.page.server.gate
-        return connect(
-            f"ws://127.0.0.1:{gate.port}/{gate.token}{path}",
-            origin=f"http://127.0.0.1:{gate.port}",
-            subprotocols=[f"viser-v{viser.__version__}"] if path == "/" else None,
-            max_size=None,
-            compression=None,
-            open_timeout=SECONDS,
-            ping_interval=None,
-        )
+    def hand_socket(self):
+        origin, _, token = self.address.rpartition("/")
+        address = f"{origin.replace('http', 'ws')}/{token}/hand"
+        return connect(address, origin=origin, open_timeout=SECONDS, ping_interval=None)
 
 
 def wait_until(condition, seconds=SECONDS):
@@ -76,17 +65,3 @@ def wait_until(condition, seconds=SECONDS):
     while not condition():
         assert time.monotonic() < deadline, "it did not come to pass"
         time.sleep(0.02)
-
-
-def setting(handle, value):
-    return msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}})
-
-
-async def send(served, *messages, until):
-    """Messages of a tab that stays open until a condition holds."""
-    async with served.socket() as socket:
-        await socket.send(msgspec.msgpack.encode(CAMERA))
-        await asyncio.wait_for(socket.recv(), SECONDS)
-        for message in messages:
-            await socket.send(message)
-        await asyncio.to_thread(wait_until, until)

@@ -58,7 +58,7 @@ def test_a_physics_that_dies_is_said(tmp_path):
     page = None
     try:
         session.wait()
-        page = Page(session, host="127.0.0.1", port=0, remote=False, out=tmp_path)
+        page = Page(session, port=0, out=tmp_path)
         session._process.kill()
         with pytest.raises(LiveError, match="physics' process died"):
             page.run(lambda: False)

@@ -1,142 +1,175 @@
-"""What the panel and the browser ask of a page, as their own messages: settings, recordings, plain pictures."""
+"""What the panel shows, and what its elements call, with a gui that keeps its elements by label."""
 
-import asyncio
-import os
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from surgsim_env.live.exchange_records import Pause, Phase, Record, Reset
-from surgsim_env.live.messages import DrawingReport, HandMotion
-from surgsim_env.live.protocol_client import ProtocolClient, press_path
-from tests.live.packets import write_hand, write_report
-from tests.live.served import send, setting, wait_until
+from surgsim_env.live import panel as module
+from surgsim_env.live.exchange_records import Phase, new_exchange
+from surgsim_env.live.organ_choice import HIDDEN
+from surgsim_env.live.panel import PLOT_LEAST, PLOTTED, Panel
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.motions import with_motion
 
-pytestmark = pytest.mark.usefixtures("fresh")
-
-
-def has_place(session) -> bool:
-    """Whether some recorded step has a hand's place."""
-    return bool(np.isfinite(session.exchange.recorded.steps["hand"]).all(axis=2).any())
-
-
-def test_panel_settings_reach_the_physics(served):
-    """A slider's own message, as a browser sends it; one beyond its range changes nothing."""
-    panel, session = served.page._panel, served.session
-
-    organ = int(session.frame()["organ"])
-    asyncio.run(send(served, setting(panel._modulus, 9.0), until=lambda: int(session.frame()["organ"]) > organ))
-    assert session.choice.modulus_factor == pytest.approx(9.0 / (session.scene.material.youngs_modulus / 1e3))
-    ignored = served.page._message_filter.ignored
-    beyond = (setting(panel._modulus, 1e9), setting(panel._lesions, "all of them"))
-    asyncio.run(send(served, *beyond, until=lambda: served.page._message_filter.ignored >= ignored + 2))
-    assert served.page._message_filter.ignored == ignored + 2 and panel._modulus.value == 9.0
-    asyncio.run(send(served, setting(panel._pause, True), until=lambda: session.frame()["phase"] == Phase.PAUSED))
-    session.ask(Pause(False))
-    wait_until(lambda: session.frame()["phase"] == Phase.RUNNING)
+BUTTONS = {"Pause": "pause", "Reset": "reset", "Record": "record", "Replay": "replay", "Clear": "clear_map"}
+SWITCHES = {
+    "Close the jaw": "close_jaw",
+    "Hold the breath": "hold_breath",
+    "Plain light": "plain",
+    "Show lesions": "show_lesions",
+    "Paint it on the organ": "paint",
+}
 
 
-def test_a_click_means_what_the_physics_is_doing(served, monkeypatch, tmp_path):
-    """Whatever the button's name says: names are never renewed here."""
-    panel, session = served.page._panel, served.session
-    monkeypatch.setattr(served.page, "_out", tmp_path)
-    monkeypatch.setattr("surgsim_env.live.panel._set", lambda *_: None)
-    for phase in (Phase.PAUSED, Phase.RUNNING):
-        clicked = setting(panel._pause, True)
-        asyncio.run(send(served, clicked, until=lambda phase=phase: session.frame()["phase"] == phase))
-    clicked = setting(panel._record, True)
-    # A recording without a hand's place is not written.
-    asyncio.run(send(served, clicked, until=lambda: session.frame()["recording"] and has_place(session)))
-    asyncio.run(send(served, clicked, until=lambda: not session.frame()["recording"]))
-    wait_until((tmp_path / "recording-1.csv").is_file)
+class Element:
+    """An element of a gui; `set` is what a browser does."""
+
+    def __init__(self, value=None, **look):
+        self.value, self.visible, self.disabled, self.calls = value, True, False, []
+        self.__dict__.update(look)
+
+    def on_click(self, call):
+        self.calls.append(call)
+
+    on_update = on_click
+
+    def set(self, value=True):
+        self.value = value
+        for call in self.calls:
+            call(None)
 
 
-def test_buttons_are_renamed_with_the_next_picture(served, monkeypatch):
-    panel, session = served.page._panel, served.session
-    # They do not wait for the words that are said twice a second.
-    monkeypatch.setattr(served.page, "_say", lambda _: None)
-    session.ask(Pause(True))
-    wait_until(lambda: panel._pause.label == "Continue")
-    session.ask(Pause(False))
-    wait_until(lambda: panel._pause.label == "Pause")
+class Gui:
+    """Elements by label, plots by unit, and all texts."""
+
+    def __init__(self):
+        self.elements, self.plots, self.texts = {}, {}, []
+
+    def _add(self, label, value=None, **look):
+        self.elements[label] = Element(value, label=label, **look)
+        return self.elements[label]
+
+    def add_button(self, label, **_):
+        return self._add(label)
+
+    def add_checkbox(self, label, initial_value, visible=True, **_):
+        return self._add(label, initial_value, visible=visible)
+
+    def add_slider(self, label, initial_value, **_):
+        return self._add(label, initial_value)
+
+    def add_dropdown(self, label, options, initial_value):
+        return self._add(label, initial_value, options=options)
+
+    def add_uplot(self, data, series, scales, **_):
+        plot = Element(data=data, series=series, scales=scales)
+        self.plots[series[1]["label"].rpartition("[")[2].rstrip("]")] = plot
+        return plot
+
+    def add_html(self, content):
+        self.texts.append(Element(content=content))
+        return self.texts[-1]
+
+    add_markdown = add_html
+
+    def add_folder(self, *_, **__):
+        return nullcontext()
 
 
-def test_a_recording_shorter_than_a_picture_is_written(served, monkeypatch, tmp_path):
-    session = served.session
-    monkeypatch.setattr(served.page, "_out", tmp_path)
-    with monkeypatch.context() as patch:
-        # The page does not look while it runs.
-        patch.setattr(served.page, "_attend", lambda _: None)
-        session.ask(Record(True))
-        wait_until(lambda: session.frame()["recording"] and has_place(session))
-        session.ask(Record(False))
-        wait_until(lambda: not session.frame()["recording"])
-    wait_until((tmp_path / "recording-1.csv").is_file)
+def made(scene, *, arm_count=1, has_jaw=False):
+    """A panel, its gui, and the calls that were made."""
+    gui, made_calls = Gui(), []
+    calls = {
+        name: lambda *given, name=name: made_calls.append((name, *given)) for name in {**BUTTONS, **SWITCHES}.values()
+    }
+    return Panel(gui, scene, arm_count, has_jaw, calls), gui, made_calls
 
 
-def test_a_recording_is_written_to_its_folder_alone(served):
-    session = served.session
-    session.ask(Record(True))
-    wait_until(lambda: session.frame()["recording"])
-    wait_until(lambda: session.exchange.recorded.count > 100)
-    session.ask(Record(False))
-    # While it is written, a part of it lies beside it.
-    wait_until(lambda: served.out.is_dir() and os.listdir(served.out) == ["recording-1.csv"])
-    stopped = session.frame()["time"]
-    session.ask(Reset())
-    wait_until(lambda: session.frame()["time"] < stopped)
+@pytest.fixture
+def clock(monkeypatch):
+    now = SimpleNamespace(value=100.0)
+    monkeypatch.setattr(module.time, "monotonic", lambda: now.value)
+    return now
 
 
-def test_plain_pictures_have_fewer_triangles_and_keep_the_paint(served):
-    """Whoever changes it, and whatever is painted meanwhile; lesions that are shown stay so."""
-    organ = served.page._organ
-    fine = len(organ._organ.faces)
-    client = ProtocolClient(served.address, press_path(served.session.anatomy), rate=30.0)
-    client.start()
-    try:
-        wait_until(lambda: served.page.felt.felt.any())
-        served.page._show_lesions(True)
-        for plain in (True, False, True, False):
-            served.page.show_plain(plain)
-            made = served.page.pictures
-            wait_until(lambda made=made: served.page.pictures > made + 3)
-            assert (len(organ._organ.faces) < fine) == plain and len(organ._organ.vertices) > organ._organ.faces.max()
-            assert served.page._panel._plain.value == plain
-            for paint in organ._paint:
-                assert not len(paint._used) or paint._used.max() < len(organ._organ.vertices)
-            wait_until(lambda: any(len(paint._used) for paint in organ._paint))
-        served.page._show_lesions(False)
-    finally:
-        client.stop()
-    assert not client.errors
+def test_sliders_describe_an_organ_once_they_stand_still(clock):
+    scene = make_scene("liver")
+    panel, gui, _ = made(scene)
+    assert panel.settled_choice() is None
+    modulus, damping = gui.elements["Young's modulus [kPa]"], gui.elements["Damping [1/s]"]
+    modulus.set(2.0 * modulus.value)
+    damping.set(3.0 * damping.value)
+    gui.elements["Lesions' modulus / tissue's"].set(5.0)
+    gui.elements["Lesions' size"].set(0.5)
+    assert panel.settled_choice() is None
+    clock.value += 1.0
+    choice = panel.settled_choice()
+    assert choice.modulus_factor == pytest.approx(2.0) and choice.damping_factor == pytest.approx(3.0)
+    assert choice.lesion_ratio == 5.0 and choice.lesion_size == 0.5
+    assert panel.settled_choice() is None
 
 
-def report_of(served, monkeypatch, software, rate=None):
-    """What a tab says of its drawing, until the page has attended to it."""
-    heard, attended = [], []
-    push, attend = served.session.push, served.page._attend
-
-    async def attempt():
-        async with served.socket("/hand") as socket:
-            await socket.send(write_report(DrawingReport(rate, software)))
-            await socket.send(write_hand(HandMotion((0.0, 0.0, 0.0), 0)))
-            await asyncio.to_thread(wait_until, lambda: heard)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(served.session, "push", lambda motion: (push(motion), heard.append(motion)))
-        asyncio.run(attempt())
-        patched.setattr(served.page, "_attend", lambda frame: (attend(frame), attended.append(frame)))
-        wait_until(lambda: len(attended) > 1)
+def test_each_click_hides_another_lesion_at_once(clock):
+    panel, gui, _ = made(make_scene("phantom_small"))
+    seeds = []
+    for _ in range(2):
+        gui.elements["Hide another lesion"].set()
+        clock.value += 0.001
+        choice = panel.settled_choice()
+        assert choice.lesions == HIDDEN == gui.elements["Lesions"].value
+        seeds.append(choice.seed)
+    assert seeds[0] != seeds[1]
 
 
-@pytest.mark.slow
-def test_a_browser_without_a_graphics_card_is_drawn_for_plainly_until_its_user_says_otherwise(served, monkeypatch):
-    page = served.page
-    page._plain, page._tabs.software = None, False
-    report_of(served, monkeypatch, False, 60.0)
-    assert page._plain is None
-    report_of(served, monkeypatch, True)
-    assert page._plain
-    asyncio.run(send(served, setting(page._panel._plain, False), until=lambda: page._plain is False))
-    report_of(served, monkeypatch, True)
-    assert page._plain is False and not page._panel._plain.value
+def test_each_element_has_its_call():
+    _, gui, calls = made(with_motion(make_scene("phantom_small"), "calm"), has_jaw=True)
+    for label in (*BUTTONS, *SWITCHES):
+        gui.elements[label].set(True)
+    assert calls == [*((call,) for call in BUTTONS.values()), *((call, True) for call in SWITCHES.values())]
+
+
+def test_only_what_there_is_can_be_switched():
+    for scene in (make_scene("phantom_small"), with_motion(make_scene("phantom_small"), "calm")):
+        for has_jaw in (False, True):
+            _, gui, _ = made(scene, has_jaw=has_jaw)
+            assert gui.elements["Close the jaw"].visible == has_jaw
+            assert gui.elements["Hold the breath"].visible == scene.has_breath
+
+
+def test_buttons_are_named_by_what_a_click_does():
+    panel, gui, _ = made(make_scene("phantom_small"))
+    pause, record, replay = (gui.elements[name] for name in ("Pause", "Record", "Replay"))
+    frame = new_exchange(1, 4, 1).frame.read()
+    for phase, recording, replaying, names in (
+        (Phase.RUNNING, False, False, ("Pause", "Record", "Replay (2.0 s)")),
+        (Phase.PAUSED, False, False, ("Continue", "Record", "Replay (2.0 s)")),
+        (Phase.RUNNING, True, False, ("Pause", "End recording (2 s)", "Replay (2.0 s)")),
+        (Phase.RUNNING, False, True, ("Pause", "Record", "End replay")),
+    ):
+        frame["phase"], frame["recording"], frame["replaying"] = phase, recording, replaying
+        panel.show_phase(frame, 2.0, jaw_closed=True, breath_held=True)
+        assert (pause.label, record.label, replay.label) == names
+        assert replay.disabled == recording
+    assert gui.elements["Close the jaw"].value and gui.elements["Hold the breath"].value
+    panel.show_phase(frame, 0.0, jaw_closed=False, breath_held=False)
+    assert replay.disabled and not gui.elements["Close the jaw"].value
+    panel.show_status(frame, [("force", "0.25 N")])
+    assert "replaying" in gui.texts[0].content and "0.25 N" in gui.texts[0].content
+    panel.show_plain(True)
+    assert gui.elements["Plain light"].value
+
+
+def test_plots_show_the_last_seconds_of_each_arm():
+    panel, gui, _ = made(make_scene("phantom_small"), arm_count=2)
+    trace = np.zeros(2000, dtype=new_exchange(2, 4, 1).trace.read()["row"].dtype)
+    trace["time"] = 0.01 * np.arange(len(trace))
+    trace["force"][:, 0, 2], trace["force"][:, 1, 0] = 0.3, -0.7
+    trace["depth"][:, 0] = 0.001
+    panel.plot(trace)
+    time, left, right = gui.plots["N"].data
+    assert time[-1] - time[0] == pytest.approx(PLOTTED, abs=0.1)
+    assert np.allclose(left, 0.3) and np.allclose(right, 0.7)
+    assert gui.plots["N"].scales["y"]["max"] == 2.0 * PLOT_LEAST["N"]
+    assert np.allclose(gui.plots["mm"].data[1], 1.0) and gui.plots["mm"].scales["y"]["max"] == PLOT_LEAST["mm"]

@@ -27,7 +27,7 @@ from surgsim_env.live.organ_choice import (
     lesion_kinds,
     live_scene,
 )
-from surgsim_env.live.physics import REQUESTS_MOST, Physics
+from surgsim_env.live.physics import Physics
 from surgsim_env.live.recording import read_recording
 from surgsim_env.live.stage import COLOURS, FeltMap, colour_levels
 from surgsim_env.rendering.scene_model import shown_geoms
@@ -227,29 +227,6 @@ def test_a_recording_that_runs_is_not_begun_again(bench):
     bench.ask(Record(False))
     steps = bench.exchange.recorded.steps
     assert len(steps) == 100 and np.allclose(np.diff(steps["time"]), 1e-3)
-
-
-def test_lateness_is_forgiven_to_requests_that_take_long_alone(bench):
-    starts = []
-    bench.physics._pacer.start = lambda: starts.append(True)
-    for request in (Pause(True), Pause(False), Record(True), Record(False)):
-        bench.ask(request)
-    assert not starts
-    for request in (Reset(), Change(OrganChoice(lesions=NONE)), Replay(True)):
-        bench.ask(request)
-    assert len(starts) == 3
-
-
-def test_many_requests_wait_for_their_turn(bench):
-    for _ in range(3 * REQUESTS_MOST):
-        bench.pipe.send(Pause(True))
-    with bench.exchange.hand.writing() as hand:
-        hand["requests"] += 3 * REQUESTS_MOST
-    heeded = []
-    bench.physics._handle = heeded.append
-    for looks in range(1, 5):
-        assert bench.physics._handle_requests(lambda: True)
-        assert len(heeded) == min(looks, 3) * REQUESTS_MOST
 
 
 def test_nobody_left_ends_it(bench):

@@ -1,8 +1,5 @@
 """Commands of `surgsim`: how they are chosen, and how their errors and warnings are told."""
 
-import contextlib
-import io
-import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -27,9 +24,6 @@ from surgsim_env.cli.train import Train
 from surgsim_env.cli.validate import Validate
 from surgsim_env.cli.view import View
 
-# Options whose value is a list of numbers, which may begin with a minus.
-NUMBER_LISTS = ("--lesion", "--anchors", "--approach", "--around", "--trocar")
-
 Command = (
     Palpate
     | Retract
@@ -51,17 +45,13 @@ Command = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; exit status 0, 1 (a row not met, no success), 2 (invalid input, one line), 130 (Ctrl-C)."""
-    given = _joined(list(sys.argv[1:] if arguments is None else arguments))
-    said = io.StringIO()
+    """Run the command line; exit status 0, 1 (a row not met, no success), 2 (invalid input), 130 (Ctrl-C)."""
     try:
-        with contextlib.redirect_stderr(said):
-            command = tyro.cli(
-                Command, prog="surgsim", args=given, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
-            )
+        command = tyro.cli(
+            Command, prog="surgsim", args=arguments, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
+        )
+    # After --help, or after tyro has printed what is wrong with the options.
     except SystemExit as ended:
-        if ended.code:
-            print(f"surgsim: error: {_first_part(said.getvalue())} (see surgsim --help)", file=sys.stderr)
         return 2 if ended.code else 0
     try:
         with warnings.catch_warnings():
@@ -74,24 +64,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"surgsim: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-
-
-def _joined(arguments: list[str]) -> list[str]:
-    """`--lesion -0.1,0,...` as `--lesion=-0.1,0,...`: older tyro parses a minus as an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1] in NUMBER_LISTS and re.match(r"-[\d.]", argument):
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
-    return joined
-
-
-def _first_part(box: str) -> str:
-    """The text of a tyro error box above its first rule, in one line."""
-    lines = [line.strip("│ ") for line in box.splitlines() if line.startswith("│")]
-    rules = [number for number, line in enumerate(lines) if line and set(line) == {"─"}]
-    return " ".join(lines[: rules[0]] if rules else lines) or " ".join(box.split())
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:

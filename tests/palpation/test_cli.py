@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from matplotlib.image import imread
 
-from surgsim_env.cli.main import _joined, main
+from surgsim_env.cli.main import main
 from surgsim_env.palpation.job import COLUMNS
 from surgsim_env.palpation.press import scan
 from surgsim_env.scene.anatomy import load_anatomy
@@ -191,10 +191,9 @@ def test_help(arguments, capsys):
         (["palpate", "--seed", "x"], "--seed"),
     ],
 )
-def test_unknown_words_get_one_line_and_exit_2(arguments, words, capsys):
-    said = refused(capsys, *arguments)
-    assert said.startswith("surgsim: error: ")
-    assert words in said
+def test_unknown_words_are_named_with_exit_2(arguments, words, capsys):
+    assert main(arguments) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_options_that_would_do_nothing_are_refused(capsys):
@@ -236,11 +235,6 @@ def test_zero_modulus_is_refused_by_organ_too(capsys, tmp_path):
     trimesh.creation.icosphere(2, radius=30).export(path)
     said = refused(capsys, "organ", str(path), "--length-unit", "mm", "--youngs-modulus", "0")
     assert "Young's modulus is 0; it must be finite and above 0 (Pa)" in said
-
-
-def test_lists_of_numbers_may_begin_with_a_minus():
-    given = ["--lesion", "-0.1,0,0,1,8", "--approach", "-.5,0,1", "--seed", "-1", "--out", "-x"]
-    assert _joined(given) == ["--lesion=-0.1,0,0,1,8", "--approach=-.5,0,1", "--seed", "-1", "--out", "-x"]
 
 
 def refused(capsys, *arguments):

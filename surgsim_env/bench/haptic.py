@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from surgsim_env.bench.measurement import Effort, quantile
+from surgsim_env.bench.measurement import Effort
 from surgsim_env.bench.report import Figure, Section
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.scene.anatomy import load_anatomy
@@ -25,9 +25,9 @@ def measure(effort: Effort) -> Section:
     for name in effort.scenes:
         walls, processors, note = press_times(name, effort.haptic_steps)
         for quantity, share in (("p50", 0.5), ("p99", 0.99), ("worst", 1.0)):
-            section.figures.append(Figure(name, quantity, 1e6 * quantile(walls, share), "us", note))
+            section.figures.append(Figure(name, quantity, 1e6 * float(np.quantile(walls, share)), "us", note))
         for quantity, share in (("p50, processor", 0.5), ("p99, processor", 0.99)):
-            section.figures.append(Figure(name, quantity, 1e6 * quantile(processors, share), "us"))
+            section.figures.append(Figure(name, quantity, 1e6 * float(np.quantile(processors, share)), "us"))
     return section
 
 

@@ -67,11 +67,6 @@ QUICK = Effort(
 SHORTEST_TIMING = 0.01
 
 
-def quantile(values: Sequence[float], share: float) -> float:
-    """The smallest value that at least this share of all values do not exceed: one that was measured."""
-    return float(np.quantile(values, share, method="inverted_cdf"))
-
-
 def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
     """Exponent p of cost ~ size^p: the slope of the line of least squares through the logarithms."""
     return float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])

@@ -16,12 +16,10 @@ from surgsim_env.reports.output_folder import OutputFolder
 
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
 REPORT_NAME = "benchmarks.md"
-# Written by hand; kept in the folder of the report, and appended to it.
-NOTES_NAME = "benchmarks_notes.md"
 INTRODUCTION = """# Benchmarks
 
-Written by `surgsim bench{quick}`; text after the figures, if any, is from `{notes}`, written by hand. Times hold for
-this machine and this run; compare the ratios. No test asserts any of them.
+Written by `surgsim bench{quick}`. Times hold for this machine and this run; compare the ratios. No test asserts any of
+them.
 """
 
 
@@ -132,16 +130,8 @@ def absent(case: str, quantity: str, unit: str, why: object) -> Figure:
     return Figure(case, quantity, None, unit, " ".join(str(why).split()))
 
 
-def report_text(sections: Sequence[Section], machine: str, *, quick: bool, notes: str) -> str:
-    """The whole report."""
-    introduction = INTRODUCTION.format(quick=" --quick" if quick else "", notes=NOTES_NAME)
-    parts = [introduction, f"{machine}\n", *(section.markdown() for section in sections), notes]
-    return "\n".join(part for part in parts if part).rstrip() + "\n"
-
-
 def write_report(sections: Sequence[Section], machine: str, folder: OutputFolder, *, quick: bool) -> None:
-    """Write the report into a folder, with the notes that lie there at its end."""
-    kept = folder.path / NOTES_NAME
-    notes = kept.read_text(encoding="utf-8") if kept.is_file() else ""
-    text = report_text(sections, machine, quick=quick, notes=notes)
-    (folder / REPORT_NAME).write_text(text, encoding="utf-8")
+    """Write the report into a folder."""
+    introduction = INTRODUCTION.format(quick=" --quick" if quick else "")
+    text = "\n".join([introduction, f"{machine}\n", *(section.markdown() for section in sections)])
+    (folder / REPORT_NAME).write_text(text.rstrip() + "\n", encoding="utf-8")

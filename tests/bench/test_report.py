@@ -1,7 +1,6 @@
-"""Figures as lines and tables: names without blanks, what is absent said with its reason, notes kept."""
+"""Figures as lines and tables: names without blanks, and what is absent with its reason."""
 
-from surgsim_env.bench.report import NOTES_NAME, REPORT_NAME, Figure, Section, absent, describe, version, write_report
-from surgsim_env.reports.output_folder import output_folder
+from surgsim_env.bench.report import Figure, Section, absent, describe, version
 
 SECTION = Section(
     "press",
@@ -35,17 +34,6 @@ def test_table():
 
 def test_table_without_notes_has_no_column_for_them():
     assert "| a | 1 |\n" in Section("k", "h", "m", [Figure("a", "q", 1.0, "1")]).markdown()
-
-
-def test_notes_by_hand_are_kept(tmp_path):
-    (tmp_path / NOTES_NAME).write_text("## What was tried\n\nNothing.\n", encoding="utf-8")
-    for _ in range(2):
-        with output_folder(tmp_path) as files:
-            write_report([SECTION], "* machine: this one", files, quick=True)
-    text = (tmp_path / REPORT_NAME).read_text(encoding="utf-8")
-    assert text.count("## What was tried") == 1
-    assert text.index("machine: this one") < text.index("## Presses") < text.index("## What was tried")
-    assert "`surgsim bench --quick`" in text
 
 
 def test_machine_names_versions_and_absent_packages():

@@ -1,13 +1,8 @@
 """Rates of training: what is listed of them, and what is absent with its reason; nothing looks at how long it takes."""
 
-import sys
-
-import pytest
-
 from surgsim_env.bench import training
 from surgsim_env.bench.measurement import QUICK
 from surgsim_env.bench.report import AbsentError
-from surgsim_env.rendering.gl import NoGLError
 
 
 def test_rates_are_medians_and_what_cannot_run_says_why(monkeypatch):
@@ -28,28 +23,6 @@ def test_rates_are_medians_and_what_cannot_run_says_why(monkeypatch):
     assert "training/Palpate,_phantom_small,_memory/stepping,_processor 60 1/s" in lines
     assert "training/Retract,_pictures/stepping,_wall absent 1/s (no OpenGL here)" in lines
     assert sum("PPO,_wall absent 1/s (stable-baselines3 cannot be imported)" in line for line in lines) == 3
-
-
-def test_without_stable_baselines_nothing_is_learned(monkeypatch):
-    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-    with pytest.raises(AbsentError, match=r"stable-baselines3 cannot be imported .*surgsim\[agents\]"):
-        training.learn(training.TRAININGS[0], QUICK)
-
-
-def test_without_opengl_no_picture_is_learned(monkeypatch):
-    class Blind:
-        def reset(self, seed):
-            raise NoGLError("OpenGL is missing")
-
-        def close(self):
-            self.closed = True
-
-    blind = Blind()
-    blind.action_space = training.gym.spaces.Box(-1.0, 1.0, (2,))
-    monkeypatch.setattr(training.Training, "envs", lambda self: blind)
-    with pytest.raises(AbsentError, match="OpenGL is missing"):
-        training.step(training.TRAININGS[-1], QUICK)
-    assert blind.closed
 
 
 def test_a_round_ends_where_the_next_begins(monkeypatch):

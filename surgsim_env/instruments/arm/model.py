@@ -127,7 +127,7 @@ def read_xml(path: Path) -> ElementTree.Element:
     except ElementTree.ParseError as error:
         raise ValueError(f"model file {path} is not valid XML: {error}") from None
     except LookupError as error:
-        raise ValueError(f"model file {path} is in an encoding that cannot be read ({error}): save it as UTF-8") from None
+        raise ValueError(f"model file {path} cannot be decoded ({error}): save it as UTF-8") from None
 
 
 def _check_size(file: Path) -> None:

@@ -71,8 +71,9 @@ def parsed(file: Path, parse: Callable[[str], Parsed], advice: str) -> Parsed:
         raise
     # A parser that meets a malformed file raises anything from KeyError to zlib.error, or SystemExit (meshio).
     except (Exception, SystemExit) as error:
-        reasons = [" ".join(said.getvalue().split()), f"{type(error).__name__} {error}".strip()]
-        raise MeshError(f"{file}: cannot be parsed: {'; '.join(filter(None, reasons))}: {advice}") from error
+        reasons = [said.getvalue(), f"{type(error).__name__} {error}"]
+        reason = "; ".join(" ".join(one.split()) for one in reasons if one.strip())
+        raise MeshError(f"{file}: cannot be parsed: {reason}: {advice}") from error
 
 
 def metres_per_unit(length_unit: LengthUnit) -> float:

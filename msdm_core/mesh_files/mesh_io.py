@@ -44,8 +44,6 @@ REGION_KEYS = ("region", "gmsh:physical", "medit:ref")
 _CONVERT = "convert it, for instance: meshio convert IN OUT.vtu, or gmsh IN -save -format msh22 -o OUT.msh"
 _VOLUME_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 _GMSH_TETRA = 4
-# Largest number and count of nodes and elements in a gmsh file.
-TAG_LARGEST = 50_000_000
 
 RegionNames = tuple[tuple[int, str], ...]
 
@@ -167,32 +165,10 @@ def _check_header(file: Path, file_format: str, data: bytes) -> None:
             )
         if not start.startswith((b"$MeshFormat", b"$Comments")):
             raise MeshError(f"{file}: starts with {start[:24]!r}, not $MeshFormat, so it is no gmsh file: {_CONVERT}")
-        _check_tags(file, data)
     pieces = len(re.findall(rb"<Piece\b", data)) if file_format == "vtu" else 1
     if pieces > 1:
         # meshio 5.3.5 keeps only the cells of the last piece, without a warning.
         raise MeshError(f"{file}: holds {pieces} pieces; one is the rule: merge them (ParaView: Merge Blocks)")
-
-
-def _check_tags(file: Path, data: bytes) -> None:
-    """Refuse gmsh's numbers and counts of nodes and elements above TAG_LARGEST: meshio makes room for as many."""
-    section = data.partition(b"$Nodes")[2].partition(b"$EndNodes")[0]
-    version, binary = re.match(rb"\s*([\d.]*)\s*(\d?)", data.partition(b"$MeshFormat")[2]).groups()  # type: ignore[union-attr]
-    if binary != b"1":
-        # Coordinates have a point, an exponent, or fewer digits.
-        section += data.partition(b"$Elements")[2].partition(b"$EndElements")[0]
-        tags = [int(one) for one in re.findall(rb"(?<![\w.+-])\d{8,20}(?![\w.])", section)]
-    elif version.startswith(b"2"):
-        records = section.lstrip().partition(b"\n")[2]
-        node = np.dtype([("tag", "<i4"), ("place", "<f8", 3)])
-        tags = np.frombuffer(records[: len(records) // node.itemsize * node.itemsize], node)["tag"].tolist()
-    else:
-        tags = []
-    if max(tags, default=0) > TAG_LARGEST:
-        raise MeshError(
-            f"{file}: numbers or counts {max(tags)} nodes or elements; the rule is at most {TAG_LARGEST}: renumber "
-            "them (gmsh IN -save -o OUT)"
-        )
 
 
 def _chosen_unit(file: Path, asked: float | None, stated: float | None) -> float:

@@ -4,7 +4,6 @@ import inspect
 import io
 import json
 import math
-import zipfile
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -18,7 +17,7 @@ from surgsim_env.coupling.simulation import check_entries
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
 from surgsim_env.scene.digest import content_digest, instrument_files, scene_digest, source_files
-from surgsim_env.scene.load import fill_json
+from surgsim_env.scene.load import fill
 from surgsim_env.tasks.declaration import documentation
 from surgsim_env.tasks.task import Task
 
@@ -39,8 +38,8 @@ OBSERVATION_MODES = ("state", "rgb", "rgb_force")
 PICTURE_SIZE = 84
 # Rooms of surgsim_env whose code decides an episode.
 EPISODE_ROOMS = ("scene", "instruments", "coupling", "palpation", "tasks", "envs")
-# Characters of a refused state's text that a message shows.
-LINE_MOST = 400
+# Version of the format of saved states.
+STATE_VERSION = 1
 
 
 class SurgicalEnv(gym.Env[Observation, Action]):
@@ -318,41 +317,29 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def load_state(self, state: bytes) -> None:
         """Restore a state from `save_state`, to the bit, in this or another environment of the same scene.
 
-        The whole state is read, checked and built before anything changes: a refused one leaves the environment as it
-        was.
+        Everything is read and checked before anything changes: a refused state leaves the environment as it was.
 
         Raises:
-            ValueError: bytes that are no saved state, or one of another scene or mesh (names both); names the entry
-                that is missing, unknown or wrong.
+            ValueError: bytes that are no saved state, or one of another scene, mesh or version (names both); names the
+                entry that is missing, unknown or of another shape.
         """
-        arrays = unpacked(state, made_by=self._maker())
-        text = np.array("")
-        like = {"made_by": text, "task": text, "random": text, "observation": self._observation, "running": np.False_}
+        arrays = _unpacked(state, made_by=self._maker())
+        names = ["made_by", "task", "random", "running", "observation"]
+        names += ["member"] if self.task.family is not None else []
+        names += ["look", "look_random"] if self._look_ranges is not None else []
+        own = {name: arrays.pop(name) for name in names if name in arrays}
+        check_entries(own, {**dict.fromkeys(names, np.array("")), "observation": self._observation})
+        text, anatomy = str(own["task"]), self.task.anatomy
         if self.task.family is not None:
-            like["member"] = text
+            anatomy = self.task.family.named(str(own["member"]))
+        # The first change, which leaves all as it is if it is refused.
+        self.simulation.set_state(self.task.saved_organ(text, anatomy), arrays)
+        self.task.set_state(text, anatomy)
+        self.simulation.take_anatomy(anatomy)
+        self.np_random.bit_generator.state = json.loads(str(own["random"]))
         if self._look_ranges is not None:
-            like |= {"look": text, "look_random": text}
-        own = {name: arrays.pop(name) for name in like if name in arrays}
-        try:
-            check_entries(own, like)
-            if wrong := self._out_of_bounds(own["observation"]):
-                raise ValueError(wrong)
-            random = self._random_state(str(own["random"]))
-            seen = None if self._look_ranges is None else fill_json(Look, str(own["look"]), "look")
-            look_random = None if seen is None else self._random_state(str(own["look_random"]), "look_random")
-            family = self.task.family
-            anatomy = None if family is None else family.named(str(own["member"]))
-            task, organ = self.task.restored(str(own["task"]), anatomy)
-            # The first change, which leaves all as it is if it is refused.
-            self.simulation.set_state(organ, arrays)
-        except ValueError as error:
-            raise _refused("this environment", error) from error.__cause__
-        self.task.become(task)
-        self.simulation.take_anatomy(task.anatomy)
-        self.np_random.bit_generator.state = random
-        if seen is not None and look_random is not None:
-            self._look, self._look_random = seen, np.random.default_rng(0)
-            self._look_random.bit_generator.state = look_random
+            self._look = fill(Look, json.loads(str(own["look"])), "look")
+            self._look_random.bit_generator.state = json.loads(str(own["look_random"]))
         self._take(own["observation"])
         self._begun, self._running = True, bool(own["running"])
 
@@ -430,28 +417,14 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self._view.show(self._shown())
 
     def _maker(self) -> str:
-        """What a saved state must agree with: the kind of environment, its scene and mesh, the rates."""
+        """What a saved state must agree with: the kind of environment, its scene and mesh, the rates, the version."""
         scene, mesh = self.scene, self._mesh
         digest = scene_digest(scene, mesh, size=4)
         return (
             f"{type(self).__name__} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
-            f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest})"
+            f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest}), "
+            f"version {STATE_VERSION}"
         )
-
-    def _random_state(self, text: str, name: str = "random") -> dict[str, Any]:
-        """The state in the saved JSON text of an entry, which must be one of this environment's bit generator."""
-        # Asking for np_random would make a generator where there is none yet.
-        own = self._np_random
-        kind = np.random.PCG64 if own is None else type(own.bit_generator)
-        try:
-            twin = kind(0)
-            twin.state = json.loads(text)
-            if json.dumps(twin.state) == text:
-                return json.loads(text)
-        except (ValueError, TypeError, KeyError, OverflowError, RecursionError, AttributeError):
-            # What a bit generator raises for a state that it cannot take.
-            pass
-        raise ValueError(f"{name} is {text!r:.60}; it must be the state of a {kind.__name__} generator")
 
     def _checked(self, action: Action | FloatArray) -> FloatArray:
         values = np.asarray(action, dtype=np.float64)
@@ -491,43 +464,19 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         }
 
 
-def unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
+def _unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
     """The arrays of a saved state, whose entry `made_by` must be this one.
 
     Raises:
         ValueError: bytes that are no saved state, or one that another environment made (names both).
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(state)) as archive:
-            entries = archive.infolist()
-            # Entries that are compressed, or share their bytes, could be larger than memory.
-            if packed := [one.filename for one in entries if one.compress_type != zipfile.ZIP_STORED]:
-                raise ValueError(f"{packed[0]!r:.80} is compressed, which save_state does not do")
-            if (size := sum(one.file_size for one in entries)) > len(state):
-                raise ValueError(f"its entries have {size} bytes, and all of it has {len(state)}")
         with np.load(io.BytesIO(state), allow_pickle=False) as archive:
-            if len(set(archive.files)) < len(archive.files):
-                raise ValueError("it has two entries of one name")
-            arrays = {name: np.asarray(archive[name]) for name in archive.files}
-        # Texts with code points that there are not raise here.
-        texts = {name: str(array) for name, array in arrays.items() if array.dtype.kind == "U"}
-        if "made_by" not in texts:
-            raise ValueError("made_by, the text that names its environment, is missing")
-        maker = texts["made_by"]
+            arrays = dict(archive)
+        maker = str(arrays["made_by"])
     except Exception as error:
         # Damaged bytes raise any of a dozen kinds in zipfile and numpy, from KeyError to NotImplementedError.
-        raise _refused("this kind of environment", error) from None
+        raise ValueError(f"not a saved state, as save_state gives it ({type(error).__name__}: {error})") from None
     if maker != made_by:
-        raise ValueError(f"the state was saved by {_line(maker)}, this is {made_by}: use the same scene")
+        raise ValueError(f"the state was saved by {maker}, this is {made_by}: use the same scene")
     return arrays
-
-
-def _refused(whose: str, error: Exception) -> ValueError:
-    reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-    return ValueError(f"not a saved state of {whose}, which load_state takes as save_state gave it: {_line(reason)}")
-
-
-def _line(text: str) -> str:
-    """A text from a damaged file as one line of a message."""
-    line = " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
-    return line if len(line) <= LINE_MOST else f"{line[:LINE_MOST]} ..."

@@ -12,9 +12,6 @@ from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
 # From open to closed [s].
 STROKE_TIME = 0.5
-# Far beyond what an instrument reaches [m, rad] and how fast it moves [m/s, rad/s]; forces of servos stay within what
-# MuJoCo can integrate.
-COORDINATE_MOST, SPEED_MOST = 1e3, 1e4
 # The pads of a jaw at rest face each other along UP as closely as possible; along UP_ELSE if the jaw points along UP.
 UP, UP_ELSE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
 
@@ -294,23 +291,6 @@ class Instrument(ToolBodies):
         mujoco.mj_setState(self.model, self.data, state[:size], mujoco.mjtState.mjSTATE_INTEGRATION)
         servo.command[:], servo.limited[:], servo.lower[:], servo.upper[:] = state[size:].reshape(4, -1)
         self.refresh()
-
-    def beyond_stepping(self) -> str:
-        """The coordinate, speed or acceleration that MuJoCo cannot step from, or an empty string.
-
-        Computes poses and accelerations anew, so that the next step may differ in its last bits: meant for a copy.
-        """
-        mujoco.mj_forward(self.model, self.data)
-        for what, values, most in (
-            ("coordinate", self.data.qpos, COORDINATE_MOST),
-            ("speed", self.data.qvel, SPEED_MOST),
-            ("commanded speed", self.servo.command, SPEED_MOST),
-            ("acceleration", self.data.qacc, mujoco.mjMAXVAL),
-        ):
-            wrong = np.flatnonzero(~(np.abs(values) <= most))
-            if wrong.size:
-                return f"its {what} {wrong[0]} is {values[wrong[0]]:.4g}; the rule is at most {most:g}"
-        return ""
 
     def _rest(self) -> None:
         """Reset MuJoCo's data and stop the servo."""

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -14,7 +15,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.bell_fit import BellFit, framed
 from surgsim_env.palpation.chart import ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.press import PressResult
-from surgsim_env.scene.model import PalpationSettings, Scene, Vector
+from surgsim_env.scene.model import PalpationSettings, Scene
 from surgsim_env.scene.palpable_surface import hertz_force
 
 # Speed of the tip between sites [m/s]; this travel is counted, not simulated.
@@ -49,27 +50,6 @@ class Touch:
     def stiffness(self) -> float:
         """Force over depth [N/m]; 0 where the tip did not get below the surface."""
         return self.force / self.depth if self.depth > 0.0 else 0.0
-
-
-@dataclass(frozen=True)
-class SavedTouches:
-    """What `SiteTouches.get_state` writes: the touches, `seconds` and `path_length`, where the last press began [m]."""
-
-    touches: list[Touch]
-    way: tuple[float, float]
-    last_start: Vector | None
-
-    def __post_init__(self) -> None:
-        for number, touch in enumerate(self.touches):
-            if not (max(map(abs, touch.place)) <= 1.0 and abs(touch.log_contrast) <= LOG_CONTRAST_BOUND):
-                raise ValueError(
-                    f"touches[{number}] is at {list(touch.place)} with log contrast {touch.log_contrast:g}; a place is "
-                    f"in [-1, 1], a log contrast at most {LOG_CONTRAST_BOUND:g}"
-                )
-            if touch.moved < 0.0:
-                raise ValueError(f"touches[{number}].moved is {touch.moved:g} m; it must be at least 0")
-        if min(self.way) < 0.0:
-            raise ValueError(f"way is {list(self.way)} [s, m]; both must be at least 0")
 
 
 class SiteTouches:
@@ -144,18 +124,19 @@ class SiteTouches:
             "touches": [asdict(touch) for touch in self.touches],
             "way": [self.seconds, self.path_length],
             "last_start": None if self._last_start is None else self._last_start.tolist(),
+            "map_shift": self.map_shift.tolist(),
         }
 
-    def restored(self, saved: SavedTouches) -> Self:
-        """A copy with the record that `get_state` gave; this one stays as it is."""
-        other = copy.copy(self)
-        other.clear()
-        other.touches = list(saved.touches)
-        other.seconds, other.path_length = saved.way
-        other._last_start = None if saved.last_start is None else np.array(saved.last_start)
-        for touch in saved.touches:
-            other._mark(touch)
-        return other
+    def set_state(self, table: Mapping[str, Any]) -> None:
+        """Restore the record that `get_state` gave."""
+        self.clear()
+        for touch in table["touches"]:
+            self.touches.append(Touch(**{**touch, "place": tuple(touch["place"])}))
+            self._mark(self.touches[-1])
+        self.seconds, self.path_length = table["way"]
+        start = table["last_start"]
+        self._last_start = None if start is None else np.array(start)
+        self.map_shift = np.array(table["map_shift"])
 
 
 def felt_lesion_radius(scene: Scene) -> float:
@@ -223,17 +204,9 @@ class TouchMemory:
         self._stiffest: FloatArray | None = None
 
     def restored(self, product: ArrayLike, square: ArrayLike) -> Self:
-        """A copy with other sums of the readings, (n_site,) each; this one stays as it is.
-
-        Raises:
-            ValueError: another number of sites, or a square below 0.
-        """
+        """A copy with other sums of the readings, (n_site,) each."""
         other = copy.copy(self)
         other.product, other.square = np.array(product, dtype=np.float64), np.array(square, dtype=np.float64)
-        sites = self.map.pressable.shape
-        if other.product.shape != sites or other.square.shape != sites or (other.square < 0.0).any():
-            shapes = f"{other.product.shape} and {other.square.shape}"
-            raise ValueError(f"memory: sums of shapes {shapes}; they must be {sites}, and squares at least 0")
         other._stiffest = None
         return other
 

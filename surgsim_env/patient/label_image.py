@@ -14,14 +14,7 @@ from scipy import ndimage
 
 from msdm_core.errors import MeshError
 from msdm_core.meshing.segmentation_meshing import largest_part, parts_of
-from surgsim_env.patient.label_readers import (
-    ImageGeometry,
-    LabelSource,
-    checked_whole,
-    open_itk,
-    open_nifti,
-    open_segmentation,
-)
+from surgsim_env.patient.label_readers import ImageGeometry, LabelSource, read_labels
 from surgsim_env.patient.materials import check_name, is_lesion
 
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")
@@ -104,55 +97,37 @@ def is_image(file: Path) -> bool:
 
 
 def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
-    """Read the named labels of an image file; needs one byte a voxel and a few runs of memory.
+    """Read the named labels of an image file, which is held as a whole.
 
     Raises:
-        MeshError: a file that is missing, cut short, wrongly compressed, sheared, too large or not of three axes;
+        MeshError: a file that is missing or that its library cannot read, sheared, too large or not of three axes;
             values that are not whole numbers; a label that is nowhere in it (lists those that are).
     """
-    source = _source(file, [label.value for label in labels])
-    found = np.zeros(source.shape, dtype=np.uint8, order="F")
-    counts = np.zeros(len(labels) + 1, dtype=np.int64)
-    # A view of `found`, which is stored in this order.
-    line = found.reshape(-1, order="F")
-    for first, values in source.runs():
-        whole = checked_whole(values, file)
-        part = line[first : first + len(whole)]
-        for tag, label in enumerate(labels, start=1):
-            chosen = whole == label.value
-            count = int(np.count_nonzero(chosen))
-            # Pages of `found` that are never written to take no memory.
-            if count:
-                counts[tag] += count
-                part[chosen] = tag
+    _check_there(file)
+    source = read_labels(file, [label.value for label in labels])
+    found = np.zeros(source.values.shape, dtype=np.uint8)
     for tag, label in enumerate(labels, start=1):
-        if not counts[tag]:
+        chosen = source.values == label.value
+        if not chosen.any():
             raise MeshError(
                 f"{file}: label {label.value} ({label.name!r}) is nowhere in the image; there are {_there(source)}: "
                 "correct --labels"
             )
+        found[chosen] = tag
     return _cut(found, labels, source)
 
 
-def _source(file: Path, wanted: Sequence[int]) -> LabelSource:
+def _check_there(file: Path) -> None:
     if file.is_dir():
         raise MeshError(f"{file}: is a directory; give the path of a file in it")
     if not file.is_file():
         raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
     if not file.stat().st_size:
         raise MeshError(f"{file}: is empty (0 bytes); export it again")
-    if file.name.lower().endswith((".nii", ".nii.gz")):
-        return open_nifti(file)
-    segmentation = open_segmentation(file, wanted) if file.suffix.lower() == ".dcm" else None
-    return segmentation or open_itk(file)
 
 
 def _there(source: LabelSource) -> str:
-    values: set[int] = set()
-    for _, run in source.runs():
-        values |= {int(value) for value in np.unique(run)[:100].tolist()}
-    values.discard(0)
-    known = sorted(values)
+    known = [int(value) for value in np.unique(source.values) if value]
     more = ", ..." if len(known) > 20 else ""
     return f"labels {', '.join(map(str, known[:20]))}{more}" if known else "no labels at all, every voxel is 0"
 
@@ -175,7 +150,7 @@ def _cut(found: NDArray[np.uint8], labels: Sequence[LabelName], source: LabelSou
         tuple(label.name for label in labels),
         source.geometry.moved(np.array([x, y, z], dtype=np.float64)),
         (x, y, z),
-        source.shape,
+        source.values.shape,
         source.notes,
     )
 

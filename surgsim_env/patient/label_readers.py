@@ -1,16 +1,7 @@
-"""Readers of label images, NIfTI, NRRD, MetaImage and DICOM: shape, geometry in the patient, and voxels in runs."""
+"""Readers of label images, NIfTI, NRRD, MetaImage and DICOM: geometry in the patient, and voxels."""
 
-import contextlib
-import io
-import logging
-import os
-import re
-import tempfile
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from logging.handlers import BufferingHandler
 from pathlib import Path
 from typing import Any
 
@@ -29,31 +20,11 @@ COSINE_LARGEST = 1e-3
 # Smallest and largest voxel spacing that is accepted [m].
 SPACING_RANGE = (1e-5, 0.05)
 AXES = (("right", "left"), ("front", "back"), ("feet", "head"))
-# Largest image [voxels]; a reader holds one byte of each.
+# Largest image [voxels]; it is held as a whole.
 VOXELS_MOST = 1_000_000_000
-# Length of a run [voxels]; a reader makes a few copies of it with eight bytes a voxel.
-RUN_VOXELS = 2_000_000
-ADVICE = "export or copy it again"
 # NIfTI's axes are RAS: x to the right and y to the front.
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
-# Most that may precede the image's first voxel, and follow its last one [bytes].
-HEADER_BYTES = TAIL_BYTES = 1_000_000
-# nibabel has some ten checks of a header, one remark each.
-REMARKS_MOST = 100
-# SimpleITK and pydicom read whole images: most that the image, the decoder's copies of it and the labels found, a byte
-# a voxel, may take together [bytes].
-IMAGE_BYTES_MOST = 1_600_000_000
-# What they hold of an image at once: ITK unpacks NRRD and MetaImage in place, GDCM and pydicom copy.
-COPIES = {".nrrd": 1, ".mha": 1, ".dcm": 2}
-# Only so much of a library's message is quoted [characters].
-REASON_LENGTH = 200
-READERS = {".nrrd": "NrrdImageIO", ".mha": "MetaImageIO", ".dcm": "GDCMImageIO"}
-# MetaImage's reader has room for so many axes, and checks it too late.
-META_AXES_MOST = 10
-# Entries of the headers of NRRD and MetaImage, "name: value" and "name = value", within so many bytes.
-TEXT_HEADER_BYTES = 100_000
-TEXT_ENTRY = re.compile(r"^([A-Za-z_ ]{1,40})[=:]([^\n]*)$", re.MULTILINE)
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 # Frame positions may be off the grid by this share of the slice step, or of 1 mm where slices are thinner.
@@ -128,21 +99,46 @@ class ImageGeometry:
 
 @dataclass(frozen=True, eq=False)
 class LabelSource:
-    """An image file whose header was read.
+    """An image file that was read.
 
     Fields:
         file: its path
-        shape: of the image                                     (3,)
+        values: of its voxels                                   (n_x, n_y, n_z)
         geometry: spacing, directions and origin
-        runs: reads the voxels as (first voxel, values (n,)), in order, the first axis fastest
         notes: assumptions about the header, for the report
     """
 
     file: Path
-    shape: tuple[int, int, int]
+    values: NDArray
     geometry: ImageGeometry
-    runs: Callable[[], Iterator[tuple[int, NDArray]]]
     notes: tuple[str, ...] = ()
+
+
+def read_labels(file: Path, wanted: Sequence[int]) -> LabelSource:
+    """Read an image file by its suffix.
+
+    Args:
+        file: the file.
+        wanted: segment numbers of a DICOM segmentation; where segments overlap, the later one in this list applies.
+
+    Raises:
+        MeshError: a file that its library cannot read, an image that is sheared, too large or not of three axes,
+            voxels that are no whole numbers.
+    """
+    return parsed(file, lambda _: _read(file, wanted), "export or copy it again")
+
+
+def _read(file: Path, wanted: Sequence[int]) -> LabelSource:
+    try:
+        if file.name.lower().endswith((".nii", ".nii.gz")):
+            source = _read_nifti(file)
+        else:
+            segmentation = _read_segmentation(file, wanted) if file.suffix.lower() == ".dcm" else None
+            source = segmentation or _read_itk(file)
+    except ImportError as error:
+        raise MeshError(f"{file}: reading it needs {error.name}: pip install 'surgsim[patient]'") from None
+    check_whole(source.values, file)
+    return source
 
 
 def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
@@ -170,17 +166,12 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
     return counts[0], counts[1], counts[2]
 
 
-def checked_kind(dtype: np.dtype, file: Path) -> None:
-    """Raise a MeshError for values such as colours or complex numbers."""
-    if dtype.kind not in "iubf":
-        raise MeshError(f"{file}: the image's values are {dtype}; labels are whole numbers: export a label map")
-
-
-def checked_whole(values: NDArray, file: Path) -> NDArray:
-    """The label values; raises a MeshError with the first that is not a whole number."""
-    checked_kind(values.dtype, file)
+def check_whole(values: NDArray, file: Path) -> None:
+    """Raise a MeshError for values that are no numbers, with the first that is not a whole number."""
+    if values.dtype.kind not in "iubf":
+        raise MeshError(f"{file}: the image's values are {values.dtype}; labels are whole numbers: export a label map")
     if values.dtype.kind != "f":
-        return values
+        return
     # numpy warns of a NaN of another kind than its own; all are wrong here.
     with np.errstate(invalid="ignore"):
         wrong = (values != np.rint(values)) | ~np.isfinite(values)
@@ -189,279 +180,54 @@ def checked_whole(values: NDArray, file: Path) -> NDArray:
             f"{file}: the image holds {float(values[wrong][0]):g}, which is no whole number: labels are; is this the "
             "scan itself, or resampled with interpolation? Export a label map, resampled by nearest neighbours"
         )
-    return values
 
 
-def open_nifti(file: Path) -> LabelSource:
-    """Read the header of a NIfTI file.
+def _read_nifti(file: Path) -> LabelSource:
+    import nibabel
 
-    Raises:
-        MeshError: a damaged file or an unsupported header.
-    """
-    with file.open("rb") as stream:
-        packed = stream.read(2) == b"\x1f\x8b"
-    if packed != file.name.lower().endswith(".gz"):
-        name, what = (".nii.gz", "is not") if not packed else (".nii", "is")
-        raise MeshError(f"{file}: is named {name} and {what} compressed by gzip: rename it, or {ADVICE}")
-    header, notes = _header(file)
-    shape = checked_shape(parsed(file, lambda _: header.get_data_shape(), ADVICE), file)
-    dtype = np.dtype(parsed(file, lambda _: header.get_data_dtype(), ADVICE))
-    checked_kind(dtype, file)
-    # The header's own number, infinite or not; nibabel's method would make a whole number of it.
-    stated = float(header["vox_offset"])
-    if not 0 <= stated <= HEADER_BYTES:
-        raise MeshError(
-            f"{file}: its header puts the first voxel at byte {stated:.10g} (vox_offset); the rule is 0 to "
-            f"{HEADER_BYTES}: export it without header extensions"
-        )
-    offset = int(header.get_data_offset())
-    slope, shift = parsed(file, lambda _: header.get_slope_inter(), ADVICE)
-    scaling = (1.0 if slope is None else float(slope), 0.0 if shift is None else float(shift))
-    unit = str(parsed(file, lambda _: header.get_xyzt_units(), ADVICE)[0])
+    image: Any = nibabel.load(file)
+    header, notes = image.header, []
+    shape = checked_shape(image.shape, file)
+    unit = str(header.get_xyzt_units()[0])
     if unit not in METRES:
         notes.append("the header states no length unit: millimetres are assumed, as NIfTI's readers do")
     if not int(header["sform_code"]) and not int(header["qform_code"]):
         notes.append("the header states no orientation: left and right, front and back may be swapped")
-    affine = np.asarray(parsed(file, lambda _: header.get_best_affine(), ADVICE), dtype=np.float64)
-    # What is or becomes infinite is refused with the geometry.
-    with np.errstate(over="ignore", invalid="ignore"):
-        matrix, origin = np.hsplit(matmul(RAS_TO_LPS, affine[:3] * METRES.get(unit, 1e-3)), [3])
+    matrix, origin = np.hsplit(matmul(RAS_TO_LPS, image.affine[:3] * METRES.get(unit, 1e-3)), [3])
     geometry = ImageGeometry.from_matrix(matrix, origin[:, 0], file)
-
-    runs = partial(_runs, file, shape, dtype, offset, scaling)
-    return LabelSource(file, shape, geometry, runs, tuple(notes))
+    return LabelSource(file, np.asanyarray(image.dataobj).reshape(shape), geometry, tuple(notes))
 
 
-def _header(file: Path) -> tuple[Any, list[str]]:
-    """The header without its extensions, whose stated sizes nibabel.load would trust, and what nibabel mended in it."""
-    try:
-        from nibabel.nifti1 import Nifti1Header
-        from nibabel.nifti2 import Nifti2Header
-    except ImportError:
-        raise MeshError(f"{file}: reading NIfTI needs nibabel: pip install 'surgsim[patient]'") from None
-    raw = parsed(file, lambda _: _opened(file, Nifti2Header.template_dtype.itemsize), ADVICE)
-    if len(raw) < Nifti1Header.template_dtype.itemsize:
-        raise MeshError(f"{file}: is cut short: it ends within its header, after {len(raw)} bytes: {ADVICE}")
-    # Positions of the magic words in the two versions of the format.
-    for kind, magic, place in ((Nifti1Header, b"n+1\0", 344), (Nifti2Header, b"n+2\0", 4)):
-        if raw[place : place + 4] == magic:
-            block = io.BytesIO(raw[: kind.template_dtype.itemsize])
-            return parsed(file, lambda _, kind=kind, block=block: _checked_header(kind, block), ADVICE)
-    raise MeshError(f"{file}: is no NIfTI image of one file (no n+1 or n+2 in its header): {ADVICE}")
+def _read_itk(file: Path) -> LabelSource:
+    """Read an NRRD, MetaImage or DICOM image."""
+    import SimpleITK
 
-
-def _checked_header(kind: Any, block: io.BytesIO) -> tuple[Any, list[str]]:
-    """A header after nibabel's checks. Their remarks go to a logger of this call; nibabel's own prints to stderr."""
-    header, said = kind.from_fileobj(block, check=False), BufferingHandler(REMARKS_MOST)
-    logger = logging.Logger(__name__, logging.WARNING)
-    logger.addHandler(said)
-    header.check_fix(logger=logger)
-    return header, [f"the header is unusual: {record.getMessage()}" for record in said.buffer]
-
-
-def _opened(file: Path, size: int) -> bytes:
-    from nibabel.openers import ImageOpener
-
-    stream: Any = ImageOpener(str(file))
-    with stream:
-        return stream.read(size)
-
-
-def _runs(
-    file: Path, shape: tuple[int, int, int], dtype: np.dtype, offset: int, scaling: tuple[float, float]
-) -> Iterator[tuple[int, NDArray]]:
-    """Runs of (first voxel, values); reads the whole file, so that gzip's checksum is verified."""
-    from nibabel.openers import ImageOpener
-
-    layer, total = shape[0] * shape[1], shape[0] * shape[1] * shape[2]
-    slope, shift = scaling
-    stream: Any = ImageOpener(str(file))
-    with stream:
-        parsed(file, lambda _: stream.seek(offset), ADVICE)
-        for first in range(0, total, RUN_VOXELS):
-            wanted = min(RUN_VOXELS, total - first) * dtype.itemsize
-            raw = parsed(file, lambda _, size=wanted: stream.read(size), ADVICE)
-            if len(raw) < wanted:
-                raise MeshError(
-                    f"{file}: is cut short: its header promises {' x '.join(map(str, shape))} voxels, the data end "
-                    f"within slice {(first + len(raw) // dtype.itemsize) // layer} of {shape[2]}: {ADVICE}"
-                )
-            values = np.frombuffer(raw, dtype=dtype)
-            # A number that overflows is no label: whoever takes the values refuses it.
-            with np.errstate(over="ignore"):
-                scaled = values if scaling == (1.0, 0.0) else values * slope + shift
-            yield first, scaled
-        if len(parsed(file, lambda _: stream.read(TAIL_BYTES), ADVICE)) >= TAIL_BYTES:
-            raise MeshError(f"{file}: goes on far beyond the image that its header describes: {ADVICE}")
-
-
-def open_itk(file: Path) -> LabelSource:
-    """Read the header of an NRRD, MHA or DICOM file.
-
-    Raises:
-        MeshError: a damaged file, an unsupported header, or a file that SimpleITK cannot parse.
-    """
-    try:
-        import SimpleITK
-    except ImportError:
-        raise MeshError(f"{file}: reading {file.suffix} needs SimpleITK: pip install 'surgsim[patient]'") from None
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
-    if file.suffix.lower() != ".dcm":
-        _check_text_header(file)
     reader: Any = SimpleITK.ImageFileReader()
-    reader.SetImageIO(READERS[file.suffix.lower()])
     reader.SetFileName(str(file))
-    _asked(file, reader.ReadImageInformation)
+    reader.ReadImageInformation()
     shape = checked_shape(reader.GetSize(), file)
     components = reader.GetNumberOfComponents()
     if components != 1:
         raise MeshError(f"{file}: each voxel has {components} numbers; the rule is one label: export one layer of it")
-    pixel = SimpleITK.GetPixelIDValueAsString(reader.GetPixelID())
-    width = next((size for name, size in (("8-bit", 1), ("16-bit", 2), ("32-bit", 4)) if name in pixel), 8)
-    _check_memory(file, shape, width)
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
-    # What becomes infinite is refused with the geometry.
-    with np.errstate(over="ignore", invalid="ignore"):
-        matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
+    matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
     geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * 1e-3, file)
-    notes = _stated_space(file)
-
-    def runs() -> Iterator[tuple[int, NDArray]]:
-        image = _asked(file, reader.Execute)
-        # SimpleITK's arrays have the axes reversed, so that the image's first axis is the fastest.
-        values = SimpleITK.GetArrayViewFromImage(image).reshape(-1)
-        for first in range(0, len(values), RUN_VOXELS):
-            yield first, values[first : first + RUN_VOXELS]
-
-    return LabelSource(file, shape, geometry, runs, notes)
+    notes: tuple[str, ...] = ()
+    if file.suffix.lower() == ".nrrd" and not reader.HasMetaDataKey("NRRD_space"):
+        notes = ("the header names no anatomical space: left, back and up (LPS) are assumed",)
+    # SimpleITK's arrays have the axes reversed.
+    return LabelSource(file, SimpleITK.GetArrayFromImage(reader.Execute()).T.reshape(shape), geometry, notes)
 
 
-def _check_text_header(file: Path) -> None:
-    """Refuse entries of an NRRD or MetaImage header with which ITK's readers crash, hang or take memory without end."""
-    with file.open("rb") as stream:
-        head = stream.read(TEXT_HEADER_BYTES).decode("latin-1")
-    entries = [(match[1].strip().lower(), match[2].strip()) for match in TEXT_ENTRY.finditer(head)]
-    for name, value in entries:
-        wrong = ""
-        if name == "ndims" and not (value.isdecimal() and 1 <= int(value) <= META_AXES_MOST):
-            wrong = f"a whole number from 1 to {META_AXES_MOST}"
-        elif name == "compresseddatasize" and not (value.isdecimal() and int(value) <= file.stat().st_size):
-            wrong = f"at most the file's {file.stat().st_size} bytes"
-        # The readers use it as a format of C, which may say anything.
-        elif name in ("elementdatafile", "data file", "datafile") and ("%" in value or value.startswith("LIST")):
-            wrong = "LOCAL or the name of one file"
-        if wrong:
-            shown = value if len(value) <= 40 else f"{value[:40]}..."
-            raise MeshError(f"{file}: its header's {name} is {shown!r}; the rule is {wrong}: {ADVICE}")
+def _read_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
+    """Read a DICOM segmentation; None for another DICOM file."""
+    import pydicom
 
-
-def _check_memory(file: Path, shape: tuple[int, int, int], width: int) -> None:
-    """Refuse, before it is decoded, an image whose voxels of `width` bytes take more than IMAGE_BYTES_MOST."""
-    voxels, copies = shape[0] * shape[1] * shape[2], COPIES[file.suffix.lower()]
-    taken = voxels * (copies * width + 1)
-    if taken > IMAGE_BYTES_MOST:
-        raise MeshError(
-            f"{file}: holds {' x '.join(map(str, shape))} voxels of {width} bytes, which take {taken / 1e9:.3g} GB to "
-            f"read; at most {IMAGE_BYTES_MOST / 1e9:g} GB of this format are read at once: crop it, or save it as "
-            "NIfTI, which is read in parts"
-        )
-
-
-def _asked(file: Path, question: Callable[[], Any]) -> Any:
-    """The result of a call to SimpleITK; its error messages without the positions in its own sources."""
-    with _printed_in_c() as printed:
-        try:
-            return parsed(file, lambda _: question(), ADVICE)
-        except MeshError as error:
-            lines = [line.strip() for line in str(error.__cause__).splitlines() if line.strip()]
-            reason = " ".join([*lines, *printed().split()])[-REASON_LENGTH:]
-            raise MeshError(f"{file}: cannot be parsed: {reason}: {ADVICE}") from None
-
-
-@contextlib.contextmanager
-def _printed_in_c() -> Iterator[Callable[[], str]]:
-    """Keep what C++ code prints to standard error (MetaImage's reader does) off it; the function gives it."""
-    before = os.dup(2)
-    with tempfile.TemporaryFile() as said:
-
-        def text() -> str:
-            said.seek(0)
-            return said.read().decode(errors="replace")
-
-        os.dup2(said.fileno(), 2)
-        try:
-            yield text
-        finally:
-            os.dup2(before, 2)
-            os.close(before)
-
-
-def _stated_space(file: Path) -> tuple[str, ...]:
-    """A note if an NRRD header names no anatomical space: ITK then assumes LPS."""
-    if file.suffix.lower() != ".nrrd":
-        return ()
-    with file.open("rb") as stream:
-        head = stream.read(20_000).partition(b"\n\n")[0].decode("ascii", errors="replace").lower()
-    if "\nspace:" in head:
-        return ()
-    return ("the header names no anatomical space: left, back and up (LPS) are assumed",)
-
-
-def open_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
-    """Read the header of a DICOM file; None if it is no segmentation object.
-
-    Args:
-        file: the file.
-        wanted: segment numbers; where segments overlap, the later one in this list applies.
-
-    Raises:
-        MeshError: a damaged or unsupported file; a wanted segment that is not there (lists those that are).
-    """
-    try:
-        import pydicom
-    except ImportError:
-        raise MeshError(f"{file}: reading DICOM needs pydicom: pip install 'surgsim[patient]'") from None
-    # pydicom holds the whole file.
-    if file.stat().st_size > IMAGE_BYTES_MOST:
-        raise MeshError(f"{file}: has more than {IMAGE_BYTES_MOST / 1e9:g} GB: crop it to the organ")
-    parsed(file, lambda _: _check_deflated(file), ADVICE)
-    data: Any = parsed(file, pydicom.dcmread, ADVICE)
-    # pydicom converts an element when it is asked for, with warnings and errors of any type.
-    if parsed(file, lambda _: str(data.get("SOPClassUID", "")), ADVICE) not in CLASSES:
+    data: Any = pydicom.dcmread(file)
+    if str(data.get("SOPClassUID", "")) not in CLASSES:
         return None
-    return parsed(file, lambda _: _complete_source(file, data, wanted), ADVICE)
-
-
-def _check_deflated(file: Path) -> None:
-    """Refuse a deflated data set that unpacks to more than IMAGE_BYTES_MOST; pydicom would unpack it at once."""
-    from pydicom.filereader import read_file_meta_info
-    from pydicom.uid import DeflatedExplicitVRLittleEndian
-
-    meta = read_file_meta_info(file)
-    if meta.get("TransferSyntaxUID") != DeflatedExplicitVRLittleEndian:
-        return
-    unpacked, inflate = 0, zlib.decompressobj(-zlib.MAX_WBITS)
-    with file.open("rb") as stream:
-        # The preamble with its magic word, and the element that states the length of the file meta information.
-        stream.seek(144 + int(meta.FileMetaInformationGroupLength))
-        waiting = stream.read(RUN_VOXELS)
-        while waiting and not inflate.eof:
-            unpacked += len(inflate.decompress(waiting, RUN_VOXELS))
-            if unpacked > IMAGE_BYTES_MOST:
-                raise ValueError(f"its deflated data are more than {IMAGE_BYTES_MOST / 1e9:g} GB: crop it to the organ")
-            waiting = inflate.unconsumed_tail or stream.read(RUN_VOXELS)
-
-
-def _complete_source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
-    try:
-        return _source(file, data, wanted)
-    except (AttributeError, KeyError, IndexError, TypeError) as error:
-        reason = " ".join(str(error).split())[:REASON_LENGTH]
-        raise MeshError(f"{file}: is no complete DICOM segmentation ({reason}): {ADVICE}") from None
-
-
-def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
     kind = str(data.SegmentationType)
     if kind not in ("BINARY", "LABELMAP"):
         raise MeshError(f"{file}: its segments are {kind:.80}; the rule is BINARY or LABELMAP: export it so")
@@ -472,33 +238,19 @@ def _source(file: Path, data: Any, wanted: Sequence[int]) -> LabelSource:
         raise MeshError(f"{file}: segment {missing[0]} is nowhere in it; there are {there}: correct --labels")
     frames = list(data.PerFrameFunctionalGroupsSequence)
     rows, columns = int(data.Rows), int(data.Columns)
-    stated = int(data.NumberOfFrames)
-    if stated != len(frames):
-        raise MeshError(f"{file}: states {stated} frames and describes {len(frames)}: {ADVICE}")
-    width = -(-int(data.BitsAllocated) * int(data.SamplesPerPixel) // 8)
-    _check_memory(file, checked_shape((columns, rows, len(frames)), file), width)
     geometry, slices = _geometry(file, data, frames)
-    shape = checked_shape((columns, rows, int(slices.max()) + 1), file)
-    identified = frames if kind == "BINARY" else []
-    numbers = [int(_group(data, one, "SegmentIdentificationSequence").ReferencedSegmentNumber) for one in identified]
-
-    def runs() -> Iterator[tuple[int, NDArray]]:
-        layers = (len(frames), rows, columns)
-        pixels = parsed(file, lambda _: np.atleast_3d(data.pixel_array).reshape(layers), ADVICE)
-        for place in range(shape[2]):
-            layer = np.zeros((columns, rows, 1), dtype=np.int64)
-            here = np.flatnonzero(slices == place)
-            if kind == "LABELMAP":
-                for frame in here:
-                    layer[..., 0] = pixels[frame].T
-            else:
-                for number in wanted:
-                    for frame in here:
-                        if numbers[frame] == number:
-                            layer[pixels[frame].T > 0] = number
-            yield place * rows * columns, layer.ravel(order="F")
-
-    return LabelSource(file, shape, geometry, runs)
+    values = np.zeros(checked_shape((columns, rows, int(slices.max()) + 1), file), dtype=np.int32)
+    pixels = np.atleast_3d(data.pixel_array).reshape(len(frames), rows, columns)
+    if kind == "LABELMAP":
+        for frame, place in enumerate(slices):
+            values[..., place] = pixels[frame].T
+        return LabelSource(file, values, geometry)
+    groups = [_group(data, one, "SegmentIdentificationSequence") for one in frames]
+    numbers = np.array([int(one.ReferencedSegmentNumber) for one in groups])
+    for number in wanted:
+        for frame in np.flatnonzero(numbers == number):
+            values[pixels[frame].T > 0, slices[frame]] = number
+    return LabelSource(file, values, geometry)
 
 
 def _group(data: Any, frame: Any, name: str) -> Any:

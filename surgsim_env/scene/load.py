@@ -1,7 +1,5 @@
-"""Scene files and JSON documents read into dataclasses, every entry checked; shipped scenes and arms by name."""
+"""Scene files read into dataclasses, every entry checked; shipped scenes and arms by name."""
 
-import json
-import math
 import tomllib
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
@@ -16,8 +14,6 @@ from surgsim_env.scene.model import CARTESIAN, PAIRS, LibraryMaterial, Scene
 
 Table = TypeVar("Table")
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
-# Whole numbers of a JSON document lie below this, so that a float holds each.
-WHOLE_MOST = 2**53
 # Characters of a wrong value, and of a reason, that a message shows.
 SHOWN, REASON_LENGTH = 60, 600
 
@@ -80,36 +76,19 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         raise ValueError(f"{what} file {path} cannot be read: {reason}") from None
 
 
-def fill_json(kind: type[Table], text: str, where: str) -> Table:
-    """Fill a dataclass from a JSON object, with every entry checked; numbers of typed entries are finite.
-
-    Raises:
-        ValueError: no JSON object, an unknown entry, a missing or a wrong one; the message begins with `where`.
-    """
-    try:
-        table = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{where}: {text!r:.{SHOWN}} is no JSON document: {error}") from None
-    if not isinstance(table, dict):
-        raise ValueError(f"{where}: {text!r:.{SHOWN}} is no JSON object")
-    return fill(kind, table, where, finite=True)
-
-
-def fill(kind: type[Table], table: dict[str, Any], where: str, *, finite: bool = False) -> Table:
+def fill(kind: type[Table], table: dict[str, Any], where: str) -> Table:
     """Fill a dataclass from a table of a TOML file, with every entry checked.
 
     Args:
         kind: the dataclass.
         table: its entries.
         where: what holds the table, for messages.
-        finite: refuse numbers that are not finite here; else the dataclass says which of its own must be.
 
     Raises:
         ValueError: an unknown entry (suggests the nearest), a missing or a wrong one; the message begins with `where`.
     """
     lists = {hint: _listed for part in dataclasses_in(kind) for hint in _tuples_in(*get_type_hints(part).values())}
-    numbers = {float: _finite, int: _counted} if finite else {float: _real, int: _whole}
-    hooks: dict[Any, Any] = {**numbers, **lists}
+    hooks: dict[Any, Any] = {float: _real, int: _whole, **lists}
     try:
         return dacite.from_dict(kind, table, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
     except dacite.UnexpectedDataError as error:
@@ -159,26 +138,11 @@ def _whole(value: Any) -> int:
     return value
 
 
-def _counted(value: Any) -> int:
-    if not -WHOLE_MOST < _whole(value) < WHOLE_MOST:
-        raise _EntryError(f"{value!r:.{SHOWN}} is not a whole number below 2^53")
-    return value
-
-
 def _real(value: Any) -> float:
     """Accept 5000 for 5000.0, which TOML tells apart."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise _EntryError(f"{value!r:.{SHOWN}} is not a number")
     return float(value)
-
-
-def _finite(value: Any) -> float:
-    # An integer may exceed what a float holds.
-    if isinstance(value, int) and not isinstance(value, bool):
-        value = _counted(value)
-    if not math.isfinite(number := _real(value)):
-        raise _EntryError(f"{value!r} is not a finite number")
-    return number
 
 
 def list_scenes() -> list[str]:

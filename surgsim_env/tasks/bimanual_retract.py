@@ -1,20 +1,16 @@
 """Retraction with two arms: the left one exposes the target, the right one touches it."""
 
-import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from msdm_core.arithmetic import norm
-from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.load import fill_json
-from surgsim_env.scene.model import require_number
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.retract import AXIS_BOUND, FORCE_BOUND, SUCCESS_SHARE, TURNING_FULL_SCALE, RetractTask
 from surgsim_env.tasks.task import (
@@ -24,7 +20,6 @@ from surgsim_env.tasks.task import (
     TIP_POSITION,
     InfoValue,
     Start,
-    check_share,
     force_scale,
     soft_force_share,
 )
@@ -169,6 +164,7 @@ class BimanualRetractTask(RetractTask):
     )  # fmt: skip
     default_instrument = "psm_pair"
     lanes = False
+    kept = (*RetractTask.kept, "uncovered_share", "touch_force")
     takes_pair = True
 
     def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
@@ -265,34 +261,6 @@ class BimanualRetractTask(RetractTask):
             "touches": simulation is not None and self.touches(simulation),
             "collision_force": 0.0 if simulation is None else _pair(simulation).collision_force,
         }
-
-    def get_state(self) -> str:
-        """Draw, biases, counters and measures as JSON, exact."""
-        right = {
-            "bias": self.sensors["right_force"].get_state(),
-            "felt": [self.uncovered_share, self.touch_force],
-        }
-        return json.dumps({"left": super().get_state(), **right})
-
-    def set_state(self, text: str) -> OrganModel:
-        """As `Task.set_state`."""
-        state = fill_json(_SavedBimanual, text, "task")
-        uncovered, touch_force = state.felt
-        check_share("felt[0]", uncovered)
-        require_number("task: felt[1]", touch_force, 0.0, "N")
-        organ = super().set_state(state.left)
-        self.sensors = self.biased({"right_force": state.bias})
-        self.uncovered_share, self.touch_force = uncovered, touch_force
-        return organ
-
-
-@dataclass(frozen=True)
-class _SavedBimanual:
-    """What `BimanualRetractTask.get_state` writes: RetractTask's text, and of the right arm bias and measures."""
-
-    left: str
-    bias: list[float]
-    felt: tuple[float, float]
 
 
 def _check_tips(pair: "Pair") -> None:

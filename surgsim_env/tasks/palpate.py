@@ -1,15 +1,12 @@
 """Palpation: find one hidden lesion by touch and declare it while pressing on it."""
 
-import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from msdm_core.arithmetic import matmul
-from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
@@ -19,7 +16,7 @@ from surgsim_env.palpation.face_frame import FaceFrame
 from surgsim_env.palpation.touches import Indenter, TouchMemory, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.levels import DrawnOrgan
-from surgsim_env.scene.load import fill_json, nearest
+from surgsim_env.scene.load import nearest
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.palpate_sites import CELL_BOUND, WIDE
 from surgsim_env.tasks.task import (
@@ -30,7 +27,6 @@ from surgsim_env.tasks.task import (
     TIP_VELOCITY,
     InfoValue,
     Task,
-    check_count,
     force_scale,
     soft_force_share,
 )
@@ -250,6 +246,7 @@ class PalpateTask(Task):
     )  # fmt: skip
     # Of each environment, by the size of its face.
     episode_steps = None
+    kept = ("declare_count", "_declare_value", "readings")
     drawn: DrawnOrgan | None
 
     def __init__(
@@ -399,46 +396,11 @@ class PalpateTask(Task):
         truth, _ = self.anatomy.face.project(self.lesion.centre)
         return float(self.anatomy.along_surface(truth, place[None])[0])
 
-    def get_state(self) -> str:
-        """What was drawn, bias and counters as JSON, exact (numbers are written in full)."""
-        assert self.drawn is not None
-        return json.dumps(
-            {
-                "drawn": self.drawn.to_json(),
-                "bias": self.sensors["contact_force"].get_state(),
-                "counts": [self.step_count, self.declare_count],
-                "declare_value": self._declare_value,
-                "memory": None if self.memory is None else [self.memory.product.tolist(), self.memory.square.tolist()],
-            }
-        )
+    @property
+    def readings(self) -> FloatArray | None:
+        """Sums of the memory, product and square (2, n_site); None without memory."""
+        return None if self.memory is None else np.array([self.memory.product, self.memory.square])
 
-    def set_state(self, text: str) -> OrganModel:
-        """As `Task.set_state`."""
-        state = fill_json(_SavedPalpation, text, "task")
-        step_count, declare_count = state.counts
-        check_count("counts[0]", step_count, self.episode_steps)
-        check_count("counts[1]", declare_count, DECLARE_STEPS)
-        if (state.memory is None) != (self.memory is None):
-            has, needs = ("no", "with") if state.memory is None else ("a", "without")
-            raise ValueError(f"task: the episode has {has} memory, and this environment was made {needs} one")
-        memory = None if self.memory is None or state.memory is None else self.memory.restored(*state.memory)
-        drawn = DrawnOrgan.from_json(state.drawn, self.anatomy)
-        if not drawn.lesions:
-            raise ValueError("task: drawn.lesions is empty; a palpation has a lesion to find")
-        organ = drawn.compiled(self.anatomy)
-        self.drawn, self.memory = drawn, memory
-        self.sensors = self.biased({"contact_force": state.bias})
-        self.step_count, self.declare_count = step_count, declare_count
-        self._declare_value = state.declare_value
-        return organ
-
-
-@dataclass(frozen=True)
-class _SavedPalpation:
-    """What `PalpateTask.get_state` writes."""
-
-    drawn: str
-    bias: list[float]
-    counts: tuple[int, int]
-    declare_value: float
-    memory: tuple[list[float], list[float]] | None
+    @readings.setter
+    def readings(self, sums: FloatArray | None) -> None:
+        self.memory = None if self.memory is None or sums is None else self.memory.restored(*sums)

@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -19,14 +18,14 @@ from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstim
 from surgsim_env.palpation.member_map import member_map, still_template
 from surgsim_env.palpation.press import PressResult
 from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
-from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SavedTouches, SiteTouches, Touch, felt_lesion_radius
+from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SiteTouches, Touch, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.family import family_of
 from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
-from surgsim_env.scene.load import fill_json, make_scene, with_instrument
+from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
-from surgsim_env.tasks.task import InfoValue, Start, Task, check_count, check_share, soft_force_share
+from surgsim_env.tasks.task import InfoValue, Start, Task, soft_force_share
 
 # Presses of an episode; BUDGET_WIDE where the chart's longer side exceeds WIDE tip radii.
 BUDGET, BUDGET_WIDE, WIDE = 25, 60, 10.0
@@ -215,6 +214,7 @@ class PalpateSitesTask(Task):
             lambda task, step: 1.0 - task.step_count / task.budget,
         ),
     )  # fmt: skip
+    kept = ("given_budget", "record")
     # The budget ends an episode.
     episode_steps = None
     drawn: DrawnOrgan | None
@@ -257,7 +257,7 @@ class PalpateSitesTask(Task):
         self.still: Anatomy | None = None
         if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 1):
             raise ValueError(f"budget is {budget!r}; it must be a whole number of presses, at least 1")
-        self._budget = budget
+        self.given_budget = budget
         self.reading = ForceReading(scene.sensor)
         self.cutoff, self.tip_scale = ospa_cutoff(tip), tip / REFERENCE_TIP
         self._take_map(healthy)
@@ -274,7 +274,7 @@ class PalpateSitesTask(Task):
         self.charted = charted_face(self.anatomy)
         chart = self.charted.chart
         wide = chart.extent.max() > WIDE * scene.instrument.tip_radius
-        self.budget = self._budget if self._budget is not None else (BUDGET_WIDE if wide else BUDGET)
+        self.budget = self.given_budget if self.given_budget is not None else (BUDGET_WIDE if wide else BUDGET)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
         healthy_force = float(healthy.grid.mean()) * scene.palpation.press_depth
         self.estimator = LesionEstimator(
@@ -405,59 +405,33 @@ class PalpateSitesTask(Task):
 
     # ---- saving -----------------------------------------------------------------------------------------------------
 
-    def get_state(self) -> str:
-        """What was drawn and felt, as exact JSON."""
-        assert self.drawn is not None
-        return json.dumps(
-            {
-                "drawn": self.drawn.to_json(),
-                "bias": self.reading.get_state(),
-                "map_shift": self.felt.map_shift.tolist(),
-                "felt": self.felt.get_state(),
-                "step_count": self.step_count,
-                "budget": self.budget,
-                "found_before": self._reached["found"],
-            }
-        )
+    @property
+    def record(self) -> dict[str, Any]:
+        """What was felt and the sensor's bias, as a table for JSON."""
+        return {"bias": self.reading.get_state(), **self.felt.get_state()}
 
-    def set_state(self, text: str) -> OrganModel:
-        """As `Task.set_state`.
+    @record.setter
+    def record(self, table: dict[str, Any]) -> None:
+        self.reading = ForceReading(self.reading.sensor, table["bias"])
+        self.felt.set_state(table)
+
+    def saved_organ(self, text: str, anatomy: Anatomy) -> OrganModel:
+        """As `Task.saved_organ`.
 
         Raises:
             ValueError: also if the episode has another budget, which what is observed and paid goes with.
         """
-        state = fill_json(_SavedSites, text, "task")
-        if state.budget != self.budget:
+        organ, given = super().saved_organ(text, anatomy), json.loads(text)["kept"]["given_budget"]
+        if given != self.given_budget:
             raise ValueError(
-                f"the state is of an episode of {state.budget} presses, this environment's have {self.budget}: make "
-                f"it with budget={state.budget}"
+                f"the state is of an episode with budget={given}, this environment has budget={self.given_budget}: "
+                "make it with that"
             )
-        check_count("step_count", state.step_count, self.budget)
-        check_count("the number of felt.touches", len(state.felt.touches), state.step_count)
-        check_share("found_before", state.found_before)
-        assert self.level is not None
-        if any(state.map_shift) and not self.level.map_error:
-            raise ValueError(f"map_shift is {list(state.map_shift)} m; at level {self.level.name!r} it must be 0")
-        drawn = DrawnOrgan.from_json(state.drawn, self.anatomy)
-        organ, truth, felt = drawn.compiled(self.anatomy), drawn.places(self.anatomy), self.felt.restored(state.felt)
-        self.drawn, self.truth, self.felt = drawn, truth, felt
-        self.felt.map_shift = np.array(state.map_shift)
-        self.reading = ForceReading(self.reading.sensor, state.bias)
-        self.step_count = state.step_count
-        self._pending = None
-        self._believe()
-        self._reached = {"found": state.found_before}
         return organ
 
-
-@dataclass(frozen=True)
-class _SavedSites:
-    """What `PalpateSitesTask.get_state` writes."""
-
-    drawn: str
-    bias: list[float]
-    map_shift: tuple[float, float]
-    felt: SavedTouches
-    step_count: int
-    budget: int
-    found_before: float
+    def set_state(self, text: str, anatomy: Anatomy) -> None:
+        """As `Task.set_state`; the estimate follows from what was felt."""
+        super().set_state(text, anatomy)
+        assert self.drawn is not None
+        self.truth, self._pending = self.drawn.places(anatomy), None
+        self._believe()

@@ -16,9 +16,8 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Grasp, Instrument
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.levels import SAVED_MOST
-from surgsim_env.scene.load import fill_json, make_retract_scene, with_instrument
-from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera, Vector, require_number
+from surgsim_env.scene.load import fill, make_retract_scene, with_instrument
+from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera, Vector
 from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.task import (
@@ -30,9 +29,6 @@ from surgsim_env.tasks.task import (
     InfoValue,
     Start,
     Task,
-    check_count,
-    check_names,
-    check_share,
     force_scale,
     soft_force_share,
 )
@@ -70,6 +66,57 @@ def _lobe_middle(task: "RetractTask", instrument: Instrument) -> FloatArray:
 
 def _lobe_upper(task: "RetractTask", instrument: Instrument) -> FloatArray:
     return np.tile(task.anatomy.mesh.points.max(axis=0) + LOBE_SLACK, len(ALONG))
+
+
+@dataclass(frozen=True)
+class RetractionDraw:
+    """One episode's draw, SI units.
+
+    Args:
+        scale: factor on the whole lobe.
+        youngs_modulus: of its tissue [Pa].
+        capsule_stiffness: modulus times thickness of its capsule [N/m], 0 without one.
+        held_share: which share of the anchored edge is held.
+        target: centre of the disc on the bed [m].
+        eye, looks_at: where the endoscope stands and looks [m].
+        start: the tip's place [m].
+    """
+
+    scale: float
+    youngs_modulus: float
+    capsule_stiffness: float
+    held_share: float
+    target: Vector
+    eye: Vector
+    looks_at: Vector
+    start: Vector
+    # A lobe has none.
+    lesions: ClassVar[tuple[Lesion, ...]] = ()
+
+    def to_json(self) -> str:
+        """The draw as JSON, with numbers written exactly."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str, anatomy: Anatomy) -> Self:
+        """The draw that `to_json` wrote."""
+        return fill(cls, json.loads(text), "drawn")
+
+    def compiled(self, anatomy: Anatomy) -> OrganModel:
+        """The scene's lobe as the episode has it."""
+        plain = anatomy.specification()
+        mesh = anatomy.mesh
+        capsule = plain.capsule
+        if self.capsule_stiffness > 0.0:
+            capsule = Capsule(self.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
+        specification = replace(
+            plain,
+            mesh=TetMesh(mesh.points * self.scale, mesh.tets, mesh.region, mesh.region_names),
+            materials=replace(anatomy.scene.material, youngs_modulus=self.youngs_modulus),
+            capsule=capsule,
+            anchors=held_nodes(mesh.points, anatomy.anchors, self.held_share),
+        )
+        return anatomy.compiled(specification)
 
 
 class RetractTask(Task):
@@ -216,7 +263,9 @@ class RetractTask(Task):
     episode_steps = EPISODE_STEPS
     # Whether two arms do it.
     takes_pair: ClassVar[bool] = False
-    drawn: "RetractionDraw | None"
+    kept = ("goal_count", "jaw_target", "visible_share", "measured")
+    draw_class = RetractionDraw
+    drawn: RetractionDraw | None
 
     def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
         """Retract the lobe of an anatomy.
@@ -388,36 +437,14 @@ class RetractTask(Task):
 
     # ---- saved states ------------------------------------------------------------------------------------------
 
-    def get_state(self) -> str:
-        """Draw, biases, counters and measures as JSON, exact."""
-        assert self.drawn is not None
-        return json.dumps(
-            {
-                "drawn": asdict(self.drawn),
-                "record": asdict(self.record),
-                "bias": [self.sensors[name].get_state() for name in ("contact_force", "contact_torque")],
-                "counts": [self.step_count, self.goal_count],
-                "jaw_target": self.jaw_target,
-                "visible": self.visible_share,
-                "reached": self._reached,
-            }
-        )
+    @property
+    def measured(self) -> dict[str, Any]:
+        """The record of the episode as a table for JSON."""
+        return asdict(self.record)
 
-    def set_state(self, text: str) -> OrganModel:
-        """As `Task.set_state`."""
-        state = fill_json(_SavedRetraction, text, "task")
-        step_count, goal_count = state.counts
-        check_count("counts[0]", step_count, self.episode_steps)
-        check_count("counts[1]", goal_count, step_count)
-        check_count("record.steps", state.record.steps, step_count)
-        check_names("reached", state.reached, [one.name for one in self.rewards if one.per == "change"])
-        organ = state.drawn.compiled(self.anatomy)
-        self.drawn, self.record = state.drawn, state.record
-        self.sensors = self.biased(dict(zip(("contact_force", "contact_torque"), state.bias, strict=True)))
-        self.step_count, self.goal_count = step_count, goal_count
-        self.jaw_target = state.jaw_target
-        self.visible_share, self._reached = state.visible, state.reached
-        return organ
+    @measured.setter
+    def measured(self, table: dict[str, Any]) -> None:
+        self.record = RetractionRecord(**table)
 
 
 def jaw_wrench(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
@@ -464,55 +491,6 @@ def _nearest_nodes(points: FloatArray, box: tuple[FloatArray, FloatArray]) -> ND
 CAPSULE_THICKNESS = 1e-4
 # A target lies this far above its bed [m], so that the bed does not hide it.
 TARGET_LIFT = 1e-4
-
-
-@dataclass(frozen=True)
-class RetractionDraw:
-    """One episode's draw, SI units.
-
-    Args:
-        scale: factor on the whole lobe.
-        youngs_modulus: of its tissue [Pa].
-        capsule_stiffness: modulus times thickness of its capsule [N/m], 0 without one.
-        held_share: which share of the anchored edge is held.
-        target: centre of the disc on the bed [m].
-        eye, looks_at: where the endoscope stands and looks [m].
-        start: the tip's place [m].
-    """
-
-    scale: float
-    youngs_modulus: float
-    capsule_stiffness: float
-    held_share: float
-    target: Vector
-    eye: Vector
-    looks_at: Vector
-    start: Vector
-    # A lobe has none.
-    lesions: ClassVar[tuple[Lesion, ...]] = ()
-
-    def __post_init__(self) -> None:
-        require_number("scale", self.scale, 0.0, "", above=True, most=SAVED_MOST)
-        require_number("youngs_modulus", self.youngs_modulus, 0.0, "Pa", above=True, most=SAVED_MOST)
-        require_number("capsule_stiffness", self.capsule_stiffness, 0.0, "N/m", most=SAVED_MOST)
-        if not 0.0 <= self.held_share <= 1.0:
-            raise ValueError(f"held_share is {self.held_share:g}; it must be in [0, 1]")
-
-    def compiled(self, anatomy: Anatomy) -> OrganModel:
-        """The scene's lobe as the episode has it."""
-        plain = anatomy.specification()
-        mesh = anatomy.mesh
-        capsule = plain.capsule
-        if self.capsule_stiffness > 0.0:
-            capsule = Capsule(self.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
-        specification = replace(
-            plain,
-            mesh=TetMesh(mesh.points * self.scale, mesh.tets, mesh.region, mesh.region_names),
-            materials=replace(anatomy.scene.material, youngs_modulus=self.youngs_modulus),
-            capsule=capsule,
-            anchors=held_nodes(mesh.points, anatomy.anchors, self.held_share),
-        )
-        return anatomy.compiled(specification)
 
 
 def draw_retraction(table: Retraction, endoscope: Endoscope, rng: np.random.Generator) -> RetractionDraw:
@@ -641,32 +619,6 @@ class RetractionRecord:
             "path_length": self.path,
             **{f"strain_{region}": value for region, value in zip(REGIONS, self.strain)},
         }
-
-
-@dataclass(frozen=True)
-class _SavedRetraction:
-    """What `RetractTask.get_state` writes."""
-
-    drawn: RetractionDraw
-    record: RetractionRecord
-    bias: tuple[list[float], list[float]]
-    counts: tuple[int, int]
-    jaw_target: float
-    visible: float
-    reached: dict[str, float]
-
-    def __post_init__(self) -> None:
-        record = self.record
-        for name, value in vars(record).items():
-            if name not in ("slipping", "held", "tip") and np.min(value) < 0.0:
-                raise ValueError(f"record.{name} is {value}; it must be at least 0")
-        if record.held_steps > record.steps:
-            raise ValueError(f"record.held_steps is {record.held_steps}; it must be at most {record.steps}, the steps")
-        if len(record.strain) != len(REGIONS) or (record.tip is not None and len(record.tip) != 3):
-            raise ValueError(f"record.strain is {record.strain}, record.tip {record.tip}; each must be 3 numbers")
-        if not -1.0 <= self.jaw_target <= 1.0:
-            raise ValueError(f"jaw_target is {self.jaw_target:g}; it must be in [-1, 1]")
-        check_share("visible", self.visible)
 
 
 def region_strains(model: OrganModel, node_position: FloatArray, box: tuple[FloatArray, FloatArray]) -> list[float]:

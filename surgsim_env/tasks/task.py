@@ -1,16 +1,15 @@
 """The base of all tasks: an episode's draw, commands, observation, judgement and saved state, from what is declared."""
 
-import copy
 import inspect
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
@@ -22,8 +21,8 @@ from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.family import OrganFamily, family_of
 from surgsim_env.scene.levels import DrawnOrgan, Level, find_level
-from surgsim_env.scene.load import fill_json, make_scene, with_instrument
-from surgsim_env.scene.model import Endoscope, ForceSensor, Vector
+from surgsim_env.scene.load import make_scene, with_instrument
+from surgsim_env.scene.model import Endoscope, ForceSensor
 from surgsim_env.scene.motions import with_motion
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward, check_declared
 from surgsim_env.tasks.visibility import Disc
@@ -74,6 +73,7 @@ class Task:
         default_scene, default_instrument: names of what an environment has by default; None: the scene's instrument
         episode_steps: control steps until an episode is truncated; None where the task ends it by itself
         kept: names of the attributes that a saved state holds beside what this class counts and draws
+        draw_class: of what an episode draws; has `to_json`, `from_json` and `compiled` as `DrawnOrgan` has
         lanes: whether episodes can run side by side in one vector environment
         weights: of the reward terms, by name
 
@@ -100,7 +100,8 @@ class Task:
     lanes: ClassVar[bool] = True
     default_instrument: ClassVar[str | None] = None
     weights: ClassVar[Mapping[str, float]] = {}
-    # A `DrawnOrgan`, where a subclass draws nothing else.
+    draw_class: ClassVar[type[Any]] = DrawnOrgan
+    # Of that class.
     drawn: Any
 
     def __init_subclass__(cls, **arguments: Any) -> None:
@@ -507,88 +508,42 @@ class Task:
             TypeError: a `kept` attribute that is no number, text, array or list of these.
         """
         assert self.drawn is not None
-        return json.dumps(
-            {
-                "drawn": self.drawn.to_json(),
-                "step_count": self.step_count,
-                "bias": {name: sensor.get_state() for name, sensor in self.sensors.items()},
-                "sensed": {name: value.tolist() for name, value in self.sensed.items()},
-                "reached": self._reached,
-                "kept": {name: _encoded(name, getattr(self, name)) for name in self.kept},
-            }
-        )
-
-    def set_state(self, text: str) -> OrganModel:
-        """Restore what `get_state` gave; returns the organ of that episode.
-
-        Everything is read, checked and built before the first attribute is set, and no object that the task holds is
-        changed: each attribute gets a new one (`restored` calls it on a shallow copy).
-
-        Raises:
-            ValueError: names the entry that is missing, unknown or wrong.
-        """
-        state = fill_json(_SavedTask, text, "task")
-        check_names("bias", state.bias, self.sensors)
-        check_names("sensed", state.sensed, self.sensors)
-        check_names("reached", state.reached, [one.name for one in self.rewards if one.per == "change"])
-        check_names("kept", state.kept, self.kept)
-        check_count("step_count", state.step_count, self.episode_steps)
-        kept = {name: _decoded(name, value) for name, value in state.kept.items()}
-        for name, value in kept.items():
-            # Before the first episode there is nothing to compare with; None may stand for any kind.
-            now = getattr(self, name, None)
-            if now is not None and value is not None and _kind(value) != _kind(now):
-                raise ValueError(
-                    f"task: kept.{name} is {_kind(value)}; it must be {_kind(now)}, as in this environment"
-                )
-        drawn = DrawnOrgan.from_json(state.drawn, self.anatomy)
-        organ = drawn.compiled(self.anatomy)
-        self.drawn, self.step_count, self._reached = drawn, state.step_count, state.reached
-        self.sensors = self.biased(state.bias)
-        self.sensed = {name: np.array(value) for name, value in state.sensed.items()}
-        for name, value in kept.items():
-            setattr(self, name, value)
-        return organ
-
-    def restored(self, text: str, anatomy: Anatomy | None = None) -> tuple[Self, OrganModel]:
-        """A copy of this task in the episode whose `get_state` is given, and that episode's organ.
-
-        With an anatomy the episode is one of that member of the family, else of the present one.
-
-        This task stays as it is. The copy shares with it whatever `set_state` does not set.
-
-        Raises:
-            ValueError: what `set_state` refuses, or a text that it restores otherwise than `get_state` wrote it.
-        """
-        other = copy.copy(self)
-        try:
-            if anatomy is not None:
-                other.take_anatomy(anatomy)
-            organ = other.set_state(text)
-            again = other.get_state()
-        except ValueError:
-            raise
-        except Exception as error:
-            # The set_state of a user's own task may raise anything.
-            raise ValueError(f"task: {type(self).__name__}.set_state raised {type(error).__name__}: {error}") from error
-        if again != text and json.loads(again) != json.loads(text):
-            place = next((n for n, (one, two) in enumerate(zip(text, again)) if one != two), min(len(text), len(again)))
-            raise ValueError(
-                f"task: {text[max(place - 20, 0) : place + 20]!r} at character {place} is restored as "
-                f"{again[max(place - 20, 0) : place + 20]!r}"
-            )
-        return other, organ
-
-    def become(self, other: Self) -> None:
-        """Take over the attributes of a copy that `restored` gave."""
-        vars(self).update(vars(other))
-
-    def biased(self, bias: Mapping[str, ArrayLike]) -> dict[str, ForceReading]:
-        """The sensor models, with another state (`ForceReading.get_state`) for some of them, by name."""
-        return {
-            name: ForceReading(reading.sensor, bias[name]) if name in bias else reading
-            for name, reading in self.sensors.items()
+        state = {
+            "drawn": self.drawn.to_json(),
+            "step_count": self.step_count,
+            "bias": {name: sensor.get_state() for name, sensor in self.sensors.items()},
+            "sensed": self.sensed,
+            "reached": self._reached,
+            "kept": {name: getattr(self, name) for name in self.kept},
         }
+        return json.dumps(state, default=_array_table)
+
+    def saved_organ(self, text: str, anatomy: Anatomy) -> OrganModel:
+        """The organ of the episode whose `get_state` is given; changes nothing.
+
+        Args:
+            text: from `get_state`.
+            anatomy: of the episode: of a family that member's, else this task's own.
+
+        Raises:
+            ValueError: the state keeps other attributes than this task.
+        """
+        saved = json.loads(text)
+        if saved["kept"].keys() != set(self.kept):
+            raise ValueError(f"the state keeps {', '.join(saved['kept'])}; the task keeps {', '.join(self.kept)}")
+        return self.draw_class.from_json(saved["drawn"], anatomy).compiled(anatomy)
+
+    def set_state(self, text: str, anatomy: Anatomy) -> None:
+        """Restore what `get_state` gave and `saved_organ` accepted, with the anatomy of that episode."""
+        saved = json.loads(text, object_hook=_array_of)
+        if anatomy is not self.anatomy:
+            self.take_anatomy(anatomy)
+        self.drawn = self.draw_class.from_json(saved["drawn"], anatomy)
+        self.step_count, self._reached, self.sensed = saved["step_count"], saved["reached"], saved["sensed"]
+        for name, state in saved["bias"].items():
+            self.sensors[name] = ForceReading(self.sensors[name].sensor, state)
+        for name, value in saved["kept"].items():
+            setattr(self, name, value)
 
 
 # ---- channels and values that many tasks share ------------------------------------------------------------------
@@ -657,78 +612,18 @@ def _slices(sized: Iterable[tuple[str, int]]) -> dict[str, slice]:
     return slices
 
 
-def _encoded(name: str, value: Any) -> Any:
-    """A kept attribute as JSON."""
+def _array_table(value: Any) -> Any:
+    """An array or a number of numpy's in a saved state, as JSON holds it."""
     if isinstance(value, np.ndarray):
         return {"array": value.tolist(), "dtype": str(value.dtype)}
     if isinstance(value, np.generic):
         return value.item()
-    if isinstance(value, list | tuple):
-        return [_encoded(name, one) for one in value]
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
     raise TypeError(
-        f"kept attribute {name!r} is a {type(value).__name__}; a saved state holds numbers, texts, arrays and lists of "
+        f"a kept attribute holds a {type(value).__name__}; a saved state holds numbers, texts, arrays and lists of "
         "these: keep such, and make the rest from them"
     )
 
 
-# ---- documents of saved states -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _SavedTask:
-    """What `Task.get_state` writes."""
-
-    drawn: str
-    step_count: int
-    bias: dict[str, list[float]]
-    sensed: dict[str, Vector]
-    reached: dict[str, float]
-    kept: dict[str, Any]
-
-
-def check_names(what: str, found: Collection[str], wanted: Collection[str]) -> None:
-    """Refuse an entry of a saved state whose parts have other names than those wanted."""
-    if set(found) != set(wanted):
-        raise ValueError(f"task: {what} has the entries {sorted(found)}; they must be {sorted(wanted)}")
-
-
-def check_count(what: str, count: int, most: int | None = None) -> None:
-    """Refuse a count of a saved state that is below 0, or above the most that there are."""
-    if count < 0 or (most is not None and count > most):
-        raise ValueError(
-            f"task: {what} is {count}; it must be at least 0" + ("" if most is None else f", at most {most}")
-        )
-
-
-def check_share(what: str, value: float) -> None:
-    """Refuse a share of a saved state that is not in [0, 1]."""
-    if not 0.0 <= value <= 1.0:
-        raise ValueError(f"task: {what} is {value:g}; it must be in [0, 1]")
-
-
-def _kind(value: Any) -> str:
-    """What a kept attribute is, in words."""
-    if isinstance(value, np.ndarray):
-        return f"an array of type {value.dtype} with {value.ndim} axes"
-    if isinstance(value, list | tuple):
-        return "a list"
-    return "a text" if isinstance(value, str) else "a number"
-
-
-def _decoded(name: str, value: Any) -> Any:
-    """A kept attribute from what `_encoded` wrote."""
-    if isinstance(value, list):
-        return [_decoded(name, one) for one in value]
-    if not isinstance(value, dict):
-        return value
-    if value.keys() != {"array", "dtype"}:
-        raise ValueError(f"task: kept.{name} has the entries {sorted(value)}; they must be array and dtype")
-    try:
-        dtype = np.dtype(value["dtype"])
-        if dtype.kind not in "biufU":
-            raise ValueError("it must be numbers or text")
-        return np.array(value["array"], dtype)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"task: kept.{name} cannot be an array of type {value['dtype']!r}: {error}") from None
+def _array_of(table: dict[str, Any]) -> Any:
+    """The array of a table that `_array_table` wrote; any other table unchanged."""
+    return np.array(table["array"], table["dtype"]) if table.keys() == {"array", "dtype"} else table

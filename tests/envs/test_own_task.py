@@ -279,5 +279,5 @@ def test_a_task_without_a_draw_or_with_an_unsaveable_attribute_is_refused():
         environment_class(bare)().reset(seed=0)
     env = environment_class(type("Kept", (Touch,), {"kept": ("limits",)}))()
     env.reset(seed=0)
-    with pytest.raises(TypeError, match="kept attribute 'limits' is a Limits; a saved state holds numbers"):
+    with pytest.raises(TypeError, match="kept attribute holds a Limits; a saved state holds numbers"):
         env.save_state()

@@ -108,7 +108,7 @@ def test_a_saved_state_holds_the_memory():
     other.load_state(saved)
     assert other.save_state() == saved
     assert other.step(WALK[0])[0].tobytes() == expected[0].tobytes()
-    with pytest.raises(ValueError, match="observation has shape"):
+    with pytest.raises(ValueError, match="'observation' has shape"):
         gym.make(ID, scaled=False).unwrapped.load_state(saved)
 
 

@@ -1,14 +1,16 @@
 """Every mistake in an arm of one's own gets one clear line."""
 
-import shutil
+import contextlib
+import os
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.arm import load_arm
+from surgsim_env.instruments.arm.model import FILE_SIZE_MOST
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.arm_description import read_description
 from surgsim_env.scene.load import list_arms, make_scene, scenes_folder, with_instrument
@@ -86,41 +88,22 @@ def test_the_shipped_arms_are_listed_and_load():
 TABLES = [
     ('kind = "palpator"', 'kind = "palpater"', r"kind is 'palpater'; it must be one of palpator, grasper"),
     ('kind = "palpator"', 'kind = "grasper"', r"a grasper needs a jaw"),
-    ('kind = "palpator"', "kind = 3", r"kind"),
     ('kind = "palpator"\n', "", r'missing value for field "kind"'),
-    ('kind = "palpator"', 'kind = "palpator"\nname = "other"', r"entry 'name' is unknown"),
-    (
-        'kind = "palpator"',
-        'kind = "palpator"\njoint = ["yaw"]',
-        r"entry 'joint' is unknown there; did you mean 'joints'",
-    ),
     ("speed_limit = [", "speed_limits = [", r"entry 'speed_limits' is unknown there; did you mean 'speed_limit'"),
     ("speed_limit = [2.0, 2.0, ", "speed_limit = [2.0, ", r"speed_limit has 5 numbers for 6 joints"),
     ("speed_limit = [2.0", "speed_limit = [0.0", r"speed_limit of joint 'yaw' is 0; it must be finite and above 0"),
-    ("speed_limit = [2.0", 'speed_limit = ["2.0"', r"is not a number"),
-    ('mode = "position"', 'mode = "torque"', r"control.mode is 'torque'; it must be one of position, servo"),
     ('mode = "position"', 'mode = "servo"', r"control.stiffness must be given with control.mode = 'servo'"),
     ('mode = "position"', 'mode = "position"\neffort = [1.0]', r"control.effort must be left out"),
-    ('joints = ["yaw",', 'joints = ["yaww",', r"home gives no value for joint 'yaww'"),
     ('joints = ["yaw",', 'joints = ["yaw", "yaw",', r"name 'yaw' twice"),
     ('contact = ["tip_ball"', 'contact = ["tipball"', r"contact geom 'tipball' is not .*did you mean 'tip_ball'"),
-    ('contact = ["tip_ball", "neck", "wrist", "shaft"]', "contact = []", r"contact is empty"),
-    ('contact = ["tip_ball"', 'contact = ["tip_ball", "rail"', r"contact and links name 'rail' twice"),
-    ('site = "tip"', 'site = "tipp"', r"tip site 'tipp' is not in the model; did you mean 'tip'"),
     ('site = "tip"', 'body = "wrist"', r"tip body 'wrist' is not in the model; did you mean 'wrist_"),
     ('site = "tip"\n', "", r"exactly one of tip.site and tip.body"),
     ('site = "tip"', 'site = "tip"\nsite = "tip"', r"not valid TOML"),
-    ('site = "tip"', 'site = "tip"\ndirection = [0.0, 0.0, 0.0]', r"tip.direction is .*; it must be a direction"),
-    ('ball = "tip_ball"', 'ball = "ball"', r"geom 'ball' is not in the model"),
-    ('shaft_body = "roll"', 'shaft_body = "rolled"', r"trocar.shaft_body 'rolled' is not .*did you mean 'roll'"),
     ("fixed = true", "fixed = true\npoint = [0.02, 0.0, 0.0]", r"passes the trocar at 20 mm, more than .* 1e-06 mm"),
     ("fixed = true", "fixed = true\nshaft_axis = [0.0, 0.0, -1.0]", r"tip has not passed the trocar"),
-    ("tolerance = 1e-9", "tolerance = -1.0", r"trocar.tolerance is -1 m; it must be finite and above 0"),
     ("tolerance = 1e-9", "tolerance = nan", r"trocar.tolerance is nan m"),
     ("insertion = 0.0865", "insertion = 0.3", r"home of joint 'insertion' is 0.3, outside its limits 0 to 0.24"),
-    ("insertion = 0.0865", "insertion = inf", r"home of joint 'insertion' is inf; it must be finite"),
     ("wrist_yaw = 0.0", "wrist_jaw = 0.0", r"home gives no value for joint 'wrist_yaw'"),
-    ("wrist_yaw = 0.0", "wrist_yaw = 0.0\nextra = 1.0", r"home names 'extra', which is not among joints"),
     ('model = "psm_palpator.xml"', 'model = "nothing.xml"', r"model file .*nothing.xml cannot be read: No such file"),
 ]
 
@@ -138,14 +121,14 @@ def assert_refused(path, message):
     assert text.startswith(("arm 'mine'", "arm file")) and "\n" not in text and len(text) < 700
 
 
+FLAT = '<asset><mesh name="flat" vertex="0 0 0 1 0 0 0 1 0 1 1 0"/></asset>'
+CART = '<worldbody><body name="cart"><freejoint name="loose"/><geom size="0.1"/></body>'
 # What is changed in psm_palpator.xml, and what is said.
 MODELS = [
     ('<site name="tip"', '<site name="wrist"', r"two parts <site> are named 'wrist'; names must differ"),
-    ('<site name="tip"', '<site name="tip" pos="0 0 0"/><site name="tip"', r"two parts <site> are named 'tip'"),
     ('range="0 0.24"', 'range="0.24 0.01"', r"the limits of joint 'insertion' cross: lower 0.24, upper 0.01"),
     ('range="0 0.24"', "", r"joint 'insertion' has no limits; give it a range"),
     ('<position name="hold_roll"', '<motor name="hold_roll"', r"unrecognized attribute: 'kp'"),
-    ('<position name="hold_roll" joint="roll" kp="6"/>', "", r"joint 'roll' has no position actuator"),
     (
         'name="hold_roll" joint="roll"',
         'name="hold_roll" joint="roll" gear="2"',
@@ -156,14 +139,11 @@ MODELS = [
         'name="hold_roll" joint="roll" ctrlrange="-1 1"',
         r"joint 'roll' takes -1 to 1, less than the joint's limits -4\.53786 to 4\.53786: widen its ctrlrange",
     ),
-    ('<joint name="roll" type="hinge"', '<joint name="roll" type="ball"', r"."),
     ('name="neck" type="capsule"', 'name="neck" type="cylinder"', r"contact geom 'neck' is a cylinder; only spheres"),
     ('0.02 0" size="0.003"', '0.02 0" size="1e99"', r"size of geom 'neck' is .*the rule is at most 100 m"),
-    ("<mujoco", "<mujocco", r"not valid XML|begins with <mujocco>"),
     ("</mujoco>", "", r"not valid XML"),
-    ('type="hinge"', 'type="hing"', r"hing"),
-    ("<actuator>", "<actuator><nonsense/>", r"nonsense"),
-    ('<body name="yaw"', '<body name="cart"><freejoint name="loose"/><body name="yaw"', r"not valid XML|free joint"),
+    ("<worldbody>", f'{FLAT}<worldbody><geom type="mesh" mesh="flat"/>', r"mesh 'flat' has coplanar vertices"),
+    ("<worldbody>", CART, r"hangs on the free joint 'loose'"),
 ]
 
 
@@ -173,12 +153,15 @@ def test_a_mistake_in_the_model_is_named(tmp_path, old, new, message):
     assert_refused(written(tmp_path, table, swap(model, old, new)), message)
 
 
-def test_a_floating_base_is_refused(tmp_path):
-    table, model = texts()
-    model = swap(
-        model, "<worldbody>", '<worldbody><body name="cart"><freejoint name="loose"/><geom size="0.1"/></body>'
-    )
-    assert_refused(written(tmp_path, table, model), r"hangs on the free joint 'loose'")
+def test_files_that_are_too_large_are_refused_unread(tmp_path):
+    path = written(tmp_path, *texts())
+    (tmp_path / "link.stl").touch()
+    os.truncate(tmp_path / "link.stl", FILE_SIZE_MOST + 1)
+    mesh = '<asset><mesh name="link" file="link.stl"/></asset><worldbody>'
+    written(tmp_path, texts()[0], swap(texts()[1], "<worldbody>", mesh))
+    assert_refused(path, r"file .*link\.stl has 200000001 bytes; at most 200000000 are read")
+    os.truncate(tmp_path / "psm_palpator.xml", FILE_SIZE_MOST + 1)
+    assert_refused(path, r"file .*psm_palpator\.xml has 200000001 bytes")
 
 
 def test_a_jaw_that_is_not_there_is_named(tmp_path):
@@ -258,75 +241,29 @@ def test_missing_meshes_are_named(tmp_path):
     assert_refused(path, r"mesh file .*swing\.stl is missing: put it there, or take the mesh out of stick\.urdf")
 
 
-def test_crossing_limits_of_a_urdf_are_refused(tmp_path):
-    urdf = swap(URDF, "VISUAL", '<sphere radius="0.02"/>').replace(
-        'lower="-0.8" upper="0.8"', 'lower="0.8" upper="-0.8"'
-    )
-    path = written(tmp_path, URDF_TABLE, urdf, model_name="stick.urdf")
-    assert_refused(path, r"limits of joint 'turn' cross: lower 0.8, upper -0.8")
+BALL = '<collision name="ball"><origin xyz="0 0 -0.2"/><geometry><sphere radius="0.006"/></geometry></collision>'
 
 
-ENTRIES = st.sampled_from(
-    ["kind", "model", "joints", "contact", "tip", "trocar", "control", "home", "jaw", "links", "site", "mode", "x"]
+@pytest.mark.parametrize(
+    ("part", "changed", "message"),
+    [
+        (BALL, 2 * BALL, "a second shape is named 'ball'; it has no name"),
+        ('lower="0" upper="0.2"', 'lower="0.2" upper="0.2"', "MuJoCo: .* equal lower and upper limits"),
+    ],
+    ids=["a name twice", "equal limits"],
 )
-VALUES = st.recursive(
-    st.one_of(
-        st.integers(-3, 3),
-        st.floats(),
-        st.booleans(),
-        st.sampled_from(["", "yaw", "tip", "palpator", "psm_palpator.xml"]),
-    ),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(ENTRIES, inner, max_size=3),
-    max_leaves=6,
-)
-# What any of these may be over a right table and leave it right.
-HARMLESS = {"kind": "palpator", "model": "psm_palpator.xml", "links": [], "jaw": []}
-
-
-def as_toml(value):
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {as_toml(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(as_toml, value)) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else repr(value)
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.dictionaries(ENTRIES, VALUES, max_size=8), st.booleans())
-@example({"jaw": {}}, True)
-def test_garbage_entries_give_value_errors_alone(tmp_path, table, complete):
-    """Random tables raise ValueError, alone or over a right one; only those that leave it right are taken."""
-    shutil.copy(INSTRUMENTS / "psm_palpator.xml", tmp_path)
-    lines = [f"{key} = {as_toml(value)}" for key, value in table.items()]
-    if complete:
-        right = (INSTRUMENTS / "psm_palpator.toml").read_text().splitlines()
-        top = [line for line in right[: right.index("[tip]")] if not line.startswith(tuple(f"{key} " for key in table))]
-        lines += [*top, *right[right.index("[tip]") :]]
-    if complete and all(HARMLESS.get(key) == value for key, value in table.items()):
-        taken = load_arm(written_text(tmp_path, "\n".join(lines))).description
-        assert all(getattr(taken, key) == (value if isinstance(value, str) else ()) for key, value in table.items())
-    else:
-        assert_garbage_is_refused(tmp_path, "\n".join(lines))
+def test_what_mujoco_would_print_is_a_warning(part, changed, message, tmp_path, capfd):
+    model = swap(swap(URDF, "VISUAL", '<sphere radius="0.01"/>'), part, changed)
+    path = written(tmp_path, URDF_TABLE, model, model_name="stick.urdf")
+    with pytest.warns(UserWarning, match=message), contextlib.suppress(ValueError):
+        load_arm(path)
+    assert capfd.readouterr() == ("", "")
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.text(max_size=60) | st.binary(max_size=60))
-def test_garbage_text_gives_value_errors_alone(tmp_path, text):
-    assert_garbage_is_refused(tmp_path, text)
-
-
-def written_text(folder, text):
-    path = folder / "mine.toml"
-    if isinstance(text, bytes):
-        path.write_bytes(text)
-    else:
-        path.write_text(text, encoding="utf-8")
-    return path
-
-
-def assert_garbage_is_refused(folder, text):
-    with pytest.raises(ValueError) as error:
-        load_arm(written_text(folder, text))
-    assert "\n" not in str(error.value) or len(str(error.value)) < 400
+def test_garbage_gives_value_errors_alone(tmp_path, text):
+    path = tmp_path / "mine.toml"
+    path.write_bytes(text.encode("utf-8") if isinstance(text, str) else text)
+    with pytest.raises(ValueError):
+        load_arm(path)

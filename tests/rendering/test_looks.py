@@ -192,7 +192,7 @@ def test_a_loaded_state_has_its_look():
     plain = gym.make(RETRACT, obs_mode="rgb").unwrapped
     plain.reset(seed=1)
     for one, state in ((other, plain.save_state()), (plain, other.save_state())):
-        with pytest.raises(ValueError, match=r"not a saved state of this environment.*look"):
+        with pytest.raises(ValueError, match=r"entry 'look' is (missing|unknown)"):
             one.load_state(state)
     plain.close()
     env.close()

@@ -14,7 +14,6 @@ import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.organ.support import Support
-from surgsim_env.instruments.arm.model_limits import check_model, read_spec, read_xml
 from surgsim_env.instruments.arm.urdf import prepare_urdf
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
@@ -24,6 +23,8 @@ from surgsim_env.scene.model import LENGTH_LARGEST, Port, frame_into
 # Groups of geoms: visual only, outer links for clearances; geoms of CONTACT_GROUP are felt by tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
+# Largest size of a model file and of a mesh file [bytes]: chosen, MuJoCo would read a larger one for minutes.
+FILE_SIZE_MOST = 200_000_000
 # Of shapes that a description adds.
 SHAPE_COLOUR = (0.72, 0.74, 0.78, 1.0)
 
@@ -81,7 +82,7 @@ def warned(where: str) -> Iterator[None]:
 
 
 def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes: Sequence[str] = ()) -> mujoco.MjSpec:
-    """MuJoCo's specification of an MJCF or URDF file that was checked (`model_limits`).
+    """MuJoCo's specification of an MJCF or URDF file.
 
     Args:
         path: of the file.
@@ -91,26 +92,48 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
     Raises:
         ValueError: a file that is missing, too large or wrong; entries for a URDF with an MJCF.
     """
-    text = ""
     root = read_xml(path)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"model file {path} begins with <{root.tag}>; it must be MJCF (<mujoco>) or URDF (<robot>)")
     _check_repeated_names(root)
     if root.tag == "robot":
         prepare_urdf(root, path, inertias, dropped_meshes)
-        text = ElementTree.tostring(root, encoding="unicode")
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec.modelfiledir = str(path.parent)
     elif inertias or dropped_meshes:
         name = "inertias" if inertias else "dropped_meshes"
         raise ValueError(f"{name} is for URDF files; model file {path} is MJCF: change it there")
-    wrong = check_model(path, root, text)
-    spec = read_spec(str(path), text)
+    else:
+        spec = mujoco.MjSpec.from_file(str(path))
     for mesh in spec.meshes:
         file = path.parent / spec.meshdir / mesh.file
         if mesh.file and not os.path.isfile(file):
             raise ValueError(f"mesh file {file} is missing: put it there, or take the mesh out of {path.name}")
-    if wrong:
-        raise ValueError(wrong)
+        _check_size(file)
     return spec
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root element of a model file.
+
+    Raises:
+        ValueError: a file that cannot be read, is larger than FILE_SIZE_MOST or is no XML.
+    """
+    try:
+        _check_size(path)
+        return ElementTree.fromstring(path.read_bytes())
+    except OSError as error:
+        raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None
+    except ElementTree.ParseError as error:
+        raise ValueError(f"model file {path} is not valid XML: {error}") from None
+    except LookupError as error:
+        raise ValueError(f"model file {path} cannot be decoded ({error}): save it as UTF-8") from None
+
+
+def _check_size(file: Path) -> None:
+    size = file.stat().st_size
+    if size > FILE_SIZE_MOST:
+        raise ValueError(f"file {file} has {size} bytes; at most {FILE_SIZE_MOST} are read: reduce it")
 
 
 def _check_repeated_names(root: ElementTree.Element) -> None:

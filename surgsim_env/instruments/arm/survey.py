@@ -10,8 +10,7 @@ import numpy as np
 
 from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.arm.model import read_model
-from surgsim_env.instruments.arm.model_limits import read_xml
+from surgsim_env.instruments.arm.model import read_model, read_xml
 from surgsim_env.instruments.arm.urdf import MESH_FORMATS, faulty_links, find_mesh, mesh_names, speed_limits
 from surgsim_env.scene.arm_description import LinkInertia
 from surgsim_env.scene.load import nearest

@@ -71,7 +71,7 @@ class Organ:
         """
         from msdm_core.mesh_files.mesh_io import FORMATS
         from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
-        from surgsim_env.palpation.surface_scene import SurfaceOptions
+        from surgsim_env.palpation.scene_options import SceneOptions
         from surgsim_env.patient import make_patient as patient
         from surgsim_env.patient.label_image import IMAGE_SUFFIXES, is_image
         from surgsim_env.patient.retract_scene import told
@@ -108,7 +108,7 @@ class Organ:
                 mesher=self.mesher or patient.MESHERS[0],
                 mend=self.mend,
                 remesh=self.remesh,
-                options=SurfaceOptions(
+                options=SceneOptions(
                     approach=vector_of("--approach", self.approach),
                     tip_radius=self.tip_radius,
                     press_depth=self.press_depth,

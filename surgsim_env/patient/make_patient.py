@@ -17,7 +17,7 @@ from surgsim_env.palpation.chart import healthy_file, write_healthy_map
 from surgsim_env.palpation.hold import SITES as HOLD_SITES
 from surgsim_env.palpation.hold import check_hold
 from surgsim_env.palpation.job import plan_sites
-from surgsim_env.palpation.surface_scene import PATTERN, SurfaceOptions, check_options
+from surgsim_env.palpation.scene_options import PATTERN, SceneOptions, check_options
 from surgsim_env.patient.facing import facing_approach
 from surgsim_env.patient.fine_surface import SurfaceFit, surface_file
 from surgsim_env.patient.label_image import FORM, LabelImage, is_image, parse_labels, read_label_image
@@ -71,7 +71,7 @@ def make_patient(
     mesher: str = MESHERS[0],
     mend: bool = False,
     remesh: bool = False,
-    options: SurfaceOptions,
+    options: SceneOptions,
     moduli: Mapping[str, float] | None = None,
     progress: StepProgress,
 ) -> PatientScene:
@@ -88,7 +88,7 @@ def make_patient(
         mesher: one of MESHERS.
         mend: whether holes, self-intersections and cavities are repaired.
         remesh: whether the surfaces of tets are filled anew; else the file's tets are kept.
-        options: touch, anchors and healthy tissue.
+        options: touch and healthy tissue.
         moduli: Young's modulus of regions by name [Pa].
         progress: where the steps are shown.
 
@@ -399,7 +399,7 @@ def scene_text(found: PatientScene) -> str:
         "palpation.press_depth": "[m] chosen: 7/12 of the tip's radius, as in the scene liver",
         "palpation.face_margin": "[m]",
         "palpation.thickness_smallest": "[m] of organ below a site",
-        "palpation.site_spacing": f"[m] {found.site_count} sites, at most {SITES_MOST} unless given",
+        "palpation.site_spacing": f"[m] {found.site_count} sites, at most {SITES_MOST}",
         "palpation.clearance": "[m]",
         "lesion": "drawn anew in each episode, in the organ without its segmented lesions",
         "lesion.radius": "[m] chosen in proportion to the tip, as in the scene liver",

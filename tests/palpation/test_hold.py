@@ -8,7 +8,7 @@ import pytest
 
 from surgsim_env.palpation.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST, SITES, Hold, check_hold, hold_of
 from surgsim_env.palpation.job import plan_sites
-from surgsim_env.palpation.surface_scene import soft_bed
+from surgsim_env.palpation.scene_options import soft_bed
 from surgsim_env.scene.anatomy import anatomy_of, load_anatomy
 from surgsim_env.scene.load import make_material, make_scene
 from surgsim_env.scene.model import Anchor, Bed

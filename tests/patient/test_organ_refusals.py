@@ -89,5 +89,4 @@ def test_options_that_do_not_fit_surfaces_or_tets(written, tmp_path, refusal):
     tets = [written / "patient.vtu"] * 2
     assert "one file of tets is taken, 2 are given" in refusal("organ", *tets)
     assert "is no surface" in refusal("organ", surface, written / "patient.vtu", *unit)
-    assert "goes with --segmentation" in refusal("palpate", "--scene", "phantom", *LABELS)
     assert "give a file" in refusal("organ")

@@ -3,7 +3,6 @@
 import json
 import shutil
 
-import numpy as np
 import pytest
 
 from surgsim_env.arm_study import study
@@ -67,20 +66,12 @@ def test_the_files_and_the_summary(folder, made, capsys):
     text = (folder / "out" / "summary.json").read_text(encoding="utf-8")
     summary = json.loads(text)
     assert text == json.dumps(summary, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
-    assert summary["seed"] == 3 and summary["inputs"]["points"] == 40 and summary["inputs"]["scene"] == "phantom"
-    assert summary["versions"] == made_evaluation().summary["versions"]
-    assert summary["inputs"]["ports"]["endoscope"]["point"] == [0.03, -0.02, 0.15]
-    assert summary["inputs"]["left"]["mine.toml"].startswith("sha256 ")
-    assert set(summary["inputs"]["left"]) == {"arm", "mine.toml", "psm_grasper.xml"}
-    made_one = made_evaluation(count=40, seed=3)
-    least = min(np.nanmin(arm.tip_force) for arm in (made_one.left, made_one.right))
-    assert summary["smallest_tip_force"]["value_N"] == pytest.approx(least, abs=1e-11)
-    assert summary["compared"] == [] and summary["episodes"] == [] and summary["inputs"]["episodes"] == 0
+    assert summary["seed"] == 3
+    assert summary["command"].startswith("surgsim arms --scene phantom --left mine.toml")
+    assert summary["compared"] == [] and summary["episodes"] == []
     said = " ".join(capsys.readouterr().out.split())
     assert summary["verdict"] in said and "written: out/{report.html" in said
-    # Each step that takes seconds is named when it begins.
-    steps = ("drawing the arms ...", "drawing the maps ...")
-    assert [said.index(step) for step in steps] == sorted(said.index(step) for step in steps)
+    assert "drawing the maps ..." in said
     assert made[0][0].ports.endoscope.point == (0.03, -0.02, 0.15)
 
 
@@ -137,10 +128,8 @@ def test_the_command_in_the_report_makes_it_again(folder, made):
 
 
 @pytest.mark.usefixtures("few_maps")
-def test_how_the_patient_moves_is_an_input(folder, made):
+def test_the_command_says_how_the_patient_moves(folder, made):
     assert main(arguments("--motion", "calm")) == 0
-    summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
-    assert summary["inputs"]["motion"] == "calm"
     assert made[0][1].command.endswith("--seed 0 --motion calm")
 
 
@@ -151,9 +140,6 @@ def test_compare_ranks_ports_and_robots(folder, made, capsys):
     ranking = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))["compared"]
     assert [one["name"] for one in ranking] == ["wide.toml", "ports.toml", "six_axis"]
     assert [one["place"] for one in ranking] == [1, 2, 3]
-    inputs = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))["inputs"]["compare"]
-    assert inputs[0]["file"] == "wide.toml" and inputs[0]["wide.toml"].startswith("sha256 ")
-    assert inputs[1]["arm"] == "six_axis" and inputs[1]["six_axis.xml"].startswith("sha256 ")
     setups = [setup for setup, _ in made]
     assert [(one.left.description.name, one.right.description.name) for one in setups] == [
         *[("psm_grasper", "psm_palpator")] * 2,
@@ -161,10 +147,8 @@ def test_compare_ranks_ports_and_robots(folder, made, capsys):
     ]
     assert setups[1].ports.left.point == (-0.06, 0.03, 0.15) and setups[2].ports.left.point == (-0.03, 0.03, 0.15)
     text = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    for one in ranking:
-        assert one["reasons"] in text
     assert "Ranked by the share of the surface" in text
-    assert "more of the points with both arms" in " ".join(capsys.readouterr().out.split())
+    assert "1. wide.toml: both" in " ".join(capsys.readouterr().out.split())
 
 
 URDF = """<robot name="stick"><link name="base"><visual><geometry><mesh filename="lost.stl"/></geometry></visual></link>

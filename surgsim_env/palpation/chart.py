@@ -456,7 +456,7 @@ def map_digest(anatomy: Anatomy) -> str:
     scene = anatomy.scene
     parts = (
         *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing, scene.limits),
-        *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports, scene.support_law),
+        *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports),
         tuple(region for region in scene.regions if not region.lesion),
         tuple(one for one in scene.anchors if one.is_elastic),
     )

@@ -25,7 +25,7 @@ from surgsim_env.palpation.misses import (
 from surgsim_env.palpation.truth import seen_from_surface
 from surgsim_env.scene.anatomy import anatomy_of
 from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import Anchor, Ball, Bed
+from surgsim_env.scene.model import Anchor, Ball, Box
 
 PHANTOM = make_scene("phantom")
 SPACING = 0.008
@@ -33,7 +33,7 @@ ANATOMY = anatomy_of(
     replace(
         PHANTOM,
         anchors=(
-            Anchor("floor", bed=Bed((0.0, 0.0, -1.0), 0.01)),
+            Anchor("floor", box=Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-6))),
             Anchor("clamp", ball=Ball((0.08, 0.04, 0.05), 0.012)),
         ),
         palpation=replace(PHANTOM.palpation, face_margin=0.008),

@@ -65,7 +65,6 @@ def make_patient(
     out: Path,
     *,
     labels: str | None = None,
-    regions: Sequence[str] = (),
     length_unit: LengthUnit | None = None,
     cell_size: float | None = None,
     mesher: str = MESHERS[0],
@@ -81,7 +80,6 @@ def make_patient(
         files: a label image; or closed surfaces, the organ's first, then one for each region; or one file of tets.
         out: path of the mesh to be written; its stem names the scene.
         labels: which labels of an image, or tags of tets, are which tissue, as in `parse_labels`.
-        regions: further regions of surfaces, as NAME=FILE.
         length_unit: of surfaces.
         cell_size: of the lattice, the same everywhere [m], from which the tip follows; default: cells follow from the
             tip, fine at the pressed face.
@@ -129,7 +127,7 @@ def make_patient(
                 f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
             )
         with progress.step(f"reading {first.name}"):
-            given = read_surfaces(files, regions, length_unit, mend=mend)
+            given = read_surfaces(files, length_unit, mend=mend)
         name, volume = given.organ.name, given.volume
     approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
     if isinstance(given, PatientTets):

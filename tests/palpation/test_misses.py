@@ -11,8 +11,6 @@ from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.palpation import misses
 from surgsim_env.palpation.contrast_map import Estimate, score_map
 from surgsim_env.palpation.misses import (
-    MASKED,
-    MISPLACED,
     NEAR_SUPPORT,
     NO_MAXIMUM,
     NO_SITE,
@@ -76,8 +74,6 @@ def test_a_lesion_that_is_felt_needs_no_reason(monkeypatch):
         (NO_SITE, (ABOVE,), {"sites": SITES[:12]}),
         (NOISE, (lesion(0.034, 0.042, 0.030),), {"forces": (0.219, 0.2)}),
         (TOO_DEEP, (lesion(0.034, 0.042, 0.030),), {"forces": (0.221, 0.2)}),
-        (MASKED, (ABOVE, lesion(0.050, 0.042, 0.036, "B")), {"estimates": [(0.050, 0.042, 0.05)]}),
-        (MISPLACED, (ABOVE,), {"estimates": [(0.034, 0.054, 0.05)]}),
         (NO_MAXIMUM, (ABOVE,), {}),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -400,7 +400,7 @@ class _Finder:
     def _search_home(self, arm: Arm) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         """Home, trocar, direction into the body and reach, of the pose tried around which the tip reaches most."""
         best = None
-        starts = self._good_starts(arm)
+        starts = self._good_starts(arm) if self.centre is None else self._starts_about(self.centre)
         places = [(start, place) for start in starts for place in self._trocars(arm, start)]
         for number, (start, place) in enumerate(places):
             self.tell("looking for a home", 0.1 + 0.8 * number / len(places))
@@ -408,7 +408,8 @@ class _Finder:
             into = arm.shaft_line(start)[1]
             found = self._at_depth(arm, place, into, start)
             into = into if found is None else arm.shaft_line(found)[1]
-            if found is None or self._blocked(arm, found):
+            # The mechanism of a remote centre holds its tool by links about it.
+            if found is None or (self.centre is None and self._blocked(arm, found)):
                 continue
             share = reach_share(arm, found, into)
             if best is None or share > best[3] + 1e-9:
@@ -457,6 +458,12 @@ class _Finder:
 
     def _in_trocar(self, arm: Arm, found: PoseSolution) -> bool:
         return found.trocar_error <= (FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6)
+
+    def _starts_about(self, centre: RemoteCentre) -> list[FloatArray]:
+        """Poses that differ in the joints before the slide of a remote centre."""
+        before = np.arange(len(self.chain)) < self.chain.index(centre.joint)
+        draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.chain)))
+        return [np.where(before, pose, self.zero) for pose in (self.zero, 0.5 * (self.lower + self.upper), *draws)]
 
     def _good_starts(self, arm: Arm) -> list[FloatArray]:
         """Poses with the tool pointing down, away from limits and singular poses, the best first; keyframes before."""

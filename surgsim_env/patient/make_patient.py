@@ -227,7 +227,7 @@ def write_patient(
     older += [name for name in others if (out.parent / name).exists()]
     with output_folder(out.parent, older) as files:
         with progress.step("drawing the report"):
-            names = write_organ(found, files, out.name, command, retraction)
+            names = _write_organ(found, files, out.name, command, retraction)
         if healthy_map and found.scene.lesion is not None:
             try:
                 write_healthy_map(load_scene(files / out.with_suffix(".toml").name), files / healthy, progress)
@@ -241,25 +241,10 @@ def write_patient(
     return [out.with_name(name) for name in names]
 
 
-def write_organ(
-    found: PatientScene,
-    files: OutputFolder,
-    name: str,
-    command: str,
-    retraction: RetractScene | str | None = None,
+def _write_organ(
+    found: PatientScene, files: OutputFolder, name: str, command: str, retraction: RetractScene | str | None
 ) -> list[str]:
-    """Write what `write_patient` does, among the results of a command.
-
-    Args:
-        found: the organ with its scene.
-        files: the results.
-        name: of the mesh.
-        command: see `write_patient`.
-        retraction: see `write_patient`.
-
-    Returns:
-        The names of the files.
-    """
+    """Write all but the healthy map, by the name of the mesh; returns the names of the files."""
     from msdm_core.mesh_files.mesh_io import write_mesh
 
     scene_file = Path(name).with_suffix(".toml").name

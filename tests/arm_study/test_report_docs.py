@@ -45,8 +45,3 @@ def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch)
     assert len(listed) == 6
     for pattern in listed:
         assert list(Path("runs/arms").glob(pattern)), pattern
-
-
-def test_pictures_exist():
-    for picture in re.findall(r"!\[[^]]*\]\(([^)]*)\)", DOCS):
-        assert (ROOT / "docs" / picture).is_file()

@@ -26,8 +26,6 @@ FAT_NAME = "surrounding fat and wall"
 CONTACT_MODULI_PER_CELL = 18.0
 # Limit of organ substeps in a haptic step: more would take hours.
 SUBSTEPS_MOST = 200
-# Sites with less tissue below them than this many press depths are left out.
-THICKNESS_PRESS_DEPTHS = 5.0
 
 
 @dataclass(frozen=True)

@@ -397,7 +397,7 @@ def run_study(
 
 def _said(evaluation: ArmsEvaluation, episodes: Episodes | None) -> str:
     """The first paragraph of a report."""
-    parts = verdict(evaluation), cycle_clause(evaluation), clause(episodes, evaluation.scene)
+    parts = verdict(evaluation), cycle_clause(evaluation), clause(episodes)
     return " ".join(filter(None, parts))
 
 

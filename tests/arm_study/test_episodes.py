@@ -126,7 +126,7 @@ def test_arms_that_cannot_do_it_have_stand_ins_and_are_named(monkeypatch, given,
     assert found.left_out == "the right arm does not reach" and found.runs == ()
     said = what_was_run(found, "liver")
     assert said[0] == "No episodes were run: the right arm does not reach." and len(said) == 1 + len(sides)
-    assert clause(found, "liver") == ""
+    assert clause(found) == ""
     assert plain_episodes(found)["episodes"] == []
 
 

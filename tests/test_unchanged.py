@@ -273,7 +273,6 @@ def organs() -> Parts:
     for rule, scheme, capsule in (
         ("lloyd", "barycentric", None),
         ("fitted", "voronoi", msdm_core.Capsule(1.0e6, 2.0e-5)),
-        ("van_gelder", "barycentric", msdm_core.Capsule(20000.0)),
     ):
         specification = msdm_core.OrganSpec(
             mesh,

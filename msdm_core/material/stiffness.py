@@ -1,16 +1,16 @@
-"""Spring stiffness from Young's moduli: formula (6) of Sala et al. 2011, fitted, Van Gelder's, and a membrane."""
+"""Spring stiffness from Young's moduli: formula (6) of Sala et al. 2011, fitted, and a membrane."""
 
 from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.arithmetic import dot, norm
+from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganError
 from msdm_core.material.fitting import lloyd_share, spring_fit
-from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, IntArray, TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
-STIFFNESS_RULES = ("lloyd", "fitted", "van_gelder")
+STIFFNESS_RULES = ("lloyd", "fitted")
 
 
 def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "lloyd") -> tuple[IntArray, FloatArray]:
@@ -20,7 +20,6 @@ def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "llo
       tet of the same volume (Sala et al. 2011, eq. 6; Lloyd et al. 2007).
     * "fitted": formula (6) times factors fitted to the mesh, see `msdm_core.material.fitting`; best on blocks of cubic
       cells.
-    * "van_gelder": k_ij = sum over tets of E_t V_t / l_ij^2 (Van Gelder 1998, extended to tets).
 
     Args:
         mesh: the organ's tets.
@@ -60,20 +59,11 @@ def spring_sum(mesh: TetMesh, youngs_modulus: FloatArray, amount: FloatArray, *,
 
 
 def _summed(mesh: TetMesh, modulus: FloatArray, rule: str) -> FloatArray:
-    if rule == "lloyd":
-        share = np.repeat(lloyd_share(mesh, modulus), 6)
-    elif rule == "fitted":
-        share = np.repeat(lloyd_share(mesh, modulus) * spring_fit(mesh).tet_factor, 6)
-    else:
-        share = _van_gelder_shares(mesh, modulus)
-    stiffness = np.bincount(mesh.tet_edges.ravel(), share, len(mesh.edges)).astype(np.float64)
+    share = lloyd_share(mesh, modulus)
+    if rule == "fitted":
+        share = share * spring_fit(mesh).tet_factor
+    stiffness = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(mesh.edges)).astype(np.float64)
     return stiffness * spring_fit(mesh).edge_factor if rule == "fitted" else stiffness
-
-
-def _van_gelder_shares(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
-    corners = mesh.points[mesh.tets]
-    spans = corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]]
-    return ((modulus * mesh.volumes)[:, None] / dot(spans, spans)).ravel()
 
 
 def check_stiffness_rule(rule: str) -> None:

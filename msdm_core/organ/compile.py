@@ -69,7 +69,7 @@ class OrganSpec:
         anchors: indices of the nodes held fixed, shape (n_anchor,).
         damping: Rayleigh damping; the default damps a 10 Hz mode with ratio 0.1.
         mass_scheme: "barycentric" (eq. 2) or "voronoi" (eq. 5).
-        stiffness_rule: "lloyd" (eq. 6), "fitted" (eq. 6 times factors fitted to the mesh) or "van_gelder".
+        stiffness_rule: "lloyd" (eq. 6) or "fitted" (eq. 6 times factors fitted to the mesh).
         gravity: [m/s^2]; off by default, because a scanned shape is the equilibrium.
         supports: fixed solids that it rests on.
         support_law: their contact law.

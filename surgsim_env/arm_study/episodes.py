@@ -152,21 +152,16 @@ def median_of(runs: Sequence[ArmsEpisode], measure: Measure) -> float:
     return float(np.median(known)) if len(known) else math.nan
 
 
-def clause(episodes: Episodes | None, organ: str) -> str:
+def clause(episodes: Episodes | None) -> str:
     """The episodes in a sentence for a report's first paragraph; "" where none were run."""
     if episodes is None or not episodes.runs:
         return ""
     runs = episodes.runs
     count, time = sum(one.success for one in runs), median_of(runs, MEASURES[0])
-    pulls = [one.pull_peak for one in runs if math.isfinite(one.pull_peak)]
-    others = ["this organ"] if episodes.scene != organ else []
-    others += ["these ports", *(f"this {one.side} arm" for one in episodes.stand_ins)]
-    not_these = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
     took = f" in {time:.1f} s (median)" if count else ""
-    pulled = f", with pulls up to {max(pulls):.2f} N" if pulls else ""
     return (
-        f"Run by a script on the scene {episodes.scene} (not {not_these}), {episodes.left} lifts a lobe and "
-        f"{episodes.right} touches what lies under it in {count} of {len(runs)} episodes{took}{pulled}."
+        f"Run by a script on the scene {episodes.scene} and its own ports, {episodes.left} lifts a lobe and "
+        f"{episodes.right} touches what lies under it in {count} of {len(runs)} episodes{took}."
     )
 
 

@@ -1,14 +1,10 @@
-"""How an arm follows a point of an organ that moves: its joints through the cycle, their speeds and accelerations.
+"""The joint speeds of an arm that follows a point of an organ that moves.
 
 A point X of an organ that goes with its ground is at X + sum_m s_m(t) d_m(X) (`msdm_core.organ.motion`). The tip
 follows it, the direction in which it points is free. Of all joint speeds that do so, and keep the shaft in a trocar
 that control keeps, those are taken whose shares q'_j / q'_j,max of their limits have the least sum of squares,
 
     q' = S (J S)^+ sum_m s'_m d_m,    S = diag(q'_max)       (weighted pseudoinverse: Whitney 1969)
-
-With a_m(q) = S (J S)^+ d_m and D its derivative along joint values, the accelerations are
-
-    q'' = sum_m a_m s''_m + sum_mn (D a_m)[a_n] s'_m s'_n
 """
 
 import math
@@ -25,12 +21,10 @@ from surgsim_env.scene.model import CyclicMotion
 
 # Evenly spaced positions between rest and top of the motion that moves the organ most.
 STEPS = 5
-# Instants of the cycle at which speeds and accelerations are computed.
+# Instants of the cycle at which speeds are computed.
 INSTANTS = 121
-# Largest rate and acceleration of p(x) = x^3 (10 - 15 x + 6 x^2), at x = 1/2 and x = 1/2 - sqrt(3)/6.
-RATE_MOST, ACCELERATION_MOST = 15.0 / 8.0, 10.0 / math.sqrt(3.0)
-# Joint values are moved by this share of their speeds in a second to differentiate a_m.
-DIFFERENCE = 1e-5
+# Largest rate of p(x) = x^3 (10 - 15 x + 6 x^2), at x = 1/2.
+RATE_MOST = 15.0 / 8.0
 # Smaller singular values than this share of the largest count as 0: one of the three rows of a trocar always does.
 RANK_TOLERANCE = 1e-9
 
@@ -42,13 +36,12 @@ class Course:
     Fields:
         time: since the cycle began [s]                                  (n_instant,)
         level: the signal as a share of its top                          (n_instant,)
-        rate, acceleration: of the signal [1/s], [1/s^2]                 (n_instant,)
+        rate: of the signal [1/s]                                        (n_instant,)
     """
 
     time: FloatArray
     level: FloatArray
     rate: FloatArray
-    acceleration: FloatArray
 
 
 def course(motion: CyclicMotion, count: int = INSTANTS) -> Course:
@@ -62,7 +55,6 @@ def course(motion: CyclicMotion, count: int = INSTANTS) -> Course:
         period * share,
         np.asarray(smooth_rise.py_func(x)),
         size * 30.0 * (x * (1.0 - x)) ** 2 * slope,
-        size * 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) * slope**2,
     )
 
 
@@ -127,26 +119,13 @@ def joints_per_signal(kinematics: BatchKinematics, joints: FloatArray, shifts: F
     return np.swapaxes(found, 1, 2) * scale
 
 
-def change_of_joints_per_signal(
-    kinematics: BatchKinematics, joints: FloatArray, shifts: FloatArray, per_signal: FloatArray
-) -> FloatArray:
-    """(D a_m)[a_n] [rad or m] by central differences, (n, n_motion n, n_motion m, n_joint); arguments as above."""
-    changes = []
-    for along in np.moveaxis(per_signal, 1, 0):
-        most = np.abs(along / kinematics.arm.speed_limit).max(axis=1)
-        step = (DIFFERENCE / np.where(most > 0.0, most, 1.0))[:, None]
-        ahead, behind = (joints_per_signal(kinematics, joints + sign * step * along, shifts) for sign in (1.0, -1.0))
-        changes.append((ahead - behind) / (2.0 * step[:, None]))
-    return np.stack(changes, axis=1)
-
-
 def speeds_through_cycle(
     kinematics: BatchKinematics, cycle: Cycle, joints: FloatArray, shifts: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Largest speed [rad/s or m/s] and acceleration [rad/s^2 or m/s^2] of each joint, (n_instant, n, n_joint) each.
+) -> FloatArray:
+    """Largest speed of each joint [rad/s or m/s], (n_instant, n, n_joint).
 
     The instants are those of `course` of the main motion. The other motions have other periods: each is added with its
-    largest rate and acceleration, so that the results are bounds.
+    largest rate, so that the results are bounds.
 
     Args:
         kinematics: of the arm.
@@ -156,28 +135,15 @@ def speeds_through_cycle(
     """
     one = course(cycle.motions[cycle.main])
     per_signal = np.stack([joints_per_signal(kinematics, now, shifts) for now in joints])
-    change = np.stack(
-        [change_of_joints_per_signal(kinematics, now, shifts, a) for now, a in zip(joints, per_signal, strict=True)]
-    )
     position = one.level * STEPS
     low = np.minimum(position.astype(np.int64), STEPS - 1)
     share = position - low
-    rate, rush = np.zeros((2, len(one.time), len(cycle.motions)))
+    rate = np.zeros((len(one.time), len(cycle.motions)))
     for number, motion in enumerate(cycle.motions):
-        quickest = 1.0 / (min(motion.rise, motion.fall) * motion.period[0])
-        rate[:, number] = motion.size[1] * RATE_MOST * quickest
-        rush[:, number] = motion.size[1] * ACCELERATION_MOST * quickest**2
-    rate[:, cycle.main], rush[:, cycle.main] = one.rate, one.acceleration
-    others = list(cycle.others)
-    speeds, accelerations = [], []
+        rate[:, number] = motion.size[1] * RATE_MOST / (min(motion.rise, motion.fall) * motion.period[0])
+    rate[:, cycle.main] = one.rate
+    speeds = []
     for instant, (first, part) in enumerate(zip(low, share, strict=True)):
-        a = (1.0 - part) * per_signal[first] + part * per_signal[first + 1]
-        b = (1.0 - part) * change[first] + part * change[first + 1]
-        moving = a * rate[instant][:, None]
-        speeds.append(np.abs(moving[:, cycle.main]) + np.abs(moving[:, others]).sum(axis=1))
-        bent = b * np.multiply.outer(rate[instant], rate[instant])[..., None]
-        rushing = a * rush[instant][:, None]
-        alone = rushing[:, cycle.main] + bent[:, cycle.main, cycle.main]
-        mixed = np.abs(bent).sum(axis=(1, 2)) - np.abs(bent[:, cycle.main, cycle.main])
-        accelerations.append(np.abs(alone) + np.abs(rushing[:, others]).sum(axis=1) + mixed)
-    return np.stack(speeds), np.stack(accelerations)
+        moving = (1.0 - part) * per_signal[first] + part * per_signal[first + 1]
+        speeds.append(np.abs(moving * rate[instant][:, None]).sum(axis=1))
+    return np.stack(speeds)

@@ -1,7 +1,6 @@
-"""Heat maps of two arms on an organ's surface, and pictures of both, with OpenGL where there is one and without it.
+"""Heat maps of two arms on an organ's surface, and pictures of both where there is OpenGL.
 
-In the pictures each arm has its tip at the point that `poses` names; an arm that reaches nothing stands at home, or is
-left out where it is drawn as capsules.
+In the pictures each arm has its tip at the point that `poses` names; an arm that reaches nothing stands at home.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,11 +36,9 @@ from surgsim_env.palpation.surface_drawing import (
     INK,
     PAPER,
     OrthographicView,
-    Patches,
     curved_patches,
     draw_patches,
     save_png,
-    tube,
 )
 from surgsim_env.rendering.cameras import Camera
 from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
@@ -61,8 +57,6 @@ LEFT, RIGHT, BOTH, APART, NEITHER = "#0072b2", "#e69f00", "#009e73", "#cc79a7", 
 UNTRIED = "#f4e6de"
 # Further from every point than this many of their usual distances, a part of the organ was not tried.
 TRIED_WITHIN = 2.0
-# The view from behind is left out if a smaller share of the surface in it was tried.
-BEHIND_LEAST = 0.25
 PORT_MARKS = {"left": ("L", LEFT), "right": ("R", RIGHT), "endoscope": ("E", INK)}
 SPLITS = 2
 NEIGHBOURS = 4
@@ -73,26 +67,18 @@ DPI = 100
 # Share of a colour that the light does not change.
 FLATNESS = 0.6
 
-
 # Of a map: title, which points have a value, the values [SI], and a text about the other points.
 Panel = tuple[str, NDArray[np.bool_], FloatArray, str]
 SIZE = 960, 720
-TISSUE = np.array([0.70, 0.33, 0.28])
 SCOPE, PORT, WALL = "#5c6470", "#f2bf33", (0.85, 0.65, 0.55, 0.18)
 SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
-# The endoscope is drawn this far out of its port [m]; as capsules, also into the body by this share of the way to the
-# organ's middle.
-SCOPE_OUTSIDE, SCOPE_INSIDE = 0.18, 0.45
+# The endoscope is drawn this far out of its port [m].
+SCOPE_OUTSIDE = 0.18
 # Fields of view of the camera beside the table and of the endoscope [degrees]; how far inside its port the latter's
 # camera is [m].
 BESIDE_FOV, SCOPE_FOV, SCOPE_TIP = 35.0, 70.0, 0.02
 # Each tip is put this far from the middle of the common points, towards its own port [m].
 ASIDE = 0.025
-# Long shapes are drawn in pieces no longer than this, so that what is in front hides what is behind [m].
-PIECE = 0.02
-
-# Patches, their colours and gloss.
-Part = tuple[Patches, FloatArray, float]
 
 
 class ArmMaps:
@@ -114,11 +100,7 @@ class ArmMaps:
         self._nearest = self._surface[np.reshape(index, (-1, count))]
         spacing = float(np.median(tree.query(tree.data, k=2)[0][:, -1]))
         self._tried = self._distance[:, 0] <= TRIED_WITHIN * spacing
-        front = camera_view(evaluation)
-        back = OrthographicView(-front.right, front.up, -front.towards)
-        self._views = [("from the camera", front)]
-        if self._tried[self._patches.normals @ back.towards > 0.0].mean() >= BEHIND_LEAST:
-            self._views.append(("from behind", back))
+        self._view = camera_view(evaluation)
 
     def write_all(self, folder: AnyFolder, progress: StepProgress | None = None) -> list[Picture]:
         """Write all maps into a folder: reach, each quantity, and the arms' distances; a step of `progress`."""
@@ -144,10 +126,8 @@ class ArmMaps:
         kind = np.where((either == 2) & ~one.both, 4, either)
         palette = np.array([to_rgb(colour) for colour in (LEFT, RIGHT, BOTH, NEITHER, APART)])
         names = ("left arm only", "right arm only", "both at once", "neither", "each, but not both at once")
-        figure = Figure(figsize=(10.5, 4.2), dpi=DPI, facecolor=PAPER, layout="constrained")
-        columns = figure.subplots(1, len(self._views), squeeze=False)[0]
-        for axes, (title, view) in zip(columns, self._views, strict=True):
-            self._draw(axes, view, palette[kind[self._nearest[:, 0]]], palette[kind], title)
+        figure = Figure(figsize=(7.5, 4.2), dpi=DPI, facecolor=PAPER, layout="constrained")
+        self._draw(figure.subplots(), palette[kind[self._nearest[:, 0]]], palette[kind], "from the camera")
         shown = [index for index in (2, 0, 1, 4, 3) if (kind == index).any()]
         labels = [f"{names[index]}: {share_text(kind[self._surface] == index)}" for index in shown]
         handles = [
@@ -197,7 +177,7 @@ class ArmMaps:
     def _write_panels(
         self, path: Path, heading: str, label: str, scale: float, panels: list[Panel], shared: bool = True
     ) -> None:
-        """A column for each panel, the camera's view above the one from behind; a colour bar for all or for each."""
+        """The organ as the camera sees it, once for each panel; a colour bar for all or for each."""
         from matplotlib import colormaps
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import to_rgb
@@ -206,28 +186,23 @@ class ArmMaps:
         groups = [panels] if shared else [[panel] for panel in panels]
         norms = [_norm(group, scale) for group in groups for _ in group]
         figure = Figure(
-            figsize=(0.6 + 3.7 * len(panels), 1.9 + 2.25 * len(self._views)),
+            figsize=(0.6 + 3.7 * len(panels), 4.15),
             dpi=DPI,
             facecolor=PAPER,
             layout="constrained",
         )
-        rows = figure.subplots(len(self._views), len(panels), squeeze=False)
+        row = figure.subplots(1, len(panels), squeeze=False)[0]
         grey = np.array(to_rgb(NEITHER))
-        for column, (title, mask, values, missed) in enumerate(panels):
-            norm = norms[column]
+        for axes, norm, (title, mask, values, missed) in zip(row, norms, panels, strict=True):
             tint = colormaps[COLOUR_MAP](norm(np.nan_to_num(values * scale)))[:, :3]
             dots = np.where(mask[:, None], tint, grey)
             colours = np.where(mask[self._nearest[:, :1]], self._painted(values * scale, mask, norm), grey)
-            for axes, (_, view) in zip(rows[:, column], self._views, strict=True):
-                self._draw(axes, view, colours, dots, title if axes is rows[0, column] else "")
-            axes = rows[-1, column]
+            self._draw(axes, colours, dots, title)
             axes.text(0.5, -0.02, missed, transform=axes.transAxes, ha="center", va="top", fontsize=8, color=INK)
             if not shared:
-                figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=rows[:, column], shrink=0.6, pad=0.02, label=label)
-        for row, (side, _) in zip(rows[:, 0], self._views, strict=True):
-            row.text(-0.02, 0.5, side, transform=row.transAxes, ha="right", va="center", rotation=90, fontsize=9)
+                figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=axes, shrink=0.6, pad=0.02, label=label)
         if shared:
-            figure.colorbar(ScalarMappable(norms[0], COLOUR_MAP), ax=rows, shrink=0.7, pad=0.02, label=label)
+            figure.colorbar(ScalarMappable(norms[0], COLOUR_MAP), ax=row, shrink=0.7, pad=0.02, label=label)
         if not any(np.isfinite(values).any() for _, _, values, _ in panels):
             heading = f"{heading}: nothing is reached"
         figure.suptitle(heading, fontsize=12, color=INK)
@@ -242,9 +217,9 @@ class ArmMaps:
         mean = (weight * np.nan_to_num(values)[self._nearest]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
         return colormaps[COLOUR_MAP](norm(mean))[:, :3]
 
-    def _draw(self, axes: Axes, view: OrthographicView, colours: FloatArray, dots: FloatArray, title: str) -> None:
-        """The organ painted, its points as dots, inner targets as diamonds, and the ports where they are in front."""
-        one = self.evaluation
+    def _draw(self, axes: Axes, colours: FloatArray, dots: FloatArray, title: str) -> None:
+        """The organ painted, its points as dots, inner targets as diamonds, and the ports."""
+        one, view = self.evaluation, self._view
         from matplotlib.colors import to_rgb
 
         painted = np.where(self._tried[:, None], colours, to_rgb(UNTRIED))
@@ -255,28 +230,16 @@ class ArmMaps:
         if one.inner.any():
             places = view.flat(one.points[one.inner])
             axes.scatter(*places.T, s=26, marker="D", c=dots[one.inner], edgecolors=INK, linewidths=0.8, zorder=3)
-        if view is self._views[0][1]:
-            _mark_ports(axes, one, view)
-        _finish(axes, title)
-
-
-def _finish(axes: Axes, title: str) -> None:
-    axes.set_title(title, fontsize=10, color=INK)
-    axes.set_aspect("equal")
-    axes.margins(0.03)
-    axes.set_axis_off()
+        _mark_ports(axes, one, view)
+        axes.set_title(title, fontsize=10, color=INK)
+        axes.set_aspect("equal")
+        axes.margins(0.03)
+        axes.set_axis_off()
 
 
 def camera_view(evaluation: ArmsEvaluation) -> OrthographicView:
-    """The view along the endoscope; without one, onto the points that are reached, else from above."""
-    port = evaluation.ports.get("endoscope")
-    if port is not None:
-        direction = np.array(port.into)
-    else:
-        seen = ~evaluation.inner & (evaluation.left.reachable | evaluation.right.reachable)
-        direction = -evaluation.normals[seen].sum(axis=0)
-        if not np.linalg.norm(direction) > 1e-6:
-            direction = np.array([0.0, 0.0, -1.0])
+    """The view along the endoscope."""
+    direction = np.array(evaluation.ports["endoscope"].into)
     direction = direction / np.linalg.norm(direction)
     # The patient's head is up (z); where the view is along z, the back is (y).
     return OrthographicView.along(direction, np.array([0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [0.0, 1.0, 0.0]))
@@ -288,7 +251,7 @@ def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: OrthographicView) 
 
     middle = evaluation.surface_points.mean(axis=0)
     for name, port in evaluation.ports.items():
-        letter, colour = PORT_MARKS.get(name, (name[:1].upper(), INK))
+        letter, colour = PORT_MARKS[name]
         start, into = np.array(port.point), np.array(port.into) / np.linalg.norm(port.into)
         path = view.flat(np.stack([start, start + max(0.0, float((middle - start) @ into)) * into]))
         halo = [withStroke(linewidth=3.2, foreground="white")]
@@ -330,9 +293,8 @@ def poses(evaluation: ArmsEvaluation) -> dict[str, int]:
         if not len(known):
             continue
         middle = evaluation.points[known].mean(axis=0)
-        if side in evaluation.ports and other in evaluation.ports:
-            apart = np.array(evaluation.ports[side].point) - np.array(evaluation.ports[other].point)
-            middle = middle + ASIDE * apart / max(float(np.linalg.norm(apart)), 1e-9)
+        apart = np.array(evaluation.ports[side].point) - np.array(evaluation.ports[other].point)
+        middle = middle + ASIDE * apart / np.linalg.norm(apart)
         found[side] = int(known[np.argmin(np.linalg.norm(evaluation.points[known] - middle, axis=1))])
     return found
 
@@ -350,9 +312,7 @@ def draw_arms(evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], ports: Ports) -
         reach.joints[places[side]] if side in places else arm.home
         for (side, reach), arm in zip(sides(evaluation), arms, strict=True)
     ]
-    capsules = [
-        DrawnCapsule(ends, radius, to_rgba(colour)) for ends, radius, colour in _fittings(evaluation, PORT, inside=0.0)
-    ]
+    capsules = [DrawnCapsule(ends, radius, to_rgba(colour)) for ends, radius, colour in _fittings(evaluation)]
     if not ports.wall.plate:
         # Not seen by the endoscope's camera, which stands inside the dome: OpenGL leaves out the backs of surfaces.
         capsules.append(DrawnCapsule(np.stack([ports.dome_centre] * 2), ports.wall.radius, WALL))
@@ -393,62 +353,18 @@ def _beside(
     return centre + 1.05 * radius / np.sin(np.radians(0.5 * BESIDE_FOV)) * direction, centre
 
 
-def _fittings(evaluation: ArmsEvaluation, port_colour: str, *, inside: float) -> list[tuple[FloatArray, float, str]]:
-    """Ends [m] (2, 3), radius [m] and colour of the ports and the endoscope.
-
-    The endoscope goes into the body by a share `inside` of the way to the organ's middle.
-    """
+def _fittings(evaluation: ArmsEvaluation) -> list[tuple[FloatArray, float, str]]:
+    """Ends [m] (2, 3), radius [m] and colour of the ports and the endoscope."""
     found = []
-    middle = evaluation.surface_points.mean(axis=0)
     for name, port in evaluation.ports.items():
         point, into = np.array(port.point), np.array(port.into) / np.linalg.norm(port.into)
-        found.append((np.stack([point, point]), PORT_RADIUS, port_colour))
+        found.append((np.stack([point, point]), PORT_RADIUS, PORT))
         if name == "endoscope":
-            depth = inside * max(0.0, float((middle - point) @ into))
-            found.append((np.stack([point - SCOPE_OUTSIDE * into, point + depth * into]), SCOPE_RADIUS, SCOPE))
+            found.append((np.stack([point - SCOPE_OUTSIDE * into, point]), SCOPE_RADIUS, SCOPE))
     return found
 
 
-def write_pictures(
-    evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], folder: AnyFolder, *, name: str = "arms"
-) -> list[Picture]:
-    """Write a picture of the arms as capsules, which needs no OpenGL, and those that the evaluation contains."""
-    places = poses(evaluation)
-    shown = "Drawn with OpenGL, with the arms' meshes: " + _where_tips_are(places)
-    given = write_given_pictures(evaluation.pictures, folder, name=name, description=shown)
-    if not places:
-        return given
-    organ = curved_patches(evaluation.surface_points, evaluation.surface_triangles, 2)
-    parts: list[Part] = [(organ, np.broadcast_to(TISSUE, (len(organ.corners), 3)), 0.2)]
-    for (side, reach), arm, colour in zip(sides(evaluation), arms, (LEFT, RIGHT), strict=True):
-        if side in places:
-            ends = arm.shape_ends(reach.joints[places[side]])
-            for one, radius in zip(ends, arm.shape_radius, strict=True):
-                parts.extend(_capsule(one, float(radius), colour))
-    for ends, radius, colour in _fittings(evaluation, INK, inside=SCOPE_INSIDE):
-        parts.extend(_capsule(ends, radius, colour))
-    path = folder / f"{name}.png"
-    _write_views(evaluation, parts, path)
-    tips = " and ".join(f"the {side} arm with its tip at point {index}" for side, index in places.items())
-    description = (
-        f"Close to the organ, whole from the front and above, and whole from the side: {tips}. Left arm blue, "
-        "right arm orange, endoscope grey, dark balls the ports; the body wall is left out."
-    )
-    return [Picture.of_file(path, "The arms and the endoscope over the organ", description), *given]
-
-
-def _where_tips_are(places: Mapping[str, int]) -> str:
-    """Which tips are at a point that their arm reaches, and which arms reach none and stand at home."""
-    at_home = [side for side in SIDES if side not in places]
-    if not at_home:
-        return "each tip is at a point that its arm reaches."
-    if len(at_home) == len(SIDES):
-        return "neither arm reaches a point; both stand at home."
-    (side,) = places
-    return f"the {side} tip is at a point that its arm reaches; the {at_home[0]} arm reaches none and stands at home."
-
-
-def write_given_pictures(
+def write_images(
     pictures: Mapping[str, NDArray[np.uint8]], folder: AnyFolder, *, name: str, description: str
 ) -> list[Picture]:
     """Write RGB images by caption as PNG files, numbered from 1, with a description of all."""
@@ -461,46 +377,3 @@ def write_given_pictures(
         title = caption[0].upper() + caption[1:]
         written.append(Picture.of_file(path, title, description))
     return written
-
-
-def _capsule(ends: FloatArray, radius: float, colour: str) -> list[Part]:
-    """A capsule about an axis (2, 3) [m] in short pieces."""
-    from matplotlib.colors import to_rgb
-
-    start, end = ends
-    count = max(1, int(np.ceil(np.linalg.norm(end - start) / max(PIECE, 2.0 * radius))))
-    parts = []
-    for low, high in pairwise(np.linspace(start, end, count + 1)):
-        patches = curved_patches(*tube(low, high, radius), 1)
-        parts.append((patches, np.broadcast_to(np.array(to_rgb(colour)), (len(patches.corners), 3)), 0.3))
-    return parts
-
-
-def _write_views(evaluation: ArmsEvaluation, parts: list[Part], path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.0, 4.8), dpi=100, facecolor=PAPER, layout="constrained")
-    front, side = _views(evaluation)
-    titles = ("the organ and the ports", "from the front and above", "from the side")
-    near = np.concatenate([evaluation.surface_points, *(np.array([port.point]) for port in evaluation.ports.values())])
-    for axes, view, title in zip(figure.subplots(1, 3), (front, front, side), titles, strict=True):
-        draw_patches(axes, parts, view)
-        _finish(axes, title)
-        if title == titles[0]:
-            (left, low), (right, high) = view.flat(near).min(axis=0) - 15.0, view.flat(near).max(axis=0) + 15.0
-            axes.set(xlim=(left, right), ylim=(low, high))
-    save_png(figure, path)
-
-
-def _views(evaluation: ArmsEvaluation) -> tuple[OrthographicView, OrthographicView]:
-    """Two views across the endoscope's line of sight, along which the picture's upward direction lies."""
-    into, right = -camera_view(evaluation).towards, camera_view(evaluation).right
-    if {"left", "right"} <= evaluation.ports.keys():
-        across = np.array(evaluation.ports["left"].point) - np.array(evaluation.ports["right"].point)
-        across = across - (across @ into) * into
-        if np.linalg.norm(across) > 1e-6:
-            right = across / np.linalg.norm(across)
-    front = np.cross(right, into)
-    head = np.array([0.0, 0.0, 1.0])
-    front = front if front @ head > 0.0 else -front
-    return OrthographicView.along(0.8 * front + 0.6 * into, -into), OrthographicView.along(right, -into)

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,9 +20,10 @@ Tell = Callable[[str, float], None]
 REASONS = ("reachable", "no joints put the tip there", "a joint limit", "the shaft misses its trocar",
            "the arm touches the organ", "the arm touches the wall")  # fmt: skip
 RANKING_RULE = (
-    "Ranked by the share of the surface's points that both arms reach at once, in whole per cent, the largest first; "
-    "equal shares by the share that either reaches, then by the median clearance from organ and body wall in whole "
-    "millimetres, then by the smallest tip force in tenths of a newton, always the largest first; then as given."
+    "Ranked by the share of the surface's points that both arms reach at once, in whole per cent, largest first (for "
+    "a patient who breathes: at every position); equal shares by the share that either reaches, then by the median "
+    "clearance from organ and body wall in whole millimetres, then by the smallest tip force in tenths of a newton, "
+    "always the largest first; then as given."
 )
 
 
@@ -89,10 +90,7 @@ class ArmThroughCycle:
         reachable: at each position by itself, whatever the joints before      (n_position, n_point)
         joints: along the path [m, rad]                                        (n_position, n_point, n_joint)
         clearance: smallest distance from organ and wall along the path [m]    (n_position, n_point)
-        trocar_load: sideways force on the trocar at 1 N at the tip, along the path [N]   (n_position, n_point)
-        turn: largest turn of the tip's direction on the path [rad]            (n_point,)
         speed: largest of each joint [rad/s or m/s]                            (n_point, n_joint)
-        acceleration: largest of each joint [rad/s^2 or m/s^2]                 (n_point, n_joint)
         speed_share: largest share of a speed limit over all points and joints (n_instant,)
         joint_names: base to tip
         hinge: whether a joint turns or slides                                 (n_joint,)
@@ -102,10 +100,7 @@ class ArmThroughCycle:
     reachable: NDArray[np.bool_]
     joints: FloatArray
     clearance: FloatArray
-    trocar_load: FloatArray
-    turn: FloatArray
     speed: FloatArray
-    acceleration: FloatArray
     speed_share: FloatArray
     joint_names: tuple[str, ...]
     hinge: NDArray[np.bool_]
@@ -119,7 +114,7 @@ class ArmThroughCycle:
     @property
     def has_path(self) -> NDArray[np.bool_]:
         """Which points the arm has a path for, (n_point,)."""
-        return np.isfinite(self.turn)
+        return np.isfinite(self.joints[0, :, 0])
 
     @property
     def joint_share(self) -> FloatArray:
@@ -192,11 +187,11 @@ class ArmsEvaluation:
         both: reachable by both at once, the arms at least 5 mm apart                         (n_point,)
         arm_distance_inside, arm_distance_outside: smallest distance between the arms inside and outside the body
             with both tips at the point's neighbourhood [m], NaN where not both reach it      (n_point,)
-        summary: what summary.json holds (shares, extremes, versions, seed, inputs), plain JSON types
+        summary: shares, extremes, versions, seed and inputs, as in summary.json, plain JSON types
         scene: name of the scene
         surface_points, surface_triangles: the organ's outer surface, for pictures            (n, 3), (m, 3)
         pictures: RGB images (height, width, 3) uint8 of the arms in the patient, by caption
-        ports: where the arms ("left", "right") and the camera ("endoscope") enter, for pictures; may be empty
+        ports: where the arms ("left", "right") and the camera ("endoscope") enter
         cycle: both arms while the patient breathes; None for one who holds still
     """
 
@@ -213,7 +208,7 @@ class ArmsEvaluation:
     surface_points: FloatArray
     surface_triangles: IntArray
     pictures: Mapping[str, NDArray[np.uint8]]
-    ports: Mapping[str, Port] = field(default_factory=dict)
+    ports: Mapping[str, Port]
     cycle: ThroughCycle | None = None
 
 
@@ -260,8 +255,8 @@ QUANTITIES = (
              "are left out."),
     Quantity("wall_clearance", "clearance from the body wall", "mm", 1e3, 1, "_m", True,
              "Smallest distance between the arm's surface and the body wall, a dome or plate through the ports; "
-             "parts in the hole about the arm's own port are left out. The inputs list the sizes of wall and "
-             "hole."),
+             "parts in the hole about the arm's own port are left out. summary.json lists the sizes of wall "
+             "and hole."),
     Quantity("approach_share", "approach directions", "%", 100.0, 0, "", True,
              "Share of 32 directions, spread evenly over the half space above the surface, from which the tip can "
              "come to the point within 10 degrees."),
@@ -448,13 +443,6 @@ def _because(arm: ArmReach, reason: str) -> str:
     return f"{reason} with {parts[0]}" if parts else reason
 
 
-class Column(NamedTuple):
-    """A column of points.csv: its name, which ends with the SI unit, and its meaning."""
-
-    name: str
-    meaning: str
-
-
 @dataclass(frozen=True)
 class Ranked:
     """A row of the ranking; shares 0 to 1, median clearance [m], smallest force [N], NaN where nothing is reached."""
@@ -469,56 +457,31 @@ class Ranked:
     clearance: float
     worst_clearance: float
     force: float
-    reasons: str
-
-
-def columns(evaluation: ArmsEvaluation) -> list[Column]:
-    """The columns of points.csv."""
-    listed = [Column("point", "number of the point, from 0")]
-    for axis in "xyz":
-        listed.append(Column(f"{axis}_m", f"{axis} of the point in the scene's frame"))
-    for axis in "xyz":
-        listed.append(Column(f"normal_{axis}", f"{axis} of the outward normal there"))
-    listed.append(Column("inner", "1 for a target inside the organ, 0 on its surface"))
-    for side, arm in sides(evaluation):
-        listed.append(Column(f"{side}_reachable", f"1 where the {side} arm reaches the point, else 0"))
-        listed.append(Column(f"{side}_reason", f"why not: one of {'; '.join(REASONS[1:])}"))
-        for quantity in QUANTITIES:
-            meaning = f"{quantity.title}, {quantity.si.lstrip('_') or 'a pure number'}"
-            listed.append(Column(f"{side}_{quantity.field}{quantity.si}", f"{side} arm: {meaning}"))
-        for number in range(arm.joints.shape[1]):
-            listed.append(
-                Column(f"{side}_joint_{number}", f"{side} arm: value of joint {number}, base to tip, rad or m")
-            )
-    listed.append(Column("both", "1 where both arms reach the point at once, else 0"))
-    listed.extend(Column(f"{field}_m", title) for field, title, _ in DISTANCES)
-    if evaluation.cycle is not None:
-        for side in SIDES:
-            listed.extend(Column(f"{side}_{name}", f"{side} arm: {meaning}") for name, meaning in CYCLE_COLUMNS)
-        listed.append(Column("both_always", "1 where both arms reach the point at once at every position, else 0"))
-    return listed
 
 
 # Columns of points.csv of each arm while the patient breathes.
-CYCLE_COLUMNS = (
-    ("always", "1 where it reaches the point at every position of the cycle, else 0"),
-    ("follows", "1 where it can follow the point through the cycle, else 0"),
-    ("path_clearance_worst_m", "smallest clearance from organ and wall on the path along which it follows"),
-    ("path_clearance_median_m", "median over the positions of that clearance"),
-    ("path_trocar_load_worst_N", "largest sideways load on the trocar on that path at 1 N on the tip"),
-    ("path_trocar_load_median_N", "median over the positions of that load"),
-    ("path_turn_rad", "largest turn of the tip's direction on that path"),
-    ("speed_share", "largest share of any joint's speed limit that following takes"),
-    ("speed_joint", "the joint of that share"),
-)
+CYCLE_COLUMNS = ("always", "follows", "path_clearance_worst_m", "speed_share", "speed_joint")
+
+
+def columns(evaluation: ArmsEvaluation) -> list[str]:
+    """The columns of points.csv; names of figures end with their SI unit."""
+    listed = ["point", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "inner"]
+    for side, arm in sides(evaluation):
+        listed += [f"{side}_reachable", f"{side}_reason"]
+        listed += [f"{side}_{quantity.field}{quantity.si}" for quantity in QUANTITIES]
+        listed += [f"{side}_joint_{number}" for number in range(arm.joints.shape[1])]
+    listed += ["both", *(f"{field}_m" for field, _, _ in DISTANCES)]
+    if evaluation.cycle is not None:
+        listed += [f"{side}_{name}" for side in SIDES for name in CYCLE_COLUMNS]
+        listed.append("both_always")
+    return listed
 
 
 def write_points(evaluation: ArmsEvaluation, path: Path) -> None:
     """One line for each point, in SI units; empty where there is no value."""
-    header = [column.name for column in columns(evaluation)]
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(header)
+        writer.writerow(columns(evaluation))
         for index in range(len(evaluation.points)):
             row = [str(index), *map(_cell, (*evaluation.points[index], *evaluation.normals[index]))]
             row.append(str(int(evaluation.inner[index])))
@@ -538,37 +501,31 @@ def _cycle_cells(cycle: ThroughCycle, index: int) -> list[str]:
     """The cells of a point under CYCLE_COLUMNS for each arm, and whether both reach it at every position."""
     cells = []
     for _, arm in cycle.arms:
-        has, share = bool(arm.has_path[index]), arm.joint_share[index]
+        share = arm.joint_share[index]
         cells += [str(int(arm.always[index])), str(int(arm.follows[index]))]
-        for values in (arm.clearance, arm.trocar_load):
-            worst = values[:, index].min() if values is arm.clearance else values[:, index].max()
-            cells += [_cell(worst), _cell(np.median(values[:, index]))]
-        cells += [_cell(arm.turn[index]), _cell(share.max()), arm.joint_names[int(share.argmax())] if has else ""]
-    return [*cells, str(int(cycle.both[:, index].all()))]
+        cells += [_cell(arm.clearance[:, index].min()), _cell(share.max())]
+        cells.append(arm.joint_names[int(share.argmax())] if arm.has_path[index] else "")
+    return [*cells, str(int(cycle.both_always[index]))]
 
 
 def rank(candidates: Sequence[tuple[str, str, ArmsEvaluation]]) -> list[Ranked]:
-    """Placements or robots in the order of RANKING_RULE, each with its differences from the best (the best: the next).
+    """Placements or robots in the order of RANKING_RULE.
 
     Args:
         candidates: name, description in a few words, and evaluation of each.
     """
     ordered = sorted((_row(*one) for one in candidates), key=_rank_key)
-    ranked = []
-    for place, row in enumerate(ordered):
-        other = ordered[0] if place else (ordered[1] if len(ordered) > 1 else None)
-        reasons = "" if other is None else _reasons(row, other)
-        ranked.append(replace(row, place=place + 1, reasons=reasons))
-    return ranked
+    return [replace(row, place=place) for place, row in enumerate(ordered, start=1)]
 
 
 def _row(name: str, what: str, evaluation: ArmsEvaluation) -> Ranked:
     outer, by_left, by_right = ~evaluation.inner, evaluation.left.reachable, evaluation.right.reachable
-    masks = (by_left, by_right, evaluation.both, by_left | by_right)
+    together = evaluation.both if evaluation.cycle is None else evaluation.cycle.both_always
+    masks = (by_left, by_right, together, by_left | by_right)
     left, right, both, either = (float(mask[outer].mean()) if outer.any() else 0.0 for mask in masks)
     usual, (worst, _) = spread(clearances(evaluation)).median, worst_clearance(evaluation)
     force = extreme(evaluation, "tip_force").value
-    return Ranked(0, name, what, left, right, both, either, usual, worst.value, force, "")
+    return Ranked(0, name, what, left, right, both, either, usual, worst.value, force)
 
 
 def _rank_key(row: Ranked) -> tuple[float, ...]:
@@ -581,34 +538,6 @@ def _per_cent(share: float) -> int:
 
 def _whole(value: float, scale: float) -> float:
     return round(value * scale) if math.isfinite(value) else -math.inf
-
-
-def _reasons(row: Ranked, other: Ranked) -> str:
-    """`reaches 12 % more of the points with both arms; 4 mm more median clearance`; equal figures are left out."""
-    shares = []
-    for share, title in (
-        ("both", "both arms"),
-        ("either", "either arm"),
-        ("left", "the left arm"),
-        ("right", "the right arm"),
-    ):
-        difference = _per_cent(getattr(row, share)) - _per_cent(getattr(other, share))
-        # The share of either arm counts only where the shares of both are equal.
-        if difference and not (share == "either" and shares):
-            more = "more" if difference > 0 else "fewer"
-            shares.append(f"{abs(difference)} % {more}{'' if shares else ' of the points'} with {title}")
-    parts = [f"reaches {', '.join(shares)}"] if shares else []
-    for figure, scale, digits, unit, title in (
-        ("clearance", 1e3, 0, "mm", "median clearance"),
-        ("force", 1.0, 1, "N", "smallest tip force"),
-    ):
-        mine, theirs = getattr(row, figure), getattr(other, figure)
-        if math.isfinite(mine) and math.isfinite(theirs):
-            difference = round(mine * scale, digits) - round(theirs * scale, digits)
-            if abs(difference) > 1e-9:
-                more = "more" if difference > 0 else "less"
-                parts.append(f"{number_text(abs(difference), 1.0, digits, unit)} {more} {title}")
-    return f"against {other.name}: {'; '.join(parts)}" if parts else f"the same as {other.name} in these figures"
 
 
 def _cell(value: float) -> str:

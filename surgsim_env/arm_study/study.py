@@ -1,9 +1,8 @@
 """Two arms on a patient's anatomy: reach, dexterity and clearances evaluated; setups ranked; report and files."""
 
 import json
-import math
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -16,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.arm_study.clearance import MEETING_ZONE, TIP_ZONE, ClusteredSurface, Obstacles
+from surgsim_env.arm_study.clearance import ClusteredSurface, Obstacles
 from surgsim_env.arm_study.episodes import (
     MEASURES,
     Episodes,
@@ -27,13 +26,10 @@ from surgsim_env.arm_study.episodes import (
     what_was_run,
 )
 from surgsim_env.arm_study.following import make_cycle
-from surgsim_env.arm_study.joint_search import APPROACH_ANGLE, DIRECTION_COUNT, REACHED
 from surgsim_env.arm_study.kinematics import BatchKinematics
-from surgsim_env.arm_study.pictures import ArmMaps, draw_arms, write_given_pictures, write_pictures
+from surgsim_env.arm_study.pictures import ArmMaps, draw_arms, write_images
 from surgsim_env.arm_study.ports import InnerTarget, Ports, default_ports, read_ports
 from surgsim_env.arm_study.reach import (
-    ARM_DISTANCE,
-    CHARACTERISTIC_LENGTH,
     Sites,
     evaluate_both,
     evaluate_reach,
@@ -50,7 +46,6 @@ from surgsim_env.arm_study.results import (
     ArmsEvaluation,
     Ranked,
     Tell,
-    columns,
     extreme,
     number_text,
     rank,
@@ -70,9 +65,7 @@ from surgsim_env.arm_study.through_cycle import (
     cycle_summary,
     draw_cycle,
     evaluate_cycle,
-    rank_cycle,
 )
-from surgsim_env.arm_study.tracked_press import TrackedPress, plain_presses, tracked_presses
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.palpation.job import package_version, plain_json
 from surgsim_env.rendering.gl import NoGLError
@@ -89,10 +82,10 @@ PLACES_PER_POINT = 12
 REPORT_NAME, POINTS_NAME, SUMMARY_NAME = "report.html", "points.csv", "summary.json"
 # Every file that a study can write; which pictures there are depends on the arms, the episodes and OpenGL.
 RESULT_NAMES = (
-    *(REPORT_NAME, POINTS_NAME, SUMMARY_NAME, "arms.png", "map_reach.png", "map_arm_distance.png"),
+    *(REPORT_NAME, POINTS_NAME, SUMMARY_NAME, "map_reach.png", "map_arm_distance.png"),
     PICTURE_NAME,
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
-    *(f"{name}_{number}.png" for name in ("arms", "episode") for number in range(1, 100)),
+    *("arms_1.png", "arms_2.png", "episode_1.png"),
 )
 Rows = list[tuple[str, ...]]
 
@@ -102,7 +95,6 @@ def evaluate_arms(
     left: str | Path | ArmDescription,
     right: str | Path | ArmDescription,
     ports: str | Path | Ports | None = None,
-    targets: Sequence[InnerTarget] | None = None,
     *,
     seed: int = 0,
     count: int = 500,
@@ -118,7 +110,6 @@ def evaluate_arms(
         left: a shipped arm's name or the TOML file of one's own.
         right: likewise.
         ports: a ports file, or the result of `read_ports`; `default_ports` where none is given.
-        targets: inner targets; those of the ports file where none are given.
         seed: draws the first point of the surface.
         count: number of points of the surface.
         progress: called with the current work and the share that is done.
@@ -137,12 +128,11 @@ def evaluate_arms(
     else:
         where = ports if isinstance(ports, Ports) else read_ports(ports)
     where.check_outside(anatomy)
-    inner = where.targets if targets is None else tuple(targets)
     radius = anatomy.scene.instrument.tip_radius
     arms = tuple(
         load_arm(source, place.port, tip_radius=radius) for source, place in ((left, where.left), (right, where.right))
     )
-    sites = _sites(anatomy, where, inner, count, seed)
+    sites = _sites(anatomy, where, count, seed)
     organ, reaches, around = ClusteredSurface(mesh.points, mesh.boundary_triangles), [], []
     # A patient who breathes is evaluated at several positions, of which the first is at rest.
     motions = anatomy.scene.motions
@@ -168,9 +158,9 @@ def evaluate_arms(
     inputs = {
         "scene": anatomy.scene.name,
         **{side: report.name for side, report in zip(SIDES, reports, strict=True)},
-        # As JSON has them: lists for tuples.
-        "ports": json.loads(json.dumps(asdict(where))),
+        "ports": asdict(where),
         "count": count,
+        "seed": seed,
     }
     points, triangles = anatomy.outer_surface
     found = ArmsEvaluation(
@@ -190,8 +180,7 @@ def evaluate_arms(
         ports=where.frames,
         cycle=cycle,
     )
-    cycle_figures = plain_json(cycle_summary(found), digits=12)
-    found = replace(found, summary={**summarise(found, inner, inputs, seed), **cycle_figures})
+    found = replace(found, summary=_summary(found, where.targets, inputs))
     if pictures:
         tell("pictures", 0.95)
         try:
@@ -202,11 +191,11 @@ def evaluate_arms(
     return found
 
 
-def _sites(anatomy: Anatomy, ports: Ports, targets: Sequence[InnerTarget], count: int, seed: int) -> Sites:
+def _sites(anatomy: Anatomy, ports: Ports, count: int, seed: int) -> Sites:
     """Points of the surface, then the inner targets, whose normals point to the endoscope."""
     trocars = np.array([ports.left.point, ports.right.point])
     points, normals = facing_points(anatomy, trocars, count, seed)
-    inner: FloatArray = np.array([target.point for target in targets], dtype=np.float64).reshape(-1, 3)
+    inner: FloatArray = np.array([target.point for target in ports.targets], dtype=np.float64).reshape(-1, 3)
     out = np.array(ports.endoscope.point) - inner
     out /= np.maximum(np.linalg.norm(out, axis=1), 1e-12)[:, None]
     return Sites(
@@ -264,10 +253,8 @@ def _spread(points: FloatArray, count: int, first: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def summarise(
-    found: ArmsEvaluation, targets: Sequence[InnerTarget], inputs: Mapping[str, Any], seed: int
-) -> dict[str, Any]:
-    """Shares, extremes, targets, versions, seed and inputs; SI units; the same run gives the same text."""
+def _summary(found: ArmsEvaluation, targets: Sequence[InnerTarget], inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Shares, extremes, targets, versions and inputs; SI units; the same run gives the same text."""
     outer, left, right = ~found.inner, found.left, found.right
     reached = {
         "left": left.reachable,
@@ -275,40 +262,35 @@ def summarise(
         "either": left.reachable | right.reachable,
         "both": found.both,
     }
-    return {
+    (clearance, what), force = worst_clearance(found), extreme(found, "tip_force")
+    summary = {
         "points": int(outer.sum()),
-        "reachable": {name: float(mask[outer].mean()) if outer.any() else None for name, mask in reached.items()},
+        "reachable": {name: float(mask[outer].mean()) for name, mask in reached.items()},
         "left": _arm_summary(left, outer),
         "right": _arm_summary(right, outer),
-        "arm_distance_inside": _extremes(found.arm_distance_inside[outer]),
-        "arm_distance_outside": _extremes(found.arm_distance_outside[outer]),
+        "arm_distance_inside": spread(found.arm_distance_inside[outer])._asdict(),
+        "arm_distance_outside": spread(found.arm_distance_outside[outer])._asdict(),
+        "worst_clearance": {"value_m": clearance.value, "arm": clearance.side, "from": what, "point": clearance.point},
+        "smallest_tip_force": {"value_N": force.value, "arm": force.side, "point": force.point},
         "targets": [
             {
                 "name": target.name,
-                "point": list(target.point),
+                "point": target.point,
                 "left": REASONS[left.reason[row]],
                 "right": REASONS[right.reason[row]],
-                "both": bool(found.both[row]),
+                "both": found.both[row],
             }
             for row, target in zip(np.flatnonzero(found.inner), targets, strict=True)
         ],
-        "rules": {
-            "reached_within": REACHED,
-            "approach_directions": DIRECTION_COUNT,
-            "approach_angle": APPROACH_ANGLE,
-            "characteristic_length": CHARACTERISTIC_LENGTH,
-            "tip_zone": TIP_ZONE,
-            "meeting_zone": MEETING_ZONE,
-            "arm_distance": ARM_DISTANCE,
-        },
         "versions": {
             "surgsim": package_version(),
             "python": platform.python_version(),
-            **{name: version(name) for name in ("numpy", "scipy", "mujoco", "matplotlib")},
+            **{name: version(name) for name in ("numpy", "scipy", "mujoco")},
         },
-        "seed": seed,
-        "inputs": dict(inputs),
+        "inputs": inputs,
+        **cycle_summary(found),
     }
+    return plain_json(summary, digits=12)
 
 
 def _arm_summary(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
@@ -317,13 +299,8 @@ def _arm_summary(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
         "arm": arm.name,
         "reasons": counts,
         "touches": [{"reason": REASONS[one.reason], "part": one.part, "points": one.points} for one in arm.touches],
-        **{one.field: _extremes(getattr(arm, one.field)[outer]) for one in QUANTITIES if one.field != "position_error"},
+        **{one.field: spread(getattr(arm, one.field)[outer])._asdict() for one in QUANTITIES},
     }
-
-
-def _extremes(values: FloatArray) -> dict[str, float | None]:
-    """Least, median and greatest of the finite values; None where there are none."""
-    return {name: None if math.isnan(value) else value for name, value in spread(values)._asdict().items()}
 
 
 @dataclass(frozen=True)
@@ -352,15 +329,13 @@ class StudyPlan:
         seed: of the points, of the searches for joints, and of the first episode
         episodes: number of episodes of the oracle script
         instruments: the first setup's left and right arm, each a name or a TOML file, for the episodes
-        inputs: what the arms, ports and scene were read from, for the summary
-        command: the command line, for the report
+        command: the command line, for the report and the summary
     """
 
     points: int
     seed: int
     episodes: int
     instruments: tuple[str, str]
-    inputs: Mapping[str, Any]
     command: str
 
 
@@ -383,26 +358,21 @@ def run_study(
     first = found[0]
     ranking = rank([(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
     episodes = scripted_episodes(setups[0], plan, console) if plan.episodes else None
-    named = [(setup.name, one) for setup, one in zip(setups, found, strict=True)]
-    cycle_ranking, presses = rank_cycle(named), presses_through_cycle(setups[0], first, anatomy, plan, console)
     said = _said(first, episodes)
-    played = plain_json({**plain_episodes(episodes), **plain_presses(presses)}, digits=12)
-    if first.cycle is not None:
-        played["cycle_compared"] = plain_json([one._asdict() for one in cycle_ranking], digits=12)
-    summary = {**_summary(first, plan, ranking), **played, "verdict": said}
-    first = replace(first, summary=summary)
+    more = {"verdict": said, "command": plan.command, "compared": [vars(one) for one in ranking]}
+    summary = {**first.summary, **plain_json({**more, **plain_episodes(episodes)}, digits=12)}
     (folder / SUMMARY_NAME).write_text(
         json.dumps(summary, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
     write_points(first, folder / POINTS_NAME)
     with StepProgress(console) as progress:
-        with progress.step("drawing the arms"):
-            pictures = write_pictures(first, (setups[0].left, setups[0].right), folder)
         maps = ArmMaps(first).write_all(folder, progress)
-    shown = "Drawn with OpenGL: the lobe and both arms in the overview and through the endoscope; "
+    shown = "Each tip is at a point that its arm reaches; an arm that reaches none stands at home."
+    pictures = write_images(first.pictures, folder, name="arms", description=shown)
+    shown = "The lobe and both arms in the overview and through the endoscope; "
     shown += "the target is green, arrows are the tissue's force on each tool."
     drawn = {} if episodes is None else episodes.pictures
-    ends = write_given_pictures(drawn, folder, name="episode", description=shown)
+    ends = write_images(drawn, folder, name="episode", description=shown)
     curves = draw_cycle(first, folder)
     write_report(
         first,
@@ -413,7 +383,7 @@ def run_study(
         ranking=ranking,
         episodes=episodes,
         episode_pictures=ends,
-        cycle=cycle_section(first, cycle_ranking, presses, curves),
+        cycle=cycle_section(first, curves),
     )
     console.print(said, highlight=False)
     for one in ranking:
@@ -421,13 +391,13 @@ def run_study(
             f"both {100.0 * one.both:.0f} %, median clearance {number_text(one.clearance, 1e3, 1, 'mm')}, "
             f"smallest tip force {number_text(one.force, 1.0, 2, 'N')}"
         )
-        console.print(f"{one.place}. {one.name}: {figures}; {one.reasons}", highlight=False)
+        console.print(f"{one.place}. {one.name}: {figures}", highlight=False)
     return [REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps, *ends, *curves))]
 
 
 def _said(evaluation: ArmsEvaluation, episodes: Episodes | None) -> str:
     """The first paragraph of a report."""
-    parts = verdict(evaluation), cycle_clause(evaluation), clause(episodes, evaluation.scene)
+    parts = verdict(evaluation), cycle_clause(evaluation), clause(episodes)
     return " ".join(filter(None, parts))
 
 
@@ -454,45 +424,12 @@ def scripted_episodes(setup: ArmSetup, plan: StudyPlan, console: Console) -> Epi
         return run_episodes(plan.instruments, (setup.left, setup.right), seeds, tell)
 
 
-def presses_through_cycle(
-    setup: ArmSetup, evaluation: ArmsEvaluation, anatomy: Anatomy, plan: StudyPlan, console: Console
-) -> list[TrackedPress]:
-    """Presses of a setup's arms on the moving organ, with a progress bar; none where the patient holds still."""
-    if evaluation.cycle is None:
-        return []
-    with _progress("presses", console) as tell:
-        return tracked_presses(plan.instruments, (setup.left, setup.right), evaluation, anatomy, tell)
-
-
 @contextmanager
 def _progress(name: str, console: Console) -> Iterator[Tell]:
     """A progress bar, and what tells it the current work and its share."""
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console) as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda what, share: bar.update(task, description=what, completed=share)
-
-
-def _summary(evaluation: ArmsEvaluation, plan: StudyPlan, ranking: Sequence[Ranked]) -> dict[str, Any]:
-    """The evaluation's own summary, completed by inputs, extremes and the ranking."""
-    clearance, what = worst_clearance(evaluation)
-    force = extreme(evaluation, "tip_force")
-    given = dict(evaluation.summary)
-    return plain_json(
-        {
-            **given,
-            "inputs": {**given.get("inputs", {}), "points": plan.points, "episodes": plan.episodes, **plan.inputs},
-            "seed": plan.seed,
-            "worst_clearance": {
-                "value_m": clearance.value,
-                "arm": clearance.side,
-                "from": what,
-                "point": clearance.point,
-            },
-            "smallest_tip_force": {"value_N": force.value, "arm": force.side, "point": force.point},
-            "compared": [vars(one) for one in ranking],
-        },
-        digits=12,
-    )
 
 
 def write_report(
@@ -518,9 +455,8 @@ def write_report(
         ranking: of several placements or robots; left out if there is none.
         episodes: run by a script; left out if there are none.
         episode_pictures: the ends of episodes.
-        cycle: what `cycle_section` says of a patient who breathes; left out if there is none.
+        cycle: the result of `cycle_section`; left out for a patient who holds still.
     """
-    summary = evaluation.summary
     page = render_page(
         "arms.html.j2",
         title=f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)",
@@ -531,7 +467,6 @@ def write_report(
         pictures=pictures,
         maps=maps,
         has_targets=evaluation.inner.any(),
-        has_ports=bool(evaluation.ports),
         shares=_shares(evaluation),
         values=_values(evaluation),
         distances=[(title, *spread(getattr(evaluation, field)).texts(1e3, 1)) for field, title, _ in DISTANCES],
@@ -540,9 +475,6 @@ def write_report(
         episodes=episodes and _episodes(episodes, evaluation.scene, episode_pictures),
         cycle=cycle,
         definitions=_definitions(),
-        columns=columns(evaluation),
-        inputs=[(name.capitalize(), list(_flat(summary.get(name, {})))) for name in ("inputs", "versions")],
-        seed=summary.get("seed"),
         command=command,
     )
     path.write_text(page, encoding="utf-8", newline="\n")
@@ -622,21 +554,3 @@ def _definitions() -> list[tuple[str, str]]:
         *((f"{title} [mm]", definition) for _, title, definition in DISTANCES),
         ("the worse arm", "At a point, the smaller of both arms' values where more is better, else the larger."),
     ]
-
-
-def _flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
-    """Nested tables and lists as rows of a name and a text."""
-    if isinstance(value, Mapping):
-        for key in sorted(value, key=str):
-            yield from _flat(value[key], f"{name}, {key}" if name else str(key))
-    elif isinstance(value, list | tuple) and any(isinstance(item, Mapping) for item in value):
-        for number, item in enumerate(value, start=1):
-            yield from _flat(item, f"{name} {number}")
-    elif isinstance(value, list | tuple):
-        yield name, ", ".join(map(_text, value)) or "none"
-    else:
-        yield name, _text(value)
-
-
-def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,13 +1,13 @@
-"""Two arms on a patient who breathes: reach, clearance and following through the cycle; words, tables and a figure.
+"""Two arms on a patient who breathes: reach, clearance and following through the cycle; tables and a figure.
 
 The organ goes with its ground, as at slow motion: its points and surface are displaced, its normals are not turned.
 Ports, body wall and endoscope stay.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.arm_study.clearance import ClusteredSurface, Obstacles
 from surgsim_env.arm_study.following import STEPS, Cycle, course, make_cycle, speeds_through_cycle
-from surgsim_env.arm_study.joint_search import Wanted, search_joints, turns_between
+from surgsim_env.arm_study.joint_search import Wanted, search_joints
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.arm_study.pictures import BOTH, LEFT, RIGHT
 from surgsim_env.arm_study.reach import (
@@ -26,7 +26,6 @@ from surgsim_env.arm_study.reach import (
     evaluate_both,
     evaluate_reach,
     pair_distances,
-    trocar_load,
     ways,
 )
 from surgsim_env.arm_study.results import (
@@ -37,20 +36,13 @@ from surgsim_env.arm_study.results import (
     ThroughCycle,
     number_text,
     share_text,
-    spread,
 )
-from surgsim_env.arm_study.tracked_press import TrackedPress
 from surgsim_env.palpation.surface_drawing import INK, PAPER, save_png
 from surgsim_env.reports.html_page import Picture
 from surgsim_env.reports.output_folder import AnyFolder
 from surgsim_env.scene.anatomy import Anatomy
 
 PICTURE_NAME = "cycle.png"
-CYCLE_RANKING_RULE = (
-    "Ranked by the share of the surface's points that both arms reach at once at every position, in whole per cent; "
-    "equal shares by the mean share that an arm can follow, then by the median of the smallest clearances on the "
-    "paths, in whole millimetres; then as given."
-)
 
 
 def evaluate_cycle(
@@ -131,33 +123,24 @@ def _followed(
         path, kept = _path(kinematics, cycle, places, around, rows[left], start[left])
         paths[:, rows[left][kept]] = path[:, kept]
     rows = np.flatnonzero(~np.isnan(paths[0, :, 0]))
-    clearance, load = np.full((2, len(places), n_point), np.nan)
-    turn = np.full(n_point, np.nan)
-    speed, acceleration = np.full((2, n_point, kinematics.arm.joint_count), np.nan)
+    clearance = np.full((len(places), n_point), np.nan)
+    speed = np.full((n_point, kinematics.arm.joint_count), np.nan)
     shares = np.full(len(course(cycle.motions[cycle.main]).time), np.nan)
     if rows.size:
-        directions = []
         for number, (sites, obstacles) in enumerate(zip(places, around, strict=True)):
             chain = kinematics.at(paths[number, rows])
             organ = obstacles.organ_clearance(kinematics, chain, exact=True)
             organ = np.where(sites.inner[rows], np.inf, organ)
             clearance[number, rows] = np.minimum(organ, obstacles.wall_clearance(kinematics, chain))
-            load[number, rows] = trocar_load(kinematics, chain, -sites.normals[rows])
-            directions.append(chain.direction)
-        turns = [np.linalg.norm(turns_between(directions[0], one), axis=1) for one in directions]
-        turn[rows] = np.max(turns, axis=0)
         alone = paths[: STEPS + 1, rows]
-        speeds, accelerations = speeds_through_cycle(kinematics, cycle, alone, shifts[:, rows])
-        speed[rows], acceleration[rows] = speeds.max(axis=0), accelerations.max(axis=0)
+        speeds = speeds_through_cycle(kinematics, cycle, alone, shifts[:, rows])
+        speed[rows] = speeds.max(axis=0)
         shares = (speeds / kinematics.arm.speed_limit).max(axis=(1, 2))
     return ArmThroughCycle(
         reachable=reachable,
         joints=paths,
         clearance=clearance,
-        trocar_load=load,
-        turn=turn,
         speed=speed,
-        acceleration=acceleration,
         speed_share=shares,
         joint_names=tuple(kinematics.arm.joints),
         hinge=kinematics.hinge,
@@ -267,32 +250,30 @@ def _reach_summary(reachable: NDArray[np.bool_]) -> dict[str, Any]:
 
 def _arm_summary(arm: ArmThroughCycle, outer: NDArray[np.bool_]) -> dict[str, Any]:
     joint, share = arm.limiting
-    fastest, rush = (_greatest(values) for values in (arm.speed, arm.acceleration))
+    fastest = _greatest(arm.speed)
     return {
         "reachable": _reach_summary(arm.reachable[:, outer]),
         "has_path": float(arm.has_path[outer].mean()),
         "follows": float(arm.follows[outer].mean()),
-        "path_clearance": _worst_and_median(arm.clearance[:, outer], np.min),
-        "path_trocar_load": _worst_and_median(arm.trocar_load[:, outer], np.max),
-        "path_turn": None if math.isnan(spread(arm.turn).greatest) else spread(arm.turn)._asdict(),
+        "path_clearance": _worst_and_median(arm.clearance[:, outer]),
         "limiting_joint": joint,
         "speed_share": share,
         "speed_share_over_time": arm.speed_share,
         "joints": [
-            {"name": name, "speed": speed, "speed_limit": limit, "acceleration": acceleration}
-            for name, speed, limit, acceleration in zip(arm.joint_names, fastest, arm.speed_limit, rush, strict=True)
+            {"name": name, "speed": speed, "speed_limit": limit}
+            for name, speed, limit in zip(arm.joint_names, fastest, arm.speed_limit, strict=True)
         ],
     }
 
 
-def _worst_and_median(values: FloatArray, worst: Callable[..., Any]) -> dict[str, float]:
-    """The worst of all points and positions; the median over the points of each one's worst, and of its median."""
+def _worst_and_median(values: FloatArray) -> dict[str, float]:
+    """The least of all points and positions; the median over the points of each one's least, and of its median."""
     known = values[:, np.isfinite(values).all(axis=0)]
     if not known.size:
         return dict.fromkeys(("worst", "median_of_worst", "median"), math.nan)
-    each = worst(known, axis=0)
+    each = known.min(axis=0)
     return {
-        "worst": float(worst(each)),
+        "worst": float(each.min()),
         "median_of_worst": float(np.median(each)),
         "median": float(np.median(np.median(known, axis=0))),
     }
@@ -304,158 +285,54 @@ def _greatest(values: FloatArray) -> FloatArray:
     return known.max(axis=0) if len(known) else np.full(values.shape[1], np.nan)
 
 
-class CycleRank(NamedTuple):
-    """A placement or robots through the cycle: shares of the surface's points, 0 to 1, and figures of the paths.
-
-    Fields:
-        place: 1 is the best
-        name: of the placement or robot
-        both: both reach at once at rest
-        both_always: both reach at once at every position
-        left_always, right_always: each arm reaches at every position
-        left_follows, right_follows: each arm can follow
-        clearance: median over the points of the smallest clearance of either arm's path [m]
-        speed_share: largest share of any joint's speed limit
-    """
-
-    place: int
-    name: str
-    both: float
-    both_always: float
-    left_always: float
-    right_always: float
-    left_follows: float
-    right_follows: float
-    clearance: float
-    speed_share: float
-
-
-def rank_cycle(candidates: Sequence[tuple[str, ArmsEvaluation]]) -> list[CycleRank]:
-    """Placements or robots in the order of CYCLE_RANKING_RULE; empty for a patient who holds still."""
-    rows = []
-    for name, evaluation in candidates:
-        cycle, outer = evaluation.cycle, ~evaluation.inner
-        if cycle is None:
-            return []
-        masks = (evaluation.both, cycle.both_always, cycle.left.always, cycle.right.always,
-                 cycle.left.follows, cycle.right.follows)  # fmt: skip
-        gaps = np.concatenate([arm.clearance[:, outer & arm.has_path].min(axis=0) for _, arm in cycle.arms])
-        shares = np.array([arm.limiting[1] for _, arm in cycle.arms])
-        figures = spread(gaps).median, spread(shares).greatest
-        rows.append(CycleRank._make((0, name, *(float(mask[outer].mean()) for mask in masks), *figures)))
-    ordered = sorted(rows, key=_rank_key)
-    return [row._replace(place=place) for place, row in enumerate(ordered, start=1)]
-
-
-def _rank_key(row: CycleRank) -> tuple[float, ...]:
-    clearance = round(row.clearance * 1e3) if math.isfinite(row.clearance) else -math.inf
-    follow = row.left_follows + row.right_follows
-    return -round(100.0 * row.both_always), -round(50.0 * follow), -clearance
-
-
-def cycle_section(
-    evaluation: ArmsEvaluation,
-    ranking: Sequence[CycleRank],
-    presses: Sequence[TrackedPress],
-    picture: Sequence[Picture],
-) -> dict[str, Any] | None:
-    """What the report's template shows of the cycle; None for a patient who holds still."""
+def cycle_section(evaluation: ArmsEvaluation, picture: Sequence[Picture]) -> dict[str, Any] | None:
+    """Contents of the report's section on the cycle; None for a patient who holds still."""
     cycle, outer = evaluation.cycle, ~evaluation.inner
     if cycle is None:
         return None
-    return {
-        "paragraphs": [_how(cycle), *(_following(side, arm, outer) for side, arm in cycle.arms), *_worst(ranking)],
-        "reach": _reach_rows(cycle, outer),
-        "paths": _path_rows(cycle, outer),
-        "joints": _joint_rows(cycle),
-        "ranking": [_rank_texts(row) for row in ranking],
-        "rule": CYCLE_RANKING_RULE,
-        "trocar": [one.text for one in presses],
-        "pictures": picture,
-    }
-
-
-def _how(cycle: ThroughCycle) -> str:
     parts = [
         f"{name} by up to {_millimetres(travel)} in cycles of {period:.2g} s"
         for name, travel, period in zip(cycle.motions, cycle.travel, cycle.period, strict=True)
     ]
-    others = f"; then rest and top again with {_listed(cycle.motions[1:])} at the top" if cycle.motions[1:] else ""
-    return (
-        f"The organ moves with its ground: {', '.join(parts)} (the largest and quickest cycles of the scene's ranges; "
-        f"ports, body wall and endoscope stay). It is evaluated at {len(cycle.level)} positions: from rest to the top "
-        f"of {cycle.motions[0]} in even steps{others}."
-    )
-
-
-def _following(side: str, arm: ArmThroughCycle, outer: NDArray[np.bool_]) -> str:
-    joint, share = arm.limiting
-    if not joint:
-        return f"The {side} arm follows no point."
-    turn, rush = spread(arm.turn), _greatest(arm.acceleration)
-    turning = [
-        f"{_greatest_text(rush[arm.hinge == kind])} {unit}"
-        for kind, unit in ((True, "rad/s²"), (False, "m/s²"))
-        if (arm.hinge == kind).any()
-    ]
-    return (
-        f"The {side} arm has a path that keeps joint limits and trocar, off organ and wall, for "
-        f"{share_text(arm.has_path[outer])} of the points, and its joints are quick enough for "
-        f"{share_text(arm.follows[outer])}. The joint that limits it is {joint}, which takes up to {_per_cent(share)} "
-        f"of its speed limit; accelerations are up to {' and '.join(turning)} (no limits of them are stated). The "
-        f"tip's direction, which is left free, turns by up to {math.degrees(turn.greatest):.0f} degrees."
-    )
-
-
-def _worst(ranking: Sequence[CycleRank]) -> list[str]:
-    if len(ranking) < 2:
-        return []
-    last = ranking[-1]
-    return [
-        f"Of those compared {last.name} is worst: through the cycle both reach {_per_cent(last.both_always)} at once, "
-        f"against {_per_cent(ranking[0].both_always)} with {ranking[0].name}."
-    ]
+    return {
+        "motions": ", ".join(parts),
+        "positions": len(cycle.level),
+        "reach": _reach_rows(cycle, outer),
+        "clearance": _clearance_rows(cycle, outer),
+        "joints": _joint_rows(cycle),
+        "pictures": picture,
+    }
 
 
 def _reach_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
-    rows = [("left arm", cycle.left.reachable), ("right arm", cycle.right.reachable), ("both at once", cycle.both)]
+    """Shares of points at rest, median and least over the positions, at every position, and followed."""
+    rows = [(f"{side} arm", arm.reachable, _per_cent(float(arm.follows[outer].mean()))) for side, arm in cycle.arms]
+    rows.append(("both at once", cycle.both, ""))
     texts = []
-    for name, reachable in rows:
+    for name, reachable, follows in rows:
         each = reachable[:, outer]
         share = each.mean(axis=1)
-        figures = (share[0], float(np.median(share)), float(share.min()))
-        texts.append((name, *map(_per_cent, figures), _per_cent(float(each.all(axis=0).mean()))))
+        figures = (share[0], float(np.median(share)), float(share.min()), float(each.all(axis=0).mean()))
+        texts.append((name, *map(_per_cent, figures), follows))
     return texts
 
 
-def _path_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
+def _clearance_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
     rows = []
     for side, arm in cycle.arms:
-        for title, values, worst, scale in (
-            ("clearance from organ and wall [mm]", arm.clearance, np.min, 1e3),
-            ("sideways load on the trocar [N]", arm.trocar_load, np.max, 1.0),
-        ):
-            found = _worst_and_median(values[:, outer], worst)
-            rows.append((f"{side} arm: {title}", *(number_text(one, scale, 2) for one in found.values())))
+        found = _worst_and_median(arm.clearance[:, outer])
+        rows.append((f"{side} arm: clearance [mm]", *(number_text(one, 1e3, 2) for one in found.values())))
     return rows
 
 
 def _joint_rows(cycle: ThroughCycle) -> list[tuple[str, ...]]:
     rows = []
     for side, arm in cycle.arms:
-        for index, (speed, rush) in enumerate(zip(_greatest(arm.speed), _greatest(arm.acceleration), strict=True)):
-            unit, limit = "rad" if arm.hinge[index] else "m", arm.speed_limit[index]
-            rows.append(
-                (f"{side} arm: {arm.joint_names[index]}", f"{number_text(speed, 1.0, 3)} {unit}/s",
-                 f"{limit:g} {unit}/s", _per_cent(speed / limit), f"{number_text(rush, 1.0, 3)} {unit}/s²")
-            )  # fmt: skip
+        for index, speed in enumerate(_greatest(arm.speed)):
+            unit, limit = "rad/s" if arm.hinge[index] else "m/s", arm.speed_limit[index]
+            figures = f"{number_text(speed, 1.0, 3)} {unit}", f"{limit:g} {unit}", _per_cent(speed / limit)
+            rows.append((f"{side} arm: {arm.joint_names[index]}", *figures))
     return rows
-
-
-def _rank_texts(row: CycleRank) -> tuple[str, ...]:
-    shares = (row.both, row.both_always, row.left_always, row.right_always, row.left_follows, row.right_follows)
-    figures = number_text(row.clearance, 1e3, 1), _per_cent(row.speed_share)
-    return f"{row.place}. {row.name}", *map(_per_cent, shares), *figures
 
 
 def draw_cycle(evaluation: ArmsEvaluation, folder: AnyFolder) -> list[Picture]:
@@ -526,7 +403,3 @@ def _millimetres(value: float) -> str:
 
 def _per_cent(share: float) -> str:
     return number_text(share, 100.0, 0, "%")
-
-
-def _greatest_text(values: FloatArray) -> str:
-    return number_text(float(values.max()), 1.0, 2)

@@ -83,8 +83,6 @@ class Arm:
     """Mount a straight palpator of this length [m], whatever the model has; default: 0.4 on arms without a shaft."""
     out: MaybePath = None
     """Folder for the results; default: that of the file."""
-    overwrite: bool = False
-    """Whether an arm's file that is there already is replaced."""
 
     def run(self, console: Console) -> int:
         """Make the arm, print what was found and chosen, write its TOML file and a picture; 1 if it reaches little.
@@ -103,8 +101,8 @@ class Arm:
             require_number("--tool", self.tool, 0.05, "m")
         folder, stem = self.out or self.file.parent, self.file.stem
         names = f"{stem}.toml", f"{stem}.png"
-        if (folder / names[0]).exists() and not self.overwrite:
-            raise ValueError(f"{folder / names[0]} is there already: give another --out, or --overwrite")
+        if (folder / names[0]).exists():
+            raise ValueError(f"{folder / names[0]} is there already: remove it, or give another --out")
         with _progress(console) as bar:
             task = bar.add_task("", total=1.0)
             found = find_arm(

@@ -1,10 +1,8 @@
 """`surgsim arms`: two arms evaluated on an organ, with a report."""
 
-import hashlib
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -77,9 +75,7 @@ class Arms:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
         anatomy = load_anatomy(with_motion(make_scene(self.scene), self.motion))
         setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
-        plan = StudyPlan(
-            self.points, self.seed, self.episodes, (self.left, self.right), _inputs(self), self.command_line
-        )
+        plan = StudyPlan(self.points, self.seed, self.episodes, (self.left, self.right), self.command_line)
         with output_folder(self.out, RESULT_NAMES) as files:
             written = run_study(setups, anatomy, plan, files, console)
         console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
@@ -131,34 +127,3 @@ def _shown(source: str | Path) -> str:
     if not path.is_absolute():
         return path.as_posix()
     return path.relative_to(Path.cwd()).as_posix() if path.is_relative_to(Path.cwd()) else path.name
-
-
-def _inputs(command: Arms) -> dict[str, Any]:
-    """The inputs by name with checksums; default ports are in the evaluation's own summary."""
-    inputs: dict[str, Any] = {
-        "scene": _file_input(Path(command.scene)) if command.scene.endswith(".toml") else _shown(command.scene),
-        "left": _arm_input(command.left),
-        "right": _arm_input(command.right),
-        "compare": [_file_input(Path(one)) if _is_ports_file(one) else _arm_input(one) for one in command.compare],
-    }
-    if command.motion is not None:
-        inputs["motion"] = command.motion
-    if command.ports is not None:
-        inputs["ports"] = {"file": _shown(command.ports), **read_toml(command.ports, "ports")}
-    return inputs
-
-
-def _file_input(path: Path) -> dict[str, str]:
-    return {"file": _shown(path), path.name: _checksum(path)}
-
-
-def _checksum(path: Path) -> str:
-    return f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
-
-
-def _arm_input(source: str) -> dict[str, str]:
-    """An arm's name with the checksums of its files, which identify it wherever they were."""
-    description = read_description(source)
-    files = (description.folder / f"{description.name}.toml", description.folder / description.model)
-    sums = {file.name: _checksum(file) for file in files}
-    return {"arm": _shown(source), **sums}

@@ -14,11 +14,10 @@ from rich.console import Console
 
 from surgsim_env.cli.values import MaybeText
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_env.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
-from surgsim_env.haptics.settings import BREATH_BIT, ForceLimits, HapticSettings
+from surgsim_env.haptics.settings import BREATH_BIT, HapticSettings
 from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.haptics.udp import PORT, UdpDevice
 from surgsim_env.instruments.arm.arm_instrument import parked_place
@@ -56,14 +55,6 @@ class Haptics:
     """Mass of a device that pushes back, at its handle [kg]."""
     device_delay: float = 0.0
     """Delay of pose and force together [s]."""
-    stiffness: float | None = None
-    """Stiffness of the coupling [N/m]; default: the largest that is stable with the device, or 500."""
-    damping: float | None = None
-    """Damping of the coupling [N s/m]; default: as in docs/haptics.md, or 0 if a stiffness is given."""
-    force_largest: float = 3.0
-    """Largest force on the device and on the tip [N]."""
-    absolute: bool = False
-    """The device's position is a position in the scene; otherwise its first position is the tip's start."""
     seconds: float | None = None
     """Duration [s]; default: until Ctrl-C, or the end of the trajectory."""
     out: Path | None = None
@@ -73,8 +64,7 @@ class Haptics:
         """Run the loop until its time is over, the trajectory ends, or Ctrl-C.
 
         Raises:
-            ValueError: an unknown scene or motion, a bad trajectory, a coupling that is unstable with the device, two
-                arms, apnoea of a patient who does not breathe.
+            ValueError: an unknown scene or motion, a bad trajectory, two arms, apnoea without breathing.
             OSError: the port is taken, or a file cannot be read.
         """
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
@@ -90,7 +80,8 @@ class Haptics:
         simulation.hold_breath(self.apnoea)
         simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
         with _device(self, simulation.haptic_dt) as device, _telemetry(self.out) as note:
-            loop = HapticLoop(simulation, device, _settings(self))
+            settings = HapticSettings(relative=True, breath_button=None if self.apnoea else BREATH_BIT)
+            loop = HapticLoop(simulation, device, settings)
             coupling = loop.held[0].coupling
             console.print(f"scene {scene.name}: coupling {coupling.stiffness:.4g} N/m, {coupling.damping:.3g} N s/m")
             if isinstance(device, UdpDevice):
@@ -176,20 +167,6 @@ def _dynamics(command: Haptics) -> DeviceDynamics | None:
             "only one of both"
         )
     return DeviceDynamics(command.device_damping, command.device_mass, command.device_delay)
-
-
-def _settings(command: Haptics) -> HapticSettings:
-    coupling = None
-    if command.stiffness is not None:
-        coupling = VirtualCoupling(command.stiffness, command.damping or 0.0)
-    elif command.damping is not None:
-        raise ValueError("--damping needs --stiffness: give both")
-    return HapticSettings(
-        coupling,
-        ForceLimits(command.force_largest),
-        relative=not command.absolute,
-        breath_button=None if command.apnoea else BREATH_BIT,
-    )
 
 
 @contextmanager

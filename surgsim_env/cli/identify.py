@@ -26,8 +26,6 @@ class Identify:
     """Thickness of the tissue on its rigid bed [m]; default: searched, with an interval."""
     poisson_ratio: float = 0.45
     """Poisson's ratio of the tissue; presses alone do not tell it."""
-    density: float = 1060.0
-    """Density of the tissue [kg/m^3], for material.toml; presses do not tell it."""
     seed: int = 0
     """Seed that draws which half of the sites is fitted."""
     workers: MaybeCount = None
@@ -51,21 +49,19 @@ class Identify:
         from surgsim_env.identify import results
         from surgsim_env.identify.identification import IdentifyOptions, identify
         from surgsim_env.identify.recordings import read_recording
-        from surgsim_env.scene.model import require_number
 
         if not self.recordings:
             raise ValueError("give a recording: a CSV file with the columns site, depth_mm, normal_force_n")
-        require_number("--density", self.density, 0.0, "kg/m^3", above=True)
         options = IdentifyOptions(self.ball_radius, self.thickness, self.poisson_ratio, self.seed, self.workers)
         sets = [read_recording(path) for path in self.recordings]
         default = Path("runs") / f"identify-{sets[0].name}"
         with output_folder(self.out or default, results.RESULT_NAMES, numbered=self.out is None) as files:
             found = identify(sets, options, console=console)
-            results.write_material(found, files / results.MATERIAL_NAME, self.command_line, self.density)
+            results.write_material(found, files / results.MATERIAL_NAME, self.command_line)
             results.write_sites(found, files / results.SITES_NAME)
             results.write_curves(found, files / results.CURVES_NAME)
             has_map = results.write_map(found, files / results.MAP_NAME)
-            results.write_summary(found, files / results.SUMMARY_NAME, self.command_line, self.density)
+            results.write_summary(found, files / results.SUMMARY_NAME, self.command_line)
         results.print_result(found, console)
         written = [name for name in results.RESULT_NAMES if has_map or name != results.MAP_NAME]
         console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)

@@ -24,8 +24,6 @@ class Organ:
     region in it, which names the region; or one file of tets (vtu, vtk, msh, mesh)."""
     labels: MaybeText = None
     """NAME=LABEL,...: the labels of an image, or the region tags of tets, the organ first, such as liver=1,lesion=2."""
-    region: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=FILE: a further region from a closed surface; repeatable."""
     length_unit: MaybeText = None
     """Unit of the file: m, cm, mm, or metres per unit as a number; required if the format states none."""
     cell_size: MaybeNumber = None
@@ -71,7 +69,7 @@ class Organ:
         """
         from msdm_core.mesh_files.mesh_io import FORMATS
         from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
-        from surgsim_env.palpation.surface_scene import SurfaceOptions
+        from surgsim_env.palpation.scene_options import SceneOptions
         from surgsim_env.patient import make_patient as patient
         from surgsim_env.patient.label_image import IMAGE_SUFFIXES, is_image
         from surgsim_env.patient.retract_scene import told
@@ -80,12 +78,12 @@ class Organ:
             raise ValueError(f"give a file: a label image ({', '.join(IMAGE_SUFFIXES)}), surfaces or a mesh of tets")
         unit, first = unit_of(self.length_unit), self.files[0]
         if is_image(first):
-            _refuse(self, ("region", "length_unit", "remesh"), "surfaces or tets; an image has its own")
+            _refuse(self, ("length_unit", "remesh"), "surfaces or tets; an image has its own")
         elif first.suffix.lower() in SURFACE_SUFFIXES:
             _refuse(self, ("labels",), "a label image or tets; regions of surfaces have a file each")
             _refuse(self, ("remesh",), "a file of tets")
         elif first.suffix.lower() in FORMATS:
-            _refuse(self, ("region", "mend"), "a label image or surfaces")
+            _refuse(self, ("mend",), "a label image or surfaces")
             if not self.remesh:
                 _refuse(self, ("cell_size", "mesher"), "a label image, surfaces, or tets with --remesh")
         else:
@@ -102,13 +100,12 @@ class Organ:
                 self.files,
                 out,
                 labels=self.labels,
-                regions=self.region,
                 length_unit=unit,
                 cell_size=self.cell_size,
                 mesher=self.mesher or patient.MESHERS[0],
                 mend=self.mend,
                 remesh=self.remesh,
-                options=SurfaceOptions(
+                options=SceneOptions(
                     approach=vector_of("--approach", self.approach),
                     tip_radius=self.tip_radius,
                     press_depth=self.press_depth,

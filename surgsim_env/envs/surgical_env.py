@@ -79,7 +79,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         obs_mode: str = "state",
         scaled: bool = True,
         observe_force: bool = True,
-        looks: str | LookRanges | None = None,
+        looks: str | None = None,
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
@@ -139,8 +139,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._begun = False
         self._running = False
 
-    def take_looks(self, looks: str | LookRanges) -> None:
-        """Draw a look of the pictures for each episode from the next reset on, of a split or of ranges of your own.
+    def take_looks(self, looks: str) -> None:
+        """Draw a look of a split for the pictures of each episode from the next reset on.
 
         Looks have random numbers of their own, which follow from the seed of the reset: nothing else is changed.
 

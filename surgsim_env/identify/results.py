@@ -23,6 +23,8 @@ COLUMNS = (
     *("set", "site", "x", "y", "z", "half", "youngs_modulus", "contact_offset", "error"),
     *("linear_youngs_modulus", "linear_error"),
 )
+# Density in material.toml [kg/m^3].
+DENSITY = 1060.0
 # Digits of numbers in files.
 DIGITS = 4
 # Sites whose curves are drawn one by one: at these quantiles of their errors.
@@ -34,11 +36,11 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def material_tables(result: Identification, density: float) -> dict[str, Any]:
+def material_tables(result: Identification) -> dict[str, Any]:
     """The table `material` of a scene file, with its sub-tables, as plain values."""
     material: dict[str, Any] = {
         "youngs_modulus": rounded(float(np.median(result.moduli))),
-        "density": density,
+        "density": DENSITY,
         "poisson_ratio": result.options.poisson_ratio,
     }
     if not result.is_linear:
@@ -52,12 +54,12 @@ def material_tables(result: Identification, density: float) -> dict[str, Any]:
     return material
 
 
-def write_material(result: Identification, path: Path, command_line: str, density: float) -> None:
+def write_material(result: Identification, path: Path, command_line: str) -> None:
     """Write the material as TOML: `[material]` with its sub-tables, to be put into any scene file."""
     document = tomlkit.document()
     for line in _head(result, command_line):
         document.add(tomlkit.comment(line))
-    document.add("material", _table(material_tables(result, density), _comments(result)))
+    document.add("material", _table(material_tables(result), _comments(result)))
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
@@ -94,7 +96,7 @@ def _comments(result: Identification) -> dict[str, str]:
     low, high = np.percentile(result.moduli, [25.0, 75.0])
     comments = {
         "youngs_modulus": f"[Pa] median of {len(result.moduli)} sites; quartiles {low:.4g} to {high:.4g}",
-        "density": "[kg/m^3] given, not identified",
+        "density": "[kg/m^3] of soft tissue, chosen: presses do not tell it",
         "poisson_ratio": "given, not identified",
         "times": "[s]",
     }
@@ -121,11 +123,11 @@ def write_sites(result: Identification, path: Path) -> None:
                 writer.writerow([one.recording.name, site.site, *place, half, *(f"{value:.6g}" for value in values)])
 
 
-def summary(result: Identification, command_line: str, density: float) -> dict[str, Any]:
+def summary(result: Identification, command_line: str) -> dict[str, Any]:
     """The identification as plain values, for `summary.json`."""
     return {
         "command": command_line,
-        "material": material_tables(result, density),
+        "material": material_tables(result),
         "thickness": rounded(result.shape.thickness),
         "intervals": {
             name: {"value": rounded(one.value), "low": rounded(one.low), "high": rounded(one.high), "told": one.told}
@@ -165,9 +167,9 @@ def summary(result: Identification, command_line: str, density: float) -> dict[s
     }
 
 
-def write_summary(result: Identification, path: Path, command_line: str, density: float) -> None:
+def write_summary(result: Identification, path: Path, command_line: str) -> None:
     """Write `summary` as JSON."""
-    path.write_text(json.dumps(summary(result, command_line, density), indent=2) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(summary(result, command_line), indent=2) + "\n", encoding="utf-8")
 
 
 def error_table(sets: Sequence[SetResult]) -> Table:

@@ -8,7 +8,7 @@ interpolation.
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -323,8 +323,3 @@ def _intervals(
             share = (max(values) - min(values)) / (most - least)
         intervals[name] = Interval(values[0], min(values), max(values), share <= UNTOLD_SHARE)
     return intervals
-
-
-def with_thickness(shape: PressShape, thickness: float) -> PressShape:
-    """The same law in tissue of another thickness [m]."""
-    return replace(shape, thickness=thickness)

@@ -18,7 +18,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup, core_count
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import SitePress, press_in_lanes, press_phases
-from surgsim_env.palpation.surface_scene import with_substeps
+from surgsim_env.palpation.scene_options import with_substeps
 from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
@@ -456,7 +456,7 @@ def map_digest(anatomy: Anatomy) -> str:
     scene = anatomy.scene
     parts = (
         *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing, scene.limits),
-        *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports, scene.support_law),
+        *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports),
         tuple(region for region in scene.regions if not region.lesion),
         tuple(one for one in scene.anchors if one.is_elastic),
     )

@@ -9,7 +9,7 @@ from msdm_core.arithmetic import arccos, matmul, norm
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.contrast_map import APART_SPACINGS, MATCHING_REACH, ContrastMap, LesionScore, smoothed
+from surgsim_env.palpation.contrast_map import ContrastMap, LesionScore, smoothed
 from surgsim_env.palpation.press import scan
 from surgsim_env.palpation.scores import LesionReach
 from surgsim_env.palpation.truth import Truth, felt_weights, surface_points
@@ -20,9 +20,9 @@ HIDDEN_RATIO = 2.0
 # A baseline from fewer healthy sites is weak.
 HEALTHY_FEWEST = 8
 
-NOT_FACED, NEAR_SUPPORT, NO_SITE, NOISE, TOO_DEEP, MASKED, MISPLACED, NO_MAXIMUM = (
+NOT_FACED, NEAR_SUPPORT, NO_SITE, NOISE, TOO_DEEP, NO_MAXIMUM = (
     *("not under the pressed face", "too near a support", "no complete press near it", "below the sensor's noise"),
-    *("deeper than the map's reach", "masked by a neighbour", "felt elsewhere", "no maximum of the map"),
+    *("deeper than the map's reach", "no maximum of the map"),
 )
 
 
@@ -139,22 +139,11 @@ def _why(
         return NOISE, f"{felt}; the sensor's noise is {reach.noise:g} N"
     if weak:
         return TOO_DEEP, f"{felt}; this map shows what exceeds its surroundings by {one.threshold:.2f}"
-    for other in one.scores:
-        apart = float(norm(other.truth.point - truth.point))
-        if other is not score and apart < APART_SPACINGS * pressed.spacing:
-            return MASKED, (
-                f"{felt}, but {other.truth.name} is felt {apart * 1e3:.1f} mm beside it: maxima nearer than "
-                f"{APART_SPACINGS * pressed.spacing * 1e3:.1f} mm, {APART_SPACINGS:g} site spacings, are one"
-            )
-    if score.estimate is not None and score.error < MATCHING_REACH:
-        return MISPLACED, (
-            f"{felt}, but the nearest maximum of the map lies {score.error * 1e3:.1f} mm from it, farther than its "
-            f"radius of {truth.radius * 1e3:.1f} mm"
-        )
     level = float(smoothed(pressed.sites, one.contrast, spacing=pressed.spacing)[int(np.argmin(away))])
     return NO_MAXIMUM, (
         f"{felt}, but the smoothed contrast of the nearest site, {away.min() * 1e3:.1f} mm away, is {level:.2f} "
-        f"and does not exceed its surroundings by {one.threshold:.2f}"
+        f"and no maximum within its radius of {truth.radius * 1e3:.1f} mm exceeds its surroundings by "
+        f"{one.threshold:.2f}"
     )
 
 

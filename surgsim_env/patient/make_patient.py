@@ -17,7 +17,7 @@ from surgsim_env.palpation.chart import healthy_file, write_healthy_map
 from surgsim_env.palpation.hold import SITES as HOLD_SITES
 from surgsim_env.palpation.hold import check_hold
 from surgsim_env.palpation.job import plan_sites
-from surgsim_env.palpation.surface_scene import PATTERN, SurfaceOptions, check_options
+from surgsim_env.palpation.scene_options import PATTERN, SceneOptions, check_options
 from surgsim_env.patient.facing import facing_approach
 from surgsim_env.patient.fine_surface import SurfaceFit, surface_file
 from surgsim_env.patient.label_image import FORM, LabelImage, is_image, parse_labels, read_label_image
@@ -65,13 +65,12 @@ def make_patient(
     out: Path,
     *,
     labels: str | None = None,
-    regions: Sequence[str] = (),
     length_unit: LengthUnit | None = None,
     cell_size: float | None = None,
     mesher: str = MESHERS[0],
     mend: bool = False,
     remesh: bool = False,
-    options: SurfaceOptions,
+    options: SceneOptions,
     moduli: Mapping[str, float] | None = None,
     progress: StepProgress,
 ) -> PatientScene:
@@ -81,14 +80,13 @@ def make_patient(
         files: a label image; or closed surfaces, the organ's first, then one for each region; or one file of tets.
         out: path of the mesh to be written; its stem names the scene.
         labels: which labels of an image, or tags of tets, are which tissue, as in `parse_labels`.
-        regions: further regions of surfaces, as NAME=FILE.
         length_unit: of surfaces.
         cell_size: of the lattice, the same everywhere [m], from which the tip follows; default: cells follow from the
             tip, fine at the pressed face.
         mesher: one of MESHERS.
         mend: whether holes, self-intersections and cavities are repaired.
         remesh: whether the surfaces of tets are filled anew; else the file's tets are kept.
-        options: touch, anchors and healthy tissue.
+        options: touch and healthy tissue.
         moduli: Young's modulus of regions by name [Pa].
         progress: where the steps are shown.
 
@@ -129,7 +127,7 @@ def make_patient(
                 f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
             )
         with progress.step(f"reading {first.name}"):
-            given = read_surfaces(files, regions, length_unit, mend=mend)
+            given = read_surfaces(files, length_unit, mend=mend)
         name, volume = given.organ.name, given.volume
     approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
     if isinstance(given, PatientTets):
@@ -229,7 +227,7 @@ def write_patient(
     older += [name for name in others if (out.parent / name).exists()]
     with output_folder(out.parent, older) as files:
         with progress.step("drawing the report"):
-            names = write_organ(found, files, out.name, command, retraction)
+            names = _write_organ(found, files, out.name, command, retraction)
         if healthy_map and found.scene.lesion is not None:
             try:
                 write_healthy_map(load_scene(files / out.with_suffix(".toml").name), files / healthy, progress)
@@ -243,25 +241,10 @@ def write_patient(
     return [out.with_name(name) for name in names]
 
 
-def write_organ(
-    found: PatientScene,
-    files: OutputFolder,
-    name: str,
-    command: str,
-    retraction: RetractScene | str | None = None,
+def _write_organ(
+    found: PatientScene, files: OutputFolder, name: str, command: str, retraction: RetractScene | str | None
 ) -> list[str]:
-    """Write what `write_patient` does, among the results of a command.
-
-    Args:
-        found: the organ with its scene.
-        files: the results.
-        name: of the mesh.
-        command: see `write_patient`.
-        retraction: see `write_patient`.
-
-    Returns:
-        The names of the files.
-    """
+    """Write all but the healthy map, by the name of the mesh; returns the names of the files."""
     from msdm_core.mesh_files.mesh_io import write_mesh
 
     scene_file = Path(name).with_suffix(".toml").name
@@ -399,7 +382,7 @@ def scene_text(found: PatientScene) -> str:
         "palpation.press_depth": "[m] chosen: 7/12 of the tip's radius, as in the scene liver",
         "palpation.face_margin": "[m]",
         "palpation.thickness_smallest": "[m] of organ below a site",
-        "palpation.site_spacing": f"[m] {found.site_count} sites, at most {SITES_MOST} unless given",
+        "palpation.site_spacing": f"[m] {found.site_count} sites, at most {SITES_MOST}",
         "palpation.clearance": "[m]",
         "lesion": "drawn anew in each episode, in the organ without its segmented lesions",
         "lesion.radius": "[m] chosen in proportion to the tip, as in the scene liver",

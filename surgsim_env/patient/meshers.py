@@ -32,7 +32,7 @@ from msdm_core.meshing.segmentation_meshing import (
 from surgsim_env.patient.fine_surface import SurfaceFit, fitted_surface, level_surface, surface_area
 from surgsim_env.patient.label_image import CleanLabels, LabelImage, clean_labels
 from surgsim_env.patient.label_readers import CONVENTION
-from surgsim_env.patient.materials import check_name, is_lesion
+from surgsim_env.patient.materials import is_lesion
 from surgsim_env.patient.surface_files import (
     BrokenSurface,
     ClosedSurface,
@@ -259,29 +259,23 @@ class PatientSurfaces:
         return abs(surface_volume(self.organ.vertices, self.organ.triangles))
 
 
-def read_surfaces(
-    files: Sequence[Path], regions: Sequence[str], length_unit: LengthUnit, *, mend: bool
-) -> PatientSurfaces:
+def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool) -> PatientSurfaces:
     """Read closed surfaces, in the files' own axes.
 
     Args:
         files: the organ's surface, then those of regions, named after their files.
-        regions: further regions, as NAME=FILE.
         length_unit: of all files.
         mend: whether an organ's surface that is open or crosses itself may be rebuilt from voxels.
     """
     organ, dropped = read_organ_surface(files[0], length_unit, mend=mend)
     inner = []
-    for name, file in [*((region_name(file), file) for file in files[1:]), *map(_named, regions)]:
-        inner += read_region_surfaces(file, length_unit, name)
+    for file in files[1:]:
+        inner += read_region_surfaces(file, length_unit, region_name(file))
     names = [organ.name, *(one.name for one in inner)]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise MeshError(
-            f"region {twice!r} is given twice; give the files other names, or name them: --region NAME=FILE"
-        )
-    sources = tuple(file.name for file in files) + tuple(_named(text)[1].name for text in regions)
-    return PatientSurfaces(organ, tuple(inner), sources, tuple(dropped))
+        raise MeshError(f"region {twice!r} is given twice; give the files other names")
+    return PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files), tuple(dropped))
 
 
 def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
@@ -348,13 +342,6 @@ def file_surface(given: PatientSurfaces, mesh: PatientMesh) -> SurfaceFit:
     field = smoothed_share(inside, corner, step, mesh.cell_size)
     vertices, triangles = level_surface(field, mesh.volumes[0].source, area)
     return fitted_surface(vertices + start, triangles, mesh.mesh, mesh.cell_size)
-
-
-def _named(text: str) -> tuple[str, Path]:
-    name, found, file = text.partition("=")
-    if not found or not file:
-        raise MeshError(f"--region: {text!r} is no NAME=FILE, such as lesion=tumour.stl")
-    return check_name(name, "--region"), Path(file)
 
 
 def _with_regions(

@@ -10,10 +10,10 @@ import numpy as np
 from msdm_core.material.regions import Material
 from surgsim_env.palpation.hold import Hold
 from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, plan_sites
-from surgsim_env.palpation.surface_scene import (
+from surgsim_env.palpation.scene_options import (
     CONTACT_MODULI_PER_CELL,
     PATTERN,
-    SurfaceOptions,
+    SceneOptions,
     with_options,
     with_substeps,
 )
@@ -86,13 +86,13 @@ class PatientScene:
         return self.anatomy.scene
 
 
-def approach_of(options: SurfaceOptions, *, is_scan: bool) -> Vector:
+def approach_of(options: SceneOptions, *, is_scan: bool) -> Vector:
     """Direction of the probe: the one given, or the default for axes of a patient or of a file."""
     return options.approach or (APPROACH_SCAN if is_scan else APPROACH_FILE)
 
 
 def patient_scene(
-    patient: PatientMesh, out: Path, *, touch: TouchPlan, options: SurfaceOptions, moduli: Mapping[str, float]
+    patient: PatientMesh, out: Path, *, touch: TouchPlan, options: SceneOptions, moduli: Mapping[str, float]
 ) -> PatientScene:
     """Make the palpation scene of a patient's organ.
 
@@ -100,7 +100,7 @@ def patient_scene(
         patient: the organ.
         out: path of the mesh file, beside which the scene file is; its stem names the scene.
         touch: tip and press depth.
-        options: spacing, approach, anchors and healthy tissue.
+        options: approach and healthy tissue.
         moduli: of regions by name [Pa].
 
     Raises:
@@ -113,11 +113,11 @@ def patient_scene(
     _check_moduli(moduli, list(regions))
     scene = _first_scene(patient, out, organ.material, regions, touch, options)
     anchors, sources = organ_anchors(
-        patient.organ_name, patient.mesh, options, scene.instrument.approach, is_scan=patient.is_scan
+        patient.organ_name, patient.mesh, scene.instrument.approach, is_scan=patient.is_scan
     )
     scene = replace(scene, anchors=anchors)
     notes = faced_note(patient, scene)
-    anatomy, sites = _with_sites(scene, patient, options, notes)
+    anatomy, sites = _with_sites(scene, patient, notes)
     anatomy = _with_lesions(anatomy, notes)
     return PatientScene(patient, _substeps_of_worst(anatomy), organ, regions, sites, tuple(notes), sources)
 
@@ -134,7 +134,7 @@ def _first_scene(
     material: Material,
     regions: Mapping[str, TissueMaterial],
     touch: TouchPlan,
-    options: SurfaceOptions,
+    options: SceneOptions,
 ) -> Scene:
     """The scene with all values that follow from the touch, the cells and the tissue."""
     liver, cell = make_scene(PATTERN), patient.cell_size
@@ -157,7 +157,7 @@ def _first_scene(
             press_depth=depth,
             face_angle_deg=liver.palpation.face_angle_deg,
             face_margin=tip,
-            site_spacing=options.spacing or _rounded(SPACING_PER_TIP * tip, SPACING_STEP),
+            site_spacing=_rounded(SPACING_PER_TIP * tip, SPACING_STEP),
         ),
         lesion=None,
         demonstration=(),
@@ -168,11 +168,7 @@ def _first_scene(
     scene = with_options(scene, replace(options, approach=approach, tip_radius=tip, press_depth=depth))
     x, y, z = (round(part, 6) + 0.0 for part in scene.instrument.approach)
     direction = (x, y, z)
-    return replace(
-        scene,
-        instrument=replace(scene.instrument, approach=direction),
-        material=material,
-    )
+    return replace(scene, instrument=replace(scene.instrument, approach=direction))
 
 
 def _limits(material: Material, tip: float, depth: float) -> Limits:
@@ -181,10 +177,10 @@ def _limits(material: Material, tip: float, depth: float) -> Limits:
     return Limits(_digits(SOFT_PER_PRESS * press, 2), _digits(HARD_PER_PRESS * press, 2))
 
 
-def _with_sites(scene: Scene, patient: PatientMesh, options: SurfaceOptions, notes: list[str]) -> tuple[Anatomy, int]:
+def _with_sites(scene: Scene, patient: PatientMesh, notes: list[str]) -> tuple[Anatomy, int]:
     """The anatomy with a raster of 1 to SITES_MOST sites, and their number."""
     anatomy, count = _thick_enough(scene, patient, notes)
-    while count > SITES_MOST and options.spacing is None:
+    while count > SITES_MOST:
         palpation = anatomy.scene.palpation
         factor = max(math.sqrt(count / SITES_MOST), 1.02)
         wider = math.ceil(palpation.site_spacing * factor / SPACING_STEP) * SPACING_STEP

@@ -15,7 +15,7 @@ from msdm_core.mesh.ordering import in_sweep_order
 from msdm_core.mesh.quality import surface_cell
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.support import Support
-from surgsim_env.palpation.surface_scene import with_substeps
+from surgsim_env.palpation.scene_options import with_substeps
 from surgsim_env.patient.fine_surface import mesh_source
 from surgsim_env.patient.patient_scene import PatientScene
 from surgsim_env.patient.surface_files import voxels_inside

@@ -7,7 +7,7 @@ import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from surgsim_env.palpation.surface_scene import FAT_NAME, FAT_SOURCE, SurfaceOptions, anchors_of, soft_bed
+from surgsim_env.palpation.scene_options import FAT_NAME, FAT_SOURCE, soft_bed
 from surgsim_env.scene.model import Anchor, Ball, Vector
 
 # Stiffness of ligaments and of a hilum, per area [N/m^3]: chosen, four times that of fat: 1 mm under 1 kPa.
@@ -44,22 +44,19 @@ ATTACHMENTS: Mapping[str, tuple[Attachment, ...]] = {
 
 
 def organ_anchors(
-    organ_name: str, mesh: TetMesh, options: SurfaceOptions, approach: Vector, *, is_scan: bool
+    organ_name: str, mesh: TetMesh, approach: Vector, *, is_scan: bool
 ) -> tuple[tuple[Anchor, ...], dict[str, str]]:
     """The anchors of a patient's organ, and where their numbers come from by the path of their entry in a scene.
 
-    Balls that are given replace all others. Attachments need the axes of a scan: in a surface's axes nobody knows where
+    Attachments need the axes of a scan: in a surface's axes nobody knows where
     the back is, and only the fat holds it.
 
     Args:
         organ_name: such as "left kidney".
         mesh: of the organ.
-        options: with the balls that are given.
         approach: of the probe, of length 1.
         is_scan: whether the axes are those of a scan.
     """
-    if options.anchors:
-        return anchors_of(options, approach), {"anchors": "given on the command line"}
     word = next((one for one in ATTACHMENTS if one in organ_name.lower()), "")
     anchors = [soft_bed(approach, FAT_NAMES.get(word, FAT_NAME))]
     sources = {"anchors[0].stiffness": FAT_SOURCE, "anchors[0].side": "away from the probe"}

@@ -92,9 +92,7 @@ def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list
     vertices, triangles = read_surface(file, length_unit=length_unit)
     bodies = bodies_of(vertices, triangles.astype(np.int64))
     if len(bodies) > 1 and not is_lesion(name):
-        raise MeshError(
-            f"{file}: region {name!r} has {len(bodies)} surfaces, and one is taken: give a file for each (--region)"
-        )
+        raise MeshError(f"{file}: region {name!r} has {len(bodies)} surfaces, and one is taken: give a file for each")
     surfaces = []
     for number, body in enumerate(bodies, start=1):
         try:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from msdm_core.arithmetic import cbrt, power
 from msdm_core.material.regions import Material
-from surgsim_env.palpation.surface_scene import SurfaceOptions
+from surgsim_env.palpation.scene_options import SceneOptions
 from surgsim_env.scene.model import Vector
 from surgsim_env.scene.palpable_surface import contact_radius
 
@@ -80,7 +80,7 @@ class TouchPlan:
         return HAPTIC_STEP / (TIME_PER_TET * TETS_PER_NODE * self.node_count * substeps)
 
 
-def plan_touch(volume: float, options: SurfaceOptions, *, cell_size: float | None, graded: bool) -> TouchPlan:
+def plan_touch(volume: float, options: SceneOptions, *, cell_size: float | None, graded: bool) -> TouchPlan:
     """The touch and cells of an organ of a volume [m^3].
 
     Without a cell size the tip passes a trocar and cells follow from it; with one the tip follows from the cells, which
@@ -125,7 +125,7 @@ def plan_text(plan: TouchPlan, material: Material, approach: Vector) -> str:
     )
     if plan.is_given:
         return text
-    options = SurfaceOptions(tip_radius=round(COARSER * plan.tip_radius, 4))
+    options = SceneOptions(tip_radius=round(COARSER * plan.tip_radius, 4))
     coarser = plan_touch(plan.volume, options, cell_size=None, graded=plan.coarsening > 1)
     return (
         f"{text}; coarser: --tip-radius {coarser.tip_radius:g}, about {coarser.node_count} nodes, "

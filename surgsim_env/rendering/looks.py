@@ -6,7 +6,7 @@ vessels, and their looks come from different streams of random numbers.
 
 import colorsys
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,109 +24,38 @@ LOOK_STREAM = 0x4C_6F_6F_6B
 SEEDS_MOST = 2**31
 
 
+# Camera: its move as a share of its distance from its target, turn about a random axis across the view [degrees], roll
+# of the picture [degrees], factor on the vertical field of view.
+CAMERA_SHIFT, CAMERA_TURN, CAMERA_ROLL, FOV_FACTOR = (0.0, 0.05), (0.0, 2.0), (-5.0, 5.0), (0.76, 0.92)
+# Light: turn of the lamps [degrees], factors on lamps and headlight, share added to red and taken from blue.
+LIGHT_TILT, LIGHT_STRENGTH, WARMTH = (0.0, 25.0), (0.7, 1.35), (-0.12, 0.18)
+# Saturation and value of the colours of tissue, and of drape and supports.
+TISSUE_COLOUR, DRAPE_COLOUR = ((0.55, 0.85), (0.35, 0.62)), ((0.25, 0.75), (0.2, 0.5))
+INSTRUMENT_BRIGHTNESS = (0.7, 1.1)
+# Vessels: how much darker than tissue, and the share of the surface that they take, about.
+VESSEL_STRENGTH, VESSEL_WIDTH = (0.0, 0.6), (0.1, 0.3)
+# The tissue's highlights: strength and narrowness.
+GLOSS, SHARPNESS = (0.1, 1.0), (0.4, 0.95)
+# Factor on the picture, and standard deviation of a pixel's noise as a share of full scale.
+EXPOSURE, NOISE = (0.8, 1.2), (0.0, 0.03)
+
+
 @dataclass(frozen=True)
 class LookRanges:
-    """Ranges from which looks are drawn evenly; each is (low, high), those called `bands` are several of these.
+    """Ranges in which the looks of a split differ from those of another; several (low, high) each.
 
     Fields:
-        stream: which random numbers draw the looks; ranges of another purpose need another number
-        camera_shift: how far the camera is moved, as a share of its distance from what it looks at
-        camera_turn: how far its view is turned, about a random axis across it [degrees]
-        camera_roll: rotation of the picture, to either side [degrees]
-        fov_factor: factor on the vertical field of view
-        light_tilt: how far the lamps are turned from where they are [degrees]
-        light_strength: factor on lamps and headlight, drawn for each
-        warmth: added to red and taken from blue of the light, as a share
+        stream: number of the random numbers that draw the looks
         tissue_hue_bands, drape_hue_bands, target_hue_bands: [degrees], of the colour wheel
-        tissue_saturation, tissue_value: of the tissue's colour
-        drape_saturation, drape_value: of the drape's and the supports'
-        instrument_brightness: factor on the instrument's colours
         vessel_bands: vessels crossed on a metre of surface [1/m]
-        vessel_strength: how much darker vessels are than tissue, 0 to 1
-        vessel_width: share of the surface that they take, about
-        gloss: strength of the tissue's highlights
-        sharpness: narrowness of its highlights
-        exposure: factor on the picture
-        noise: standard deviation of a pixel's noise, as a share of full scale
-
-    Raises:
-        ValueError: a range that is not finite or whose ends are in the wrong order, a share outside [0, 1] (names it).
     """
 
-    stream: int = 2
-    camera_shift: Range = (0.0, 0.05)
-    camera_turn: Range = (0.0, 2.0)
-    camera_roll: Range = (-5.0, 5.0)
-    fov_factor: Range = (0.76, 0.92)
-    light_tilt: Range = (0.0, 25.0)
-    light_strength: Range = (0.7, 1.35)
-    warmth: Range = (-0.12, 0.18)
-    tissue_hue_bands: Bands = ((-22.0, 22.0),)
-    drape_hue_bands: Bands = ((150.0, 260.0),)
-    target_hue_bands: Bands = ((90.0, 150.0),)
-    tissue_saturation: Range = (0.55, 0.85)
-    tissue_value: Range = (0.35, 0.62)
-    drape_saturation: Range = (0.25, 0.75)
-    drape_value: Range = (0.2, 0.5)
-    instrument_brightness: Range = (0.7, 1.1)
-    vessel_bands: Bands = ((60.0, 300.0),)
-    vessel_strength: Range = (0.0, 0.6)
-    vessel_width: Range = (0.1, 0.3)
-    gloss: Range = (0.1, 1.0)
-    sharpness: Range = (0.4, 0.95)
-    exposure: Range = (0.8, 1.2)
-    noise: Range = (0.0, 0.03)
+    stream: int
+    tissue_hue_bands: Bands
+    drape_hue_bands: Bands
+    target_hue_bands: Bands
+    vessel_bands: Bands
 
-    def __post_init__(self) -> None:
-        if isinstance(self.stream, bool) or not isinstance(self.stream, int) or self.stream < 0:
-            raise ValueError(f"stream is {self.stream!r}; it must be a whole number from 0")
-        for name in [one.name for one in fields(self) if one.name != "stream"]:
-            given = getattr(self, name)
-            for low, high in given if name.endswith("_bands") else (given,):
-                if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-                    raise ValueError(f"{name} holds ({low}, {high}); both must be finite, the lower one first")
-                least, most = LIMITS.get(name, (-math.inf, math.inf))
-                if low < least or high > most:
-                    raise ValueError(f"{name} holds ({low}, {high}); it must lie within {least:g} and {most:g}")
-
-
-# Limits of ranges: shares, factors that must not be 0, and angles that leave a picture.
-LIMITS: dict[str, Range] = {
-    "camera_shift": (0.0, 0.5),
-    "camera_turn": (0.0, 45.0),
-    "camera_roll": (-180.0, 180.0),
-    "fov_factor": (0.1, 2.0),
-    "light_tilt": (0.0, 60.0),
-    "light_strength": (0.0, 3.0),
-    "warmth": (-0.5, 0.5),
-    "instrument_brightness": (0.0, 2.0),
-    "vessel_bands": (20.0, 600.0),
-    "exposure": (0.1, 3.0),
-    **dict.fromkeys(
-        (
-            *("tissue_saturation", "tissue_value", "drape_saturation", "drape_value"),
-            *("vessel_strength", "vessel_width", "gloss", "sharpness", "noise"),
-        ),
-        (0.0, 1.0),
-    ),
-}
-
-# Limits of a look's numbers.
-LOOK_LIMITS: dict[str, Range] = {
-    "shift": (-0.5, 0.5),
-    "turn": (-45.0, 45.0),
-    "roll": (-180.0, 180.0),
-    "light_turn": (-2.0, 2.0),
-    **dict.fromkeys(("lamp", "head"), (0.0, 5.0)),
-    **dict.fromkeys(("tissue", "drape", "target"), (0.0, 1.0)),
-    "instrument": LIMITS["instrument_brightness"],
-    "vessel_density": LIMITS["vessel_bands"],
-    "seed": (0, SEEDS_MOST - 1),
-    **{
-        name: LIMITS[name]
-        for name in ("fov_factor", "vessel_strength", "vessel_width", "gloss", "sharpness", "exposure", "noise")
-    },
-}
 
 # Hues and vessel spacings of evaluation lie between and beyond those of training.
 TRAIN = LookRanges(
@@ -161,9 +90,9 @@ class Look:
         lamp, head: factors on lamps and headlight for red, green and blue                                  (3,) each
         tissue, drape, target: colours
         instrument: factor on its colours
-        vessel_density, vessel_strength, vessel_width: as in LookRanges
+        vessel_density, vessel_strength, vessel_width: crossed on a metre [1/m], darkness, and share of the surface
         gloss, sharpness: of the tissue's highlights
-        exposure, noise: as in LookRanges
+        exposure, noise: factor on the picture, and a pixel's standard deviation as a share of full scale
         seed: of the vessels and the noise
     """
 
@@ -186,12 +115,6 @@ class Look:
     exposure: float
     noise: float
     seed: int
-
-    def __post_init__(self) -> None:
-        for name, (least, most) in LOOK_LIMITS.items():
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if not ((value >= least) & (value <= most)).all():
-                raise ValueError(f"{name} is {value.tolist()}; it must lie within {least:g} and {most:g}")
 
     def seen_from(self, camera: Camera) -> Camera:
         """A camera moved, turned and zoomed as the look has it."""
@@ -222,17 +145,15 @@ class Look:
         return np.clip(np.rint(values), 0.0, 255.0).astype(np.uint8)
 
 
-def find_look_ranges(given: "str | LookRanges") -> LookRanges:
-    """The ranges of a split by its name, or those given.
+def find_look_ranges(split: str) -> LookRanges:
+    """The ranges of a split by its name.
 
     Raises:
         ValueError: an unknown split (lists the known).
     """
-    if isinstance(given, LookRanges):
-        return given
-    if given not in LOOK_SPLITS:
-        raise ValueError(f"looks is {given!r}; it must be None, {', '.join(map(repr, LOOK_SPLITS))} or a LookRanges")
-    return LOOK_SPLITS[given]
+    if split not in LOOK_SPLITS:
+        raise ValueError(f"looks is {split!r}; it must be None, {' or '.join(map(repr, LOOK_SPLITS))}")
+    return LOOK_SPLITS[split]
 
 
 def look_generator(ranges: LookRanges, seed: int) -> np.random.Generator:
@@ -256,17 +177,17 @@ def draw_look(ranges: LookRanges, rng: np.random.Generator) -> Look:
         return bands[-1][1]
 
     way = rng.normal(size=3)
-    shift = way / np.linalg.norm(way) * one(ranges.camera_shift)
+    shift = way / np.linalg.norm(way) * one(CAMERA_SHIFT)
     angle = rng.uniform(0.0, 2.0 * math.pi)
-    turn = one(ranges.camera_turn) * np.array([math.cos(angle), math.sin(angle)])
-    roll, fov = one(ranges.camera_roll), one(ranges.fov_factor)
+    turn = one(CAMERA_TURN) * np.array([math.cos(angle), math.sin(angle)])
+    roll, fov = one(CAMERA_ROLL), one(FOV_FACTOR)
     angle = rng.uniform(0.0, 2.0 * math.pi)
-    light = math.tan(math.radians(one(ranges.light_tilt))) * np.array([math.cos(angle), math.sin(angle)])
-    warm = one(ranges.warmth)
+    light = math.tan(math.radians(one(LIGHT_TILT))) * np.array([math.cos(angle), math.sin(angle)])
+    warm = one(WARMTH)
     white = np.array([1.0 + warm, 1.0, 1.0 - warm])
-    lamp, head = one(ranges.light_strength) * white, one(ranges.light_strength) * white
-    tissue = _colour(among(ranges.tissue_hue_bands), one(ranges.tissue_saturation), one(ranges.tissue_value))
-    drape = _colour(among(ranges.drape_hue_bands), one(ranges.drape_saturation), one(ranges.drape_value))
+    lamp, head = one(LIGHT_STRENGTH) * white, one(LIGHT_STRENGTH) * white
+    tissue = _colour(among(ranges.tissue_hue_bands), *map(one, TISSUE_COLOUR))
+    drape = _colour(among(ranges.drape_hue_bands), *map(one, DRAPE_COLOUR))
     target = _colour(among(ranges.target_hue_bands), 0.73, 0.75)
     return Look(
         shift=_triple(shift),
@@ -279,14 +200,14 @@ def draw_look(ranges: LookRanges, rng: np.random.Generator) -> Look:
         tissue=tissue,
         drape=drape,
         target=target,
-        instrument=one(ranges.instrument_brightness),
+        instrument=one(INSTRUMENT_BRIGHTNESS),
         vessel_density=among(ranges.vessel_bands),
-        vessel_strength=one(ranges.vessel_strength),
-        vessel_width=one(ranges.vessel_width),
-        gloss=one(ranges.gloss),
-        sharpness=one(ranges.sharpness),
-        exposure=one(ranges.exposure),
-        noise=one(ranges.noise),
+        vessel_strength=one(VESSEL_STRENGTH),
+        vessel_width=one(VESSEL_WIDTH),
+        gloss=one(GLOSS),
+        sharpness=one(SHARPNESS),
+        exposure=one(EXPOSURE),
+        noise=one(NOISE),
         seed=int(rng.integers(SEEDS_MOST)),
     )
 

@@ -1,6 +1,5 @@
 """Options of pictures."""
 
-import math
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from typing import Any
@@ -21,7 +20,6 @@ class RenderOptions:
         width: of the picture [pixels], up to 4096.
         height: likewise.
         show_force: draw the tissue's force on each tool as an arrow with its size in newtons; none where it is 0.
-        force_mm_per_newton: length of that arrow in the scene [mm/N].
         show_lesion: the organ is translucent and its lesions are solid inside.
         cut_away: the organ is cut open through its first lesion (without one, through its palpable face).
         shadows: the lamp casts true shadows, from the instrument too; twice as long a picture without a graphics card.
@@ -35,7 +33,6 @@ class RenderOptions:
     width: int = 640
     height: int = 480
     show_force: bool = True
-    force_mm_per_newton: float = 60.0
     show_lesion: bool = False
     cut_away: bool = False
     shadows: bool = False
@@ -50,9 +47,6 @@ class RenderOptions:
         for name in ("show_force", "show_lesion", "cut_away", "shadows", "smooth_edges"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} is {getattr(self, name)!r}; it must be True or False")
-        scale = self.force_mm_per_newton
-        if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0.0 < scale < math.inf:
-            raise ValueError(f"force_mm_per_newton is {scale!r}; it must be finite and above 0")
 
 
 def check_camera(camera: str) -> None:

@@ -37,6 +37,8 @@ from surgsim_env.tasks.visibility import Disc
 SHADOW_GAP = 0.0002
 # A force whose label would be "0.00 N" is not drawn [N].
 SMALLEST_FORCE = 0.005
+# Length of a force's arrow in the scene [m/N].
+FORCE_LENGTH = 0.06
 ARROW_COLOUR, ARROW_OUTLINE, LABEL_BACK = (255, 214, 10, 255), (25, 22, 0, 255), (10, 14, 18, 165)
 # Half width of the shaft, half width and length of the head, outline, at a picture height of 480 [pixels].
 ARROW_SHAFT, ARROW_HEAD_WIDTH, ARROW_HEAD_LENGTH, ARROW_EDGE, TEXT_SIZE = 3.0, 8.0, 16.0, 1.3, 15.0
@@ -108,7 +110,7 @@ class OrganRenderer:
         if self.look is not None:
             frame = self.look.exposed(frame, self.moment)
         if self.options.show_force:
-            draw_forces(frame, self._simulation, view, self.options.force_mm_per_newton)
+            draw_forces(frame, self._simulation, view)
         return frame
 
     def depth(self, camera: str | Camera | None = None) -> NDArray[np.float32]:
@@ -268,14 +270,14 @@ def draw_still(
 # ---- the tissue's force on each tool: an arrow with its size in newtons over a finished picture --------------------
 
 
-def draw_forces(frame: NDArray[np.uint8], simulation: Simulation, camera: Camera, mm_per_newton: float) -> None:
+def draw_forces(frame: NDArray[np.uint8], simulation: Simulation, camera: Camera) -> None:
     """Paint the force on each tool into a picture (height, width, 3), as seen by its camera."""
     for tool, force in enumerate(simulation.contact_wrench[:, :3]):
         size = float(np.linalg.norm(force))
         if size < SMALLEST_FORCE:
             continue
         start = contact_point(simulation, tool)
-        ends = np.stack([start, start + force * mm_per_newton * 1e-3])
+        ends = np.stack([start, start + FORCE_LENGTH * force])
         pixels, depth = camera.project(ends, frame.shape[1], frame.shape[0])
         # After a fault positions may not be finite.
         if (depth > 0.0).all() and np.isfinite(pixels).all():

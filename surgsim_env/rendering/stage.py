@@ -239,7 +239,7 @@ class Stage:
 
 def borrow_stage(anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> Stage:
     """The stage that all simulations of one anatomy share, for pictures of one size and kind; return it when done."""
-    drawn = replace(options, camera="overview", show_force=True, force_mm_per_newton=1.0)
+    drawn = replace(options, camera="overview", show_force=True)
     key = anatomy, int(instrument.signature), drawn, id(gl_context)
     with LOCK:
         _close_all_at_exit()

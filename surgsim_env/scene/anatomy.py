@@ -193,7 +193,7 @@ class Anatomy:
             stiffness_rule=scene.stiffness_rule,
             gravity=scene.gravity,
             supports=scene.supports,
-            support_law=scene.support_law or SupportLaw(scene.contact.stiffness, scene.contact.damping),
+            support_law=SupportLaw(scene.contact.stiffness, scene.contact.damping),
             motions=self.ground_motions,
         )
 
@@ -389,7 +389,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
     source = scene.mesh
     if source.block is not None:
         block = source.block
-        return box_mesh(block.size, block.cells, coarsening=block.coarsening, fine_depth=block.fine_depth)
+        return box_mesh(block.size, block.cells)
     # Reading files imports meshio and trimesh: only where a scene needs them.
     from msdm_core.mesh_files.mesh_io import read_mesh
     from msdm_core.mesh_files.surface_io import read_surface
@@ -439,10 +439,6 @@ def _inside(mesh: TetMesh, anchor: Anchor, on_surface: NDArray[np.bool_]) -> NDA
     if anchor.box is not None:
         within = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
         return np.asarray(within & on_surface if anchor.is_elastic else within, dtype=np.bool_)
-    if anchor.bed is not None:
-        depth: FloatArray = matmul(mesh.points, np.asarray(anchor.bed.direction))
-        deep = depth >= depth.max() - anchor.bed.share * np.ptp(depth)
-        return on_surface & np.asarray(deep, dtype=np.bool_)
     if anchor.side is not None:
         direction = np.asarray(anchor.side.direction) / norm(anchor.side.direction)
         if anchor.side.angle_deg == 180.0:

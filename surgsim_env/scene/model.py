@@ -12,7 +12,7 @@ from msdm_core.material.regions import Capsule, Damping, Lesion, Material
 from msdm_core.material.stiffness import check_stiffness_rule
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.motion import Motion
-from msdm_core.organ.support import Support, SupportLaw
+from msdm_core.organ.support import Support
 
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
@@ -47,12 +47,10 @@ def _require_range(what: str, bounds: Range) -> None:
 
 @dataclass(frozen=True)
 class BlockMesh:
-    """A block on a cubic lattice (`box_mesh`): size [m], cells along x, y, z, and coarsening from the top down."""
+    """A block on a cubic lattice (`box_mesh`): size [m], and cells along x, y, z."""
 
     size: Vector
     cells: tuple[int, int, int]
-    coarsening: int = 1
-    fine_depth: float | None = None
 
 
 @dataclass(frozen=True)
@@ -120,18 +118,6 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Bed:
-    """The side on which an organ lies: the deepest share of its extent along a direction, such as 0.15."""
-
-    direction: Vector
-    share: float
-
-    def __post_init__(self) -> None:
-        if not any(self.direction) or not 0.0 < self.share < 1.0:
-            raise ValueError(f"bed: direction {self.direction}, share {self.share}; give a direction and 0 < share < 1")
-
-
-@dataclass(frozen=True)
 class Side:
     """The surface whose outward normal is less than an angle from a direction; 90 degrees: all that faces that way."""
 
@@ -153,7 +139,7 @@ class Anchor:
 
     Args:
         name: of the tissue.
-        box, ball, bed, side: the place; exactly one of them.
+        box, ball, side: the place; exactly one of them.
         stiffness: pressure per displacement along the normal, about E / h of a layer h thick [N/m^3]; None: fixed.
         shear_stiffness: traction per displacement along the surface, about G / h [N/m^3]; given with `stiffness`.
     """
@@ -161,15 +147,14 @@ class Anchor:
     name: str
     box: Box | None = None
     ball: Ball | None = None
-    bed: Bed | None = None
     side: Side | None = None
     stiffness: float | None = None
     shear_stiffness: float | None = None
 
     def __post_init__(self) -> None:
         what = f"anchor {self.name!r}"
-        if sum(part is not None for part in (self.box, self.ball, self.bed, self.side)) != 1:
-            raise ValueError(f"{what}: give one of a box, a ball, a bed and a side")
+        if sum(part is not None for part in (self.box, self.ball, self.side)) != 1:
+            raise ValueError(f"{what}: give one of a box, a ball and a side")
         if (self.stiffness is None) != (self.shear_stiffness is None):
             raise ValueError(
                 f"{what}: stiffness and shear_stiffness go together; give both for elastic tissue, none for fixed nodes"
@@ -755,8 +740,7 @@ class Scene:
         ports: those of two arms, the left one's first.
         endoscope: camera of retractions.
         gravity: [m/s^2]; the organ is settled under it onto anchors and supports.
-        supports: solids on which the organ rests.
-        support_law: their contact law; None: that of `contact`.
+        supports: solids on which the organ rests, with the contact law of `contact`.
         regions: of the mesh, with materials of their own.
         retract_scene: file of the scene in which this organ is retracted.
         retract_refusal: why this organ cannot be retracted.
@@ -788,7 +772,6 @@ class Scene:
     endoscope: Endoscope | None = None
     gravity: Vector = (0.0, 0.0, 0.0)
     supports: tuple[Support, ...] = ()
-    support_law: SupportLaw | None = None
     regions: tuple[TissueRegion, ...] = ()
     retract_scene: str | None = None
     retract_refusal: str | None = None

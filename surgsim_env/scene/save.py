@@ -9,12 +9,12 @@ import tomlkit
 from tomlkit.items import AbstractTable, Item, Table
 
 from surgsim_env.scene.arm_description import ArmDescription
-from surgsim_env.scene.model import Ball, Bed, Box, Scene, Side
+from surgsim_env.scene.model import Ball, Box, Scene, Side
 
 # A file's own name and folder, which it does not state.
 PATH_FIELDS = ("name", "folder")
 # Tables that are written on one line.
-INLINE_TABLES = (Box, Ball, Bed, Side)
+INLINE_TABLES = (Box, Ball, Side)
 # Comments begin here [characters], or behind an entry that is longer.
 COMMENT_COLUMN = 23
 

@@ -9,21 +9,18 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.pictures import ArmMaps, camera_view, poses, write_pictures
+from surgsim_env.arm_study.pictures import ArmMaps, poses, write_images
 from surgsim_env.arm_study.results import (
     QUANTITIES,
     REASONS,
     Touch,
     columns,
-    number_text,
-    share_text,
     verdict,
     worse_of_both,
     write_points,
 )
 from surgsim_env.arm_study.study import _touches, write_report
-from surgsim_env.instruments.arm.arm import load_arm
-from tests.arm_study.made import PICTURE, PORTS, made_evaluation
+from tests.arm_study.made import PICTURE, made_evaluation
 
 VOID = {"meta", "link", "img", "br"}
 
@@ -76,8 +73,7 @@ def folder(evaluation, tmp_path_factory):
 
 
 def written(evaluation, folder):
-    arms = tuple(load_arm(name, PORTS[side]) for name, side in (("psm_grasper", "left"), ("psm_palpator", "right")))
-    pictures = write_pictures(evaluation, arms, folder)
+    pictures = write_images(evaluation.pictures, folder, name="arms", description="the arms")
     maps = ArmMaps(evaluation).write_all(folder)
     write_points(evaluation, folder / "points.csv")
     write_report(evaluation, folder / "report.html", pictures=pictures, maps=maps, command="surgsim arms <b>&amp;")
@@ -110,12 +106,6 @@ def test_the_verdict_names_the_worse_of_organ_and_wall_and_its_arm(evaluation):
     assert "The worst clearance is 3.1 mm, between the right arm and the body wall; the median" in verdict(
         replace(evaluation, right=replace(evaluation.right, wall_clearance=wall))
     )
-
-
-def test_the_verdict_speaks_of_a_single_target_as_one():
-    one = made_evaluation(inner_count=1)
-    for reached, said in ((True, " Both reach the target"), (False, " Not both reach the target")):
-        assert said in verdict(replace(one, both=np.where(one.inner, reached, one.both)))
 
 
 def test_clearances_that_nothing_limits_are_left_aside(evaluation):
@@ -171,21 +161,6 @@ def test_tables_show_shares_and_reasons(evaluation, page):
         assert [int(cell.split()[0]) for cell in page.row(reason)[1:]] == counts
 
 
-def test_figures_are_rounded_with_units():
-    force, clearance, angle = (
-        next(one for one in QUANTITIES if one.field == field)
-        for field in ("tip_force", "organ_clearance", "camera_angle")
-    )
-    assert force.text(1.23456) == "1.23 N"
-    assert clearance.text(0.0123456) == "12.3 mm"
-    assert angle.text(np.pi / 4) == "45 degrees"
-    assert number_text(-1e-9) == "0.0"
-    assert number_text(np.nan, 1e3, 1, "mm") == "–"
-    assert share_text(np.arange(1000) < 2) == "<1 %"
-    assert share_text(np.arange(1000) < 998) == ">99 %"
-    assert share_text(np.ones(3, dtype=bool)) == "100 %"
-
-
 def test_the_worse_of_both_is_the_less_useful(evaluation):
     for field, pick in (("tip_force", np.minimum), ("trocar_load", np.maximum)):
         quantity = next(one for one in QUANTITIES if one.field == field)
@@ -198,7 +173,7 @@ def test_the_worse_of_both_is_the_less_useful(evaluation):
 def test_points_come_back_from_the_table(evaluation, folder):
     with (folder / "points.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert list(rows[0]) == [column.name for column in columns(evaluation)]
+    assert list(rows[0]) == columns(evaluation)
     assert len(rows) == len(evaluation.points)
 
     def read(name):
@@ -223,14 +198,6 @@ def test_points_come_back_from_the_table(evaluation, folder):
             same(f"{side}_{quantity.field}{quantity.si}", getattr(arm, quantity.field))
 
 
-def test_arms_of_other_joint_counts_have_their_own_columns(tmp_path):
-    evaluation = made_evaluation(joint_counts=(2, 7))
-    write_points(evaluation, tmp_path / "points.csv")
-    header = (tmp_path / "points.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
-    assert [name for name in header if "left_joint" in name] == ["left_joint_0", "left_joint_1"]
-    assert "right_joint_6" in header and "right_joint_7" not in header
-
-
 def test_the_page_is_whole_and_stands_alone(folder, page):
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>")
@@ -247,36 +214,15 @@ def test_the_page_is_whole_and_stands_alone(folder, page):
     assert "surgsim arms <b>&amp;" in "".join(page.text)
 
 
-def test_the_page_can_be_read_aloud(page):
-    assert page.of("html")[0]["lang"] == "en"
-    assert len(page.of("img")) == 2 + (len(QUANTITIES) - 2) + 2
-    for image in page.of("img"):
-        assert image["alt"]
-    assert len(page.of("caption")) == len(page.of("table")) >= 7
-    for head in page.of("th"):
-        assert head["scope"] in ("col", "row", "colgroup")
-
-
-def test_the_page_says_the_verdict_first_and_what_it_was_made_from(evaluation, page):
+def test_the_page_says_the_verdict_first(evaluation, page):
     text = "".join(page.text)
-    parts = ["The arms in the patient", "Maps on the organ", "Numbers", "What each figure means", "Columns of points"]
+    parts = ["The arms in the patient", "Maps on the organ", "Numbers", "What each figure means"]
     body = text[text.index("Contents") :] if "Contents" in text else text
     assert text.index(verdict(evaluation)) < text.index("Who reaches what")
     places = [body.rindex(part) for part in parts]
     assert places == sorted(places)
     for quantity in QUANTITIES:
         assert quantity.definition in text
-    assert "Seed: 0" in text and page.row("numpy")[1] == np.__version__ and page.row("points", -1)[1] == "120"
-
-
-def test_inputs_are_told_whatever_their_shape(evaluation, tmp_path):
-    inputs = {"targets": [{"name": "a", "point": [0.1, 0.2]}, {"name": "b"}], "compare": [], "ports": {"hole": 0.03}}
-    write_report(
-        replace(evaluation, summary={"inputs": inputs}), tmp_path / "r.html", pictures=[], maps=[], command="surgsim"
-    )
-    page = Page((tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert page.row("targets 1, point")[1] == "0.1, 0.2" and page.row("targets 2, name")[1] == "b"
-    assert page.row("compare")[1] == "none" and page.row("ports, hole")[1] == "0.03"
 
 
 @pytest.mark.slow
@@ -304,7 +250,7 @@ def test_the_map_is_grey_just_where_neither_arm_reaches(evaluation):
 
 
 def test_nothing_is_painted_where_no_point_was_tried(evaluation):
-    """Points on one half only: the other half is claimed by no colour, and the view of it is left out."""
+    """Points on one half only: the other half is claimed by no colour."""
     kept = evaluation.inner | (evaluation.points @ np.array([0.0, -0.74, 0.67]) > 0.0)
     names = ("points", "normals", "inner", "both", "arm_distance_inside", "arm_distance_outside")
     arms = {
@@ -320,32 +266,16 @@ def test_nothing_is_painted_where_no_point_was_tried(evaluation):
     }
     half = replace(evaluation, **{name: getattr(evaluation, name)[kept] for name in names}, **arms)
     maps = ArmMaps(half)
-    assert [title for title, _ in maps._views] == ["from the camera"]
-    assert [title for title, _ in ArmMaps(evaluation)._views] == ["from the camera", "from behind"]
     centres = maps._patches.corners.mean(axis=1)
     height = centres @ np.array([0.0, -0.74, 0.67])
     assert not maps._tried[height < -0.03].any()
     assert maps._tried[height > 0.01].mean() > 0.9
 
 
-def test_the_first_view_is_the_cameras(evaluation):
-    into = np.array(PORTS["endoscope"].into)
-    np.testing.assert_allclose(camera_view(evaluation).towards, -into / np.linalg.norm(into), atol=1e-12)
-    without = camera_view(replace(evaluation, ports={}))
-    assert without.towards @ np.array([0.0, -0.74, 0.67]) > 0.9
-
-
-@pytest.mark.slow
-def test_arms_are_drawn_where_both_reach_when_no_picture_came(tmp_path):
-    evaluation = made_evaluation(pictures=False)
-    arms = tuple(load_arm(name, PORTS[side]) for name, side in (("psm_grasper", "left"), ("psm_palpator", "right")))
+def test_arms_are_posed_where_both_reach(evaluation):
     places = poses(evaluation)
     assert all(evaluation.both[index] for index in places.values())
     assert evaluation.points[places["left"], 0] > evaluation.points[places["right"], 0]
-    (picture,) = write_pictures(evaluation, arms, tmp_path)
-    image = imread(tmp_path / picture.name)
-    assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 100
-    assert f"the left arm with its tip at point {places['left']}" in picture.description
 
 
 @pytest.mark.slow
@@ -356,22 +286,6 @@ def test_nothing_reached_is_told_as_that(tmp_path):
     assert "reaches 0 %" in said and "no clearances and forces to report" in said
     page = Page((written(evaluation, tmp_path) / "report.html").read_text(encoding="utf-8"))
     assert page.row("tip force [N]")[1:] == ["–"] * 9
-
-
-@pytest.mark.parametrize(
-    ("left_to", "right_to", "words"),
-    [
-        (2.0, 2.0, "each tip is at a point that its arm reaches."),
-        (-2.0, 2.0, "the right tip is at a point that its arm reaches; the left arm reaches none and stands at home."),
-        (-2.0, -2.0, "neither arm reaches a point; both stand at home."),
-    ],
-)
-def test_a_picture_says_which_arm_stands_at_home(tmp_path, left_to, right_to, words):
-    evaluation = made_evaluation(left_to=left_to, right_to=right_to)
-    arms = tuple(load_arm(name, PORTS[side]) for name, side in (("psm_grasper", "left"), ("psm_palpator", "right")))
-    drawn = [one for one in write_pictures(evaluation, arms, tmp_path) if one.name != "arms.png"]
-    assert drawn
-    assert all(one.description.endswith(words) for one in drawn)
 
 
 def test_parts_that_touch_are_named(tmp_path):
@@ -396,7 +310,7 @@ def test_everything_reached_without_inner_targets(tmp_path):
     evaluation = made_evaluation(inner_count=0, count=60)
     everywhere = np.zeros(60, dtype=np.int32)
     arms = {side: replace(getattr(evaluation, side), reason=everywhere) for side in ("left", "right")}
-    evaluation = replace(evaluation, both=np.ones(60, dtype=bool), ports={}, **arms)
+    evaluation = replace(evaluation, both=np.ones(60, dtype=bool), **arms)
     page = Page((written(evaluation, tmp_path) / "report.html").read_text(encoding="utf-8"))
     assert page.row("on the surface (60 points)")[1:] == ["100 %"] * 3
     assert "missed" not in verdict(evaluation)

@@ -56,8 +56,13 @@ def phantom():
 
 @pytest.fixture(scope="module")
 def found(phantom):
-    targets = [InnerTarget((0.03, 0.03, 0.015), "deep"), InnerTarget((0.03, 0.03, -2.0), "far")]
-    return evaluate_arms(phantom, "psm_palpator", "psm_grasper", targets=targets, count=25)
+    return evaluate_both_arms(phantom)
+
+
+def evaluate_both_arms(phantom):
+    targets = (InnerTarget((0.03, 0.03, 0.015), "deep"), InnerTarget((0.03, 0.03, -2.0), "far"))
+    ports = replace(default_ports(phantom), targets=targets)
+    return evaluate_arms(phantom, "psm_palpator", "psm_grasper", ports, count=25)
 
 
 def arm_figures(arm: ArmReach):
@@ -120,8 +125,7 @@ def test_mujoco_agrees_with_what_is_reported(found, phantom):
 @pytest.mark.slow
 def test_run_repeats_to_the_byte(found, phantom):
     """Same arguments, same bytes, of every array and of the summary; another seed, other points."""
-    targets = [InnerTarget((0.03, 0.03, 0.015), "deep"), InnerTarget((0.03, 0.03, -2.0), "far")]
-    again = evaluate_arms(phantom, "psm_palpator", "psm_grasper", targets=targets, count=25)
+    again = evaluate_both_arms(phantom)
     for arm, other in ((found.left, again.left), (found.right, again.right)):
         for name in vars(arm):
             if name != "name":
@@ -134,9 +138,11 @@ def test_run_repeats_to_the_byte(found, phantom):
 
 def test_summary_tells_versions_seed_and_inputs(found):
     summary = json.loads(json.dumps(found.summary, allow_nan=False))
-    assert summary["seed"] == 0 and summary["points"] == 25
-    assert {"surgsim", "python", "numpy", "scipy", "mujoco", "matplotlib"} == set(summary["versions"])
     inputs = summary["inputs"]
+    assert inputs["seed"] == 0 and summary["points"] == inputs["count"] == 25
+    assert {"surgsim", "python", "numpy", "scipy", "mujoco"} == set(summary["versions"])
+    least = min(np.nanmin(arm.tip_force) for arm in (found.left, found.right))
+    assert summary["smallest_tip_force"]["value_N"] == pytest.approx(least)
     assert (inputs["scene"], inputs["left"], inputs["right"]) == ("phantom", "psm_palpator", "psm_grasper")
     assert inputs["ports"]["wall"]["thickness"] == 0.02
     assert sum(summary["left"]["reasons"].values()) == 25

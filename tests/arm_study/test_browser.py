@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.pictures import ArmMaps, write_given_pictures
+from surgsim_env.arm_study.pictures import ArmMaps, write_images
 from surgsim_env.arm_study.results import rank
 from surgsim_env.arm_study.study import write_report
 from surgsim_env.reports.html_page import POLICY
@@ -47,12 +47,12 @@ def report(tmp_path_factory) -> Path:
     write_report(
         evaluation,
         path,
-        pictures=write_given_pictures(evaluation.pictures, folder, name="arms", description="the arms"),
+        pictures=write_images(evaluation.pictures, folder, name="arms", description="the arms"),
         maps=ArmMaps(evaluation).write_all(folder),
         command="surgsim arms --scene liver --left psm_grasper --right psm_palpator --ports ports.toml",
         ranking=rank(others),
         episodes=episodes,
-        episode_pictures=write_given_pictures(episodes.pictures, folder, name="episode", description="the ends"),
+        episode_pictures=write_images(episodes.pictures, folder, name="episode", description="the ends"),
     )
     return path
 

@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from dataclasses import replace
 
 import gymnasium as gym
@@ -13,7 +12,6 @@ from rich.console import Console
 from surgsim_env.arm_study import episodes, study
 from surgsim_env.arm_study.episodes import (
     MEASURES,
-    ArmsEpisode,
     clause,
     has_pads,
     median_of,
@@ -128,7 +126,7 @@ def test_arms_that_cannot_do_it_have_stand_ins_and_are_named(monkeypatch, given,
     assert found.left_out == "the right arm does not reach" and found.runs == ()
     said = what_was_run(found, "liver")
     assert said[0] == "No episodes were run: the right arm does not reach." and len(said) == 1 + len(sides)
-    assert clause(found, "liver") == ""
+    assert clause(found) == ""
     assert plain_episodes(found)["episodes"] == []
 
 
@@ -156,31 +154,10 @@ def test_the_table_and_the_summary_of_failures(tmp_path):
     json.dumps(table, allow_nan=False)
 
 
-def test_no_column_of_failures_where_all_succeeded(tmp_path):
-    page = page_of(made_episodes(), tmp_path)
-    assert len(page.row("3")) == len(page.row("medians")) == 2 + len(MEASURES)
-    assert "why it failed" not in page.text
-    assert len(page_of(made_episodes(failing=True), tmp_path).row("5")) == 3 + len(MEASURES)
-
-
 def test_without_episodes_there_is_no_section(tmp_path):
     assert "Scripted episodes" not in page_of(None, tmp_path).text
     assert "Scripted episodes" in page_of(made_episodes(), tmp_path).text
     assert plain_episodes(None) == {"episodes": [], "episodes_of": None}
-
-
-def test_what_is_said_of_the_episodes():
-    run = made_episodes()
-    assert clause(run, "liver") == (
-        "Run by a script on the scene lobe (not this organ, these ports or this left arm), psm_retractor lifts a lobe "
-        "and psm_palpator touches what lies under it in 2 of 2 episodes in 11.8 s (median), with pulls up to 0.52 N."
-    )
-    assert "(not these ports)" in clause(replace(run, stand_ins=()), "lobe")
-    said = " ".join(what_was_run(run, "liver"))
-    assert "seeds 3 to 4" in said and "not liver" in said
-    assert "not lobe" not in " ".join(what_was_run(run, "lobe"))
-    failed = replace(run, runs=(ArmsEpisode(0, False),))
-    assert re.search(r"in 0 of 1 episodes\.$", clause(failed, "liver"))
 
 
 def test_medians_are_of_what_was_measured():
@@ -188,17 +165,3 @@ def test_medians_are_of_what_was_measured():
     time, grip = MEASURES[0], MEASURES[1]
     assert median_of(run.runs, time) == 11.2 and median_of(run.runs, grip) == pytest.approx(0.39)
     assert np.isnan(median_of(run.runs[2:], grip))
-
-
-@pytest.mark.parametrize(
-    ("failure", "reason"),
-    [
-        ("", ""),
-        ("step 2 of 9, 'grasp', closed on nothing: MayEnd(step=CloseJaw(force=0.25)); tip at (1, 2, 3) mm", None),
-        ("step 2 of 9, 'grasp', closed on nothing; tip at (1, 2, 3) mm", None),
-    ],
-)
-def test_the_reason_leaves_out_where_the_tip_was(failure, reason):
-    assert ArmsEpisode(0, False, failure=failure).reason == (
-        "step 2 of 9, 'grasp', closed on nothing" if reason is None else reason
-    )

@@ -38,16 +38,10 @@ def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     for name in ("ports.toml", "wide.toml"):
         Path(name).write_text(text)
-    monkeypatch.setattr(study, "evaluate", lambda *_, **__: made_evaluation(pictures=False))
+    monkeypatch.setattr(study, "evaluate", lambda *_, **__: made_evaluation())
     monkeypatch.setattr(study, "scripted_episodes", lambda *_: made_episodes())
-    # The made evaluation's arms stand anywhere: enough to be drawn.
     assert main(command.split()) == 0
     listed = re.findall(r"^\| `([\w.*]+)` \|", DOCS, flags=re.M)
     assert len(listed) == 6
     for pattern in listed:
         assert list(Path("runs/arms").glob(pattern)), pattern
-
-
-def test_pictures_exist():
-    for picture in re.findall(r"!\[[^]]*\]\(([^)]*)\)", DOCS):
-        assert (ROOT / "docs" / picture).is_file()

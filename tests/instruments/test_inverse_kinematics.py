@@ -7,7 +7,6 @@ from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.instruments.arm.inverse_kinematics import (
     KinematicTask,
     follow,
-    joint_speeds,
     prioritised_step,
     reach_pose,
     solve_pose,
@@ -68,32 +67,6 @@ def test_two_directions_at_once_are_refused(psm):
 def test_targets_that_are_none_are_refused(psm, position):
     with pytest.raises(ValueError, match=r"position"):
         solve_pose(psm, position)
-
-
-def test_speeds_make_the_velocity_that_was_asked_for(psm, six_axis):
-    """J qdot = v; and for the arm without a remote centre the shaft stands still across the trocar."""
-    rng = np.random.default_rng(2)
-    for arm in (psm, six_axis):
-        for _ in range(20):
-            joints = arm.home + 0.05 * rng.standard_normal(6)
-            if not arm.remote_centre_fixed:
-                joints = solve_pose(arm, arm.tip_pose(joints).position, start=joints).joints
-            velocity = rng.uniform(-0.01, 0.01, 3)
-            speeds = joint_speeds(arm, joints, velocity)
-            assert np.abs(arm.tip_jacobian(joints)[:3] @ speeds - velocity).max() < 1e-6
-            if not arm.remote_centre_fixed:
-                assert np.abs(arm.trocar_task(joints)[1] @ speeds).max() < 1e-7
-
-
-def test_turning_yields_to_the_velocity(psm):
-    """Six joints do both where they can; where speed limits leave too little, the place keeps its share."""
-    joints = np.array([0.2, -0.1, 0.12, 0.3, 0.5, 0.4])
-    velocity, turning = np.array([0.01, 0.0, 0.005]), np.array([0.1, -0.2, 0.05])
-    twist = psm.tip_jacobian(joints) @ joint_speeds(psm, joints, velocity, turning)
-    assert np.abs(twist - np.concatenate([velocity, turning])).max() < 1e-4
-    fast = joint_speeds(psm, joints, velocity, 1e3 * turning)
-    assert (np.abs(fast) <= psm.speed_limit * (1.0 + 1e-9)).all()
-    assert np.abs(psm.tip_jacobian(joints)[:3] @ fast - velocity).max() < 1e-3 * np.abs(velocity).max()
 
 
 def test_a_held_joint_leaves_its_share_to_the_others():

@@ -8,16 +8,18 @@ import pytest
 
 from surgsim_env.palpation.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST, SITES, Hold, check_hold, hold_of
 from surgsim_env.palpation.job import plan_sites
-from surgsim_env.palpation.surface_scene import soft_bed
+from surgsim_env.palpation.scene_options import soft_bed
 from surgsim_env.scene.anatomy import anatomy_of, load_anatomy
 from surgsim_env.scene.load import make_material, make_scene
-from surgsim_env.scene.model import Anchor, Bed
+from surgsim_env.scene.model import Anchor, Box
 from surgsim_env.scene.palpable_surface import hertz_force
 from tests.patient.organs import kidney
 
 DOWN = (0.0, 0.0, -1.0)
-# The support that patients' organs had: the deepest 15 % of their surface fixed.
-BACK = Anchor("bed", bed=Bed(DOWN, 0.15))
+# The deepest 15 % of the organ fixed.
+BEAN = kidney()
+DEEP = float(BEAN.points[:, 2].min() + 0.15 * np.ptp(BEAN.points[:, 2]))
+BACK = Anchor("back", box=Box((-1.0, -1.0, -1.0), (1.0, 1.0, DEEP)))
 
 
 def bean(anchor):
@@ -37,7 +39,7 @@ def bean(anchor):
         ),
         timing=replace(liver.timing, substep_count=4),
     )
-    return anatomy_of(scene, kidney())
+    return anatomy_of(scene, BEAN)
 
 
 def held(anchor):

@@ -11,14 +11,14 @@ from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.palpation.truth import felt_weights, is_pressable, seen_from_surface
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import Anchor, Ball, Bed
+from surgsim_env.scene.model import Anchor, Ball, Box
 from surgsim_env.scene.palpable_surface import contact_radius
 
 SIZE = (0.10, 0.08, 0.05)
 PHANTOM = make_scene("phantom")
 TOP = np.array([0.0, 0.0, SIZE[2]])
 MARGIN = 0.012
-FLOOR = Anchor("floor", bed=Bed((0.0, 0.0, -1.0), 0.01))
+FLOOR = Anchor("floor", box=Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-6)))
 
 
 def block(*anchors: Anchor, slot: float = 0.0) -> Anatomy:

@@ -34,10 +34,10 @@ def test_what_is_dropped_filled_or_cut_off_is_said(tmp_path, capsys):
 @pytest.mark.slow
 def test_surfaces_one_file_a_region(tmp_path, capsys):
     organ, lesion = ball(tmp_path / "kidney.stl"), ball(tmp_path / "tumour.ply", 9.0, (8.0, 0.0, 5.0))
-    other = ball(tmp_path / "x.obj", 7.0, (-12.0, 0.0, 0.0))
+    other = ball(tmp_path / "stone.obj", 7.0, (-12.0, 0.0, 0.0))
     out = tmp_path / "out"
     out.mkdir()
-    given = ["organ", str(organ), str(lesion), "--region", f"stone={other}", "--modulus", "stone=90000"]
+    given = ["organ", str(organ), str(lesion), str(other), "--modulus", "stone=90000"]
     assert main([*given, "--length-unit", "mm", "--cell-size", "0.006", "--out", str(out / "k.vtu")]) == 0
     mesh = read_mesh(out / "k.vtu")
     assert dict(mesh.region_names) == {1: "kidney", 2: "tumour", 3: "stone"}

@@ -33,7 +33,6 @@ def test_nothing_of_others_is_overwritten_and_nothing_half_written(tmp_path, ref
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--labels", "liver=1", "--region", "a=b.stl"], "--region goes with surfaces"),
         (["--labels", "liver=1", "--length-unit", "mm"], "--length-unit goes with surfaces"),
         ([], "which labels are the organ?"),
         (["--labels", "liver=1", "--mesher", "cgal"], "must be lattice or tetwild"),
@@ -78,16 +77,13 @@ def test_options_that_do_not_fit_surfaces_or_tets(written, tmp_path, refusal):
     unit = ["--length-unit", "mm"]
     assert "needs --length-unit" in refusal("organ", surface)
     assert "--labels goes with a label image" in refusal("organ", surface, *unit, "--labels", "a=1")
-    assert "is no NAME=FILE" in refusal("organ", surface, *unit, "--region", "lesion")
     outside = ball(tmp_path / "lesion.stl", 5.0, (40.0, 0.0, 0.0))
     assert "only 0% of it lies inside" in refusal("organ", surface, outside, *unit, "--cell-size", "0.01")
-    twice = ["--region", f"lesion={outside}", "--region", f"lesion={outside}"]
-    assert "is given twice" in refusal("organ", surface, *twice, *unit)
+    assert "is given twice" in refusal("organ", surface, outside, outside, *unit)
     assert "--mend goes with" in refusal("organ", written / "patient.vtu", "--mend")
     for size in ("0.01", "0"):
         assert "--cell-size goes with" in refusal("organ", written / "patient.vtu", "--cell-size", size)
     tets = [written / "patient.vtu"] * 2
     assert "one file of tets is taken, 2 are given" in refusal("organ", *tets)
     assert "is no surface" in refusal("organ", surface, written / "patient.vtu", *unit)
-    assert "goes with --segmentation" in refusal("palpate", "--scene", "phantom", *LABELS)
     assert "give a file" in refusal("organ")

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from msdm_core.meshing.lattice_meshing import box_mesh
-from surgsim_env.palpation.surface_scene import SurfaceOptions
 from surgsim_env.patient.supports import held_text, organ_anchors
 
 MESH = box_mesh((0.06, 0.05, 0.10), (6, 5, 10))
 FRONT = (0.0, 1.0, 0.0)
 
 
-def anchors(name, *, is_scan=True, options=None):
-    return organ_anchors(name, MESH, options or SurfaceOptions(), FRONT, is_scan=is_scan)
+def anchors(name, *, is_scan=True):
+    return organ_anchors(name, MESH, FRONT, is_scan=is_scan)
 
 
 @pytest.mark.parametrize(
@@ -44,13 +43,6 @@ def test_the_hilum_faces_the_spine():
 def test_the_bare_area_is_behind_and_above():
     ball = anchors("liver")[0][1].ball
     assert ball.centre[1] > 0.04 and ball.centre[2] > 0.05
-
-
-def test_balls_that_are_given_replace_everything_and_are_fixed():
-    found, sources = anchors("liver", options=SurfaceOptions(anchors=((0.0, 0.0, 0.0, 0.01),)))
-    assert [one.is_elastic for one in found] == [False]
-    assert sources == {"anchors": "given on the command line"}
-    assert held_text(found[0]) == "anchor 1: fixed"
 
 
 def test_the_words_for_a_report_give_both_stiffnesses():

@@ -8,7 +8,7 @@ import pytest
 from msdm_core.mesh.surface import outward_facing
 from msdm_core.meshing.segmentation_meshing import FineFace, fill_labels
 from surgsim_env.cli.main import main
-from surgsim_env.palpation.surface_scene import SurfaceOptions
+from surgsim_env.palpation.scene_options import SceneOptions
 from surgsim_env.patient.lesion_room import lack_of_room, sample_face
 from surgsim_env.patient.meshers import Cells, mesh_surfaces, read_surfaces
 from surgsim_env.patient.touch import plan_touch
@@ -24,14 +24,14 @@ BALL = 4.0 / 3.0 * np.pi * 0.03**3
 
 @pytest.mark.parametrize("volume", [50e-6, 200e-6, 2000e-6])
 def test_a_default_tip_passes_a_trocar_of_12_mm(volume):
-    plan = plan_touch(volume, SurfaceOptions(), cell_size=None, graded=True)
+    plan = plan_touch(volume, SceneOptions(), cell_size=None, graded=True)
     assert 0.004 <= plan.tip_radius <= TROCAR_RADIUS
     assert plan.cell_size < 0.9 * contact_radius(plan.tip_radius, plan.press_depth) + 1e-5
 
 
 @pytest.mark.parametrize("way", ["surface", "labels"])
 def test_cells_are_fine_at_the_pressed_face_and_as_many_as_was_said(way, tmp_path):
-    plan = plan_touch(BALL, SurfaceOptions(), cell_size=None, graded=True)
+    plan = plan_touch(BALL, SceneOptions(), cell_size=None, graded=True)
     assert plan.coarsening > 1
     approach = (0.0, 0.0, -1.0)
     if way == "surface":

@@ -14,7 +14,7 @@ import trimesh
 from surgsim_env.cli.main import main
 from surgsim_env.palpation.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST
 from surgsim_env.palpation.job import MODEL, plan_sites
-from surgsim_env.palpation.surface_scene import SurfaceOptions, with_options
+from surgsim_env.palpation.scene_options import SceneOptions, with_options
 from surgsim_env.patient.supports import held_text
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import load_scene
@@ -133,7 +133,7 @@ def test_from_a_surface_to_lesions_on_a_map(name, surface, touch, lesion, tmp_pa
     assert "sways" not in said and "of Hertz's force" in said
     check_report(folder, name)
     scene, out = folder / f"{name}.toml", tmp_path / "palpated"
-    anatomy = load_anatomy(with_options(load_scene(scene), SurfaceOptions(spacing=touch.spacing)))
+    anatomy = load_anatomy(with_options(load_scene(scene), SceneOptions(spacing=touch.spacing)))
     hidden = [
         f"--lesion-below={site},{lesion.depth},{lesion.radius},{LESION_RATIO}" for site in far_apart(anatomy, lesion)
     ]
@@ -148,14 +148,15 @@ def test_from_a_surface_to_lesions_on_a_map(name, surface, touch, lesion, tmp_pa
 def test_from_a_scan_with_its_lesions_to_a_map(tmp_path, capsys):
     """Cells as by default, fine at the pressed face, so that the probe is turned before they are made."""
     out = tmp_path / "out"
-    given = ["palpate", "--segmentation", spleen(tmp_path / "spleen.nii.gz"), "--labels", "spleen=1,lesion=2"]
-    said = run(capsys, *given, "--tip-radius", SPLEEN.tip, "--spacing", SPLEEN.spacing, "--out", out)
+    given = ["organ", spleen(tmp_path / "spleen.nii.gz"), "--labels", "spleen=1,lesion=2", "--no-healthy-map"]
+    said = run(capsys, *given, "--tip-radius", SPLEEN.tip, "--out", out / "spleen.vtu")
     assert "turning the probe to the lesions" in said and "does not face" not in said
     assert "times as long elsewhere" in said
     scene = load_scene(out / "spleen.toml")
     assert -np.dot(scene.instrument.approach, SPLEEN_CROWN) > 0.7
     assert [one.name for one in scene.anchors] == ["surrounding fat and wall", "hilum"]
     check_report(out, "spleen")
+    run(capsys, "palpate", "--organ", out / "spleen.toml", "--spacing", SPLEEN.spacing, "--out", out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     check_held(summary)
     check_found(summary, 2)

@@ -203,8 +203,6 @@ def test_force_arrow_comes_with_a_force_and_points_along_it(press, draw):
     for place in (near, far):
         assert np.abs(frame[int(place[1]), int(place[0])].astype(int) - ARROW_COLOUR[:3]).max() < 12
     assert np.abs(frame[int(beyond[1]), int(beyond[0])].astype(int) - ARROW_COLOUR[:3]).max() > 12
-    longer = draw(press, force_mm_per_newton=120.0).rgb()
-    assert coloured(longer) > 1.3 * coloured(frame)
 
 
 @pytest.mark.parametrize("options", [{"show_lesion": True}, {"cut_away": True}])

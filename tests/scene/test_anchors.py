@@ -1,4 +1,4 @@
-"""Where an organ is held: fixed nodes and elastic tissue by box, ball, bed and side; sites clear of both; bad input."""
+"""Where an organ is held: fixed nodes and elastic tissue by box, ball and side; sites clear of both; bad input."""
 
 import math
 import tomllib
@@ -11,7 +11,7 @@ import pytest
 from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.scene.anatomy import anatomy_of
 from surgsim_env.scene.load import make_scene, scene_from_table
-from surgsim_env.scene.model import Anchor, Ball, Bed, Box, Side
+from surgsim_env.scene.model import Anchor, Ball, Box, Side
 from surgsim_env.scene.save import scene_toml
 
 MESH = box_mesh((0.06, 0.05, 0.04), (6, 5, 4))
@@ -53,7 +53,7 @@ def test_elastic_tissue_holds_by_its_surface_and_fixes_nothing():
 
 def test_a_node_may_be_held_by_several_tissues():
     ball = Anchor("ligament", ball=Ball((0.03, 0.025, 0.0), 0.012), stiffness=1e6, shear_stiffness=0.0)
-    fat = Anchor("fat", bed=Bed(DOWN, 0.1), **FAT)
+    fat = Anchor("fat", box=Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.004)), **FAT)
     both, alone = held(fat, ball).organ(), held(fat).organ()
     np.testing.assert_array_equal(both.foundation_nodes, alone.foundation_nodes)
     added = (both.foundation_stiffness - alone.foundation_stiffness)[:, 2, 2]
@@ -66,7 +66,7 @@ def test_sites_are_clear_of_what_holds_the_organ():
     tip = SCENE.instrument.tip_radius
     corner = Ball((0.0, 0.0, 0.04), 1e-6)
     points = np.array([[0.9 * tip, 0.0, 0.04], [1.5 * tip, 0.0, 0.04], [2.1 * tip, 0.0, 0.04]])
-    floor = Anchor("floor", bed=Bed(DOWN, 0.01))
+    floor = Anchor("floor", box=Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-6)))
     np.testing.assert_array_equal(held(floor, Anchor("a", ball=corner)).clear_of_supports(points), [False, False, True])
     elastic = held(floor, Anchor("a", ball=corner, **FAT))
     np.testing.assert_array_equal(elastic.clear_of_supports(points), [False, True, True])
@@ -90,7 +90,7 @@ def test_a_scene_with_elastic_tissue_is_written_and_read():
             {"stiffness": 1.0, "shear_stiffness": -1.0},
             r"shear_stiffness is -1 N/m\^3; it must be finite and at least 0",
         ),
-        ({"bed": Bed(DOWN, 0.1)}, "give one of a box, a ball, a bed and a side"),
+        ({"ball": Ball((0.0, 0.0, 0.0), 0.1)}, "give one of a box, a ball and a side"),
     ],
 )
 def test_bad_anchors_are_refused(entries, message):

@@ -12,7 +12,7 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.organ.compile import compile_organ, rest_state
 from msdm_core.organ.measure import support_forces
 from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.support import Support, SupportLaw
+from msdm_core.organ.support import Support
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_BIT
@@ -50,11 +50,10 @@ def test_a_scene_file_says_what_the_organ_rests_on(tmp_path):
     assert organ.gravity.tolist() == [0.0, 0.0, -9.81]
     assert (organ.support_stiffness, organ.support_damping) == (scene().contact.stiffness, scene().contact.damping)
     path = tmp_path / "other.toml"
-    wall = '[support_law]\nstiffness = 2e6\n[[supports]]\nname = "wall"\nkind = "plane"\naxis = [0, 1, 0]\n'
+    wall = '[[supports]]\nname = "wall"\nkind = "plane"\naxis = [0, 1, 0]\n'
     path.write_text(text + wall, encoding="utf-8")
     other = load_scene(path)
-    assert other.support_law == SupportLaw(2e6, 0.0) and other.supports[1].axis == (0.0, 1.0, 0.0)
-    assert load_anatomy(other).organ().support_stiffness == 2e6
+    assert other.supports[1].axis == (0.0, 1.0, 0.0)
     path.write_text(text + wall.replace("plane", "floor"), encoding="utf-8")
     with pytest.raises(ValueError, match="scene 'other': support 'wall': kind is 'floor'"):
         load_scene(path)
@@ -177,7 +176,7 @@ def test_the_lobes_substeps_bear_its_hardest_draw(scale: float):
 
 
 def test_a_scene_whose_substeps_are_too_few_for_its_bed_is_refused():
-    stiff = replace(scene(), support_law=SupportLaw(3e8))
+    stiff = replace(scene(), contact=replace(scene().contact, stiffness=3e8))
     with pytest.raises(OrganError, match=r"5 substeps.*too long.*timing.substep_count = "):
         Simulation(load_anatomy(stiff))
 

@@ -155,7 +155,7 @@ class _Finder:
                 "out"
             )
         arm = self._search_arm(link_shapes)
-        home, point, into, reach = self._fixed_home(arm) if centre is not None else self._free_home(arm)
+        home, point, into, reach = self._search_home(arm)
         self.found = self._finish(link_shapes, home, point, into, reach)
 
     # ---- what is in the file ---------------------------------------------------------------------------------
@@ -397,32 +397,10 @@ class _Finder:
             arm.trocar = self.centre.point
         return arm
 
-    def _fixed_home(self, arm: Arm) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Home of an arm with a remote centre: of the poses tried, the one around which the tip reaches most."""
-        assert self.centre is not None
-        middle = 0.5 * (self.lower + self.upper)
-        before = self.chain.index(self.centre.joint)
-        ranges = np.arange(len(self.chain)) < before
-        draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.chain)))
-        starts = [self.zero, np.where(ranges, middle, self.zero), *np.where(ranges, draws, self.zero)]
+    def _search_home(self, arm: Arm) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Home, trocar, direction into the body and reach, of the pose tried around which the tip reaches most."""
         best = None
-        for number, start in enumerate(starts):
-            self.tell("looking for a home", 0.1 + 0.8 * number / len(starts))
-            into = arm.shaft_line(start)[1]
-            found = self._at_depth(arm, arm.trocar, into, start)
-            if found is None:
-                continue
-            share = reach_share(arm, found, into)
-            if best is None or share > best[3] + 1e-9:
-                best = found, arm.trocar.copy(), into, share
-            if share == 1.0:
-                break
-        return self._required(best)
-
-    def _free_home(self, arm: Arm) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Home of an arm whose shaft control keeps in the trocar: a pose with room to move, the tool pointing down."""
-        best = None
-        starts = self._good_starts(arm)
+        starts = self._good_starts(arm) if self.centre is None else self._starts_about(self.centre)
         places = [(start, place) for start in starts for place in self._trocars(arm, start)]
         for number, (start, place) in enumerate(places):
             self.tell("looking for a home", 0.1 + 0.8 * number / len(places))
@@ -430,7 +408,8 @@ class _Finder:
             into = arm.shaft_line(start)[1]
             found = self._at_depth(arm, place, into, start)
             into = into if found is None else arm.shaft_line(found)[1]
-            if found is None or self._blocked(arm, found):
+            # The mechanism of a remote centre holds its tool by links about it.
+            if found is None or (self.centre is None and self._blocked(arm, found)):
                 continue
             share = reach_share(arm, found, into)
             if best is None or share > best[3] + 1e-9:
@@ -445,6 +424,8 @@ class _Finder:
         An arm with few joints turns its shaft only about a point of its first axis: such as the linkage of a remote
         centre, which is open in a URDF.
         """
+        if self.centre is not None:
+            return [self.centre.point]
         if self.trocar_given is not None:
             return [self.trocar_given]
         point, into = arm.shaft_line(start)
@@ -477,6 +458,12 @@ class _Finder:
 
     def _in_trocar(self, arm: Arm, found: PoseSolution) -> bool:
         return found.trocar_error <= (FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6)
+
+    def _starts_about(self, centre: RemoteCentre) -> list[FloatArray]:
+        """Poses that differ in the joints before the slide of a remote centre."""
+        before = np.arange(len(self.chain)) < self.chain.index(centre.joint)
+        draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.chain)))
+        return [np.where(before, pose, self.zero) for pose in (self.zero, 0.5 * (self.lower + self.upper), *draws)]
 
     def _good_starts(self, arm: Arm) -> list[FloatArray]:
         """Poses with the tool pointing down, away from limits and singular poses, the best first; keyframes before."""

@@ -309,22 +309,3 @@ def _newton(arm: Arm, start: FloatArray, target: Target, lower: FloatArray, uppe
         step = prioritised_step(tasks, lower - joints, upper - joints, arm.speed_limit)
         joints = (joints + step).clip(lower, upper)
     return None
-
-
-def joint_speeds(arm: Arm, joints: ArrayLike, velocity: ArrayLike, turning: ArrayLike | None = None) -> FloatArray:
-    """Joint speeds (n,) within the speed limits for a tip velocity [m/s] and, if given, angular velocity [rad/s].
-
-    Differential kinematics at one instant, in the order trocar, velocity, turning. To follow a path, use `follow`.
-    """
-    values = np.asarray(joints, dtype=np.float64)
-    jacobian = arm.tip_jacobian(values)
-    tasks = [KinematicTask(jacobian[:3], np.asarray(velocity, dtype=np.float64))]
-    if turning is not None:
-        tasks.append(KinematicTask(jacobian[3:], np.asarray(turning, dtype=np.float64)))
-    if not arm.remote_centre_fixed:
-        tasks.insert(0, KinematicTask(arm.trocar_task(values)[1], np.zeros(2)))
-    # The damping is scaled for small steps: solve for the motion in one millisecond.
-    small = [KinematicTask(task.jacobian, 1e-3 * task.error) for task in tasks]
-    lower = np.where(values <= arm.lower, 0.0, -arm.speed_limit)
-    upper = np.where(values >= arm.upper, 0.0, arm.speed_limit)
-    return 1e3 * prioritised_step(small, 1e-3 * lower, 1e-3 * upper, arm.speed_limit)

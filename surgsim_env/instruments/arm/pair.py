@@ -112,11 +112,6 @@ class Pair(SteeredArms):
         return least
 
     @property
-    def arms_collide(self) -> bool:
-        """Whether the arms touch each other."""
-        return self.distance <= 0.0
-
-    @property
     def collision_force(self) -> float:
         """Size of the force between the arms in the last haptic step [N]."""
         return self._contact_force(self._geoms_of["left"], self._geoms_of["right"])

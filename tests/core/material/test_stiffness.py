@@ -1,4 +1,4 @@
-"""Spring stiffness: formula (6), Van Gelder's rule and the membrane against closed forms on the BCC lattice."""
+"""Spring stiffness: formula (6) and the membrane against closed forms on the BCC lattice."""
 
 import math
 from collections.abc import Callable
@@ -136,57 +136,39 @@ def test_a_quarter_is_the_papers_model_to_the_bit():
     assert not model.averages_volume
 
 
-# ---- Van Gelder's rule --------------------------------------------------------------------------------------------
+# ---- one tet -------------------------------------------------------------------------------------------------------
 
 REGULAR = TetMesh(
     np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * (0.01 / math.sqrt(8.0)), [[0, 1, 2, 3]]
 )
 
 
-@pytest.mark.parametrize(
-    ("rule", "factor"), [("lloyd", 2.0 * math.sqrt(2.0) / 25.0), ("van_gelder", math.sqrt(2.0) / 12.0)]
-)
-def test_a_regular_tet(rule: str, factor: float):
-    """Edge l, V = l^3 / (6 sqrt 2): Lloyd's k = (2 sqrt 2 / 25) l E, Van Gelder's k = E V / l^2 = (sqrt 2 / 12) l E."""
-    _, stiffness = spring_network(REGULAR, MODULUS, rule=rule)
-    np.testing.assert_allclose(stiffness, factor * 0.01 * MODULUS, rtol=EXACT)
-
-
-def test_van_gelders_springs_of_any_tet_hold_six_times_its_modulus():
-    """C_iijj = (1 / V) sum k l^2 = 6 E whatever the tet's shape."""
-    tet = TetMesh(np.random.default_rng(0).uniform(0.0, 0.02, (4, 3)), [[0, 1, 2, 3]])
-    edges, stiffness = spring_network(tet, MODULUS, rule="van_gelder")
-    constants = affine_constants(tet, edges, stiffness, np.arange(4), float(tet.volumes[0]))
-    assert np.einsum("iijj", constants) == pytest.approx(6.0 * MODULUS, rel=EXACT)
-
-
-def test_van_gelders_rule_on_the_lattice():
-    """k = a E / 3 on cube edges, 2 a E / 3 on diagonals: C11 = 10/9 E, C12 = C44 = 4/9 E (not isotropic)."""
-    c11, c12, c44 = three_constants(lattice_constants(*spring_network(LATTICE, MODULUS, rule="van_gelder")))
-    assert (c11, c12, c44) == pytest.approx((10 / 9 * MODULUS, 4 / 9 * MODULUS, 4 / 9 * MODULUS), rel=EXACT)
+def test_a_regular_tet():
+    """Each edge of length l has Lloyd's k = (2 sqrt 2 / 25) l E."""
+    _, stiffness = spring_network(REGULAR, MODULUS)
+    np.testing.assert_allclose(stiffness, 2.0 * math.sqrt(2.0) / 25.0 * 0.01 * MODULUS, rtol=EXACT)
 
 
 # ---- moduli, messages ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rule", ["lloyd", "van_gelder"])
-def test_each_tet_adds_its_own_share(rule: str):
+def test_each_tet_adds_its_own_share():
     """k is linear in the tets' moduli: one tet's modulus raised by dE adds that tet's k (dE) to its six edges alone."""
     random = np.random.default_rng(1)
     modulus = random.uniform(1000.0, 9000.0, LATTICE.tet_count)
     tet, raised = 321, modulus.copy()
     raised[tet] += 5000.0
-    _, before = spring_network(LATTICE, modulus, rule=rule)
-    _, after = spring_network(LATTICE, raised, rule=rule)
+    _, before = spring_network(LATTICE, modulus)
+    _, after = spring_network(LATTICE, raised)
     alone = TetMesh(LATTICE.points[LATTICE.tets[tet]], [[0, 1, 2, 3]])
-    _, share = spring_network(alone, 5000.0, rule=rule)
+    _, share = spring_network(alone, 5000.0)
     expected = np.zeros(len(before))
     expected[LATTICE.tet_edges[tet]] = share  # both list a tet's edges in the order of its corners
     np.testing.assert_allclose(after - before, expected, rtol=0, atol=EXACT * after.max())
 
 
 def test_unknown_rule_lists_the_rules_and_suggests_one():
-    known = "the rules are lloyd, fitted, van_gelder; did you mean 'lloyd'"
+    known = "the rules are lloyd, fitted; did you mean 'lloyd'"
     with pytest.raises(OrganError, match=f"'loyd' is unknown; {known}"):
         spring_network(LATTICE, MODULUS, rule="loyd")
 

@@ -1,22 +1,17 @@
-"""A scene for any closed surface file; values that are not given are the shipped liver's, but for its stiffening."""
+"""Options that replace values of a scene, substeps that keep its organ stable, and the fat that holds an organ."""
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Lesion
-from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.organ.stability import stable_dt
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import Anchor, Ball, MeshSource, Scene, Side, SurfaceMesh, Vector, substeps_needed
+from surgsim_env.scene.model import Anchor, Scene, Side, Vector, substeps_needed
 
 PATTERN = "liver"
-# Against the file's third axis: from above if z points up; from the head in a CT's patient axes (z to the head).
-DEFAULT_APPROACH = (0.0, 0.0, -1.0)
-# Without anchors an organ lies in fat but for the side that faces the probe: E / h and E / 3h of 8 mm of it (chosen).
+# An organ lies in fat but for the side that faces the probe: E / h and E / 3h of 8 mm of it (chosen).
 # E is 3 x 752 Pa, the shear modulus of human fat that bears no load, by MR elastography at 50 Hz (gluteal, J Mech Behav
 # Biomed Mater 2023, "Strain-dependent shear properties of human adipose tissue in vivo"); in pigs 3 x 530 Pa (doi
 # 10.1007/s10237-010-0207-9).
@@ -31,62 +26,33 @@ FAT_NAME = "surrounding fat and wall"
 CONTACT_MODULI_PER_CELL = 18.0
 # Limit of organ substeps in a haptic step: more would take hours.
 SUBSTEPS_MOST = 200
-# Sites with less tissue below them than this many press depths are left out.
-THICKNESS_PRESS_DEPTHS = 5.0
 
 
 @dataclass(frozen=True)
-class SurfaceOptions:
-    """Options of a surface scene beyond its file; `surgsim palpate --help` explains them.
+class SceneOptions:
+    """Values that replace those of a scene; None: the scene's own.
 
     Args:
-        approach: direction of the probe's approach, in the file's axes; DEFAULT_APPROACH if not given.
-        anchors: balls whose surface nodes are fixed: x, y, z, radius [m]; without one, `soft_bed` holds the organ.
+        approach: direction of the probe's approach.
         press_depth, tip_radius, spacing: [m].
         youngs_modulus: of the healthy tissue [Pa].
     """
 
     approach: Vector | None = None
-    anchors: tuple[tuple[float, float, float, float], ...] = ()
     press_depth: float | None = None
     tip_radius: float | None = None
     spacing: float | None = None
     youngs_modulus: float | None = None
 
 
-def surface_scene(file: Path, *, length_unit: LengthUnit, cell_size: float, options: SurfaceOptions) -> Scene:
-    """The shipped liver's scene with another surface, on linear tissue: which organ it is, nobody knows.
-
-    Raises:
-        ValueError: an invalid length or direction (names it).
-    """
-    scene = with_options(make_scene(PATTERN), replace(options, approach=options.approach or DEFAULT_APPROACH))
-    if not cell_size > 0.0:
-        raise ValueError(f"cell size is {cell_size} m; it must be above 0")
-    contact = CONTACT_MODULI_PER_CELL * scene.material.youngs_modulus / cell_size
-    return replace(
-        scene,
-        material=replace(scene.material, stiffening=None),
-        name=file.stem,
-        description=f"the surface {file.name}",
-        folder=Path.cwd(),
-        mesh=MeshSource(surface=SurfaceMesh(str(file), length_unit, cell_size)),
-        anchors=anchors_of(options, scene.instrument.approach),
-        contact=replace(scene.contact, stiffness=contact),
-        palpation=replace(scene.palpation, thickness_smallest=THICKNESS_PRESS_DEPTHS * scene.palpation.press_depth),
-        demonstration=(),
-    )
-
-
-def with_options(scene: Scene, options: SurfaceOptions) -> Scene:
-    """A scene with another approach, press depth, tip radius, site spacing or modulus, where given.
+def with_options(scene: Scene, options: SceneOptions) -> Scene:
+    """A scene with another approach, press depth, tip radius or site spacing, where given.
 
     Raises:
         ValueError: a value that is not above 0 (names it).
     """
     check_options(options)
-    palpation, material = scene.palpation, scene.material
-    instrument = scene.instrument
+    palpation, instrument = scene.palpation, scene.instrument
     return replace(
         scene,
         palpation=replace(
@@ -99,11 +65,10 @@ def with_options(scene: Scene, options: SurfaceOptions) -> Scene:
             tip_radius=options.tip_radius or instrument.tip_radius,
             approach=_direction(options.approach) if options.approach else instrument.approach,
         ),
-        material=replace(material, youngs_modulus=options.youngs_modulus or material.youngs_modulus),
     )
 
 
-def check_options(options: SurfaceOptions) -> None:
+def check_options(options: SceneOptions) -> None:
     """Refuse a length or modulus that is not above 0, and a direction without length."""
     if options.approach is not None:
         _direction(options.approach)
@@ -169,15 +134,3 @@ def _direction(vector: Vector) -> Vector:
 def soft_bed(approach: Vector, name: str = FAT_NAME) -> Anchor:
     """Fat over the side away from the probe and the flanks."""
     return Anchor(name, side=Side(approach, FAT_ANGLE), stiffness=FAT_STIFFNESS, shear_stiffness=FAT_SHEAR_STIFFNESS)
-
-
-def anchors_of(options: SurfaceOptions, approach: Vector) -> tuple[Anchor, ...]:
-    """The balls given as anchors, else the soft bed on the side away from the probe."""
-    if not options.anchors:
-        return (soft_bed(approach),)
-    balls = []
-    for number, (x, y, z, radius) in enumerate(options.anchors, start=1):
-        if not radius > 0.0:
-            raise ValueError(f"anchor {number}: radius is {radius:g} m; it must be above 0")
-        balls.append(Anchor(f"anchor {number}", ball=Ball((x, y, z), radius)))
-    return tuple(balls)

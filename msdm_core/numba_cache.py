@@ -57,29 +57,26 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
 
 def _cache_folder(chosen: str, name: str) -> Path:
     """The folder of this name in the chosen place, else in the user's cache folder; a temporary one if it fails."""
-    place = Path(chosen or platformdirs.user_cache_dir("surgsim"))
-    folder = place / name
     try:
-        # For an account without a home it is "~/.cache", which would be a folder in the working one.
-        if not chosen and not place.is_absolute():
-            raise FileNotFoundError("the account has no home folder")
+        # An account without a home has "~/.cache", or none.
+        folder = Path(chosen or platformdirs.user_cache_dir("surgsim")).expanduser() / name
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o700)
         # Nobody takes it for unused.
         os.utime(folder)
         # `os.access` would lie to root and on read-only file systems.
         tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         warnings.warn(
-            f"compiled kernels are lost at the end of this process, and each start compiles for a minute: {place} "
-            f"cannot be written ({error}); set NUMBA_CACHE_DIR to a folder that can",
+            f"no folder can be written for compiled kernels ({error}): they are lost at the end of this process, and "
+            "each start compiles for a minute; set NUMBA_CACHE_DIR to a folder that can be written",
             RuntimeWarning,
             stacklevel=2,
         )
         folder = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         return folder
-    _remove_unused(place)
+    _remove_unused(folder.parent)
     return folder
 
 

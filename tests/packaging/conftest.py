@@ -65,7 +65,7 @@ def copy_of_project(target: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def clean_environ(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment variables without those that point a fresh interpreter at this checkout; an empty user's cache."""
+    """The environment variables that do not point at this checkout or a numba cache, with an empty user's cache."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "NUMBA_", "PYTEST_"))}
     return kept | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
 

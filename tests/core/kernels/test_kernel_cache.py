@@ -173,11 +173,7 @@ def test_without_room_functions_are_compiled_and_one_warning_says_so(source: Pat
 def test_where_nothing_can_be_written_a_temporary_folder_is_used(source: Path, monkeypatch):
     monkeypatch.setattr(numba.config, "CACHE_DIR", "/proc/nowhere")
     hits, (warning,) = used(source)
-    assert hits == 0 and "/proc/nowhere cannot be written" in warning and "NUMBA_CACHE_DIR" in warning
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
-    monkeypatch.setattr(numba_cache.platformdirs, "user_cache_dir", lambda name: f"~/.cache/{name}")
-    with pytest.warns(RuntimeWarning, match="the account has no home folder"):
-        kernels(source)
+    assert hits == 0 and "'/proc/nowhere'" in warning and "NUMBA_CACHE_DIR" in warning
 
 
 def test_folders_of_old_texts_are_removed_in_time(source: Path):

@@ -46,13 +46,14 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
     with SETTINGS_LOCK:
         settings: Any = config
-        place, cache = settings.CACHE_DIR, dispatcher.FunctionCache
+        decorators: Any = dispatcher
+        place, cache = settings.CACHE_DIR, decorators.FunctionCache
         settings.CACHE_DIR = str(_cache_folder(place, f"{FOLDER_PREFIX}{digest}"))
-        dispatcher.FunctionCache = KernelCache
+        decorators.FunctionCache = KernelCache
         try:
             yield
         finally:
-            settings.CACHE_DIR, dispatcher.FunctionCache = place, cache
+            settings.CACHE_DIR, decorators.FunctionCache = place, cache
 
 
 def _cache_folder(chosen: str, name: str) -> Path:

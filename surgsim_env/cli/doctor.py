@@ -113,7 +113,9 @@ def opengl() -> Finding:
 
 def cache() -> Finding:
     """The folder of compiled code."""
-    place = Path(advance_substeps.stats.cache_path).parents[1]
+    path = advance_substeps.stats.cache_path
+    assert path is not None, "advance_substeps is declared with cache=True"
+    place = Path(path).parents[1]
     files = [file for folder in place.glob(f"{FOLDER_PREFIX}*") for file in folder.rglob("*.nb[ic]")]
     text = f"{place}, {sum(file.stat().st_size for file in files) / 1e6:.0f} MB"
     try:

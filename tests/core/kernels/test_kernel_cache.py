@@ -63,27 +63,6 @@ def test_every_function_that_is_kept_is_decorated_within_kernel_cache():
                         assert type(function._cache) in (numba_cache.KernelCache, NullCache), f"{module.name}.{name}"
 
 
-IMPORT_IN_TWO_THREADS = """
-import importlib, os, threading
-from numba.core import config, dispatcher
-before, both = (config.CACHE_DIR, dispatcher.FunctionCache), threading.Barrier(2)
-def load(name):
-    both.wait()
-    importlib.import_module(name)
-threads = [threading.Thread(target=load, args=(name,), daemon=True) for name in ("surgsim_env", "msdm_core")]
-for thread in threads: thread.start()
-for thread in threads: thread.join(60.0)
-if any(thread.is_alive() for thread in threads): os._exit(1)
-print((config.CACHE_DIR, dispatcher.FunctionCache) == before)
-"""
-
-
-def test_both_packages_can_be_imported_by_two_threads_at_once():
-    done = subprocess.run([sys.executable, "-c", IMPORT_IN_TWO_THREADS], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr or "the threads wait for each other"
-    assert done.stdout == "True\n"
-
-
 # ---- two tiny kernels -----------------------------------------------------------------------------------------------
 
 TINY = """

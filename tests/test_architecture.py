@@ -28,7 +28,7 @@ KERNEL_FILES = tuple(
     for package in PACKAGES
     for path in sorted((REPOSITORY / package).rglob(numba_cache.KERNEL_FILES))
 )
-KERNEL_IMPORTS = {"math", "typing", "collections", "operator", "hashlib", "numpy", "numba", "llvmlite"}
+KERNEL_IMPORTS = {"math", "typing", "collections", "operator", "numpy", "numba", "llvmlite"}
 # The one kernels file that imports MuJoCo: it takes its functions, which compiled code calls by name, and a constant.
 MUJOCO_CALLS = "surgsim_env/instruments/mujoco_kernels.py"
 # May import numba, though nothing in it is compiled.
@@ -239,7 +239,6 @@ def kernels_repeat_to_the_bit(source: Source) -> Iterator[str]:
             yield f"line {node.value.lineno}: parallel={ast.unparse(node.value)}"
         if source.path in KERNEL_FILES and isinstance(node, ast.Call):
             function = ast.unparse(node.func)
-            # A kernel that is loaded has no symbols of LAPACK and of numba's random numbers (`HealingCache`).
             if re.fullmatch(
                 r"(math|np|numpy)\.(exp|expm1|log\w*|a?(sin|cos|tan)h?|atan2|arctan2?|pow|power|(linalg|random)\..+)",
                 function,

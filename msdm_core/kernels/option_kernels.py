@@ -4,7 +4,7 @@ Division by zero gives infinity and nan, as in numpy, and no function is wrapped
 references are counted (`_nrt`, numba's runtime): a kernel that makes an array does not compile, and all compile in 0.8
 of the time. A wrapper for Python takes as long to compile as a small function: those that compiled code alone calls
 have none; numba makes machine code of them all the same, and links them into their callers. Calling one of them from
-Python raises TypeError (`msdm_core.numba_cache`).
+Python ends the process (a jump to address 0); call its `py_func`.
 """
 
 from typing import Any

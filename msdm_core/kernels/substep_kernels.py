@@ -15,7 +15,6 @@ from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
 from msdm_core.kernels.layout_kernels import load_part, store_part
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
-from msdm_core.kernels.reference_kernels import by_reference
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
@@ -430,12 +429,11 @@ def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
 @njit(**INNER)
 def advance_inside(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
     """`advance_substeps`, as a part of a kernel that calls it."""
-    model, state, shapes = by_reference(model), by_reference(state), by_reference(shapes)
     lanes = lanes_of(model)
     wrench[:] = 0.0
     _wake(lanes, state)
     _load_rows(lanes, state)
-    rows = by_reference(in_rows(lanes, state))
+    rows = in_rows(lanes, state)
     _begin(lanes, model, rows, shapes, response, dt * substep_count)
     fade_every = max(1, int(FADE_INTERVAL / dt + 0.5))
     faded = 0
@@ -484,8 +482,7 @@ def evaluate_forces(model, state):
     In:  model, state: positions [m] and velocities [m/s] (n_node, 3)
     Out: state: node_force [N] (n_node, 3), volume_ratio_smallest (1,)
     """
-    model, state = by_reference(model), by_reference(state)
     lanes = lanes_of(model)
     _load_rows(lanes, state)
-    _evaluate(model, by_reference(in_rows(lanes, state)), False, 0.0)
+    _evaluate(model, in_rows(lanes, state), False, 0.0)
     _store_force(lanes, state)

@@ -114,8 +114,7 @@ def opengl() -> Finding:
 def cache() -> Finding:
     """The folder of compiled code."""
     path = advance_substeps.stats.cache_path
-    if path is None:
-        return Finding("compiled code", "missing", "no cache: each start compiles for minutes; set NUMBA_CACHE_DIR")
+    assert path is not None, "advance_substeps is declared with cache=True"
     place = Path(path).parents[1]
     files = [file for folder in place.glob(f"{FOLDER_PREFIX}*") for file in folder.rglob("*.nb[ic]")]
     text = f"{place}, {sum(file.stat().st_size for file in files) / 1e6:.0f} MB"

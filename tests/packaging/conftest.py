@@ -54,20 +54,20 @@ def run(command: list[str | Path], *, expect: int = 0, **options) -> str:
 def copy_of_project(target: Path) -> Path:
     """What a build reads, so that a test may change it."""
     target.mkdir(parents=True)
-    without_leftovers = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
     for name in BUILD_INPUTS:
         source = REPOSITORY / name
         if source.is_dir():
-            shutil.copytree(source, target / name, ignore=without_leftovers)
+            shutil.copytree(source, target / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(source, target / name)
     return target
 
 
 @pytest.fixture(scope="session")
-def clean_environ() -> dict[str, str]:
-    """The environment variables without those that point a fresh interpreter at this checkout or a numba cache."""
-    return {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "NUMBA_", "PYTEST_"))}
+def clean_environ(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment variables that do not point at this checkout or a numba cache, with an empty user's cache."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "NUMBA_", "PYTEST_"))}
+    return kept | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
 
 
 @pytest.fixture(scope="session")
@@ -88,7 +88,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel built by way of the source archive, as for a release."""
     folder = tmp_path_factory.mktemp("build")
     project = copy_of_project(folder / "project")
-    for leftover in ("msdm_core/kernels.nbi", "surgsim_env/__pycache__/env.pyc", "scenes/meshes/__pycache__/make.pyc"):
+    for leftover in ("surgsim_env/__pycache__/env.pyc", "scenes/meshes/__pycache__/make.pyc"):
         (project / leftover).parent.mkdir(exist_ok=True)
         (project / leftover).write_text("must not ship")
     run([sys.executable, "-m", "build", "--no-isolation", "--outdir", folder / "dist", project])

@@ -31,7 +31,7 @@ def test_wheel_holds_the_packages_their_data_and_nothing_else(wheel):
     shipped = {name.removeprefix(assets) for name in names if name.startswith(assets)}
     agents = {f"agents/{part}/{name}" for part in AGENTS for name in shipped_files(REPOSITORY / "agents" / part)}
     assert shipped == shipped_files(REPOSITORY / "scenes") | agents
-    assert not [name for name in names if name.endswith((".nbi", ".nbc", ".pyc"))]
+    assert not [name for name in names if name.endswith(".pyc")]
 
 
 def test_wheel_says_that_its_packages_are_typed(wheel):

@@ -41,10 +41,9 @@ from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
-from surgsim_env.scene.digest import content_digest, source_files
+from surgsim_env.scene.digest import PHYSICS_VERSION
 from surgsim_env.scoring.episodes import AgentActor, EpisodeActor, agent_generator, episode_facts
-from surgsim_env.scoring.evaluate import named_class, strangers_agent
-from surgsim_env.scoring.origin import file_digest
+from surgsim_env.scoring.evaluate import strangers_agent
 from surgsim_env.scoring.results import SITES
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.scripting.observations import stacked_observations
@@ -201,20 +200,6 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any], *, trust_pickle
     env_id = env.spec.id
     actor = AgentActor(make, site_facts if env_id == SITES else lambda one: episode_facts(one, env_id, env_arguments))
     return lambda env, seed: play_actor(env, seed, actor)
-
-
-def player_digests(by: str) -> dict[str, str]:
-    """Digests of what a player consists of, by the name of each file, or of the oracle's code; none of a person."""
-    if by == "oracle":
-        return {"scripting": content_digest(*source_files("scripting"))}
-    if by == "keyboard":
-        return {}
-    if by.endswith(POLICY_SUFFIXES):
-        files = [Path(by), Path(by).with_suffix(".json")]
-    else:
-        source = inspect.getsourcefile(named_class(by, "--by"))
-        files = [] if source is None else [Path(source)]
-    return {path.name: file_digest(path) for path in files}
 
 
 def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
@@ -457,7 +442,7 @@ def _record_lerobot(given: argparse.Namespace, who: str) -> None:
             "recorded_by": who,
             "first_seed": given.first_seed,
             "failures_kept": given.keep_failures,
-            "digests": {**inner.digests(), **player_digests(given.by)},
+            "physics_version": PHYSICS_VERSION,
         },
         first_seed=given.first_seed,
     )

@@ -50,7 +50,7 @@ ORDER = {
             "leaderboard_tables",
             "leaderboard",
         ),
-        *("palpation_figures", "organ_film", "learning_curves", "convert_policy", "replay_results"),
+        *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

@@ -303,26 +303,6 @@ def test_episodes_of_a_sampled_policy_are_those_of_their_seeds():
     np.testing.assert_array_equal(first, again)
 
 
-def test_a_recording_does_not_go_on_with_another_policy_of_the_same_name(tmp_path):
-    from agents.lerobot_format import Feature, LeRobotFolder
-    from agents.record_demonstrations import player_digests
-    from surgsim_env.scoring.evaluate import policies_folder
-
-    named = []
-    for name in ("retract_scratch", "retract_dagger"):
-        folder = tmp_path / name
-        folder.mkdir()
-        for suffix in (".safetensors", ".json"):
-            shutil.copy(policies_folder() / f"{name}{suffix}", folder / f"policy{suffix}")
-        named.append(player_digests(str(folder / "policy.safetensors")))
-    assert set(named[0]) == set(named[1]) == {"policy.safetensors", "policy.json"} and named[0] != named[1]
-    writer = {"frame_rate": 20, "robot": "probe", "task": "Wait.", "first_seed": 0}
-    features = [Feature("action", "float32", (2,), ("along", "across"))]
-    LeRobotFolder(tmp_path / "set", features, recorded={"digests": named[0]}, **writer).close()
-    with pytest.raises(ValueError, match=r"policy\.safetensors"):
-        LeRobotFolder(tmp_path / "set", features, recorded={"digests": named[1]}, **writer)
-
-
 def test_a_control_step_without_a_whole_rate_is_refused(tmp_path):
     text = (scenes_folder() / "organs" / "phantom_small.toml").read_text(encoding="utf-8")
     assert "haptic_steps_per_control = 50" in text

@@ -47,6 +47,8 @@ def write_dataset(
             f"the control step of {inner.scene.name} is {step:g} s; a data set has a whole number of frames a second: "
             "set timing.haptic_steps_per_control of the scene, as to 50 for 20 frames a second"
         )
+    # Pictures have a size from the first reset on.
+    env.reset(seed=0)
     dataset = LeRobotDataset.create(
         folder.name,
         rate,

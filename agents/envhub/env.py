@@ -47,6 +47,9 @@ class LeRobotEnv(gym.Wrapper):
     def __init__(self, env: gym.Env, cameras: list[str]) -> None:
         super().__init__(env)
         self.cameras, self.task_description = cameras, describe_task(env)
+        task: Any = env.unwrapped.task  # type: ignore[attr-defined]
+        # LeRobot asks for it by this name; where episodes are of presses, a step is a press.
+        self._max_episode_steps = task.episode_steps or task.budget
         env.reset(seed=0)
         self.observation_space = _space(observe(env, cameras))
 
@@ -123,10 +126,10 @@ def make_env(
 
     Args:
         n_envs: side by side.
-        use_async_envs: each in a process of its own.
+        use_async_envs: each in a process of its own, if there are several.
         cfg: names id, cameras and arguments; None: all of IDS, by state and wrench.
     """
-    kind: Any = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    kind: Any = gym.vector.AsyncVectorEnv if use_async_envs and n_envs > 1 else gym.vector.SyncVectorEnv
     ids = IDS if cfg is None else (str(cfg.task),)
     cameras, arguments = getattr(cfg, "cameras", []), getattr(cfg, "arguments", {})
     # LeRobot reads successes of the `final_info` that this mode gives.

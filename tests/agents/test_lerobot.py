@@ -1,6 +1,5 @@
 """LeRobot writes what is recorded here, reads it back, and plays the environments."""
 
-import importlib.util
 import json
 from pathlib import Path
 
@@ -129,8 +128,11 @@ class Idle(torch.nn.Module):
 def test_lerobot_plays_what_its_hub_gives(monkeypatch):
     """`make_env` of a repository's env.py, here from the disk, and a roll-out as `lerobot-eval` makes it."""
     from lerobot.envs import factory
+    from lerobot.envs.configs import EnvConfig
     from lerobot.scripts.lerobot_eval import rollout
 
+    # Other tests import the file as a plugin, in this process.
+    monkeypatch.setattr(EnvConfig, "_choice_registry", {})
     found = ("surgsim/envs", "env.py", str(ENV_FILE), None)
     monkeypatch.setattr(factory, "_download_hub_file", lambda *given: found)
     envs = factory.make_env("surgsim/envs", n_envs=2, trust_remote_code=True)
@@ -142,16 +144,18 @@ def test_lerobot_plays_what_its_hub_gives(monkeypatch):
 
 
 def test_lerobot_eval_plays_an_id(tmp_path, monkeypatch):
-    """The command, with an untrained policy."""
+    """The command, with an untrained policy on pictures."""
     with_pictures()
     from lerobot.scripts.lerobot_eval import main
-    from lerobot.utils import import_utils
 
-    assert importlib.util.find_spec("agents.envhub")
-    monkeypatch.setattr(import_utils, "register_third_party_plugins", lambda: None)
     arguments = ["--env.discover_packages_path=agents.envhub", "--env.type=surgsim", f"--env.task={ID}"]
     arguments += ["--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--eval.batch_size=1"]
-    arguments += ["--eval.n_episodes=1", "--policy.pretrained_backbone_weights=null", f"--output_dir={tmp_path}"]
+    arguments += [
+        "--eval.n_episodes=1",
+        "--policy.pretrained_backbone_weights=null",
+        "--env.cameras=[endoscope]",
+        f"--output_dir={tmp_path}",
+    ]
     arguments += ['--env.arguments={"max_episode_steps": 3, "width": 96, "height": 64}']
     monkeypatch.setattr("sys.argv", ["lerobot-eval", *arguments])
     main()

@@ -16,12 +16,9 @@ UV := uv==0.13.9
 TORCH := torch==2.13.0
 WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
 WITH_RAY := --editable=.[dev,distributed]
-# LeRobot 0.3 is the last that reads data sets of format v2.1. It asks for older Gymnasium and torch, and for cameras and
-# motors: beside it is what its loader imports. torchvision 0.15.2 (Python 3.11) is the last that a torch without CUDA of
-# any version lets in; the loader decodes videos with it.
-LEROBOT := lerobot==0.3.3 torchvision==0.15.2
-WITH_LEROBOT := --editable=.[dev,demonstrations] huggingface_hub~=0.34 datasets==3.6.0 draccus==0.10.0 tqdm av jsonlines \
-    einops pandas termcolor
+# LeRobot asks for numpy below 2.3, this project for 2.3 or later, and LeRobot runs with it: pip installs the second over
+# the first, and says so.
+WITH_LEROBOT := lerobot[dataset]==0.6.1 --editable=.[dev,demonstrations]
 
 # A file's tests run in one worker, which makes what they share once.
 PYTEST_ARGS ?= -n 2 --dist loadfile
@@ -36,7 +33,7 @@ help:
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch); make test-agents-all the slow ones too"
 	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
-	@echo "make test-lerobot  those that read data sets with LeRobot, in $(VENV)-lerobot (Python 3.11; installs 2.2 GB)"
+	@echo "make test-lerobot  those that need LeRobot, in $(VENV)-lerobot (Python 3.12 or 3.13; installs 5 GB)"
 	@echo "make test-newest  the core's and the environments' with the newest versions that are allowed, in $(VENV)-newest"
 	@echo "make test-oldest  the same with the lowest ones, in $(VENV)-oldest (Python 3.11)"
 	@echo "make lock         renew $(CONSTRAINTS), the versions that make installs"
@@ -78,10 +75,12 @@ test-distributed:
 with-ray: $(VENV)/.ready-distributed
 	$(PY) -m pytest tests/agents -m "distributed and not slow"
 
-# LeRobot likewise.
+# LeRobot 0.6 likewise, from Python 3.12 on.
 test-lerobot:
 	@$(MAKE) --no-print-directory VENV=$(VENV)-lerobot with-lerobot
 
+with-lerobot: CANDIDATES = $(or $(PYTHON),$(PYTHONS))
+with-lerobot: SUITABLE = (3, 12) <= sys.version_info[:2] <= (3, 13)
 with-lerobot: $(VENV)/.ready-lerobot
 	$(PY) -m pytest tests/agents/test_lerobot.py -m lerobot
 
@@ -225,10 +224,7 @@ $(VENV)/.ready-distributed: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,$(TORCH) $(WITH_RAY))
 
 $(VENV)/.ready-lerobot: pyproject.toml $(VENV)/.made
-	$(call install,$(TORCH) $(WITH_LEROBOT))
-	@rm $@
-	$(PY) -m pip install -qq --disable-pip-version-check --no-deps $(LEROBOT)
-	@touch $@
+	$(call install,$(WITH_LEROBOT))
 
 $(VENV)/.ready-bench: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,--editable=.[bench])

@@ -86,8 +86,8 @@ Student's t over training seeds (which may pass 100 %); "never" where one of the
 **sees truth** know what is hidden: `truth` reports it, the oracles press with that knowledge. Where the patient moves,
 presses and oracles track the surface by markers; methods whose name ends in `untracked` press at the rest position.
 How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
-`surgsim evaluate --compare A B`, for results with equal digests. Tables without the references `truth` and `middle`
-are drawn in the pictures.
+`surgsim evaluate --compare A B`, for results of one version of the physics. Tables without the references `truth` and
+`middle` are drawn in the pictures.
 """
 
 
@@ -112,7 +112,7 @@ def _sites(place: str, rows: list[Result], folder: Path) -> str:
         f"{len(lesions)} organs (seeds {seeds_text(first.seeds)}), {sum(lesions)} lesions, "
         f"{lesions.count(0)} organs without one; {first.budget} presses.{_reach(place, folder)}\n"
     )
-    parts = [f"\n## {_title(first)}\n", organs + _versions(rows), _table(rows, PLACES), "", _table(rows, MAPS)]
+    parts = [f"\n## {_title(first)}\n", organs, _table(rows, PLACES), "", _table(rows, MAPS)]
     return "\n".join(parts)
 
 
@@ -123,18 +123,7 @@ def _tasks(place: str, rows: list[Result]) -> str:
     most = max(counts.values())
     fewer = "".join(f", {count} of {method}" for method, count in counts.items() if count < most)
     seeds = f"{most} episodes{fewer} (seeds from {rows[0].seeds[0]}), at most {rows[0].budget} control steps.\n"
-    return "\n".join([f"\n## {_title(rows[0])}\n", seeds + _versions(rows), _table(rows, used)])
-
-
-def _versions(rows: Sequence[Result]) -> str:
-    """Which methods were played with different versions of the environment's source; "" where all with one."""
-    groups: dict[str, list[str]] = {}
-    for row in rows:
-        groups.setdefault(json.dumps(row.origin.get("environment"), sort_keys=True), []).append(shown_name(row))
-    if len(groups) == 1:
-        return ""
-    listed = "; ".join(", ".join(names) for names in groups.values())
-    return f"Played with {len(groups)} versions of the source, which `--compare` does not mix: {listed}.\n"
+    return "\n".join([f"\n## {_title(rows[0])}\n", seeds, _table(rows, used)])
 
 
 def _title(result: Result) -> str:

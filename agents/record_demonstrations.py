@@ -3,11 +3,10 @@
     python -m agents.record_demonstrations SurgSim/Retract-v0 --episodes 100 --dataset surgsim/retract/oracle-v0
     python -m agents.record_demonstrations SurgSim/Palpate-v0 --by agents.raster:RasterAgent \
         --dataset surgsim/palpate/raster-v0
-    python -m agents.record_demonstrations SurgSim/Palpate-v0 --format lerobot --dataset runs/palpate --hours 5 \
+    python -m agents.record_demonstrations SurgSim/Palpate-v0 --format lerobot --dataset runs/palpate --episodes 100 \
         --images endoscope --keep-failures
 
-With `--format lerobot` the data set is the folder `--dataset` (`agents/lerobot_format.py`, docs/datasets.md). Its
-episodes are written one by one, and the same command goes on where it was stopped.
+With `--format lerobot` the data set is the folder `--dataset` (`agents/lerobot_dataset.py`, docs/datasets.md).
 
 Minari's datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored
 with its seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations
@@ -21,11 +20,9 @@ environment:
 
 import argparse
 import copy
-import inspect
 import json
-import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,14 +34,12 @@ from numpy.typing import NDArray
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
 from agents.keyboard import Keyboard
-from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
-from surgsim_env.scene.digest import content_digest, source_files
+from surgsim_env.scene.digest import PHYSICS_VERSION
 from surgsim_env.scoring.episodes import AgentActor, EpisodeActor, agent_generator, episode_facts
-from surgsim_env.scoring.evaluate import named_class, strangers_agent
-from surgsim_env.scoring.origin import file_digest
+from surgsim_env.scoring.evaluate import strangers_agent
 from surgsim_env.scoring.results import SITES
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.scripting.observations import stacked_observations
@@ -57,30 +52,25 @@ with one_line_errors(__name__, "agents", "demonstrations"):
     from minari.storage.datasets_root_dir import get_dataset_path
     from tqdm import tqdm
 
-    from agents.lerobot_format import LeRobotFolder
-    from agents.recorded_features import PICTURES, Reading, features, readings
-
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".safetensors", ".zip")
-# Least frames a second of a LeRobot data set.
-LEAST_RATE = 20
-# With --hours alone a recording ends when so many episodes in a row added nothing.
-FAILURES_MOST = 100
 
 # Plays one episode in an environment, reset with a seed.
 Player = Callable[[gym.Env, int], None]
+# Reads what a recording holds of a moment beside observation and info.
+Reading = Callable[[gym.Env], dict[str, Any]]
 
 
 @dataclass
 class RecordedEpisode:
-    """A recorded episode, with one observation, one info and one of each reading more than actions."""
+    """A recorded episode, with one observation, one info and one reading more than actions."""
 
     seed: int | None
     observations: list[Any] = field(default_factory=list)
     infos: list[dict[str, float]] = field(default_factory=list)
     actions: list[NDArray] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
-    readings: dict[str, list[NDArray]] = field(default_factory=dict)
+    readings: list[dict[str, Any]] = field(default_factory=list)
     terminated: bool = False
     truncated: bool = False
 
@@ -88,18 +78,6 @@ class RecordedEpisode:
     def success(self) -> bool:
         """Success according to the last info."""
         return bool(self.infos[-1].get("success", False))
-
-    def frames(self) -> dict[str, NDArray]:
-        """The episode in LeRobot's form: for each action the observation before it and the reward after it."""
-        ends = np.zeros(len(self.actions), dtype=np.bool_)
-        ends[-1] = True
-        return {
-            "action": np.array(self.actions),
-            **{name: np.array(values[:-1]) for name, values in self.readings.items()},
-            "next.reward": np.array(self.rewards, dtype=np.float32),
-            "next.done": ends,
-            "next.success": np.array([bool(info.get("success", False)) for info in self.infos[1:]]),
-        }
 
     def buffer(self, index: int, observation_space: gym.Space) -> EpisodeBuffer:
         """The episode in Minari's form; an unfinished episode counts as truncated."""
@@ -122,12 +100,12 @@ class Recorder(gym.Wrapper):
 
     Args:
         env: the environment.
-        readings: functions of it that are read with each observation, by name.
+        read: called with each observation.
     """
 
-    def __init__(self, env: gym.Env, readings: "Mapping[str, Reading] | None" = None) -> None:
+    def __init__(self, env: gym.Env, read: Reading | None = None) -> None:
         super().__init__(env)
-        self._readings = readings or {}
+        self._read = read
         self.all_episodes: list[RecordedEpisode] = []
 
     @property
@@ -156,8 +134,8 @@ class Recorder(gym.Wrapper):
         """Record observation and info; Minari stores infos as typed arrays, so only numbers and booleans are kept."""
         episode = self.all_episodes[-1]
         episode.observations.append(copy.deepcopy(observation))
-        for name, read in self._readings.items():
-            episode.readings.setdefault(name, []).append(np.array(read(self.env)))
+        if self._read is not None:
+            episode.readings.append(self._read(self.env))
         episode.infos.append({name: value for name, value in info.items() if isinstance(value, bool | int | float)})
 
 
@@ -203,20 +181,6 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any], *, trust_pickle
     return lambda env, seed: play_actor(env, seed, actor)
 
 
-def player_digests(by: str) -> dict[str, str]:
-    """Digests of what a player consists of, by the name of each file, or of the oracle's code; none of a person."""
-    if by == "oracle":
-        return {"scripting": content_digest(*source_files("scripting"))}
-    if by == "keyboard":
-        return {}
-    if by.endswith(POLICY_SUFFIXES):
-        files = [Path(by), Path(by).with_suffix(".json")]
-    else:
-        source = inspect.getsourcefile(named_class(by, "--by"))
-        files = [] if source is None else [Path(source)]
-    return {path.name: file_digest(path) for path in files}
-
-
 def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
     """Play one episode, with the random numbers with which the episode of this seed is scored."""
     observation, _ = env.reset(seed=seed)
@@ -229,8 +193,10 @@ def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
     actor.end(0)
 
 
-def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False) -> list[RecordedEpisode]:
-    """Play an episode for each seed; returns those that succeeded, or all.
+def record(
+    env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False, read: Reading | None = None
+) -> Iterator[RecordedEpisode]:
+    """Play an episode for each seed; yields those that succeeded, or all.
 
     Ctrl-C, and a person who closes the window, end it with the episodes that were played to their end.
 
@@ -238,19 +204,18 @@ def record(env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: b
         ValueError: seeds that are reserved for scores.
     """
     check_seeds(seeds)
-    recorder = Recorder(env)
-    # Of `all_episodes`, those that were played to their end.
-    whole = 0
+    recorder, success_count = Recorder(env, read), 0
     with tqdm(seeds, unit="episode") as progress:
-        try:
-            for seed in progress:
+        for index, seed in enumerate(progress):
+            recorder.all_episodes.clear()
+            try:
                 play(recorder, seed)
-                whole = len(recorder.all_episodes)
-                progress.set_postfix(success=f"{np.mean([episode.success for episode in recorder.episodes]):.0%}")
-        except KeyboardInterrupt:
-            del recorder.all_episodes[whole:]
-            print(f"stopped after {whole} of {len(seeds)} episodes")
-    return [episode for episode in recorder.episodes if keep_failures or episode.success]
+            except KeyboardInterrupt:
+                print(f"stopped after {index} of {len(seeds)} episodes")
+                return
+            success_count += sum(episode.success for episode in recorder.episodes)
+            progress.set_postfix(success=f"{success_count / (index + 1):.0%}")
+            yield from (episode for episode in recorder.episodes if keep_failures or episode.success)
 
 
 def check_seeds(seeds: Iterable[int]) -> None:
@@ -262,71 +227,6 @@ def check_seeds(seeds: Iterable[int]) -> None:
     kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
     if kept is not None:
         raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
-
-
-def record_into(
-    folder: LeRobotFolder,
-    env: gym.Env,
-    play: Player,
-    *,
-    last_seed: int | None = None,
-    hours: float | None = None,
-    keep_failures: bool = False,
-) -> None:
-    """Play an episode for each seed from the folder's next on, write each at once, and append the failures at the end.
-
-    Args:
-        folder: whose features are those of the environment.
-        env: where it is played.
-        play: plays.
-        last_seed: the last to be played; None without such a limit.
-        hours: simulated time of the whole data set from which on no episode is played [h]; None likewise.
-        keep_failures: write them too.
-
-    Raises:
-        ValueError: the next seed is reserved for scores, or FAILURES_MOST episodes in a row added nothing and only
-            `hours` would end the recording; what was recorded before is whole.
-    """
-    known = readings([name.removeprefix(PICTURES) for name in folder.feature_names if name.startswith(PICTURES)])
-    recorder = Recorder(env, known)
-    first, most, failures = folder.next_seed, math.inf if last_seed is None else last_seed, 0
-    progress = tqdm(unit="episode", total=None if last_seed is None else max(last_seed + 1 - first, 0))
-    try:
-        while folder.next_seed <= most and (hours is None or folder.duration < 3600.0 * hours):
-            seed = folder.next_seed
-            check_seeds([seed])
-            recorder.all_episodes.clear()
-            try:
-                play(recorder, seed)
-            except KeyboardInterrupt:
-                print("stopped; the same command goes on")
-                break
-            episode = recorder.all_episodes[0]
-            if episode.actions and (episode.success or keep_failures):
-                folder.add(seed, episode.frames(), success=episode.success)
-                failures = 0
-            else:
-                folder.skip(seed)
-                failures += 1
-            progress.update()
-            progress.set_postfix(hours=f"{folder.duration / 3600.0:.3f}", failures=len(folder.waiting))
-            if last_seed is None and failures == FAILURES_MOST:
-                break
-        folder.finish()
-    except KeyboardInterrupt:
-        # A half-written episode is removed when the folder is opened again, and by nothing before.
-        raise SystemExit("stopped while an episode was written; the same command goes on") from None
-    finally:
-        progress.close()
-    if last_seed is None and failures == FAILURES_MOST:
-        # Who plays and what is kept are those of the folder.
-        raise ValueError(
-            f"the last {failures} episodes, up to seed {folder.next_seed - 1}, all "
-            f"{'had no step' if keep_failures else 'failed'}, and {folder.duration / 3600.0:.3f} of {hours:g} h are "
-            "recorded: limit the number of seeds by --episodes, or record into another folder with another --by"
-            + " or with --keep-failures"
-            * (not keep_failures)
-        )
 
 
 def check_dataset_name(name: str) -> None:
@@ -396,7 +296,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
     parser.add_argument("--by", default="oracle", help="oracle, keyboard, a policy's NAME.safetensors, or MODULE:CLASS")
     parser.add_argument("--trust-pickle", action="store_true", help="let --by be a zip, which runs code of its author")
-    parser.add_argument("--episodes", type=int, help="number of episodes to play; 10 by default")
+    parser.add_argument("--episodes", type=int, default=10, help="number of episodes to play")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
     parser.add_argument(
@@ -404,7 +304,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--format", choices=("minari", "lerobot"), default="minari")
     lerobot = parser.add_argument_group("with --format lerobot")
-    lerobot.add_argument("--hours", type=float, help="play until so much simulated time is recorded [h]")
     lerobot.add_argument("--images", nargs="+", choices=CAMERAS, default=[], help="cameras whose pictures are recorded")
     lerobot.add_argument("--image-size", nargs=2, type=int, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
     given = parser.parse_args(arguments)
@@ -412,73 +311,50 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.format == "lerobot":
         _record_lerobot(given, who)
         return
-    if given.hours is not None or given.images:
-        raise ValueError("--hours and --images are for --format lerobot: add it, or leave them out")
+    if given.images:
+        raise ValueError("--images is for --format lerobot: add it, or leave --images out")
     check_dataset_name(given.dataset)
     env = gym.make(given.env, **given.env_arguments)
-    seeds = range(given.first_seed, given.first_seed + (10 if given.episodes is None else given.episodes))
-    play = player(given.by, env, given.env_arguments, trust_pickle=given.trust_pickle)
-    episodes = record(env, play, seeds, keep_failures=given.keep_failures)
-    dataset = write_dataset(episodes, env, given.dataset, algorithm_name=who)
+    dataset = write_dataset(list(_episodes(given, env)), env, given.dataset, algorithm_name=who)
     print(
         f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps, in {dataset.spec.data_path}"
     )
 
 
+def _episodes(given: argparse.Namespace, env: gym.Env, read: Reading | None = None) -> Iterator[RecordedEpisode]:
+    """The episodes that the command line asks for."""
+    seeds = range(given.first_seed, given.first_seed + given.episodes)
+    play = player(given.by, env, given.env_arguments, trust_pickle=given.trust_pickle)
+    return record(env, play, seeds, keep_failures=given.keep_failures, read=read)
+
+
 def _record_lerobot(given: argparse.Namespace, who: str) -> None:
     """Record as the command line says."""
+    from agents import lerobot_dataset
+    from agents.envhub.env import observe
+
     width, height = given.image_size
-    if given.images and (width % 2 or height % 2 or min(width, height) < 16):
-        raise ValueError(f"--image-size is {width} {height}; H.264 takes even numbers of pixels from 16 on")
-    if given.hours is not None and not 0.0 < given.hours < math.inf:
-        raise ValueError(f"--hours is {given.hours:g}; it must be above 0")
     sight = {"show_force": False, "width": width, "height": height} if given.images else {}
     env = gym.make(given.env, **sight, **given.env_arguments)
-    inner = env.unwrapped
-    if not isinstance(inner, SurgicalEnv):
-        raise ValueError(f"{given.env} is a {type(inner).__name__}; frames are read from environments of this project")
-    count = 10 if given.episodes is None and given.hours is None else given.episodes
-    rate, step = round(1.0 / inner.scene.timing.control_step), inner.scene.timing.control_step
-    if rate < LEAST_RATE or abs(rate * step - 1.0) > 1e-9:
-        raise ValueError(
-            f"the control step of {inner.scene.name} is {step:g} s; a data set has a whole number of frames a second, "
-            f"at least {LEAST_RATE}: set timing.haptic_steps_per_control of the scene, as to 50 for 20 frames a second"
-        )
-    folder = LeRobotFolder(
-        Path(given.dataset),
-        features(env, given.images, width=width, height=height),
-        frame_rate=rate,
-        robot=Path(inner.scene.instrument.model).stem,
-        task=(inspect.getdoc(type(inner.task)) or type(inner.task).__name__).splitlines()[0],
-        recorded={
-            "env_id": given.env,
-            "env_arguments": given.env_arguments,
-            "scene": inner.scene.name,
-            "recorded_by": who,
-            "first_seed": given.first_seed,
-            "failures_kept": given.keep_failures,
-            "digests": {**inner.digests(), **player_digests(given.by)},
-        },
-        first_seed=given.first_seed,
-    )
     try:
-        record_into(
-            folder,
+        dataset = lerobot_dataset.write_dataset(
+            Path(given.dataset),
             env,
-            player(given.by, env, given.env_arguments, trust_pickle=given.trust_pickle),
-            last_seed=None if count is None else given.first_seed + count - 1,
-            hours=given.hours,
-            keep_failures=given.keep_failures,
+            _episodes(given, env, lambda env: observe(env, given.images)),
+            cameras=given.images,
+            recorded={
+                "env_id": given.env,
+                "env_arguments": given.env_arguments,
+                "recorded_by": who,
+                "failures_kept": given.keep_failures,
+                "physics_version": PHYSICS_VERSION,
+            },
         )
     except NoGLError as error:
         raise ValueError(f"--images: {error}; or leave --images out") from None
     finally:
-        folder.close()
         env.close()
-    print(
-        f"{folder.path}: {folder.episode_count} episodes, {folder.frame_count} frames, "
-        f"{folder.duration / 3600.0:.3f} h of simulated time"
-    )
+    print(f"{dataset.root}: {dataset.num_episodes} episodes, {dataset.num_frames} frames")
 
 
 if __name__ == "__main__":

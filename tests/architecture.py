@@ -43,15 +43,15 @@ ORDER = {
         *("__init__", "command_line", "raster", "keyboard", "make_press_library", "record_faces", "learn_palpate"),
         *("learn_palpate_organs", "learn_palpate_recurrent", "learn_retract", "learn_retract_pixels", "learn_sites"),
         *(
-            "lerobot_format",
-            "recorded_features",
+            "envhub",
+            "lerobot_dataset",
             "record_demonstrations",
             "behaviour_cloning",
             "train_rllib",
             "leaderboard_tables",
             "leaderboard",
         ),
-        *("palpation_figures", "organ_film", "learning_curves", "convert_policy", "replay_results"),
+        *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

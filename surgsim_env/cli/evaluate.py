@@ -13,7 +13,7 @@ from surgsim_env.scoring.options import ScoringOptions
 class Evaluate:
     """Score a method on fixed seeds: a search or a script by name, a trained policy, or an agent of your own.
 
-    Give one of --agent, --policy, --all, --reach, --compare and --check. Results, the agents' interface and what makes
+    Give one of --agent, --policy, --all, --reach and --compare. Results, the agents' interface and what makes
     a score comparable: docs/own_agent.md. Reading NAME.safetensors runs no code of its author; a zip of
     stable-baselines3 is read with --trust-pickle only.
     """
@@ -28,20 +28,18 @@ class Evaluate:
     """Count the lesions below the sensor's reach."""
     compare: tuple[str, str] | None = None
     """Two methods of --results on this scene and level, or two files."""
-    check: MaybePath = None
-    """Whether this result can be compared with those made here."""
     played: ScoringOptions = field(default_factory=ScoringOptions)
 
     def run(self, console: Console) -> int:
         """Play, print and write; returns 0.
 
         Raises:
-            ValueError: not one of the six, options that do not go with it, a missing package, an unknown method.
+            ValueError: not one of the five, options that do not go with it, a missing package, an unknown method.
         """
-        asked = [name for name in ("agent", "policy", "all", "reach", "compare", "check") if getattr(self, name)]
+        asked = [name for name in ("agent", "policy", "all", "reach", "compare") if getattr(self, name)]
         if len(asked) != 1:
             told = " and ".join(f"--{name}" for name in asked) or "none"
-            raise ValueError(f"give one of --agent, --policy, --all, --reach, --compare, --check; given: {told}")
+            raise ValueError(f"give one of --agent, --policy, --all, --reach, --compare; given: {told}")
         options = self.played
         if options.video is not None and self.policy is None:
             raise ValueError("--video films a policy: give --policy as well")
@@ -70,6 +68,4 @@ class Evaluate:
                 evaluate.write_reach(options, console)
             elif self.compare is not None:
                 evaluate.print_comparison(*self.compare, options, console)
-            elif self.check is not None:
-                evaluate.check(self.check, console)
         return 0

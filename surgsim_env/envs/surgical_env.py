@@ -1,11 +1,9 @@
 """The Gymnasium environment: it puts a simulation and a task together and computes no physics and no reward itself."""
 
-import inspect
 import io
 import json
 import math
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -16,7 +14,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import check_entries
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
-from surgsim_env.scene.digest import content_digest, instrument_files, scene_digest, source_files
+from surgsim_env.scene.digest import scene_digest
 from surgsim_env.scene.load import fill
 from surgsim_env.tasks.declaration import documentation
 from surgsim_env.tasks.task import Task
@@ -36,8 +34,6 @@ DRAWS_MOST = 20
 # Kinds of observation, and the size of an observed picture [pixels].
 OBSERVATION_MODES = ("state", "rgb", "rgb_force")
 PICTURE_SIZE = 84
-# Rooms of surgsim_env whose code decides an episode.
-EPISODE_ROOMS = ("scene", "instruments", "coupling", "palpation", "tasks", "envs")
 # Version of the format of saved states.
 STATE_VERSION = 1
 
@@ -275,19 +271,6 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._view.close()
         if self._eye is not None:
             self._eye.close()
-
-    def digests(self) -> dict[str, str]:
-        """Hashes of what decides an episode beside the seed and the environment's arguments.
-
-        "scene" is of the scene, its mesh and the instrument's files, "source" of the code of organ, instruments, tasks
-        and environments, with the task's own file. Equal ones on two machines mean the same episodes.
-        """
-        scene, rooms = self.scene, EPISODE_ROOMS if self._eye is None else (*EPISODE_ROOMS, "rendering")
-        own = Path(inspect.getsourcefile(type(self.task)) or __file__)
-        return {
-            "scene": content_digest(scene_digest(scene, self._mesh), *instrument_files(scene)),
-            "source": content_digest(*source_files(*rooms), own),
-        }
 
     def save_state(self) -> bytes:
         """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed.

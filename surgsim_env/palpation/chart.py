@@ -22,7 +22,7 @@ from surgsim_env.palpation.scene_options import with_substeps
 from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
-from surgsim_env.scene.digest import content_digest, source_files
+from surgsim_env.scene.digest import PHYSICS_VERSION, content_digest
 from surgsim_env.scene.family import KEPT_MOST
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
@@ -452,7 +452,7 @@ def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
 
 
 def map_digest(anatomy: Anatomy) -> str:
-    """Hash of everything that determines the map, including the source of the organ and of the press."""
+    """Hash of what determines the map: the scene without its lesions, the instrument's file, the physics' version."""
     scene = anatomy.scene
     parts = (
         *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing, scene.limits),
@@ -460,12 +460,8 @@ def map_digest(anatomy: Anatomy) -> str:
         tuple(region for region in scene.regions if not region.lesion),
         tuple(one for one in scene.anchors if one.is_elastic),
     )
-    here = Path(__file__)
-    scenes = here.parents[1] / "scene"
-    sources = (scenes / "palpable_surface.py", scenes / "anatomy.py", here.with_name("press.py"), here)
-    instrument = scenes_folder() / "instruments" / scene.instrument.model
-    arrays = (anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors)
-    return content_digest(*arrays, parts, *sources, *source_files("instruments", "coupling"), instrument)
+    instrument = (scenes_folder() / "instruments" / scene.instrument.model).read_bytes()
+    return content_digest(anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors, parts, instrument, PHYSICS_VERSION)
 
 
 def cache_folder() -> Path | None:

@@ -8,7 +8,6 @@ to all.
 
 import contextlib
 from collections import OrderedDict
-from pathlib import Path
 from threading import Lock
 
 import numpy as np
@@ -79,7 +78,7 @@ def member_map(template: Anatomy, name: MemberName, progress: StepProgress | Non
 def _read_or_press(member: Anatomy, progress: StepProgress | None) -> HealthyMap:
     template, folder = member.template, cache_folder()
     assert template is not None
-    digest = content_digest(Path(__file__), map_digest(template), map_digest(member))
+    digest = content_digest(map_digest(template), map_digest(member))
     path = None if folder is None else folder / f"healthy-{digest}.npy"
     with contextlib.suppress(OSError, ValueError, EOFError):
         if path is not None:

@@ -42,7 +42,7 @@ def compare(one: Sequence[Result], other: Sequence[Result], rng: np.random.Gener
     and so on, where EPISODES_LEAST episodes have as many.
 
     Raises:
-        ValueError: results of other seeds or another environment, or without single episodes or digests (names both).
+        ValueError: results of other seeds, environments or physics, or without single episodes (names both).
     """
     _check([*one, *other])
     groups = [[_Episodes.of(result) for result in group] for group in (one, other)]
@@ -125,11 +125,6 @@ def _check(results: Sequence[Result]) -> None:
     for result in results:
         if not result.successes:
             raise ValueError(f"the result of {result.method} does not list its episodes: evaluate it again")
-        if "environment" not in result.origin:
-            raise ValueError(
-                f"the result of {result.method} has no digests of its environment, as an earlier version wrote it: "
-                "evaluate it again"
-            )
         for fault in _faults(first, result):
             raise ValueError(f"{first.method} and {result.method} cannot be compared: {fault}: evaluate both again")
 
@@ -139,9 +134,8 @@ def _faults(one: Result, other: Result) -> Iterator[str]:
         yield f"their seeds are {seeds_text(one.seeds)} and {seeds_text(other.seeds)}"
     if (one.env_id, one.place) != (other.env_id, other.place) or one.budget != other.budget:
         yield f"they played {one.place} with {one.budget} steps and {other.place} with {other.budget}"
-    pair = [result.origin["environment"] for result in (one, other)]
-    if pair[0] != pair[1]:
-        yield f"the digests of their environments differ, {pair[0]} and {pair[1]}"
+    if one.physics_version != other.physics_version:
+        yield f"their physics versions are {one.physics_version} and {other.physics_version}"
 
 
 @dataclass(frozen=True, eq=False)

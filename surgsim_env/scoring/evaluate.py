@@ -6,7 +6,6 @@ scene and level. Other results are printed, and written where the options `resul
 
 import datetime
 import importlib
-import inspect
 import json
 import math
 import sys
@@ -22,8 +21,8 @@ from rich.console import Console
 
 from surgsim_env.palpation.scores import PalpationRecord, press_errors, score, with_intervals
 from surgsim_env.reports.step_progress import StepProgress
+from surgsim_env.scene.digest import PHYSICS_VERSION
 from surgsim_env.scene.load import agents_folder, list_scenes, make_scene
-from surgsim_env.scoring import site_search
 from surgsim_env.scoring.comparison import compare, describe
 from surgsim_env.scoring.episodes import (
     Actor,
@@ -44,7 +43,6 @@ from surgsim_env.scoring.episodes import (
 from surgsim_env.scoring.expert_palpate import PalpateExpert
 from surgsim_env.scoring.expert_retract import RetractExpert
 from surgsim_env.scoring.options import ScoringOptions
-from surgsim_env.scoring.origin import check_origin, describe_origin
 from surgsim_env.scoring.results import (
     SITES,
     Result,
@@ -56,7 +54,6 @@ from surgsim_env.scoring.results import (
     shipped_results,
 )
 from surgsim_env.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
-from surgsim_env.scripting import oracle
 from surgsim_env.training.site_agent import SiteAgent, site_facts
 
 # Seed of the bootstrap.
@@ -78,7 +75,6 @@ class Player:
         actor: what plays; None: the oracle's script.
         env_id, kwargs: the environment.
         command: that scores it.
-        files: that it consists of.
         sees_truth: whether it may see what is hidden.
         own_estimate: whether its own estimate is scored.
         ours: whether its result belongs in agents/results.
@@ -90,7 +86,6 @@ class Player:
     env_id: str
     kwargs: dict[str, Any]
     command: str
-    files: tuple[Path, ...]
     sees_truth: bool = False
     own_estimate: bool = False
     ours: bool = True
@@ -104,14 +99,12 @@ class TaskAgent:
     Args:
         env_id: the environment's.
         make: the script, for the environment's arguments.
-        file: that it is in.
         kwargs: further arguments of the environment.
         has_places: whether the environment takes `scene` and `level`.
     """
 
     env_id: str
     make: Callable[[dict[str, Any]], Actor]
-    file: str
     kwargs: dict[str, Any] = field(default_factory=dict)
     has_places: bool = False
 
@@ -128,22 +121,15 @@ def _organ_expert(*, blind: bool) -> Callable[[dict[str, Any]], Actor]:
 
 
 TASK_AGENTS = {
-    "expert_retract": TaskAgent(
-        "SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all, "expert_retract.py", {"scaled": False}
-    ),
+    "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all, {"scaled": False}),
     "expert_palpate": TaskAgent(
         "SurgSim/Palpate-v0",
         lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,
-        "expert_palpate.py",
         {"memory": True},
         has_places=True,
     ),
-    "expert_organs": TaskAgent(
-        "SurgSim/Palpate-v0", _organ_expert(blind=False), "expert_organs.py", IN_FACE, has_places=True
-    ),
-    "blind_middle": TaskAgent(
-        "SurgSim/Palpate-v0", _organ_expert(blind=True), "expert_organs.py", IN_FACE, has_places=True
-    ),
+    "expert_organs": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=False), IN_FACE, has_places=True),
+    "blind_middle": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=True), IN_FACE, has_places=True),
 }
 
 
@@ -247,28 +233,25 @@ def find_player(name: str, options: ScoringOptions) -> Player:
     Raises:
         ValueError: an unknown name, or a class that is not there.
     """
-    command, ours = f"surgsim evaluate --agent {name}", Path(__file__).resolve().parent
+    command = f"surgsim evaluate --agent {name}"
     if ":" in name:
         return _strangers_player(name, options)
     if name in ORACLES:
         env_id, has_places = ORACLES[name]
         kwargs = _places(options, PLACES if has_places else {})
-        return Player(
-            name, None, env_id, kwargs, command + _place_options(kwargs), (Path(oracle.__file__),), sees_truth=True
-        )
+        return Player(name, None, env_id, kwargs, command + _place_options(kwargs), sees_truth=True)
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
         kwargs = _places(options, PLACES if script.has_places else {})
         command += _place_options(kwargs)
         kwargs |= script.kwargs
-        return Player(name, script.make(kwargs), script.env_id, kwargs, command, (ours / script.file,))
+        return Player(name, script.make(kwargs), script.env_id, kwargs, command)
     make, kwargs = find_agent(name), _places(options, PLACES)
     command += _place_options(kwargs)
     if name in REFERENCES:
         # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
-    files = (Path(site_search.__file__),)
-    return Player(name, AgentActor(make), SITES, kwargs, command, files, *_declared(make()))
+    return Player(name, AgentActor(make), SITES, kwargs, command, *_declared(make()))
 
 
 def _strangers_player(name: str, options: ScoringOptions) -> Player:
@@ -284,10 +267,8 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     command += f" --env-arguments '{json.dumps(options.env_kwargs)}'" * bool(options.env_kwargs)
     command += _place_options(_places(options, {}))
     facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, _arguments(player, options))
-    file = inspect.getsourcefile(type(agent))
-    files = () if file is None else (Path(file),)
     actor = AgentActor(make, facts)
-    player = Player(name.replace(":", "."), actor, env_id, kwargs, command, files, *_declared(agent), ours=False)
+    player = Player(name.replace(":", "."), actor, env_id, kwargs, command, *_declared(agent), ours=False)
     return player
 
 
@@ -354,9 +335,8 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
             film(policy, _arguments(player, options), options.played_seeds[: options.video_episodes], options.video)
             policy.reset(min(options.envs, len(options.played_seeds)))
 
-    files = (path, path.with_suffix(".json"))
     player = Player(
-        *(path.stem, policy, env_id, kwargs, command + _place_options(told), files),
+        *(path.stem, policy, env_id, kwargs, command + _place_options(told)),
         ours=_is_ours(path),
         check=check,
     )
@@ -402,7 +382,6 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         raise ValueError(f"{name}: {env_id} with {kwargs} cannot be made: {error}") from error
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
     player.check(first)
-    origin = describe_origin(first, player.files, "float64" if actor is None else options.dtype)
     start = time.perf_counter()
     with StepProgress(console) as shown, shown.step(f"{name}, {len(seeds)} episodes", total=len(seeds)) as ended:
         if actor is not None and env_id == SITES:
@@ -423,10 +402,10 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         command=_with_options(player.command, options),
         wall_time=round(taken, 1),
         date=datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        physics_version=PHYSICS_VERSION,
         successes=succeeded,
         sees_truth=player.sees_truth,
         own_estimate=player.own_estimate,
-        origin=origin,
         **scored,
     )
     path = _write(result, player, options)
@@ -517,33 +496,6 @@ def _group(name: str, options: ScoringOptions) -> list[Result]:
             f"has some at {places}: give --scene, --level and --motion, or a file"
         )
     return found
-
-
-def check(path: Path, console: Console) -> None:
-    """Say whether a result can be compared with those made here.
-
-    Raises:
-        ValueError: it cannot (says why).
-    """
-    result = load_result(path)
-    faults = list(check_origin(result, _files_here(result)))
-    if faults:
-        raise ValueError(f"{path} cannot be compared with results made here: {'; '.join(faults)}")
-    _say(
-        console,
-        f"{path}: {result.method} on {result.place}, seeds {seeds_text(result.seeds)}: the environment is the same",
-    )
-
-
-def _files_here(result: Result) -> list[Path]:
-    """The agent's files that are in the working folder or in the project, for digests to be compared."""
-    ours = Path(__file__).resolve().parent
-    folders = (Path(), ours, policies_folder(), Path(oracle.__file__).parent)
-    return [
-        next(folder / name for folder in folders if (folder / name).is_file())
-        for name in map(str, result.origin.get("agent", {}))
-        if Path(name).name == name and any((folder / name).is_file() for folder in folders)
-    ]
 
 
 def write_reach(options: ScoringOptions, console: Console) -> None:

@@ -33,11 +33,11 @@ class Result:
         command: that produced it
         wall_time: of all episodes [s], on a machine with other load
         date: of its end
+        physics_version: that it was played with (`surgsim_env.scene.digest`)
         errors_mm: OSPA after each press of each episode (PalpateSites only)
         lesion_counts: lesions of each episode (PalpateSites only)
         sees_truth: whether the method is declared to see what is hidden
         own_estimate: whether its own estimate is scored in place of the common estimator's
-        origin: versions and digests (`surgsim_env.scoring.origin`); empty in files of earlier versions
     """
 
     method: str
@@ -49,12 +49,12 @@ class Result:
     command: str
     wall_time: float
     date: str
+    physics_version: int
     errors_mm: list[list[float]] = field(default_factory=list)
     lesion_counts: list[int] = field(default_factory=list)
     successes: list[bool] = field(default_factory=list)
     sees_truth: bool = False
     own_estimate: bool = False
-    origin: dict[str, Any] = field(default_factory=dict)
 
     @property
     def place(self) -> str:

@@ -28,10 +28,10 @@ def result(method: str, errors: np.ndarray, **changes: object) -> Result:
         command="",
         wall_time=1.0,
         date="2026-11-24",
+        physics_version=1,
         errors_mm=errors.tolist(),
         lesion_counts=[1] * len(errors),
         successes=(errors[:, -1] <= 5.0).tolist(),
-        origin={"environment": {"source": "a"}},
     )
     return replace(made, **changes)  # type: ignore[arg-type]
 
@@ -122,12 +122,11 @@ def test_presses_are_compared_by_the_number_of_lesions():
         ),
         ({"budget": 25}, "with 10 steps and PalpateSites_phantom_standard with 25"),
         ({"successes": []}, "the result of other does not list its episodes"),
-        ({"origin": {"environment": {"scene": "b"}}}, "the digests of their environments differ"),
-        ({"origin": {}}, "the result of other has no digests of its environment"),
+        ({"physics_version": 2}, "their physics versions are 1 and 2"),
     ],
 )
 def test_results_of_other_episodes_are_refused(changes: dict[str, object], message: str):
-    one = result("one", falling(np.full(40, 3)), origin={"environment": {"scene": "a"}})
+    one = result("one", falling(np.full(40, 3)))
     with pytest.raises(ValueError, match=message):
         compare([one], [replace(one, method="other", **changes)], np.random.default_rng(0))  # type: ignore[arg-type]
 

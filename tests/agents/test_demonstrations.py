@@ -102,8 +102,8 @@ def test_any_agent_is_recorded_and_failures_are_kept_if_asked(folder):
 
     env = gym.make("SurgSim/Palpate-v0", max_episode_steps=5)
     play = player(f"{__name__}:Idle", env, {})
-    assert record(env, play, range(2)) == []
-    episodes = record(env, play, range(2), keep_failures=True)
+    assert not list(record(env, play, range(2)))
+    episodes = list(record(env, play, range(2), keep_failures=True))
     assert [episode.seed for episode in episodes] == [0, 1] and len(episodes[0].actions) == 5
     written = write_dataset(episodes, env, "surgsim/palpate/idle-v0", algorithm_name="nobody")
     assert list(written[0].truncations) == [False] * 4 + [True] and not written[0].terminations.any()
@@ -171,7 +171,7 @@ def test_dictionaries_of_observations_come_back_to_the_bit(folder):
         pytest.skip(f"no pictures on this machine: {error}")
     env, watching = gym.make("SurgSim/Retract-v0", obs_mode="rgb_force", max_episode_steps=3), Watching()
     players = [lambda env, seed: play_actor(env, seed, watching), play_oracle]
-    episodes = [record(env, play, [7], keep_failures=True)[0] for play in players]
+    episodes = [next(record(env, play, [7], keep_failures=True)) for play in players]
     force = env.observation_space["force"].shape  # type: ignore[index]
     assert watching.shapes == [{"picture": (1, 84, 84, 3), "force": (1, *force)}] * 3
     written = write_dataset(episodes, env, "surgsim/retract/pictures-v0", algorithm_name="nobody")
@@ -191,7 +191,7 @@ def test_what_cannot_be_recorded_is_refused(folder):
 
     env = gym.make("SurgSim/Palpate-v0")
     with pytest.raises(ValueError, match="seed 1000000 is reserved for scores"):
-        record(env, lambda env, seed: None, [1_000_000])
+        list(record(env, lambda env, seed: None, [1_000_000]))
     with pytest.raises(ValueError, match="there is no episode to write"):
         write_dataset([], env, "surgsim/palpate/none-v0", algorithm_name="nobody")
     with pytest.raises(ValueError, match="--by is 'raster'; the rule is"):
@@ -251,7 +251,7 @@ def test_a_recorded_episode_of_presses_is_the_one_that_is_scored():
     result = evaluate(find_player(f"{__name__}:Wanderer", options), options, Console(quiet=True))
     arguments = {"scene": "phantom_small", "level": "standard", "budget": 4}
     env = gym.make("SurgSim/PalpateSites-v0", **arguments)
-    episodes = record(env, player(f"{__name__}:Wanderer", env, arguments), (3, 4), keep_failures=True)
+    episodes = list(record(env, player(f"{__name__}:Wanderer", env, arguments), (3, 4), keep_failures=True))
     errors = [[info["error_mm"] for info in one.infos[1:]] for one in episodes]
     # A result has two decimals, and lanes of float32 round.
     np.testing.assert_allclose(errors, result.errors_mm, atol=0.01)
@@ -268,7 +268,7 @@ def test_a_recorded_episode_of_control_steps_is_the_one_that_is_scored_to_the_bi
     actor = find_player(f"{__name__}:Seer", options).actor
     scored = play_tasks(actor, make_envs(env_id, 2, dtype="float64", **short), (3, 4))
     env = gym.make(env_id, **short)
-    episodes = record(env, player(f"{__name__}:Seer", env, short), (3, 4), keep_failures=True)
+    episodes = list(record(env, player(f"{__name__}:Seer", env, short), (3, 4), keep_failures=True))
     for one, other in zip(episodes, scored, strict=True):
         assert [info["force_peak"] for info in one.infos[1:]] == other.force_peaks
         assert max(other.force_peaks) > 0.0 and sum(one.rewards) == other.total

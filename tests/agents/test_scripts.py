@@ -30,7 +30,6 @@ ELSEWHERE = {
     "raster": "test_agents.py",
     "record_demonstrations": "test_demonstrations.py",
     "record_faces": "test_recorded_faces.py",
-    "replay_results": "test_replay_results.py",
     "train_rllib": "test_rllib.py",
 }
 

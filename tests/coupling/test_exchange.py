@@ -349,12 +349,6 @@ def test_the_wrist_feels_what_the_tissue_gives():
     np.testing.assert_allclose(data.qpos[:3] - data.ctrl[:3], wrench[:3] / 5000.0, rtol=0, atol=0.01 * force / 5000.0)
 
 
-def test_time_counts_haptic_steps():
-    simulated = simulation()
-    run(simulated, (0.0, 0.0, 0.0), 7)
-    assert simulated.time == pytest.approx(0.007, rel=1e-15)
-
-
 def test_restart_goes_back_to_the_settled_shape_under_gravity():
     anatomy = load_anatomy(scene())
     organ = compile_organ(OrganSpec(anatomy.mesh, scene().material, anchors=anatomy.anchors, gravity=(0.0, 0.0, -9.81)))

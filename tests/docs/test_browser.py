@@ -2,13 +2,10 @@
 
 import functools
 import http.server
-import io
 import threading
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
-from matplotlib.image import imread
 
 from tests.chromium import GRAB_TIMEOUT
 
@@ -51,17 +48,6 @@ def test_pages_are_whole(address, chromium, page, width):
     assert made["widest"] <= made["window"] == width, made
     # Drawn as mathematics a fraction or a sum is higher than a line of text.
     assert page != "concepts.html" or made["math"] > 35, made
-
-
-def test_the_home_page_is_painted(address, chromium):
-    with chromium.page(1280, 1400) as browser:
-        browser.open(f"{address}/index.html")
-        browser.wait_for_page()
-        image = imread(io.BytesIO(browser.shot()))[:, :, :3]
-    # Our style sheet came along: its dark green bar lies on top.
-    np.testing.assert_allclose(image[5, 640], np.array([0x12, 0x34, 0x3B]) / 255, atol=0.02)
-    for part in np.split(image, 4):
-        assert len(np.unique((part * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 60
 
 
 @pytest.mark.parametrize("page", ["index.html", "environments/palpate.html"])

@@ -61,11 +61,6 @@ def resolved(name: str) -> object:
     return None
 
 
-def test_names_are_resolved_or_not():
-    assert resolved("surgsim_env.scene.levels.find_level") and resolved("msdm_core.OrganSpec.mesh")
-    assert resolved("surgsim_env.scene.levels.nothing") is None and resolved("surgsim_env.nowhere.at_all") is None
-
-
 @pytest.mark.parametrize(
     ("page", "names"),
     [
@@ -131,14 +126,6 @@ def test_tables_have_every_command_channel_and_reward(id):
         rows = re.findall(r"^\| `(\w+)` \| (\S[^|]*) \|", told[heading], flags=re.MULTILINE)
         assert [name for name, _ in rows] == [part.name for part in parts]
     assert {name: float(weight) for name, weight in rows} == dict(task.weights)
-
-
-def test_a_docstring_without_a_heading_is_refused(monkeypatch):
-    module = hook("generated_parts")
-    bad = type("Env", (), {"__doc__": "One.\n\n## Description\nx"})
-    monkeypatch.setattr(module, "environment_class", lambda id: bad)
-    with pytest.raises(module.PluginError, match="has the headings Description; it must have Description, Action"):
-        module.environment_text("SurgSim/Palpate-v0")
 
 
 def test_every_command_and_every_option_is_on_the_page():

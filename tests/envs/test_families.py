@@ -119,14 +119,6 @@ def test_a_saved_state_brings_its_member(blocks, env_id, settings):
     assert test.save_state() == before, "what is refused changes nothing"
 
 
-def test_unknown_splits_are_refused(blocks):
-    for env_id in (SITES, PALPATE):
-        with pytest.raises(ValueError, match=r"split 'tset' is unknown; .* did you mean 'test'"):
-            gym.make(env_id, scene=blocks, split="tset")
-        with pytest.raises(ValueError, match="split is 'test', and scene 'phantom_small' is one organ"):
-            gym.make(env_id, scene="phantom_small", split="test")
-
-
 @pytest.mark.parametrize(
     ("env_id", "settings"),
     [

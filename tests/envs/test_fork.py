@@ -58,15 +58,6 @@ def test_side_by_side_they_name_both_processes_and_the_way_out(lanes, call):
     assert np.isfinite(lanes.step(np.stack([DOWN, DOWN]))[0]).all()
 
 
-def test_side_by_side_they_work_in_the_child_that_makes_them(lanes):
-    def play():
-        envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", scene="phantom_small")
-        envs.reset(seed=1)
-        return envs.step(np.stack([DOWN, DOWN]))[0]
-
-    np.testing.assert_array_equal(in_a_fork(play), play())
-
-
 def test_alone_it_goes_on_to_the_bit():
     env = gym.make(ID, scene="phantom_small")
     env.reset(seed=2)

@@ -65,20 +65,3 @@ def test_a_saved_state_continues_as_the_episode_did(env_id, scene_file):
         again, same, *_ = env.step(action)
         np.testing.assert_array_equal(again, observation)
         assert same == reward
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", IDS)
-def test_environments_side_by_side_equal_single_ones(env_id, scene_file):
-    together = gym.make_vec(env_id, num_envs=3, vectorization_mode="vector_entry_point", scene=scene_file)
-    alone = [gym.make(env_id, scene=scene_file) for _ in range(3)]
-    first, _ = together.reset(seed=5)
-    np.testing.assert_array_equal(first, [env.reset(seed=5 + n)[0] for n, env in enumerate(alone)])
-    together.action_space.seed(5)
-    for _ in range(4):
-        actions = together.action_space.sample()
-        observations, rewards, *_ = together.step(actions)
-        for n, (env, action) in enumerate(zip(alone, actions)):
-            observation, reward, *_ = env.step(action)
-            np.testing.assert_array_equal(observations[n], observation)
-            assert rewards[n] == reward

@@ -107,18 +107,6 @@ def test_a_saved_state_continues_as_the_episode_did(env_id, scene_file):
     assert other.unwrapped.save_state() == env.unwrapped.save_state()
 
 
-def test_a_saved_retraction_continues_as_the_episode_did():
-    """On a lobe whose bed moves, as above."""
-    env, other = (gym.make("SurgSim/Retract-v0", motion="calm") for _ in range(2))
-    env.reset(seed=1)
-    env.step(env.action_space.sample())
-    state, action = env.unwrapped.save_state(), env.action_space.sample()
-    expected = env.step(action)[0]
-    other.reset(seed=2)
-    other.unwrapped.load_state(state)
-    assert other.step(action)[0].tobytes() == expected.tobytes()
-
-
 @pytest.mark.parametrize("env_id", IDS)
 def test_organs_side_by_side_breathe_as_alone(env_id, scene_file):
     """Each lane its own cycles, to the bit."""
@@ -258,16 +246,6 @@ def test_a_preset_moves_towards_feet_and_front(name):
     assert below[way.argmax()] < 0.1 * np.ptp(below)
 
 
-def test_motion_none_and_unknown_ones():
-    """ "none" takes away what a scene says, None keeps it, another name is refused with those that there are."""
-    scene = replace(make_scene("phantom_small"), motions=(BREATH,))
-    assert with_motion(scene, "none").motions == () and with_motion(scene, None) is scene
-    for env_id in gym.registry:
-        if env_id.startswith("SurgSim/"):
-            with pytest.raises(ValueError, match="motion 'clam' is unknown; the motions are none, calm, free; did you"):
-                gym.make(env_id, motion="clam")
-
-
 # ---- a surface that moves --------------------------------------------------------------------------------------------
 
 LONG = CyclicMotion("breathing", (0.004, 0.0, 0.0015), period=(4.0, 4.0), rise=0.4, fall=0.4)
@@ -301,17 +279,6 @@ def test_an_organ_rests_on_its_moving_ground(breathing):
         for _ in range(100):
             assert brought.haptic_step() and put.haptic_step()
         assert put.motion_time == pytest.approx(brought.motion_time)
-
-
-def test_a_saved_simulation_goes_on_with_its_motion(breathing):
-    """Its clock began later than its motions, as in a press after others."""
-    first, second = Simulation(breathing), Simulation(breathing)
-    first.draw_motion(np.random.default_rng(3))
-    first.restart(first.instrument.parked, elapsed=float(first.drive.delay[0]) + 0.5)
-    second.set_state(first.organ_model, first.get_state())
-    for _ in range(50):
-        assert first.haptic_step() and second.haptic_step()
-    assert first.organ_state.node_position.tobytes() == second.organ_state.node_position.tobytes()
 
 
 def test_a_press_goes_with_the_surface(breathing, still):

@@ -7,7 +7,6 @@ from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401
 from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.tasks.declaration import ControlStep
 from surgsim_env.tasks.palpate import EPISODE_STEPS, EPISODE_STEPS_WIDE
 
 ID = "SurgSim/Palpate-v0"
@@ -115,34 +114,3 @@ def test_an_episode_has_the_steps_that_were_asked_for():
     envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", episode_steps=2)
     envs.reset(seed=0)
     assert [envs.step(np.tile(up, (2, 1)))[3].all() for _ in range(2)] == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"frame": "faces"}, "frame 'faces' is unknown; did you mean 'face'"),
-        ({"episode_steps": 0}, "episode_steps is 0; it must be a whole number"),
-        ({"episode_steps": True}, "episode_steps is True"),
-        ({"episode_steps": 2.5}, "episode_steps is 2.5"),
-    ],
-)
-def test_a_wrong_argument_is_refused(wrong, said):
-    with pytest.raises(ValueError, match=said):
-        gym.make(ID, **wrong)
-
-
-def test_episodes_of_any_length_cost_alike():
-    """An episode of 3 control steps without contact costs what one of 600 does, and a late failure no more."""
-    costs = []
-    for settings in ({}, {"episode_steps": 3}):
-        env = gym.make(ID, scene="phantom_small", **settings).unwrapped
-        env.reset(seed=0)
-        *_, info = env.step(np.array([0.0, 0.0, 0.2, 0.0], dtype=np.float32))
-        costs.append(info["reward_time"] * env.task.episode_steps)
-        step = ControlStep(env.simulation, 0.0)
-        forgone = next(one for one in env.task.rewards if one.name == "forgone")
-        assert forgone.value is not None
-        left = 1.0 - 1.0 / env.task.episode_steps
-        assert forgone.weight * forgone.value(env.task, step) == pytest.approx(-0.015 * 600 * left)
-        env.close()
-    assert costs == pytest.approx([-3.0, -3.0])

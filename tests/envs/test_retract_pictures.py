@@ -1,10 +1,6 @@
 """SurgSim/Retract-v0 with pictures: what is seen, observed, and said without OpenGL."""
 
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +10,6 @@ from surgsim_env.rendering import gl
 from surgsim_env.rendering.stage import LABELS
 from surgsim_env.scripting import Hold, Until, run_script
 from tests.envs.retract_steps import act
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -104,30 +98,3 @@ def test_scripts_feel_forces_where_pictures_are_observed(tmp_path):
     columns = table.read_text().splitlines()[0].split(",")
     assert columns[:3] == ["time_s", "step", "action_0"]
     env.close()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("opengl")
-def test_the_checker_accepts_pictures():
-    from gymnasium.utils.env_checker import check_env
-
-    env = RetractEnv(obs_mode="rgb")
-    check_env(env)
-    env.close()
-
-
-@pytest.mark.slow
-def test_pictures_without_opengl_say_what_is_missing():
-    code = """
-import gymnasium as gym, surgsim_env
-env = gym.make("SurgSim/Retract-v0", obs_mode="rgb").unwrapped
-try:
-    env.reset(seed=0)
-except Exception as error:
-    print(type(error).__name__)
-"""
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code], cwd=REPOSITORY, env={**os.environ, gl.VARIABLE: "off"},
-        capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
-    assert done.stdout.strip() == "NoGLError", done.stderr

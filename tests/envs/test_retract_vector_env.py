@@ -77,23 +77,6 @@ def test_equals_environments_one_after_the_other(mode: str, instrument: str | No
     apart.close()
 
 
-def test_a_fault_leaves_the_neighbours_untouched():
-    spoilt, whole = side_by_side(autoreset_mode="SameStep"), side_by_side(autoreset_mode="SameStep")
-    still = np.zeros((COUNT, 5), dtype=np.float32)
-    for envs in (spoilt, whole):
-        envs.reset(seed=SEED)
-        envs.step(still)
-    spoilt.envs[1].unwrapped.simulation.organ_state.node_velocity[700, 1] = np.nan  # type: ignore[attr-defined]
-    found, expected = spoilt.step(still), whole.step(still)
-    assert found[2].tolist() == [False, True, False]
-    assert "no longer finite" in found[4]["final_info"]["sim_fault"][1]
-    for _ in range(2):
-        for lane in (0, 2):
-            np.testing.assert_array_equal(found[0][lane], expected[0][lane])
-            assert found[1][lane] == expected[1][lane]
-        found, expected = spoilt.step(still), whole.step(still)
-
-
 @pytest.mark.slow  # compiles float32 for rest shapes of their own
 def test_single_precision_feels_the_same_force():
     """Over an approach and a grasp: within 0.5 % of the largest force on a finger."""
@@ -120,24 +103,6 @@ def test_lanes_have_rest_shapes_of_their_own_only_where_they_differ():
         envs.reset(seed=SEED)
         envs.step(np.zeros(envs.action_space.shape, dtype=np.float32))  # type: ignore[arg-type]
     assert lobes._groups[0]._own_rest and not phantoms._groups[0]._own_rest  # type: ignore[attr-defined]
-
-
-@pytest.mark.slow
-def test_a_state_saved_alone_goes_on_in_a_lane():
-    envs, single = side_by_side(), gym.make(ID)
-    observation, _ = envs.reset(seed=SEED)
-    goal = goals(envs)
-    single.reset(seed=SEED + 1)
-    for _ in range(3):
-        told = action(observation, goal, grasp=False, size=5)
-        observation = envs.step(told)[0]
-        single.step(told[1])
-    state = envs.envs[1].unwrapped.save_state()  # type: ignore[attr-defined]
-    assert state == single.unwrapped.save_state()  # type: ignore[attr-defined]
-    told = action(observation, goal, grasp=False, size=5)
-    ahead = envs.step(told)[0][1]
-    envs.envs[2].unwrapped.load_state(state)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(envs.step(np.tile(told[1], (COUNT, 1)))[0][2], ahead)
 
 
 def test_lobes_on_moving_ground_equal_environments_one_after_the_other():

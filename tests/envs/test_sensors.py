@@ -48,20 +48,6 @@ def test_a_plain_sensor_draws_what_it_did():
     assert first.random() == second.random()
 
 
-@pytest.mark.parametrize("entry", ["drift", "hysteresis"])
-@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
-def test_what_no_sensor_has_is_refused(entry: str, value: float):
-    with pytest.raises(ValueError, match=f"sensor.{entry}"):
-        replace(QUIET, **{entry: value})
-
-
-def test_the_state_of_another_sensor_is_refused():
-    with pytest.raises(ValueError, match="bias has 9 entries; the rule is 3 for this sensor"):
-        ForceReading(QUIET, np.zeros(9))
-    with pytest.raises(ValueError, match="bias has 4 entries; the rule is 9 for this sensor"):
-        ForceReading(replace(QUIET, drift=0.1), np.zeros(4))
-
-
 def test_clinical_has_all_that_a_patient_brings():
     scene, level = make_scene("phantom_small"), LEVELS["clinical"]
     made = level.scene(scene)

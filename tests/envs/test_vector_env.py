@@ -5,10 +5,8 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.coupling import lane_group
 from surgsim_env.envs.ids import PalpateEnv
 from surgsim_env.envs.vector_env import group_width, vector_class
-from tests.allocations import allocations
 
 ID = "SurgSim/Palpate-v0"
 COUNT = 3  # five lanes stay empty
@@ -126,19 +124,6 @@ def test_an_environment_whose_episode_is_over_can_be_paused():
     assert [env.unwrapped.simulation.time for env in envs.envs] == times
 
 
-@pytest.mark.parametrize(
-    ("mode", "mask", "message"),
-    [
-        ("SameStep", np.zeros(COUNT, dtype=np.bool_), 'only with "Disabled" can environments be paused'),
-        ("Disabled", np.zeros(COUNT + 1, dtype=np.bool_), r"the mask has shape \(4,\) of bool; it must be one bool"),
-        ("Disabled", np.zeros(COUNT), r"the mask has shape \(3,\) of float64"),
-    ],
-)
-def test_a_wrong_pause_is_refused(mode: str, mask: np.ndarray, message: str):
-    with pytest.raises(ValueError, match=message):
-        side_by_side(autoreset_mode=mode).pause(mask)
-
-
 def test_a_fault_leaves_the_neighbours_untouched():
     """A node of the middle organ is not a number any more: its episode ends, the others' bits are as without it."""
     spoilt, whole = side_by_side(autoreset_mode="SameStep"), side_by_side(autoreset_mode="SameStep")
@@ -190,20 +175,6 @@ def test_groups_are_as_wide_as_keeps_the_threads_busy(envs: int, dtype: str, thr
     assert group_width(envs, np.dtype(dtype), threads) == lanes
 
 
-def test_nothing_is_allocated_within_the_loop(monkeypatch):
-    envs = side_by_side()
-    envs.reset(seed=0)
-    envs.step(np.tile(DOWN, (COUNT, 1)))
-    compiled, counts = lane_group.advance_lane_haptic_steps, []
-
-    def counted(*given) -> None:
-        counts.append(allocations(compiled, *given))
-
-    monkeypatch.setattr(lane_group, "advance_lane_haptic_steps", counted)
-    envs._groups[0].control_step(np.ones(COUNT, dtype=np.bool_), 30, np.inf)
-    assert counts == [0]
-
-
 def test_states_are_saved_and_loaded_as_alone():
     """A state saved alone goes on in a lane, and the other way round."""
     envs, single = side_by_side(), gym.make(ID)
@@ -234,13 +205,6 @@ def test_threads_and_the_number_of_environments_change_nothing():
         envs.close()
     np.testing.assert_array_equal(runs[0], runs[1])
     np.testing.assert_array_equal(runs[0], runs[2])
-
-
-def test_a_shorter_time_limit_truncates():
-    envs = side_by_side(max_episode_steps=4)
-    envs.reset(seed=0)
-    ends = [envs.step(np.zeros((COUNT, 4), dtype=np.float32))[3].all() for _ in range(4)]
-    assert ends == [False, False, False, True]
 
 
 def test_a_bad_action_is_refused_before_anything_moves():

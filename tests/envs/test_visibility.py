@@ -150,8 +150,3 @@ def test_a_tilted_disc_is_seen_as_an_upright_one():
     # The mean square distance from the middle of an even disc is r^2 / 2.
     assert np.mean(np.sum((points - disc.centre) ** 2, axis=1)) == pytest.approx(0.5 * RADIUS**2, rel=1e-3)
     np.testing.assert_allclose(disc.rotation.T @ disc.rotation, np.eye(3), atol=1e-12)
-
-
-def test_an_eye_among_the_points_is_refused():
-    with pytest.raises(ValueError, match="stands among the points"):
-        seen(eye=[0.001, 0.0, 0.0])

@@ -13,7 +13,6 @@ from surgsim_env.haptics import udp_client
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.pacing import SPIN, Pacer
 from surgsim_env.haptics.trajectory import save_trajectory
-from surgsim_env.scene.load import scenes_folder
 from tests.haptics.udp_link import SharedTime
 
 
@@ -143,22 +142,3 @@ def test_apnoea_holds_the_breath_whatever_the_button_does(tmp_path, apnoea, monk
     assert main([*arguments, *(["--apnoea"] if apnoea else [])]) == 0
     # The first step only compiles.
     assert held[1:] == [True] * (21 if apnoea else 10) + [False] * (0 if apnoea else 11)
-
-
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [("0,0,0,0,1e300", "line 2: buttons is 1e+300"), (f"0,0,0,0,{'1' * 200_000}", "line 2: field larger than")],
-)
-def test_bad_trajectory_is_one_line(tmp_path, row, words, capsys):
-    path = tmp_path / "way.csv"
-    path.write_text(f"time,x,y,z,buttons\n{row}\n", encoding="utf-8")
-    assert main(["haptics", "--scene", "phantom_small", "--trajectory", str(path)]) == 2
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1 and "Traceback" not in said
-
-
-def test_two_arms_are_refused(tmp_path, capsys):
-    text = (scenes_folder() / "organs" / "lobe.toml").read_text(encoding="utf-8")
-    (tmp_path / "two.toml").write_text(text.replace("grasper.xml", "psm_pair"), encoding="utf-8")
-    assert main(["haptics", "--scene", str(tmp_path / "two.toml")]) == 2
-    assert "has two arms; one device holds one tip" in capsys.readouterr().err

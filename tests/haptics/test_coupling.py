@@ -106,19 +106,6 @@ def test_scaled_motion_stiffens_the_damper_too():
         check_coupling(VirtualCoupling(1.001 * limit, damping), device, TIP, DT, scale=4.0)
 
 
-def test_a_tip_too_light_for_the_least_damper_has_no_coupling():
-    """K T^2 + 2 B T <= 2 m leaves nothing for K where m <= B T, B a quarter of the dampings: 5 g at 20 N s/m."""
-    device = DeviceDynamics(20.0, 0.05)
-    assert coupling_for(device, TipDynamics(0.0051, 20.0), DT).stiffness > 0.0
-    with pytest.raises(ValueError, match="damping 20 N s/m and tip damping 20 N s/m allow no coupling at steps"):
-        coupling_for(device, TipDynamics(0.0049, 20.0), DT)
-
-
-def test_coupling_too_stiff_for_the_tip_is_refused():
-    with pytest.raises(ValueError, match=r"too stiff for a tip of 140 g.*at most 2 m, 0\.28 kg, and is 0\.3 kg"):
-        check_coupling(VirtualCoupling(1e5, 100.0), None, TIP, DT)
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [

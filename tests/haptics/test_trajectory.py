@@ -81,31 +81,3 @@ def test_bad_file_is_refused_by_name_and_row(tmp_path, text, words):
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=rf"way\.csv{words}"):
         TrajectoryDevice.load(path)
-
-
-def test_bytes_that_are_no_text_are_refused(tmp_path):
-    path = tmp_path / "way.csv"
-    path.write_bytes(bytes(range(256)) * 8)
-    with pytest.raises(ValueError, match=r"way\.csv: column 'time' is missing"):
-        TrajectoryDevice.load(path)
-
-
-@pytest.mark.parametrize(
-    ("time", "place", "buttons", "words"),
-    [
-        (np.zeros(0), np.zeros((0, 3)), None, "n at least 1"),
-        (np.arange(2.0), np.zeros((3, 3)), None, r"these are \(2,\) and \(3, 3\)"),
-        (np.arange(2.0), np.zeros((2, 3)), [0], "give one per row"),
-        (
-            np.arange(2.0),
-            np.zeros((2, 3)),
-            [0, 2**31],
-            "buttons of row 1 of the trajectory are 2147483648; they must be",
-        ),
-        (np.arange(2.0), np.zeros((2, 3)), [0, 10**300], "buttons of row 1 of the trajectory are 1000"),
-        (np.arange(2.0), np.zeros((2, 3)), [-1, 0], "buttons of row 0 of the trajectory are -1"),
-    ],
-)
-def test_shapes_that_do_not_fit_are_refused(time, place, buttons, words):
-    with pytest.raises(ValueError, match=words):
-        TrajectoryDevice(time, place, buttons)

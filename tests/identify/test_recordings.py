@@ -52,11 +52,3 @@ def test_a_wrong_file_is_refused(tmp_path, text, words):
     with pytest.raises(ValueError, match="recording") as caught:
         read_recording(path)
     assert words in str(caught.value)
-
-
-def test_a_file_that_is_not_there_or_no_text(tmp_path):
-    with pytest.raises(ValueError, match="cannot be read"):
-        read_recording(tmp_path / "none.csv")
-    (tmp_path / "binary.csv").write_bytes(b"site,\xff\xfe\n")
-    with pytest.raises(ValueError, match="is no CSV text"):
-        read_recording(tmp_path / "binary.csv")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.identify.recordings import SitePress
-from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, draw_halves, fit_sites, sort_out
+from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites, sort_out
 from tests.identify.made import recording, truth
 
 
@@ -69,10 +69,3 @@ def test_sites_that_cannot_be_used_are_named_with_their_reason():
     assert {reason.split(" ")[0]: sites for reason, sites in left_out.items()} == {
         "less": [100], "fewer": [101], "a": [102], "force": [103], "deeper": [104]
     }  # fmt: skip
-
-
-def test_halves_are_drawn_by_the_seed():
-    training, held_out = draw_halves(11, 0)
-    assert sorted([*training, *held_out]) == list(range(11)) and len(training) == 6
-    assert not np.array_equal(training, draw_halves(11, 1)[0])
-    assert np.array_equal(training, draw_halves(11, 0)[0])

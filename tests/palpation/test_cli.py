@@ -2,7 +2,6 @@
 
 import csv
 import json
-import re
 
 import numpy as np
 import pytest
@@ -126,36 +125,6 @@ def test_a_lesion_below_a_site_that_is_too_deep_is_missed_for_that_reason(tmp_pa
 
 
 @pytest.mark.slow
-def test_same_seed_same_table_and_another_seed_another(run, tmp_path, capsys):
-    around = ["--around", "0.036,0.026,0.03,0.008"]
-    for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
-        assert main([*COARSE, *around, "--out", str(tmp_path / name), "--seed", seed, "--workers", "1"]) == 0
-    first, again, other = ((tmp_path / name / "palpation.csv").read_bytes() for name in "abc")
-    assert first == again
-    assert first != other
-    said = " ".join(capsys.readouterr().out.split())
-    for bar in ("organ", "its pre-operative model"):
-        assert re.search(rf"pressing {bar} \S+ (\d+)/\1 ", said), "the bar did not fill"
-    assert "real time" in said
-    assert "peak force" in said
-    assert "felt" in said
-
-
-@pytest.mark.slow
-def test_no_lesion_on_a_surface_of_ones_own(tmp_path, capsys):
-    cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
-    arguments = ["palpate", "--surface", str(cube), "--length-unit", "mm", "--cell-size", "0.010"]
-    arguments += ["--anchors", "0.03,0.03,-0.01,0.04", "--tip-radius", "0.008", "--press-depth", "0.004"]
-    assert main([*arguments, "--spacing", "0.012", "--out", str(tmp_path / "out")]) == 0
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
-    assert summary["truth"] == []
-    assert summary["maps"]["pre-operative model"]["estimates"] == []
-    said = capsys.readouterr().out
-    assert "held by the anchors given" in " ".join(said.split())
-    assert "no lesion was hidden" in said
-
-
-@pytest.mark.slow
 def test_organ_reports_and_writes(tmp_path, capsys):
     cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
     out = tmp_path / "made" / "by it" / "organ.vtu"
@@ -167,19 +136,6 @@ def test_organ_reports_and_writes(tmp_path, capsys):
     assert "0.15" in said  # 144 ml at 1060 kg/m^3
     assert main(["organ", str(out)]) == 0
     assert "0 reoriented" in capsys.readouterr().out
-
-
-def test_scenes_are_listed_with_what_they_are(capsys):
-    assert main(["scenes"]) == 0
-    said = capsys.readouterr().out
-    for word in ("phantom", "liver", "bonded to its tray", "held by its ligaments"):
-        assert word in " ".join(said.split())
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["palpate", "--help"], ["organ", "--help"]])
-def test_help(arguments, capsys):
-    assert main(arguments) == 0
-    assert "surgsim" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -197,28 +153,6 @@ def test_unknown_words_get_one_line_and_exit_2(arguments, words, capsys):
     assert words in said
 
 
-def test_options_that_would_do_nothing_are_refused(capsys):
-    for option, value in (("--cell-size", "0.02"), ("--length-unit", "mm"), ("--anchors", "0,0,0,0.01")):
-        assert f"{option} goes with --surface" in refused(capsys, "palpate", "--scene", "phantom", option, value)
-    assert "workers is 0" in refused(capsys, "palpate", "--scene", "phantom", "--workers", "0")
-    assert "cannot be read" in refused(capsys, "palpate", "--organ", "mine.tml")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--spacing", "inf"], "spacing is inf; it must be finite"),
-        (["--press-depth", "inf"], "press depth is inf"),
-        (["--spacing", "1e-6"], "raster points"),
-        (["--youngs-modulus", "1e12"], "are the moduli in pascals"),
-        (["--seed", "-1"], "--seed is -1"),
-        (["--around", "0,0,0,-1"], "the radius is -1 m"),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused_at_once(arguments, words, capsys, tmp_path):
-    assert words in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "out"), *arguments)
-
-
 def test_a_place_that_cannot_be_written_is_known_before_the_work(capsys, tmp_path):
     (tmp_path / "out" / "palpation.csv").mkdir(parents=True)
     assert "is a folder there" in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "out"))
@@ -229,13 +163,6 @@ def test_a_place_that_cannot_be_written_is_known_before_the_work(capsys, tmp_pat
     given = ("organ", str(path), "--length-unit", "mm", "--out")
     assert "is no folder that you may write to" in refused(capsys, *given, str(tmp_path / "file" / "a.vtu"))
     assert "unknown extension" in refused(capsys, *given, str(tmp_path / "a.xyz"))
-
-
-def test_zero_modulus_is_refused_by_organ_too(capsys, tmp_path):
-    path = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(2, radius=30).export(path)
-    said = refused(capsys, "organ", str(path), "--length-unit", "mm", "--youngs-modulus", "0")
-    assert "Young's modulus is 0; it must be finite and above 0 (Pa)" in said
 
 
 def test_lists_of_numbers_may_begin_with_a_minus():
@@ -250,18 +177,6 @@ def refused(capsys, *arguments):
     assert said.count("\n") == 1, said
     assert "Traceback" not in said
     return said
-
-
-def test_unknown_scene_suggests_the_nearest(capsys):
-    said = refused(capsys, "palpate", "--scene", "fantom")
-    assert "did you mean 'phantom'" in said
-    assert "liver" in said
-
-
-def test_lesion_outside(capsys, tmp_path):
-    assert "lies inside the organ" in refused(
-        capsys, *COARSE, "--lesion", "-0.3,0.1,0.2,0.008,8", "--out", str(tmp_path)
-    )
 
 
 @pytest.mark.parametrize(
@@ -291,34 +206,6 @@ def test_lesion_outside(capsys, tmp_path):
 )
 def test_bad_values(extra, words, capsys, tmp_path):
     assert words in refused(capsys, *COARSE, "--out", str(tmp_path), *extra)
-
-
-def test_missing_files(capsys, tmp_path):
-    assert "no such file" in refused(capsys, "palpate", "--surface", "none.stl", "--length-unit", "mm")
-    assert "cannot be read" in refused(capsys, "palpate", "--organ", str(tmp_path / "none.toml"))
-    assert "no such file" in refused(capsys, "organ", "none.vtu")
-
-
-def test_units_and_sizes(capsys, tmp_path):
-    cube = str(write_stl(tmp_path / "cube.stl", CUBE * 60.0, FACES))
-    assert "--surface needs --length-unit" in refused(capsys, "palpate", "--surface", cube)
-    assert 'did you mean "mm"' in refused(capsys, "palpate", "--surface", cube, "--length-unit", "milimeter")
-    assert "units forgotten" in refused(capsys, "palpate", "--surface", cube, "--length-unit", "m")
-    assert "units forgotten" in refused(capsys, "organ", cube, "--length-unit", "0.3")  # 18 m
-    assert "too coarse" in refused(capsys, "organ", cube, "--length-unit", "mm", "--cell-size", "0.05")
-    assert "cell size is 0.0 m" in refused(
-        capsys, "palpate", "--surface", cube, "--length-unit", "mm", "--cell-size", "0"
-    )
-
-
-def test_open_surface(capsys, tmp_path):
-    cube = str(write_stl(tmp_path / "open.stl", CUBE * 60.0, FACES[:-1]))
-    assert "open" in refused(capsys, "palpate", "--surface", cube, "--length-unit", "mm")
-
-
-def test_a_place_that_cannot_be_written(capsys, tmp_path):
-    (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    assert "file" in refused(capsys, *COARSE, "--out", str(tmp_path / "file" / "out"))
 
 
 def test_interrupt(monkeypatch, capsys):

@@ -114,21 +114,6 @@ def test_no_lesion_no_estimate(noise, seed):
     assert felt(sites, contrast_with_model(stiffness, stiffness_of(sites))) == []
 
 
-def test_flat_map_is_one_everywhere():
-    sites = raster()
-    flat = np.full(len(sites), 42.0)
-    np.testing.assert_allclose(contrast_with_neighbours(flat, sites[:, :2]), 1.0, rtol=1e-12)
-    np.testing.assert_allclose(contrast_with_model(flat, flat), 1.0, rtol=1e-12)
-    assert felt(sites, np.ones(len(sites))) == []
-
-
-def test_all_sites_in_one_place():
-    sites = np.repeat([[0.1, 0.08, 0.0]], 12, axis=0)
-    contrast = contrast_with_neighbours(np.full(12, 50.0), sites[:, :2])
-    np.testing.assert_allclose(contrast, 1.0, rtol=1e-9)
-    assert felt(sites, contrast) == []
-
-
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_few_sites(count):
     sites = raster()[:count]

@@ -105,37 +105,3 @@ def test_a_deep_lesion_that_a_press_feels_all_the_same_is_not_called_hidden(monk
 def test_presses_that_ended_early_are_counted(monkeypatch):
     (miss,) = missed(monkeypatch, ABOVE, sites=SITES[:12], early=np.array([[0.034, 0.042, 0.05], [0.0, 0.0, 0.05]]))
     assert "1 presses near it ended early" in miss.text
-
-
-def test_a_weak_baseline_is_said_so(monkeypatch):
-    few = SITES[np.linalg.norm(SITES - [0.034, 0.042, 0.05], axis=1) < 0.02]
-    (miss,) = missed(monkeypatch, ABOVE, sites=few)
-    assert "the baseline is weak: 0 healthy sites, 8 are the rule" in miss.text
-    assert "weak" not in missed(monkeypatch, ABOVE)[0].text
-
-
-def test_forces_and_noise_are_in_the_text(monkeypatch):
-    (miss,) = missed(monkeypatch, lesion(0.034, 0.042, 0.030), forces=(0.219, 0.2))
-    assert "0.219 N, 0.200 N without the lesion (contrast 1.09); the sensor's noise is 0.01 N" in miss.text
-
-
-def test_presses_over_missed_lesions_are_counted(monkeypatch):
-    """Two for each lesion that a map misses, told before the first and counted after each."""
-    told, done = [], []
-
-    def scan(*args, progress, **options):
-        assert told == [2]
-        progress()
-        return [SimpleNamespace(force=0.2)]
-
-    monkeypatch.setattr(misses, "scan", scan)
-    truths = seen_from_surface((ABOVE,), ANATOMY)
-    one = score_map("m", SITES, np.ones(len(SITES)), [], truths, ANATOMY.along_surface, spacing=SPACING)
-    pressed = PressedSites(SITES, NOWHERE, SPACING)
-
-    def progress(count):
-        told.append(count)
-        return lambda: done.append(1)
-
-    explain_misses(ANATOMY, ANATOMY.organ((ABOVE,)), (ABOVE,), truths, (one,), pressed, progress)
-    assert len(done) == 2

@@ -8,27 +8,7 @@ from msdm_core.mesh_files.mesh_io import read_mesh
 from surgsim_env.cli.main import main
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
-from tests.patient.scans import LABELS, affine_of, labels_on, write_nifti
 from tests.patient.surfaces import ball
-
-
-@pytest.mark.slow
-def test_what_is_dropped_filled_or_cut_off_is_said(tmp_path, capsys):
-    affine, shape = affine_of(margin=0.0)
-    labels = labels_on(affine, shape)
-    labels[0:2, 0, 0] = 1
-    labels[20:23, 15:18, 14:17] = 0
-    labels[30, 10, 20] = 2
-    labels = labels[:, : shape[1] // 2 + 6]
-    file = write_nifti(tmp_path / "a.nii.gz", labels, affine)
-    assert main(["organ", str(file), *LABELS, "--cell-size", "0.008"]) == 0
-    said = capsys.readouterr().err
-    assert "1 part(s) apart from the largest were left out: 2 voxels" in said
-    assert "1 cavity(ies) inside the labels, 0.216 ml, were left as they are (--mend fills them)" in said
-    assert "lesion: 1 part(s), 0.008 ml together, are smaller than what cells of 8 mm can show" in said
-    assert "touches the image's border towards the front" in said
-    assert main(["organ", str(file), *LABELS, "--cell-size", "0.008", "--mend"]) == 0
-    assert "mended: 1 cavity(ies) inside the labels, 0.216 ml, were filled with liver" in capsys.readouterr().err
 
 
 @pytest.mark.slow

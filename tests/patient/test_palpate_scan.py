@@ -1,9 +1,7 @@
 """`surgsim palpate` from a scan or a surface: from file to map in one command."""
 
-import html
 import json
 import re
-import shlex
 
 import numpy as np
 import pytest
@@ -33,51 +31,6 @@ def test_palpate_goes_from_a_scan_to_a_map_in_one_command(tmp_path, capsys):
     # Healthy sites would be felt as 1.
     assert summary["maps"]["pre-operative model"]["lesions"][0]["contrast"] > 1.1
     assert "written" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_the_report_shows_the_command_that_was_given(tmp_path, monkeypatch):
-    given = ["--anchors=-0.06,0.025,0.08,0.03", "--tip-radius", "0.008", "--press-depth", "0.004", "--spacing", "0.012"]
-    file = scan(tmp_path / "ct.nii.gz", spacing=(3.0, 3.0, 3.0))
-    arguments = ["palpate", "--segmentation", str(file), *LABELS, "--cell-size", "0.009", *given]
-    arguments += ["--around=-0.06,0.0,0.13,0.01", "--out", str(tmp_path / "out"), "--workers", "1"]
-    pressed = []
-    monkeypatch.setattr("surgsim_env.cli.palpate.run_palpation", lambda *_, **__: pressed.append(1) or 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        main(arguments)
-    assert pressed
-    page = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
-    (command,) = re.findall(r"<code>(surgsim .*)</code>", page)
-    words = shlex.split(command)
-    assert words[:2] == ["surgsim", "palpate"]
-    for word in arguments:
-        assert word in words, word
-    # It is read as what was given.
-    again = []
-    monkeypatch.setattr("surgsim_env.cli.palpate.Palpate.run", lambda self, _: again.append(self) or 0)
-    assert main(words[1:]) == 0
-    assert again[0].command_line == command
-    assert again[0].anchors == ("-0.06,0.025,0.08,0.03",)
-    assert again[0].spacing == 0.012
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        (["--seed", "-1"], "--seed is -1"),
-        (["--around", "0,0,0,-1"], "the radius is -1 m"),
-        (["--around", "0,0,0"], "the form is x,y,z,radius"),
-        (["--lesion", "0,0,0,0.01,0"], "the modulus ratio is 0"),
-    ],
-)
-def test_palpation_s_options_are_looked_at_before_an_organ_is_made(option, words, tmp_path, refusal, monkeypatch):
-    monkeypatch.setattr(
-        "surgsim_env.patient.make_patient.make_patient", lambda *_, **__: pytest.fail("an organ was made")
-    )
-    file = scan(tmp_path / "ct.nii.gz", spacing=(6.0, 6.0, 6.0))
-    given = ["palpate", "--segmentation", file, *LABELS, *option, "--out", tmp_path / "out"]
-    assert words in refusal(*given)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

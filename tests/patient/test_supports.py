@@ -51,8 +51,3 @@ def test_balls_that_are_given_replace_everything_and_are_fixed():
     assert [one.is_elastic for one in found] == [False]
     assert sources == {"anchors": "given on the command line"}
     assert held_text(found[0]) == "anchor 1: fixed"
-
-
-def test_the_words_for_a_report_give_both_stiffnesses():
-    (fat,) = anchors("pancreas")[0]
-    assert f"{fat.stiffness:g}" in held_text(fat) and f"{fat.shear_stiffness:g}" in held_text(fat)

@@ -7,7 +7,6 @@ import pytest
 
 from msdm_core.mesh.surface import outward_facing
 from msdm_core.meshing.segmentation_meshing import FineFace, fill_labels
-from surgsim_env.cli.main import main
 from surgsim_env.palpation.surface_scene import SurfaceOptions
 from surgsim_env.patient.lesion_room import lack_of_room, sample_face
 from surgsim_env.patient.meshers import Cells, mesh_surfaces, read_surfaces
@@ -59,27 +58,6 @@ def test_cells_are_fine_at_the_pressed_face_and_as_many_as_was_said(way, tmp_pat
     assert mesh.node_count == pytest.approx(plan.node_count, rel=0.3)
 
 
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        (["--tip-radius", "0"], "tip radius is 0; it must be finite and above 0"),
-        (["--press-depth", "inf"], "press depth is inf; it must be finite"),
-        (["--remesh"], "--remesh goes with a file of tets"),
-    ],
-)
-def test_touches_that_are_impossible(option, words, tmp_path, refusal):
-    assert words in refusal("organ", ball(tmp_path / "liver.stl"), "--length-unit", "mm", *option)
-
-
-def test_the_plan_is_said_with_a_coarser_choice_before_the_mesh(tmp_path, capsys):
-    """The cells of this tip are finer than any mesh may have, so that the command ends there."""
-    given = ["organ", str(ball(tmp_path / "liver.stl")), "--length-unit", "mm", "--tip-radius", "0.00012"]
-    assert main(given) == 2
-    said = capsys.readouterr()
-    assert "nodes" in said.out and "times real time" in said.out and "coarser: --tip-radius" in said.out
-    assert "filling it with tets" in said.out
-
-
 @pytest.fixture(scope="module")
 def phantom():
     return sample_face(load_anatomy(make_scene("phantom")))
@@ -101,8 +79,3 @@ def test_why_lesions_do_not_fit(changes, words, phantom):
     """The border, the depth of 30 mm, and three of them beside each other on 60 mm."""
     draw: LesionDraw = replace(phantom.anatomy.scene.lesion, **changes)
     assert words in lack_of_room(phantom, draw)
-
-
-def test_thin_tissue_is_named_too(phantom):
-    thin = replace(phantom, thick=np.zeros(len(phantom.points), dtype=bool))
-    assert "lie over less than" in lack_of_room(thin, phantom.anatomy.scene.lesion)

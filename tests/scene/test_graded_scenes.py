@@ -47,8 +47,3 @@ def test_graded_block_scene():
         np.unique(graded.face.points[graded.face.triangles].reshape(-1, 3).round(12), axis=0),
         np.unique(uniform.face.points[uniform.face.triangles].reshape(-1, 3).round(12), axis=0),
     )
-
-
-def test_a_grading_that_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match=r"is 3 times cell_size .*1, 2 or 4 times"):
-        load_anatomy(changed_scene("liver", "surface", coarse_cell_size=0.0234))

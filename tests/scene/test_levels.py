@@ -8,7 +8,7 @@ import pytest
 
 from surgsim_env.scene import levels
 from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.levels import LEVELS, DrawnOrgan, Level, find_level
+from surgsim_env.scene.levels import LEVELS, DrawnOrgan, Level
 from surgsim_env.scene.load import make_scene
 
 SCENES = ("phantom", "phantom_small")
@@ -98,12 +98,6 @@ def test_stiff_draws_get_little_mass_and_need_no_more_substeps():
     stiff = replace(level, background=(1.3, 1.3), radius=(1.0, 1.0), cover=(0.0, 0.0), modulus_ratio=(1.0, 1.0))
     organ = stiff.draw(anatomy, np.random.default_rng(1), lesion_count=2).compiled(anatomy)
     assert 0.0 < organ.added_mass < 0.02 * organ.node_mass.sum()
-
-
-@pytest.mark.parametrize("name", ["harder", None, 3])
-def test_unknown_levels_are_refused(name: object):
-    with pytest.raises(ValueError, match=r"level .* is unknown.*the levels are easy, standard, hard"):
-        find_level(name)  # type: ignore[arg-type]
 
 
 def test_scenes_that_a_level_cannot_draw_from_are_refused(monkeypatch):

@@ -162,12 +162,6 @@ def test_a_fault_is_named():
         run_script(env, [Control(break_it, timeout=1.0)])
 
 
-def test_an_episode_whose_time_is_up_says_so():
-    env = gym.wrappers.TimeLimit(above().unwrapped, 3)
-    with pytest.raises(ScriptError, match="'Hold', was cut short: the episode is over, its time is up"):
-        run_script(env, [Hold(1.0)], seed=0)
-
-
 def test_an_episode_may_end_in_the_last_step_that_is_made_for_it():
     trace = run_script(above(), [PressUntil(0.1, 0.01), Declare()])
     assert trace.terminated and trace.info["declared"]
@@ -271,37 +265,8 @@ def test_a_recording_is_followed(tmp_path, pause):
     assert played.duration > first.haptic_time[-1] - first.haptic_time[0]
 
 
-def test_a_trajectory_of_places_alone_is_followed(tmp_path):
-    start = np.array([*MIDDLE, TOP + RADIUS + 0.004])
-    path = tmp_path / "t.csv"
-    path.write_text(
-        "time,x,y,z\n" + "\n".join(f"{t},{start[0] + 0.01 * (t - 5)},{start[1]},{start[2]}" for t in (5, 5.5, 6))
-    )
-    trace = run_script(above(gap=0.004), [Follow(path), Hold(0.2)])
-    np.testing.assert_allclose(trace.tip_position[-1] - start, [0.01, 0.0, 0.0], atol=1e-4)
-
-
 def test_a_path_that_is_too_fast_fails_with_the_distance(tmp_path):
     path, height = tmp_path / "fast.csv", TOP + RADIUS + 0.002
     path.write_text(f"time,x,y,z\n0,0.03,0.03,{height}\n0.1,0.05,0.03,{height}\n1,0.05,0.03,{height}\n")
     with pytest.raises(ScriptError, match=r"was \d+\.\d mm from the path of fast.csv at 0\.\d+ s"):
         run_script(above(), [Follow(path)])
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("time,x,y\n0,0,0\n", "column 'z' is missing"),
-        ("time,x,y,z\n0,0,0,0\n0.1,nan,nan,nan\n", "row 1: a number is not finite"),
-        ("time,x,y,z\n0,0,0,0\n0,0,0,0\n", "row 1: time 0 s is not after"),
-    ],
-)
-def test_what_cannot_be_followed_is_refused(tmp_path, text, words):
-    (tmp_path / "bad.csv").write_text(text)
-    with pytest.raises(ValueError, match=words):
-        run_script(above(), [Follow(tmp_path / "bad.csv")])
-
-
-def test_an_arm_that_is_not_there_is_refused():
-    with pytest.raises(ValueError, match="Follow: arm is 3; it must be 1 or 2"):
-        Follow("r.csv", arm=3)

@@ -474,12 +474,6 @@ def test_arms_out_of_range_are_refused(moduli: tuple[float, ...], times: tuple[f
         Relaxation(moduli, times)
 
 
-def test_materials_with_other_times_are_refused():
-    lesion = Lesion((0.02, 0.02, 0.01), 0.008, Material(30e3, 1060.0, 0.45, None, Relaxation((0.3,), (1.0,))))
-    with pytest.raises(OrganError, match="share their times"):
-        block(None, ARMS, lesions=(lesion,))
-
-
 def test_an_organ_under_gravity_settles_with_its_arms_relaxed():
     mesh = box_mesh(SIZE, CELLS)
     bottom = np.flatnonzero(mesh.points[:, 2] < 1e-9)

@@ -259,12 +259,6 @@ def contact_forces(organs: list[OrganModel], dtype: type) -> np.ndarray:
     return np.array(rows)
 
 
-@pytest.mark.slow  # compiles lanes of another width
-def test_eight_of_sixteen_lanes_press_like_eight_alone():
-    organs = pressed_organs(16)
-    np.testing.assert_array_equal(contact_forces(organs, np.float32), contact_forces(organs[:8], np.float32))
-
-
 def test_float32_presses_like_float64():
     """Over a whole press and its release the contact force is within 0.5 % of the largest of float64."""
     organs = pressed_organs(8)
@@ -342,19 +336,3 @@ def test_only_organs_that_share_a_mesh_stand_side_by_side():
         stack_organs([one], dtype=np.int64)
     with pytest.raises(OrganError, match="lane 8 does not exist"):
         set_lane(model, 8, one)
-
-
-def test_what_does_not_fit_is_refused_before_it_is_loaded():
-    organs = pressed_organs()
-    model, state, shapes, _, wrench = pressing(organs)
-    for given, words in (
-        ((model, rest_lanes(organs, shape_count=1), shapes, LAW, SUBSTEP, 1, wrench), "contact_engaged has shape"),
-        ((model, rest_lanes([oracle.block()]), shapes, LAW, SUBSTEP, 1, wrench), "node_position has shape"),
-        ((model, state, shapes, LAW, SUBSTEP, 1, wrench[:3]), "wrench has shape"),
-        ((model, state, shapes, LAW, SUBSTEP, 0, wrench), "at least one"),
-        ((model, state, shapes, LAW, 1.0, 1, wrench), "stable step of lane"),
-    ):
-        with pytest.raises(OrganError, match=words):
-            advance_lanes(*given)
-    with pytest.raises(OrganError, match="the state has 48 nodes"):
-        put_lane(state, 0, rest_state(oracle.irregular_organ(0)))

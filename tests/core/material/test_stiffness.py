@@ -185,12 +185,6 @@ def test_each_tet_adds_its_own_share(rule: str):
     np.testing.assert_allclose(after - before, expected, rtol=0, atol=EXACT * after.max())
 
 
-def test_unknown_rule_lists_the_rules_and_suggests_one():
-    known = "the rules are lloyd, fitted, van_gelder; did you mean 'lloyd'"
-    with pytest.raises(OrganError, match=f"'loyd' is unknown; {known}"):
-        spring_network(LATTICE, MODULUS, rule="loyd")
-
-
 @pytest.mark.parametrize("bad", [0.0, -3.0, math.nan, math.inf])
 def test_bad_modulus_names_the_tet(bad: float):
     modulus = np.full(LATTICE.tet_count, MODULUS)

@@ -113,10 +113,6 @@ def test_regions_are_found_by_name():
         mesh.region_tag("tumour")
 
 
-def test_repr_tells_size_in_millimetres_and_millilitres():
-    assert repr(TetMesh(TET / 10, [[0, 1, 2, 3]])) == "TetMesh(4 nodes, 1 tets, 100.0 x 100.0 x 100.0 mm, 166.7 ml)"
-
-
 FAR = np.vstack([TET, TET + 5])
 REFUSED = {
     "flat points": (TET[:, :2], [[0, 1, 2, 3]], r"points have shape \(4, 2\); the rule is \(n_node, 3\)"),

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from msdm_core.errors import MeshError
-from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
+from msdm_core.meshing.lattice_meshing import mesh_surface
 
 
 @pytest.mark.parametrize(
@@ -26,25 +26,3 @@ def test_impossible_gradings_are_refused(graded, words):
     solid = trimesh.creation.icosphere(4, 0.08)
     with pytest.raises(MeshError, match=words):
         mesh_surface(solid.vertices, solid.faces, cell_size=0.01, **graded)
-
-
-def test_coarse_cells_too_large_for_the_surface_are_refused():
-    solid = trimesh.creation.icosphere(4, 0.03)
-    with pytest.raises(MeshError, match=r"coarse_cell_size 0\.04 m is too coarse.*use 0\.02 m"):
-        mesh_surface(solid.vertices, solid.faces, cell_size=0.01, coarse_cell_size=0.04)
-
-
-@pytest.mark.parametrize(
-    ("graded", "words"),
-    [
-        ({"coarsening": 3, "fine_depth": 0.01}, "coarsening is 3"),
-        ({"coarsening": 2}, "give a fine_depth"),
-        ({"fine_depth": 0.01}, "give a fine_depth"),
-        ({"coarsening": 4, "fine_depth": 0.01}, r"cells is \[4, 4, 6\] with coarsening 4"),
-        ({"coarsening": 2, "fine_depth": 0.0}, "fine_depth is 0 m"),
-        ({"coarsening": 2, "fine_depth": 0.07}, r"at most the height, 0\.06 m"),
-    ],
-)
-def test_impossible_graded_blocks_are_refused(graded, words):
-    with pytest.raises(ValueError, match=words):
-        box_mesh((0.04, 0.04, 0.06), (4, 4, 6), **graded)

@@ -113,17 +113,6 @@ def test_only_named_labels_are_filled():
     assert part.volumes.sum() == pytest.approx(0.5 * whole.volumes.sum(), rel=0.15)
 
 
-def test_the_same_image_gives_the_same_bits():
-    labels, _ = ellipsoid((0.002, 0.002, 0.003))
-    first, second = (
-        mesh_segmentation(one, (0.002, 0.002, 0.003), cell_size=0.007, region_names=NAMES)
-        for one in (labels, np.pad(labels, 3)[3:-3, 3:-3, 3:-3].astype(np.uint8))
-    )
-    np.testing.assert_array_equal(first.tets, second.tets)
-    np.testing.assert_array_equal(first.region, second.region)
-    assert first.points.tobytes() == second.points.tobytes()
-
-
 def test_where_the_image_begins_does_not_matter():
     labels, _ = ellipsoid((0.002, 0.002, 0.002))
     first = mesh_segmentation(labels, (0.002,) * 3, cell_size=0.008, region_names=NAMES)

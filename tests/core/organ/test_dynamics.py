@@ -299,12 +299,6 @@ def test_a_step_that_is_not_stable_is_refused(factor: float):
     np.testing.assert_array_equal(state.node_position, model.node_rest_position)
 
 
-def test_shapes_without_memory_are_refused():
-    model = oracle.irregular_organ(5)
-    with pytest.raises(OrganError, match=r"1 contact shapes, but the state remembers 0: .* shape_count"):
-        advance(model, rest_state(model), dt=1e-5, shapes=oracle.ball((0.0, 0.0, 1.0), 0.01))
-
-
 @pytest.mark.parametrize(
     ("fields", "message"), [({"alpha": -1.0}, "alpha is -1.0 1/s"), ({"alpha": 1.0, "beta": math.nan}, "beta is nan s")]
 )

@@ -114,11 +114,6 @@ def test_lanes_move_as_the_organ_alone():
         np.testing.assert_array_equal(get_lane(lanes, lane).node_position, state.node_position, err_msg=f"lane {lane}")
 
 
-def test_lanes_share_their_foundations():
-    with pytest.raises(OrganError, match="organ for lane 1 has another foundation_stiffness than its neighbours"):
-        stack_organs([on(FAT), on(replace(FAT, stiffness=2.0 * SOFT))])
-
-
 INNER = next(node for node in range(MESH.node_count) if node not in MESH.boundary_nodes)
 
 

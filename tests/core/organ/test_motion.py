@@ -195,11 +195,6 @@ def test_motions_that_are_impossible_are_refused(given, words):
         Motion(**{"name": "breathing", "displacement": (0.0, 0.0, 0.01), **given})
 
 
-def test_two_motions_of_one_name_are_refused():
-    with pytest.raises(OrganError, match="two motions are named 'breathing'"):
-        compile_organ(replace(HELD, motions=(BREATH, BREATH)))
-
-
 def test_a_state_of_an_organ_that_moves_otherwise_is_refused():
     """Compiled code would read beyond its arrays."""
     moved, still = (compile_organ(replace(HELD, motions=motions)) for motions in ((BREATH,), ()))

@@ -211,16 +211,14 @@ def test_a_state_saved_in_a_held_breath_goes_on_to_the_bit(anatomy):
         assert other.organ_state.motion[0, SIGNAL] > 0.1
 
 
-def test_what_a_scene_says_of_motion_is_checked(scene):
-    for changes, words in (
-        ({"period": (0.0, 1.0)}, "period"),
-        ({"rise": 0.7, "fall": 0.5}, "together at most 1"),
+def test_what_a_scene_says_of_motion_is_checked():
+    for changes, named in (
+        ({"rise": 0.7, "fall": 0.5}, "rise"),
         ({"size": (2.0, 1.0)}, "size"),
-        ({"variation": 0.9}, "variation is 0.9; it must be from 0 to 0.3"),
+        ({"variation": 0.9}, "variation is 0.9"),
         ({"side": (0.0, 0.0, 1.0)}, "reach"),
-        ({"side": (0.0, 0.0, 1.0), "reach": 0.1, "centre": (0.0, 0.0, 0.0)}, "give a side or a centre, not both"),
     ):
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=named):
             replace(BREATH, **changes)
 
 

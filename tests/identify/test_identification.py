@@ -113,8 +113,8 @@ def test_the_held_out_half_does_not_choose_the_law(stiffening_set):
 def test_bad_sites_are_told(stiffening_set):
     flat = SitePress(77, np.zeros(3), stiffening_set.presses[0].depth, np.full(10, 0.1))
     found = identify([Recording("some", (*stiffening_set.presses, flat))], KNOWN)
-    assert any("some: 1 sites are left out" in line and line.endswith(": 77") for line in found.warnings)
-    with pytest.raises(ValueError, match=r"recording few: 5 of 6 sites can be used \(1 with force that rises"):
+    assert any("some" in line and "77" in line for line in found.warnings)
+    with pytest.raises(ValueError, match="few: 5 of 6 sites"):
         identify([Recording("few", (*stiffening_set.presses[:5], flat))], KNOWN)
 
 

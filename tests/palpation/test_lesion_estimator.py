@@ -112,16 +112,7 @@ def test_a_map_that_deviates_asks_for_more_excess() -> None:
     assert len(doubtful.estimate(places, values).points) == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"extent": (0.04, 0.0)}, "extent is"),
-        ({"extent": (0.04,)}, "extent is"),
-        ({"lesion_radius": 0.0}, "lesion_radius is 0 m"),
-        ({"noise": -0.1}, "noise is -0.1"),
-        ({"map_spread": -0.1}, "map_spread is -0.1"),
-    ],
-)
-def test_refusals_at_construction(arguments: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("arguments", [{"extent": (0.04, 0.0)}, {"lesion_radius": 0.0}, {"noise": -0.1}])
+def test_refusals_at_construction(arguments: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(arguments))} is"):
         LesionEstimator(**({"extent": EXTENT, "lesion_radius": LESION_RADIUS, "noise": NOISE} | arguments))

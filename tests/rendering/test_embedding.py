@@ -95,7 +95,5 @@ def test_a_vertex_far_outside_is_refused_by_its_name(ball):
     mesh, surface, vertices = ball
     moved = vertices.copy()
     moved[17] *= 1.5
-    with pytest.raises(MeshError, match=r"vertex 17 of the fine surface.* is 15(\.\d+)? mm from the boundary"):
+    with pytest.raises(MeshError, match=r"vertex 17 .* 15(\.\d+)? mm"):
         embedded_surface(moved, surface.faces, mesh)
-    with pytest.raises(MeshError, match="in the same axes and unit"):
-        embedded_surface(vertices * 1e3, surface.faces, mesh)

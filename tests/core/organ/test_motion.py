@@ -181,17 +181,15 @@ def test_lanes_move_as_organs_alone():
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("given", "named"),
     [
-        ({"displacement": (0.0, math.nan, 0.0)}, "displacement is .* 3 finite numbers"),
-        ({"displacement": (0.0, 0.1)}, "displacement"),
-        ({"reach": -1.0, "centre": (0.0, 0.0, 0.0)}, "reach is -1 m; it must be above 0"),
-        ({"reach": 0.1}, "give both"),
-        ({"centre": (0.0, 0.0, 0.0)}, "give both"),
+        ({"displacement": (0.0, math.nan, 0.0)}, "displacement is .*nan"),
+        ({"reach": -1.0, "centre": (0.0, 0.0, 0.0)}, "reach is -1"),
+        ({"reach": 0.1}, "centre"),
     ],
 )
-def test_motions_that_are_impossible_are_refused(given, words):
-    with pytest.raises(OrganError, match=words):
+def test_motions_that_are_impossible_are_refused(given, named):
+    with pytest.raises(OrganError, match=named):
         Motion(**{"name": "breathing", "displacement": (0.0, 0.0, 0.01), **given})
 
 

@@ -1,6 +1,5 @@
 """The notebooks of docs/ run from their first cell to their last, and what they store is small and names no machine."""
 
-import base64
 import importlib.util
 import json
 import re
@@ -30,11 +29,6 @@ def script(path: Path):
 @pytest.fixture(scope="module")
 def maker():
     return script(ROOT / "docs" / "make_notebooks.py")
-
-
-@pytest.fixture(scope="module")
-def pages():
-    return script(ROOT / "docs" / "hooks" / "notebook_pages.py")
 
 
 def stored(name: str) -> dict:
@@ -73,43 +67,6 @@ def test_what_is_stored_names_no_machine(name, maker):
             assert OF_A_MACHINE.search(said) is None, said
             assert output.get("name") != "stderr" and output["output_type"] != "error"
             assert set(output.get("data", {})) <= {"image/png", "text/plain"}
-
-
-def test_what_is_of_the_machine_is_left_out(maker):
-    new = maker.nbformat.v4
-    cell = new.new_code_cell("draw()", metadata={"execution": {"iopub.execute_input": "2025-01-01"}})
-    cell.outputs = [
-        new.new_output("stream", name="stderr", text="/tmp/ipykernel_1/2.py:1: UserWarning"),
-        new.new_output("execute_result", data={"text/plain": "<Figure at 0x7f1234567890>"}),
-    ]
-    kept = maker.cleaned(
-        new.new_notebook(cells=[cell], metadata={"language_info": {"name": "python", "version": "3.11.7"}})
-    )
-    assert kept.metadata == maker.METADATA and kept.cells[0].metadata == {}
-    (output,) = kept.cells[0].outputs
-    assert output.data["text/plain"] == "<Figure>"
-
-
-def test_a_page_has_text_code_outputs_and_pictures(pages):
-    picture = base64.b64encode(b"\x89PNG...").decode()
-    cells = [
-        {"cell_type": "markdown", "source": ["# Press\n", "\n", "See [another](own_patient.ipynb)."]},
-        {
-            "cell_type": "code",
-            "source": "press()",
-            "outputs": [
-                {"output_type": "stream", "name": "stdout", "text": "0.40 N\n"},
-                {"output_type": "display_data", "data": {"image/png": picture}},
-            ],
-        },
-    ]
-    text, pictures = pages.page_of({"cells": cells}, "press")
-    assert pictures == {"press/0.png": b"\x89PNG..."}
-    assert text.startswith("# Press\n\nSee [another](own_patient.md).\n\n[Save this notebook](press.ipynb)")
-    assert text.endswith('```python\npress()\n```\n\n```text title="prints"\n0.40 N\n```\n\n![Press](press/0.png)\n')
-    cells[1]["outputs"] = [{"output_type": "error", "ename": "ValueError"}]
-    with pytest.raises(pages.PluginError, match=r"press.ipynb: an output of the kind 'error'"):
-        pages.page_of({"cells": cells}, "press")
 
 
 def test_the_site_has_each_notebook_with_its_pictures(site_folder):

@@ -104,18 +104,6 @@ def test_every_environment_has_a_page_with_gymnasiums_headings(id):
     assert "Arguments" in told and all(told.values())
 
 
-@pytest.mark.parametrize(
-    "page",
-    [page for page in PAGES if "<!-- made from the code -->" in page.read_text(encoding="utf-8")],
-    ids=lambda one: one.stem,
-)
-def test_what_stands_for_the_generated_part_is_replaced(page):
-    text = page.read_text(encoding="utf-8")
-    made = hook("generated_parts").on_page_markdown(text, None, None, None)
-    assert "The site (`make docs`)" in text and "The site (`make docs`)" not in made
-    assert len(made) > 2 * len(text) and "<!--" not in made
-
-
 @pytest.mark.parametrize("id", IDS)
 def test_tables_have_every_command_channel_and_reward(id):
     task, text = TASKS[id], hook("generated_parts").environment_text(id)
@@ -140,27 +128,3 @@ def test_every_command_and_every_option_is_on_the_page():
         rows = dict(re.findall(r"^\| <code>(?:-\w, )?(--[\w-]+)[^|]*\| (.*) \|$", section, flags=re.MULTILINE))
         assert options == set(rows), name
         assert [option for option, told in rows.items() if len(told) < 5 or told.endswith(",")] == [], name
-
-
-def test_paths_of_pages_become_links_outside_of_code():
-    module = hook("site_pages")
-
-    class One:
-        def __init__(self, place: str, text: str) -> None:
-            self.src_uri, self.content_string = place, text
-            self.inclusion = self
-
-        def is_included(self) -> bool:
-            return True
-
-    class All(dict):
-        get_file_from_path = dict.get
-
-    files = All({"arms.md": One("arms.md", "# Arms of all kinds\n"), "agents.md": One("agents.md", "# Agents\n")})
-    page = type("Page", (), {"file": One("tutorials/robot.md", "")})
-    text = "See `docs/arms.md`, agents/README.md (docs/arms.md)."
-    code = "\n\n```sh\ncat docs/arms.md\n```\n\n`cat docs/arms.md` `x docs/arms.md y` [x](docs/arms.md)"
-    link = "[Arms of all kinds](../arms.md)"
-    turned = module.on_page_markdown(text + code, page, None, files)
-    assert turned == f"See {link}, [Agents](../agents.md) ({link})." + code
-    assert module.on_page_markdown("`docs/nowhere.md`", page, None, files) == "`docs/nowhere.md`"

@@ -31,6 +31,11 @@ CASES = [(env_id, SETTINGS.get(env_id, {})) for env_id in IDS] + [
     ("SurgSim/Palpate-v0", {"scene": "phantom", "instrument": "psm_palpator"}),
     pytest.param(("SurgSim/Retract-v0", {"instrument": "psm_retractor"}), marks=pytest.mark.slow),
     ("SurgSim/Palpate-v0", {"scene": "kidney_family"}),
+    # All that an episode may remember, draw and follow.
+    (
+        "SurgSim/Palpate-v0",
+        {"scene": "phantom_small", "memory": True, "frame": "face", "level": "clinical", "motion": "free"},
+    ),
     *(
         pytest.param((env_id, {"scene": scene}), marks=pytest.mark.slow)
         for env_id, scene in (

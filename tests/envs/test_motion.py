@@ -89,25 +89,6 @@ def test_the_ground_is_where_the_signals_say_after_each_haptic_step(scene):
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_a_saved_state_continues_as_the_episode_did(env_id, scene_file):
-    """To the bit, with the cycles that were drawn; another environment that loads it too."""
-    env = gym.make(env_id, scene=scene_file)
-    env.reset(seed=1)
-    env.action_space.seed(1)
-    actions = [env.action_space.sample() for _ in range(6)]
-    for action in actions[:3]:
-        env.step(action)
-    state = env.unwrapped.save_state()
-    expected = [env.step(action)[0] for action in actions[3:]]
-    other = gym.make(env_id, scene=scene_file)
-    other.reset(seed=9)
-    other.unwrapped.load_state(state)
-    for action, observation in zip(actions[3:], expected, strict=True):
-        assert other.step(action)[0].tobytes() == observation.tobytes()
-    assert other.unwrapped.save_state() == env.unwrapped.save_state()
-
-
-@pytest.mark.parametrize("env_id", IDS)
 def test_organs_side_by_side_breathe_as_alone(env_id, scene_file):
     """Each lane its own cycles, to the bit."""
     lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled"}

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401
 from surgsim_env.palpation.chart import MAP_SIDE
@@ -62,29 +61,6 @@ def test_a_command_moves_the_tip_along_an_axis_of_the_face(liver, axis):
     # The action of a velocity in the world is that of the frame.
     world = liver.task.frame.axes[axis] * 0.01
     np.testing.assert_allclose(liver.task.action(world)[:3], action[:3], atol=1e-7)
-
-
-def test_the_frame_keeps_to_the_contract_and_saved_states():
-    env = gym.make(ID, memory=True, frame="face")
-    check_env(env.unwrapped, skip_render_check=True)
-    env.reset(seed=2)
-    down = np.array([0.1, 0.0, -0.5, 0.0], dtype=np.float32)
-    for _ in range(5):
-        env.step(down)
-    state = env.unwrapped.save_state()
-    rows = [[env.step(down)[0] for _ in range(3)]]
-    env.unwrapped.load_state(state)
-    rows.append([env.step(down)[0] for _ in range(3)])
-    np.testing.assert_array_equal(*rows)
-
-
-def test_lanes_in_the_frame_equal_a_single_environment():
-    envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", frame="face")
-    single, action = gym.make(ID, frame="face"), np.array([0.3, 0.1, -0.5, 0.0], dtype=np.float32)
-    envs.reset(seed=[5, 6])
-    single.reset(seed=6)
-    for _ in range(10):
-        np.testing.assert_array_equal(envs.step(np.tile(action, (2, 1)))[0][1], single.step(action)[0])
 
 
 def test_a_member_of_a_family_has_its_own_frame():

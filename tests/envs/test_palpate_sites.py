@@ -9,7 +9,7 @@ import pytest
 import surgsim_env  # noqa: F401
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation import chart as healthy_module
-from surgsim_env.palpation.chart import ChartedFace, charted_face, healthy_map, interpolated, make_chart
+from surgsim_env.palpation.chart import charted_face, healthy_map, interpolated
 from surgsim_env.palpation.press import SitePress, press, press_alone, press_phases, stop_force
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import LEVELS, DrawnOrgan
@@ -99,24 +99,6 @@ def test_a_press_tells_where_the_instrument_was_held_back(monkeypatch):
 
 
 # ---- the chart ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_charts_hold_the_sites_that_keep_the_margin():
-    for name, extent, side in (("phantom", 0.04, 13), ("phantom_small", 0.03, 13), ("phantom_wide", 0.1, 25)):
-        scene = make_scene(name)
-        anatomy = load_anatomy(scene)
-        chart = make_chart(anatomy.face, scene.instrument.tip_radius)
-        np.testing.assert_allclose(chart.extent, extent, rtol=1e-12)
-        assert chart.side_count == side
-        charted = ChartedFace(anatomy, chart)
-        for place in ([-1.0, -1.0], [1.0, 1.0], [0.3, -0.7]):
-            site = charted.site(place)
-            assert site.moved == 0.0
-            top, margin = scene.mesh.block.size[2], scene.palpation.face_margin
-            expected = [*(margin + 0.5 * (np.array(place) + 1.0) * extent), top]
-            np.testing.assert_allclose(site.point, expected, atol=1e-12)
-            np.testing.assert_allclose(charted.surface(place), expected, atol=1e-12)
 
 
 def test_a_place_beyond_the_liver_is_moved_to_its_nearest_site():

@@ -8,7 +8,6 @@ import pytest
 from surgsim_env.envs.ids import RetractEnv
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.stage import LABELS
-from surgsim_env.scripting import Hold, Until, run_script
 from tests.envs.retract_steps import act
 
 
@@ -60,19 +59,6 @@ def test_what_is_seen_is_what_a_picture_shows(width, height, tolerance):
 
 
 @pytest.mark.usefixtures("opengl")
-def test_observing_pictures_changes_no_bit_of_the_episode():
-    plain, seeing = RetractEnv(), RetractEnv(obs_mode="rgb")
-    assert seeing.observation_space.shape == (84, 84, 3) and seeing.observation_space.dtype == np.uint8
-    one, other = plain.reset(seed=5), seeing.reset(seed=5)
-    assert seeing.observation_space.contains(other[0]) and np.ptp(other[0]) > 50
-    for _ in range(5):
-        one, other = act(plain, (0.0, -0.02, 0.0), jaw=-1.0), act(seeing, (0.0, -0.02, 0.0), jaw=-1.0)
-    assert one[1:] == other[1:]
-    assert plain.save_state() == seeing.save_state()
-    seeing.close()
-
-
-@pytest.mark.usefixtures("opengl")
 def test_a_fault_shows_the_last_picture_before_it():
     """Not one of a lobe whose nodes are nowhere."""
     env = RetractEnv(obs_mode="rgb")
@@ -82,19 +68,4 @@ def test_a_fault_shows_the_last_picture_before_it():
     observation, _, terminated, _, info = act(env)
     assert terminated and "no longer finite" in info["sim_fault"]
     np.testing.assert_array_equal(observation, before)
-    env.close()
-
-
-@pytest.mark.usefixtures("opengl")
-def test_scripts_feel_forces_where_pictures_are_observed(tmp_path):
-    """The sensor's reading is a force, not rows of the picture, and a trace's table has no pictures in it."""
-    env, felt = RetractEnv(obs_mode="rgb"), []
-    wait = Until(Hold(0.2), lambda view: felt.append(view.sensed_force) or False)
-    trace = run_script(env, [wait], seed=6)
-    assert trace.observation.shape == (4, 84, 84, 3)
-    bias, noise = env.task.sensors["contact_force"].bias, env.scene.sensor.noise
-    np.testing.assert_allclose(np.array(felt), np.tile(bias, (len(felt), 1)), atol=6 * noise)
-    _, table = trace.to_csv(tmp_path / "run.csv")
-    columns = table.read_text().splitlines()[0].split(",")
-    assert columns[:3] == ["time_s", "step", "action_0"]
     env.close()

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.envs.ids import PalpateEnv, RetractEnv
-from surgsim_env.envs.vector_env import LaneVectorEnv, vector_class
+from surgsim_env.envs.ids import RetractEnv
+from surgsim_env.envs.vector_env import vector_class
 from tests.envs.test_vector_env import assert_equal
 
 ID = "SurgSim/Retract-v0"
@@ -75,34 +75,6 @@ def test_equals_environments_one_after_the_other(mode: str, instrument: str | No
     assert len({float(model.node_rest_position.max()) for model in models}) == COUNT, "sizes differ"
     together.close()
     apart.close()
-
-
-@pytest.mark.slow  # compiles float32 for rest shapes of their own
-def test_single_precision_feels_the_same_force():
-    """Over an approach and a grasp: within 0.5 % of the largest force on a finger."""
-    exact, fast = side_by_side(), side_by_side(dtype="float32")
-    felt = []
-    for envs in (exact, fast):
-        observation, _ = envs.reset(seed=SEED)
-        goal, rows = goals(envs), []
-        for step in range(56):
-            observation = envs.step(action(observation, goal, grasp=step >= 45, size=5))[0]
-            rows.append([env.unwrapped.simulation.contact_wrench[:, :3] for env in envs.envs])  # type: ignore[attr-defined]
-        felt.append(np.array(rows))
-    largest, error = np.abs(felt[0]).max(), np.abs(felt[1] - felt[0]).max()
-    print(f"\nlargest force {largest:.3f} N, float32 off by {error:.2e} N, {100.0 * error / largest:.3f} %")
-    assert largest > 0.1
-    assert 0.0 < error < 0.005 * largest
-
-
-def test_lanes_have_rest_shapes_of_their_own_only_where_they_differ():
-    """Lesions leave the phantom's rest shape alone: its lanes share it, which is faster."""
-    lobes, phantoms = side_by_side(), vector_class(PalpateEnv)(2, scene="phantom")
-    for envs in (lobes, phantoms):
-        assert isinstance(envs, LaneVectorEnv)
-        envs.reset(seed=SEED)
-        envs.step(np.zeros(envs.action_space.shape, dtype=np.float32))  # type: ignore[arg-type]
-    assert lobes._groups[0]._own_rest and not phantoms._groups[0]._own_rest  # type: ignore[attr-defined]
 
 
 def test_lobes_on_moving_ground_equal_environments_one_after_the_other():

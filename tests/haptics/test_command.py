@@ -10,7 +10,6 @@ import pytest
 
 from surgsim_env.cli.main import main
 from surgsim_env.haptics import udp_client
-from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.pacing import SPIN, Pacer
 from surgsim_env.haptics.trajectory import save_trajectory
 from tests.haptics.udp_link import SharedTime
@@ -106,22 +105,3 @@ def test_ctrl_c_keeps_the_steps_until_then_whole(tmp_path, monkeypatch, capsys):
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     assert len(rows) == 26 and {len(row) for row in rows} == {len(rows[0])}
-
-
-@pytest.mark.parametrize("apnoea", [False, True])
-def test_apnoea_holds_the_breath_whatever_the_button_does(tmp_path, apnoea, monkeypatch):
-    """Without it the second button holds the breath while it is pressed: here in the first half."""
-    held = []
-
-    class Watched(HapticLoop):
-        def step(self):
-            told = super().step()
-            held.append(self.simulation.holds_breath)
-            return told
-
-    monkeypatch.setattr("surgsim_env.cli.haptics.HapticLoop", Watched)
-    save_trajectory(tmp_path / "still.csv", np.array([0.0, 0.01, 0.02]), np.zeros((3, 3)), [2, 0, 0])
-    arguments = ["haptics", "--scene", "phantom_small", "--trajectory", str(tmp_path / "still.csv"), "--motion", "calm"]
-    assert main([*arguments, *(["--apnoea"] if apnoea else [])]) == 0
-    # The first step only compiles.
-    assert held[1:] == [True] * (21 if apnoea else 10) + [False] * (0 if apnoea else 11)

@@ -169,17 +169,6 @@ def test_the_material_fits_into_a_scene(run):
     assert scene.material.stiffening.tangent_cap == table["material"]["stiffening"]["tangent_cap"]
 
 
-def test_without_places_there_is_no_map(tmp_path, stiffening_set):
-    path = tmp_path / "set.csv"
-    lines = write_csv(stiffening_set, path).read_text(encoding="utf-8").splitlines()
-    rows = [line.split(",") for line in lines]
-    path.write_text("\n".join(",".join([row[0], *row[5:7]]) for row in rows) + "\n", encoding="utf-8")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "modulus_map.png").write_bytes(b"of an older run")
-    assert main(["identify", str(path), "--thickness", "0.012", "--out", str(tmp_path / "out")]) == 0
-    assert {one.name for one in (tmp_path / "out").iterdir()} == set(RESULT_NAMES) - {"modulus_map.png"}
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

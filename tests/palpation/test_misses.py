@@ -1,6 +1,5 @@
 """Each lesion that a map does not show has its reason: one organ, in which a lesion can be missed in every way."""
 
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -88,20 +87,6 @@ def test_the_reason(monkeypatch, reason, lesions, options):
     assert miss.text.startswith(f"{reason}: ")
 
 
-def test_the_approach_that_would_face_it_is_said(monkeypatch):
-    """A lesion near the flank at y = 0, below: from there."""
-    (miss,) = missed(monkeypatch, lesion(0.034, 0.011, 0.022), forces=(0.201, 0.2))
-    said = re.search(r"--approach (\S+) faces it", miss.text)
-    assert said, miss.text
-    into = np.array([float(part) for part in said[1].split(",")])
-    np.testing.assert_allclose(into, [0.0, 1.0, 0.0], atol=0.01)
-
-
 def test_a_deep_lesion_that_a_press_feels_all_the_same_is_not_called_hidden(monkeypatch):
     (miss,) = missed(monkeypatch, lesion(0.034, 0.042, 0.012), forces=(0.30, 0.2))
     assert miss.reason == NO_MAXIMUM
-
-
-def test_presses_that_ended_early_are_counted(monkeypatch):
-    (miss,) = missed(monkeypatch, ABOVE, sites=SITES[:12], early=np.array([[0.034, 0.042, 0.05], [0.0, 0.0, 0.05]]))
-    assert "1 presses near it ended early" in miss.text

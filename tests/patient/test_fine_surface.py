@@ -9,7 +9,6 @@ import trimesh
 from msdm_core.errors import MeshError
 from msdm_core.mesh.carriers import find_carriers
 from msdm_core.mesh.surface import check_surface, surface_volume
-from msdm_core.mesh_files.surface_io import read_surface
 from msdm_core.meshing.lattice_meshing import mesh_surface
 from msdm_core.meshing.segmentation_meshing import smoothed_share
 from surgsim_env.palpation.surface_drawing import organ_patches
@@ -144,14 +143,3 @@ def test_a_surface_of_another_organ_or_unit_is_refused_when_it_is_drawn(written)
     for draw in (organ_surface, organ_patches):
         with pytest.raises(MeshError, match=r"vertex \d+"):
             draw(anatomy)
-
-
-def test_a_file_s_own_surface_is_read_back_as_it_was(tmp_path):
-    ball = trimesh.creation.icosphere(4, RADIUS)
-    mesh = mesh_surface(ball.vertices, ball.faces, cell_size=0.008)
-    fit = fitted_surface(np.array(ball.vertices), np.array(ball.faces), mesh, 0.008)
-    np.testing.assert_array_equal(fit.vertices, ball.vertices)
-    fit.write(tmp_path / "own.ply")
-    vertices, triangles = read_surface(tmp_path / "own.ply", length_unit="m")
-    # The file holds single precision.
-    np.testing.assert_allclose(vertices[triangles], fit.vertices[fit.triangles], rtol=0, atol=1e-8)

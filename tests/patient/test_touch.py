@@ -1,19 +1,16 @@
 """Tip, cells and their cost, and hidden lesions that fit: `surgsim organ` before and after it makes a mesh."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from msdm_core.mesh.surface import outward_facing
 from msdm_core.meshing.segmentation_meshing import FineFace, fill_labels
 from surgsim_env.palpation.surface_scene import SurfaceOptions
-from surgsim_env.patient.lesion_room import lack_of_room, sample_face
+from surgsim_env.patient.lesion_room import sample_face
 from surgsim_env.patient.meshers import Cells, mesh_surfaces, read_surfaces
 from surgsim_env.patient.touch import plan_touch
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import LesionDraw
 from surgsim_env.scene.palpable_surface import contact_radius
 from tests.patient.surfaces import ball
 
@@ -61,21 +58,3 @@ def test_cells_are_fine_at_the_pressed_face_and_as_many_as_was_said(way, tmp_pat
 @pytest.fixture(scope="module")
 def phantom():
     return sample_face(load_anatomy(make_scene("phantom")))
-
-
-def test_lesions_that_a_scene_draws_find_room_in_it(phantom):
-    assert lack_of_room(phantom, phantom.anatomy.scene.lesion) == ""
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"rim_distance": 0.029}, "nearer than 29 mm to the border of the palpable face"),
-        ({"cover": (0.02, 0.03)}, "another side of the organ"),
-        ({"radius": (0.0115, 0.0125)}, "balls of"),
-    ],
-)
-def test_why_lesions_do_not_fit(changes, words, phantom):
-    """The border, the depth of 30 mm, and three of them beside each other on 60 mm."""
-    draw: LesionDraw = replace(phantom.anatomy.scene.lesion, **changes)
-    assert words in lack_of_room(phantom, draw)

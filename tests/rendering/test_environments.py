@@ -69,21 +69,6 @@ def test_pictures_change_no_bit_of_an_episode(env_id):
     drawn.close()
 
 
-@EACH_ID
-@needs_opengl
-def test_loaded_state_looks_like_the_saved_one(env_id):
-    env, other = (gym.make(env_id, render_mode="rgb_array", show_lesion=True).unwrapped for _ in range(2))
-    env.reset(seed=5)
-    other.reset(seed=6)
-    for action in islice(walk(env, np.random.default_rng(7)), 20):
-        env.step(action)
-    assert env.render().tobytes() != other.render().tobytes()
-    other.load_state(env.save_state())
-    assert env.render().tobytes() == other.render().tobytes()
-    env.close()
-    other.close()
-
-
 def test_window_without_a_display_says_what_to_do(env_id, monkeypatch):
     for name in gl.DISPLAYS:
         monkeypatch.delenv(name, raising=False)
@@ -110,24 +95,6 @@ def test_vector_environments_give_a_frame_for_each(mode):
     alone.close()
     envs.close()
     assert len(stage._stages) == held
-
-
-@pytest.mark.slow
-@needs_opengl
-def test_works_in_other_processes():
-    """Workers that are started anew draw by themselves; a fork of a process that has drawn says why it cannot."""
-    envs = gym.make_vec(
-        IDS[0],
-        num_envs=2,
-        vectorization_mode="async",
-        vector_kwargs={"context": "spawn"},
-        render_mode="rgb_array",
-        width=64,
-        height=48,
-    )
-    envs.reset(seed=[3, 4])
-    assert [frame.shape for frame in envs.render()] == [(48, 64, 3)] * 2
-    envs.close()
 
 
 @needs_opengl

@@ -51,12 +51,6 @@ def test_one_number_of_the_law_is_overridden_alone():
     assert found == replace(library, tangent_cap=20.0)
 
 
-def test_entries_of_the_scene_override_those_of_the_library():
-    found = scene_with({"name": "kidney_in_vivo", "density": 1100}).material
-    library = make_material("kidney_in_vivo").material
-    assert found == Material(library.youngs_modulus, 1100.0, library.poisson_ratio)
-
-
 def test_regions_take_materials_too():
     region = {"name": "tumour", "lesion": True, "material": {"name": "prostate_cancer_ex_vivo", "poisson_ratio": 0.4}}
     found = scene_with({"name": "prostate_ex_vivo"}, regions=[region])

@@ -16,7 +16,6 @@ from surgsim_env.scripting import (
     OpenJaw,
     PressUntil,
     ScriptError,
-    Until,
     oracle_script,
     run_script,
 )
@@ -51,15 +50,6 @@ def test_jaw_closes_to_its_force_and_opens_to_nothing(env):
 def test_a_jaw_that_closes_on_nothing_fails(env):
     with pytest.raises(ScriptError, match=r"CloseJaw.*ran out of its 1 s"):
         run_script(env, [CloseJaw(0.2, timeout=1.0)], seed=0)
-
-
-def test_until_ends_a_step_and_keeps_its_name(env):
-    step = Until(MoveTo((0.040, 0.068, 0.006), name="there"), lambda view: view.step_time >= 0.2)
-    trace = run_script(env, [step, Hold(0.1)], seed=0)
-    assert [one.name for one in trace.steps] == ["there", "Hold"]
-    assert trace.between("there").duration == pytest.approx(0.2)
-    with pytest.raises(TypeError, match="Until: predicate"):
-        Until(Hold(0.1), True)
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import pytest
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel
-from msdm_core.lanes.lanes import advance_lanes, get_lane, rest_lanes, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Material
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
@@ -95,23 +94,6 @@ def test_mass_scaling_makes_a_step_on_a_stiff_foundation_stable():
 def test_fixed_nodes_are_not_held_twice():
     model = on(FAT, anchors=BOTTOM[:5])
     assert set(model.foundation_nodes) == set(BOTTOM[5:])
-
-
-def test_lanes_move_as_the_organ_alone():
-    """To the bit, with another modulus in each lane."""
-    organs = [on(FAT, materials=Material(5e3 + 1e3 * lane, 1000.0, 0.45)) for lane in range(8)]
-    model, lanes = stack_organs(organs), rest_lanes(organs)
-    alone = [rest_state(organ) for organ in organs]
-    dt = 0.5 * stable_dt(organs[-1])
-    for lane, state in enumerate(alone):
-        state.node_velocity[:, 2] = 1e-2 * (lane + 1)
-        lanes.node_velocity[:, 2, lane] = 1e-2 * (lane + 1)
-    shapes = stack_shapes([NO_SHAPES] * 8)
-    advance_lanes(model, lanes, shapes, NO_CONTACT, dt, 50, np.zeros((8, 0, 6)))
-    for lane, (organ, state) in enumerate(zip(organs, alone, strict=True)):
-        advance_organ(organ, state, NO_SHAPES, NO_CONTACT, dt, 50, np.zeros((0, 6)))
-        assert np.abs(state.node_position - organ.node_rest_position).max() > 1e-5
-        np.testing.assert_array_equal(get_lane(lanes, lane).node_position, state.node_position, err_msg=f"lane {lane}")
 
 
 INNER = next(node for node in range(MESH.node_count) if node not in MESH.boundary_nodes)

@@ -1,4 +1,4 @@
-"""The shipped liver is what its generator writes, and is a body fit to be meshed.
+"""The shipped liver is what its generator writes, and is one closed body.
 
 The files are compared byte for byte: the generator rounds coordinates to one micrometre,
 some 1e7 times the last-bit noise of its arithmetic (it uses no random numbers and no

@@ -1,4 +1,4 @@
-"""The compiled control step makes no object, holds no lock, starts from the cache, and says why it cannot be had."""
+"""The compiled control step makes no object, holds no lock, and starts from the cache."""
 
 import os
 import subprocess

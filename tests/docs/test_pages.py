@@ -1,4 +1,4 @@
-"""What the pages say of the project is so: files and modules that they name exist, what is generated tells all."""
+"""Files and modules that the pages name exist, and what is generated is complete."""
 
 import importlib
 import importlib.util

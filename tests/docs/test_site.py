@@ -1,11 +1,16 @@
-"""The documentation site builds without a warning, asks nothing of the network, and its links lead somewhere."""
+"""The site that `make docs` has just built asks nothing of the network, and its links lead somewhere."""
 
 import html.parser
 import os
 import re
+from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
+
+SITE = Path(__file__).resolve().parents[2] / "site"
+# `make docs` runs these.
+pytestmark = pytest.mark.slow
 
 # What a browser fetches by itself; links are fetched when somebody follows them.
 FETCHED = {"img": "src", "script": "src", "link": "href", "source": "src", "iframe": "src", "video": "src"}
@@ -28,6 +33,13 @@ class Html(html.parser.HTMLParser):
             self.links.append(given["href"])
         if tag in FETCHED and FETCHED[tag] in given and given.get("rel") != "canonical":
             self.fetched.append(given[FETCHED[tag]])
+
+
+@pytest.fixture(scope="module")
+def site_folder() -> Path:
+    if not (SITE / "index.html").is_file():
+        pytest.skip(f"no site in {SITE}: `make docs` builds it and runs these tests")
+    return SITE
 
 
 @pytest.fixture(scope="module")

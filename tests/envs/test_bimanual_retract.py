@@ -1,4 +1,4 @@
-"""SurgSim/BimanualRetract-v0: what counts as touched and exposed, what ends it, what it pays and refuses."""
+"""SurgSim/BimanualRetract-v0: what counts as touched and exposed, what ends it, and what it pays."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Environments in a forked child: alone they go on, side by side they refuse at once."""
+"""Environments side by side refuse at once in a forked child."""
 
 import multiprocessing
 

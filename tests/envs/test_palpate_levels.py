@@ -1,4 +1,4 @@
-"""SurgSim/Palpate-v0 with a level: one lesion whatever the level says, the rest as it says, in lanes too; the cost."""
+"""SurgSim/Palpate-v0 with a level: one lesion whatever the level says, the rest as it says; the cost."""
 
 import gymnasium as gym
 import numpy as np

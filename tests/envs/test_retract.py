@@ -1,4 +1,4 @@
-"""SurgSim/Retract-v0: what it observes and measures, and what it refuses."""
+"""SurgSim/Retract-v0: what it observes and measures."""
 
 from dataclasses import replace
 
@@ -85,6 +85,3 @@ def test_strains_are_those_of_a_stretched_lobe(retract_env):
         region_strains(model, moved, (rest.min(axis=0), rest.max(axis=0))), [0.02, 0.02, 0.05], rtol=1e-6
     )
     np.testing.assert_allclose(region_strains(model, 0.9 * rest, (rest.min(axis=0), rest.max(axis=0))), 0.0)
-
-
-# ---- what it refuses --------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""SurgSim/Retract-v0: what it draws, and draws that cannot be."""
+"""SurgSim/Retract-v0: what it draws."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""SurgSim/Retract-v0 with pictures: what is seen, observed, and said without OpenGL."""
+"""SurgSim/Retract-v0 with pictures: what is seen and observed."""
 
 import math
 

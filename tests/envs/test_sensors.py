@@ -1,4 +1,4 @@
-"""The force sensor's errors: drift and hysteresis, what levels make of them, and that saved states hold them."""
+"""The force sensor's errors: drift and hysteresis, and what levels make of them."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Limits on what tissue bears: in `info`, as the end of an episode, and in the scene file."""
+"""Limits on what tissue bears, in `info` and as the end of an episode."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Arms in a hand: tips follow through inverse kinematics, the hand feels the tissue; two arms take two hands."""
+"""Arms in a hand: tips follow through inverse kinematics, the hand feels the tissue."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""docs/haptics.md: its Python runs as printed, its tables hold what the code has."""
+"""The Python of docs/haptics.md runs as printed."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Every mistake in an arm of one's own gets one clear line."""
+"""A mistake in an arm of one's own is named."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""docs/palpation.md says what the code does: its example runs, its levels and its estimator's numbers are those."""
+"""The example of docs/palpation.md runs."""
 
 import re
 from pathlib import Path

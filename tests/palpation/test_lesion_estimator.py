@@ -1,4 +1,4 @@
-"""The common estimator: its posterior against brute conditioning and scikit-learn, its lesions against made maps."""
+"""The common estimator: its posterior against brute conditioning, its lesions against made maps."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A large lesion under a thin cover is felt, a small one far below is not, and one is not mistaken for another."""
+"""A small lesion far below is not felt."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Labels made ready to be meshed: their parts numbered, and names and counts that cannot be."""
+"""Labels made ready to be meshed: their parts are numbered."""
 
 import numpy as np
 import pytest

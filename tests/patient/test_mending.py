@@ -1,4 +1,4 @@
-"""Organs from surfaces and faulty labels: what is left out, mended when asked, and said."""
+"""Organs from surfaces and faulty labels: mended when asked."""
 
 import numpy as np
 import pytest

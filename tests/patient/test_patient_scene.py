@@ -1,4 +1,4 @@
-"""What a patient's scene is made of: materials by names, sites, and what an organ has no room for."""
+"""A patient's scene: materials by names, and an organ without room for hidden lesions."""
 
 import pytest
 import trimesh

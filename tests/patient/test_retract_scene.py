@@ -1,4 +1,4 @@
-"""The scene of retraction of a patient's organ: which edge is lifted, what is written, what takes it, who refuses."""
+"""The scene of retraction of a patient's organ: which edge is lifted, what is written, and what takes it."""
 
 import json
 from pathlib import Path

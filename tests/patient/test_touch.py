@@ -1,4 +1,4 @@
-"""Tip, cells and their cost, and hidden lesions that fit: `surgsim organ` before and after it makes a mesh."""
+"""Tip and cells of `surgsim organ`."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Pictures through Gymnasium: modes, checkers, vector environments, videos; the simulation is not touched."""
+"""Pictures through Gymnasium: vector environments, videos; the simulation is not touched."""
 
 import pickle
 import warnings

@@ -1,4 +1,4 @@
-"""Every bad option is a ValueError that says what, the value and the rule. Needs no OpenGL."""
+"""A bad option is a ValueError that names it. Needs no OpenGL."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""OpenGL is loaded when a picture is asked for and not before; where there is none, the error says what to install."""
+"""OpenGL is loaded when a picture is asked for and not before; where there is none, the error names the packages."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Cell over contact radius: what a mesh is against its touch, said in reports, with a warning above 1."""
+"""Cell over contact radius: what a mesh is against its touch, with a warning above 1."""
 
 import warnings
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The library of materials: complete, true to its sources, and taken over by scenes."""
+"""The library of materials: complete, and taken over by scenes."""
 
 import tomllib
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Scene files: read, refused, found, and true to what they state."""
+"""Scene files: read, refused, and true to what they state."""
 
 import math
 import tomllib

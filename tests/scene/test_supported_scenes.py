@@ -1,4 +1,4 @@
-"""Scenes whose organ rests on something: read, settled, saved; tools and pictures meet the same supports."""
+"""Scenes whose organ rests on something: settled; tools and pictures meet the same supports."""
 
 from dataclasses import replace
 from functools import cache

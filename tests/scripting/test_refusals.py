@@ -1,4 +1,4 @@
-"""What a script is refused for, before anything runs: the value, the rule, the way out."""
+"""Scripts that are refused before anything runs."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Scripts that grasp: jaw steps, steps that end otherwise, and the oracle of a retraction."""
+"""Scripts that grasp: jaw steps, and the oracle of a retraction."""
 
 import gymnasium as gym
 import numpy as np

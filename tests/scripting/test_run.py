@@ -1,4 +1,4 @@
-"""A run begins from a seed, from where the environment is, or from a saved state: the same trace to the bit."""
+"""A run goes on from a saved state: the same trace to the bit; every steered tip has an oracle."""
 
 import gymnasium as gym
 import numpy as np

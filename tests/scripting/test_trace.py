@@ -1,4 +1,4 @@
-"""A trace: what it says of itself, its cuts, its tables read back, its picture."""
+"""A trace: its cuts, its depth, and its tables read back."""
 
 import csv
 from functools import cache

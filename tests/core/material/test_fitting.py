@@ -1,4 +1,4 @@
-"""Springs fitted to the mesh: stiffness of whole bodies against the solid's, the fallback, the cache and the file."""
+"""Springs fitted to the mesh: stiffness of whole bodies against the solid's, and the fallback."""
 
 import warnings
 from functools import cache
@@ -280,6 +280,3 @@ def test_fallback_where_cells_of_several_sizes_meet():
     assert fit.report.fallback and fit.report.residual_after < LARGEST_RESIDUAL
     np.testing.assert_array_equal(fit.edge_factor, 1.0)
     assert np.unique(fit.tet_factor).tolist() == [fit.report.factor_smallest] == [fit.report.factor_largest]
-
-
-# ---- cache, file, time ------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Materials, capsule and lesions: what they refuse, how much of each tet they fill, and what the organ makes of it."""
+"""Materials, capsule and lesions: bad values, how much of each tet they fill, and what the organ makes of it."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Closed surfaces: what is refused and with which words, what is repaired, and where lines cross."""
+"""Closed surfaces: refusals, repairs, and where lines cross."""
 
 import numpy as np
 import pytest

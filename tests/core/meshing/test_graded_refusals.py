@@ -1,4 +1,4 @@
-"""Gradings that cannot be had are refused with the value, the rule and the way out."""
+"""Gradings that cannot be had are refused with the value."""
 
 import pytest
 import trimesh

@@ -1,4 +1,4 @@
-"""Blocks and stuffed surfaces: counts, exact faces, shapes, fit, conformity, determinism and refusals."""
+"""Blocks and stuffed surfaces: counts, exact faces, shapes, fit, conformity and refusals."""
 
 import warnings
 

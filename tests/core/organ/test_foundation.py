@@ -1,4 +1,4 @@
-"""An organ on an elastic foundation: weight, period, stiffness of a node, step, energy, lanes, bad input."""
+"""An organ on an elastic foundation: weight, period, stiffness of a node, step, energy, bad input."""
 
 import math
 from dataclasses import replace

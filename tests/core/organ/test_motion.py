@@ -1,4 +1,4 @@
-"""Motion of what holds an organ: quasi-static, work against energy, damping, supports, lanes, bad input."""
+"""Motion of what holds an organ: quasi-static, work against energy, damping, supports, bad input."""
 
 import math
 from dataclasses import replace

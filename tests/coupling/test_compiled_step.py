@@ -165,17 +165,6 @@ def test_a_fault_in_mid_step_is_the_same():
         assert compiled.get_state()[name].tobytes() == array.tobytes(), name
 
 
-def test_the_workspace_limit_is_the_same():
-    compiled, plain = on_phantom()
-    for env in (compiled, plain):
-        env.simulation.restart(env.simulation.instrument.upper - 0.0025)
-    seen = []
-    for action in ([1.0, -1.0, 0.5, 0.0], [1.0, 0.5, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [-1.0, -0.2, -0.1, 0.0]):
-        for _ in range(2):
-            seen.append(assert_same(compiled, plain, np.array(action, dtype=np.float32))[-1]["workspace_limited"])
-    assert seen[0] is False and True in seen and seen[-1] is False
-
-
 TWO_ARMS = """
 <mujoco>
   <option timestep="0.001" integrator="implicitfast" jacobian="dense"><flag autoreset="disable"/></option>

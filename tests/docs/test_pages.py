@@ -94,17 +94,6 @@ IDS = sorted(id for id in gym.registry if id.startswith("SurgSim/"))
 
 
 @pytest.mark.parametrize("id", IDS)
-def test_every_environment_has_a_page_with_gymnasiums_headings(id):
-    (page,) = (page for page in PAGES if f"<!-- environment {id} -->" in page.read_text(encoding="utf-8"))
-    text = page.read_text(encoding="utf-8")
-    assert text.startswith(f"# {id}\n")
-    assert re.search(r"!\[[^]]+\]\(\.\./images/\w+\.webp\)", text)
-    _, told = docstring_sections(hook("generated_parts").environment_class(id).__doc__)
-    assert set(told) >= {"Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End"}
-    assert "Arguments" in told and all(told.values())
-
-
-@pytest.mark.parametrize("id", IDS)
 def test_tables_have_every_command_channel_and_reward(id):
     task, text = TASKS[id], hook("generated_parts").environment_text(id)
     _, told = docstring_sections(text)

@@ -32,7 +32,6 @@ BREATH = CyclicMotion(
 BEAT = CyclicMotion(
     "heartbeat", (0.0, 0.0, 0.002), period=(0.2, 0.3), rise=0.2, fall=0.3, centre=(0.0, 0.0, 0.0), reach=0.05
 )
-IDS = ("SurgSim/Palpate-v0", "SurgSim/PalpateSites-v0")
 
 
 @pytest.fixture(scope="module")
@@ -86,25 +85,6 @@ def test_the_ground_is_where_the_signals_say_after_each_haptic_step(scene):
         np.testing.assert_allclose(simulation.organ_state.node_position[anatomy.anchors], at_rest + shift, atol=1e-12)
         farthest = max(farthest, float(np.abs(shift).max()))
     assert farthest > 0.003
-
-
-@pytest.mark.parametrize("env_id", IDS)
-def test_organs_side_by_side_breathe_as_alone(env_id, scene_file):
-    """Each lane its own cycles, to the bit."""
-    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled"}
-    many = gym.make_vec(env_id, num_envs=3, scene=scene_file, **lanes)
-    one = [gym.make(env_id, scene=scene_file) for _ in range(3)]
-    first, _ = many.reset(seed=[3, 4, 5])
-    for row, env, seed in zip(first, one, (3, 4, 5), strict=True):
-        assert env.reset(seed=seed)[0].tobytes() == row.tobytes()
-    one[0].action_space.seed(0)
-    for _ in range(4):
-        action = one[0].action_space.sample()
-        rows = many.step(np.stack([action] * 3))[0]
-        for row, env in zip(rows, one, strict=True):
-            assert env.step(action)[0].tobytes() == row.tobytes()
-    courses = [env.unwrapped.simulation.organ_state.motion[:, 0] for env in one]
-    assert np.ptp(courses, axis=0).max() > 1e-3
 
 
 def patient(anatomy, seed=3) -> Simulation:

@@ -172,16 +172,6 @@ def test_force_reading_is_noisy_biased_and_flags_saturation(env):
     assert observation[8] == np.float32(2.0)
 
 
-@pytest.mark.slow
-def test_workspace_edge_is_flagged_and_stops_the_tip(env):
-    env.reset(seed=8)
-    for _ in range(80):
-        observation, _, terminated, _, info = act(env, (0.0, 0.0, SPEED))
-        assert not terminated
-    assert info["workspace_limited"] is True
-    assert observation[2] <= env.simulation.instrument.upper[2] + 1e-4
-
-
 def test_tip_follows_the_commanded_velocity(env):
     env.reset(seed=9)
     start = env.simulation.instrument.tip_position

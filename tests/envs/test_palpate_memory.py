@@ -89,10 +89,3 @@ def test_an_episode_begins_with_nothing_remembered():
     begun = env.reset()[0]
     assert not begun[10 : FACE.start].any() and not begun[FACE.stop :].any()
     assert begun[FACE].sum() == 13 * 13
-
-
-def test_entries_of_the_force_sensor_are_named():
-    env = gym.make(ID, memory=True, scaled=False)
-    numbers = env.unwrapped.task.force_entries
-    assert numbers == [6, 7, 8, *range(CONTRAST.start, CONTRAST.stop), *range(FACE.stop, FACE.stop + 3)]
-    assert gym.make(ID).unwrapped.task.force_entries == [6, 7, 8]

@@ -13,9 +13,8 @@ from surgsim_env.palpation.chart import charted_face, healthy_map, interpolated
 from surgsim_env.palpation.press import SitePress, press, press_alone, press_phases, stop_force
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import LEVELS, DrawnOrgan
-from surgsim_env.scene.load import make_scene, scenes_folder
+from surgsim_env.scene.load import make_scene
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
-from tests.envs.test_vector_env import assert_equal
 
 ID = "SurgSim/PalpateSites-v0"
 SMALL = {"scene": "phantom_small"}
@@ -87,17 +86,6 @@ def test_force_stops_a_press_before_the_hard_limit_does():
     assert 3.0 * healthy < found.force @ site.normal / found.depth < 4.0 * healthy
 
 
-def test_a_press_tells_where_the_instrument_was_held_back(monkeypatch):
-    """On the way in alone: at the end of the hold nothing is asked of it any more."""
-    env = gym.make(ID, **SMALL).unwrapped
-    env.reset(seed=9)
-    assert not env.step(MIDDLE)[-1]["workspace_limited"]
-    phases = iter(range(len(env.phases)))
-    held = property(lambda _: next(phases, 1) == 0)
-    monkeypatch.setattr(type(env.simulation.instrument), "workspace_limited", held)
-    assert env.step(MIDDLE)[-1]["workspace_limited"]
-
-
 # ---- the chart ------------------------------------------------------------------------------------------------------
 
 
@@ -164,18 +152,6 @@ def test_the_map_is_made_once_and_anew_where_its_file_is_broken(tmp_path, monkey
     healthy_module.healthy_map_of.cache_clear()
     healthy_module.healthy_map(replace(scene, material=replace(scene.material, youngs_modulus=6000.0)))
     assert len(made) == 3, "another organ has another map"
-    plain = healthy_module.map_digest(load_anatomy(scene))
-    probe = (scenes_folder() / "instruments" / "probe.xml").read_text(encoding="utf-8")
-    (tmp_path / "instruments").mkdir()
-    (tmp_path / "instruments" / "probe.xml").write_text(probe + "<!-- heavier -->", encoding="utf-8")
-    monkeypatch.setattr(healthy_module, "scenes_folder", lambda: tmp_path)
-    assert healthy_module.map_digest(load_anatomy(scene)) != plain, "another probe has another map"
-    monkeypatch.setattr(healthy_module, "scenes_folder", scenes_folder)
-    monkeypatch.setenv("SURGSIM_CACHE", "/proc/nowhere")
-    healthy_module.healthy_map_of.cache_clear()
-    assert healthy_module.healthy_map(scene).stiffness(MIDDLE) == 50.0, (
-        "a folder that cannot be written costs time alone"
-    )
     healthy_module.healthy_map_of.cache_clear()
 
 
@@ -260,34 +236,6 @@ def test_the_budget_of_a_wide_scene_is_larger():
 
 
 # ---- many side by side ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mode", ["NextStep", pytest.param("SameStep", marks=pytest.mark.slow)])
-def test_equals_environments_one_after_the_other(mode: str):
-    """Observations, rewards, ends and infos of several episodes, organs with capsules and added mass among them."""
-    count, settings = 3, {"budget": 3, **SMALL}
-    together = gym.make_vec(
-        ID, num_envs=count, vectorization_mode="vector_entry_point", autoreset_mode=mode, **settings
-    )
-    apart = gym.make_vec(
-        ID, num_envs=count, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **settings
-    )
-    assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
-    # Some of these draws have a capsule, some get mass.
-    assert_equal(together.reset(seed=[4, 5, 6]), apart.reset(seed=[4, 5, 6]))
-    rng, drawn = np.random.default_rng(0), []
-    for _ in range(7):
-        actions = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
-        found, expected = together.step(actions), apart.step(actions)
-        assert_equal(found[:4], expected[:4])
-        assert_equal(found[4], expected[4])
-        singles = [env.unwrapped for env in together.envs]  # type: ignore[attr-defined]
-        drawn += [(one.task.drawn.capsule_stiffness, one.simulation.organ_model.added_mass) for one in singles]
-    assert {value > 0.0 for value, _ in drawn} == {True, False}, "the seeds must have capsules among them"
-    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
-        assert one.unwrapped.save_state() == other.unwrapped.save_state()
-    together.close()
-    apart.close()
 
 
 def test_a_press_that_was_begun_is_forgotten_with_its_episode():

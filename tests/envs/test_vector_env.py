@@ -6,7 +6,7 @@ import pytest
 
 import surgsim_env  # noqa: F401
 from surgsim_env.envs.ids import PalpateEnv
-from surgsim_env.envs.vector_env import group_width, vector_class
+from surgsim_env.envs.vector_env import vector_class
 
 ID = "SurgSim/Palpate-v0"
 COUNT = 3  # five lanes stay empty
@@ -140,39 +140,6 @@ def test_a_fault_leaves_the_neighbours_untouched():
         for lane in (0, 2):
             np.testing.assert_array_equal(found[0][lane], expected[0][lane])
             assert found[1][lane] == expected[1][lane]
-
-
-@pytest.mark.slow
-def test_single_precision_feels_the_same_force():
-    """Within 0.5 % of the largest contact force of a press to 4 mm and back."""
-    exact, fast = side_by_side(), side_by_side(dtype="float32")
-    forces = []
-    for envs in (exact, fast):
-        envs.reset(seed=3)
-        felt = []
-        for step in range(24):
-            envs.step(np.tile(DOWN * (0.5 if step < 14 else -0.5), (COUNT, 1)))
-            felt.append([env.unwrapped.simulation.contact_force for env in envs.envs])
-        forces.append(np.array(felt))
-    largest = np.abs(forces[0]).max()
-    error = np.abs(forces[1] - forces[0]).max()
-    print(f"\nlargest force {largest:.3f} N, float32 off by {error:.2e} N, {100.0 * error / largest:.4f} %")
-    assert largest > 0.1
-    assert 0.0 < error < 0.005 * largest
-
-
-@pytest.mark.parametrize(
-    ("envs", "dtype", "threads", "lanes"),
-    [
-        (16, "float32", 2, 8),
-        (17, "float32", 2, 16),
-        (3, "float32", 1, 8),
-        (16, "float32", 1, 16),
-        (16, "float64", 2, 8),
-    ],
-)
-def test_groups_are_as_wide_as_keeps_the_threads_busy(envs: int, dtype: str, threads: int, lanes: int):
-    assert group_width(envs, np.dtype(dtype), threads) == lanes
 
 
 def test_states_are_saved_and_loaded_as_alone():

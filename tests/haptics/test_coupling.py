@@ -96,14 +96,6 @@ def test_scaled_motion_stiffens_the_device():
         check_coupling(VirtualCoupling(1.001 * limit), device, TIP, DT, scale=4.0)
 
 
-def test_scaled_motion_stiffens_the_damper_too():
-    device, damping = DeviceDynamics(0.5, 0.05), 0.05
-    limit = stiffness_limit(device, TipDynamics(0.56, 8.0), 4.0 * damping, DT) / 4.0
-    check_coupling(VirtualCoupling(0.999 * limit, damping), device, TIP, DT, scale=4.0)
-    with pytest.raises(ValueError, match=r"coupling damping 0\.2 N s/m"):
-        check_coupling(VirtualCoupling(1.001 * limit, damping), device, TIP, DT, scale=4.0)
-
-
 @pytest.mark.parametrize(
     ("make", "named"),
     [

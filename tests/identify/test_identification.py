@@ -167,19 +167,3 @@ def test_the_material_fits_into_a_scene(run):
     scene = scene_from_table({**phantom, **table}, name="mine", folder=folder)
     assert scene.material.youngs_modulus == table["material"]["youngs_modulus"]
     assert scene.material.stiffening.tangent_cap == table["material"]["stiffening"]["tangent_cap"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "give a recording"),
-        (["none.csv"], "recording none.csv cannot be read"),
-        (["none.csv", "--thickness", "12"], "thickness is 12 m"),
-        (["none.csv", "--density", "0"], "--density is 0 kg/m^3"),
-    ],
-)
-def test_bad_input_gets_one_line(arguments, words, capsys, tmp_path):
-    assert main(["identify", *arguments, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("surgsim: error: ") and said.count("\n") == 1 and words in said
-    assert not (tmp_path / "out").exists()

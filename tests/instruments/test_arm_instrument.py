@@ -269,22 +269,3 @@ def test_the_jaw_goes_to_its_target_and_stays_there():
         grasper.command_jaw(2.0)
     with pytest.raises(ValueError, match="has no jaw: it carries a palpator"):
         made("psm_palpator").command_jaw(0.1)
-
-
-def test_a_state_is_restored_to_the_bit(instrument):
-    instrument.place(ABOVE)
-    instrument.command_velocity(np.array([0.01, 0.0, -0.02]), np.array([0.1, 0.0, 0.0]))
-    for _ in let_run(instrument, 30):
-        pass
-    saved = instrument.get_state()
-    tips = []
-    for direction in (instrument.direction, np.array([0.6, 0.0, -0.8])):
-        instrument.steered.wanted = direction.copy()
-        instrument.set_state(saved)
-        assert instrument.get_state().tobytes() == saved.tobytes()
-        for _ in range(3):
-            instrument.command_velocity(np.array([0.0, 0.01, 0.0]))
-            for _ in let_run(instrument, 50):
-                pass
-        tips.append(instrument.get_state().tobytes())
-    assert tips[0] == tips[1]

@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
 from matplotlib.image import imread
 
 from surgsim_env.cli.main import _joined, main
@@ -15,7 +14,6 @@ from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
 COARSE = ["palpate", "--scene", "phantom", "--spacing", "0.008"]
-STL_FACET = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
 
 
 @pytest.fixture(scope="module")
@@ -35,20 +33,6 @@ def rows(run):
 @pytest.fixture(scope="module")
 def summary(run):
     return json.loads((run / "summary.json").read_text(encoding="utf-8"))
-
-
-def write_stl(path, vertices, triangles):
-    facets = "".join(
-        STL_FACET.format("".join(f"vertex {x} {y} {z}\n" for x, y, z in np.asarray(vertices)[list(triangle)]))
-        for triangle in triangles
-    )
-    path.write_text(f"solid s\n{facets}endsolid s\n", encoding="ascii")
-    return path
-
-
-CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
-FACES = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4)]
-FACES += [(1, 5, 7), (1, 7, 3)]
 
 
 def test_files(run, rows):
@@ -105,63 +89,9 @@ def test_the_lesion_raises_the_stiffness_above_it(rows):
     assert np.linalg.norm(stiffest - [0.036, 0.026]) < 0.008
 
 
-@pytest.mark.slow
-def test_a_lesion_below_a_site_that_is_too_deep_is_missed_for_that_reason(tmp_path, capsys, rows):
-    """Around a site of the middle; 10 mm of cover, twice as stiff, hardly changes a press."""
-    place = np.array([float(rows[5][key]) for key in "xyz"])
-    around = ",".join(map(str, [*place, 0.012]))
-    given = [*COARSE, "--lesion-below", "5,0.016,0.006,2", "--around", around, "--out", str(tmp_path)]
-    assert main(given) == 0
-    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    (truth,) = summary["truth"]
-    assert truth["centre_m"] == pytest.approx([*place[:2], place[2] - 0.016], abs=1e-6)
-    said = " ".join(capsys.readouterr().out.split())
-    for entry in summary["maps"].values():
-        (lesion,) = entry["lesions"]
-        assert lesion["miss"] in ("deeper than the map's reach", "below the sensor's noise")
-        assert lesion["why"].startswith(f"{lesion['miss']}: a press feels ")
-        assert entry["healthy_sites"] < 8
-    assert "weak baseline: " in said and "of Hertz's force; far nodes move by " in said
-
-
-@pytest.mark.slow
-def test_organ_reports_and_writes(tmp_path, capsys):
-    cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
-    out = tmp_path / "made" / "by it" / "organ.vtu"
-    given = ["organ", str(cube), "--length-unit", "mm", "--cell-size", "0.01", "--no-healthy-map"]
-    assert main([*given, "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    for word in ("nodes", "tets", "springs", "mass", "dihedral", "radius ratio", "stable step", "reoriented", "error"):
-        assert word in said, word
-    assert "0.15" in said  # 144 ml at 1060 kg/m^3
-    assert main(["organ", str(out)]) == 0
-    assert "0 reoriented" in capsys.readouterr().out
-
-
-def test_a_place_that_cannot_be_written_is_known_before_the_work(capsys, tmp_path):
-    (tmp_path / "out" / "palpation.csv").mkdir(parents=True)
-    assert "is a folder there" in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "out"))
-    (tmp_path / "file").write_text("")
-    assert "cannot be written" in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "file"))
-    path = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(2, radius=30).export(path)
-    given = ("organ", str(path), "--length-unit", "mm", "--out")
-    assert "is no folder that you may write to" in refused(capsys, *given, str(tmp_path / "file" / "a.vtu"))
-    assert "unknown extension" in refused(capsys, *given, str(tmp_path / "a.xyz"))
-
-
 def test_lists_of_numbers_may_begin_with_a_minus():
     given = ["--lesion", "-0.1,0,0,1,8", "--approach", "-.5,0,1", "--seed", "-1", "--out", "-x"]
     assert _joined(given) == ["--lesion=-0.1,0,0,1,8", "--approach=-.5,0,1", "--seed", "-1", "--out", "-x"]
-
-
-def refused(capsys, *arguments):
-    """The one line on standard error."""
-    assert main(list(arguments)) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1, said
-    assert "Traceback" not in said
-    return said
 
 
 def test_interrupt(monkeypatch, capsys):

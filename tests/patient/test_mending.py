@@ -62,13 +62,3 @@ def test_surfaces_that_cross_are_joined_when_mended(tmp_path, refusal):
     h = 0.03 - 0.0125
     union = 2 * 4 / 3 * np.pi * 0.03**3 - 2 * np.pi * h**2 * (0.09 - h) / 3
     assert read_mesh(tmp_path / "a.vtu").volumes.sum() == pytest.approx(union, rel=0.03)
-
-
-@pytest.mark.slow
-def test_the_largest_surface_is_kept(tmp_path, capsys):
-    both = trimesh.util.concatenate(
-        [trimesh.creation.icosphere(3, 30.0), trimesh.creation.icosphere(2, 5.0).apply_translation([60.0, 0.0, 0.0])]
-    )
-    both.export(tmp_path / "liver.stl")
-    assert main(["organ", str(tmp_path / "liver.stl"), "--length-unit", "mm", "--cell-size", "0.01"]) == 0
-    assert "1 surface(s) apart from the largest were left out (0.506 ml)" in capsys.readouterr().err

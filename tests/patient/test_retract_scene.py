@@ -1,6 +1,5 @@
 """The scene of retraction of a patient's organ: which edge is lifted, what is written, and what takes it."""
 
-import json
 from pathlib import Path
 
 import gymnasium as gym
@@ -147,19 +146,6 @@ def test_the_oracle_lifts_the_wedge_s_edge(env):
     assert trace.info["success"]
     assert trace.info["slips"] == 0
     assert trace.info["pull_force_peak"] < env.unwrapped.scene.limits.soft_force
-
-
-@pytest.mark.slow
-def test_a_real_liver_s_edge_is_lifted_from_the_command_line(tmp_path, anatomy_folder):
-    out = tmp_path / "patient.vtu"
-    given = ["organ", str(anatomy_folder / "openhelp_liver.stl"), "--length-unit", "mm", "--no-healthy-map"]
-    assert main([*given, "--out", str(out)]) == 0
-    for arms in ([], ["--bimanual"]):
-        run = ["retract", "--scene", str(out.with_suffix(".toml")), "--seed", "3", "--out", str(tmp_path / "run")]
-        assert main([*run, *arms]) == 0
-        summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
-        assert summary["success"] and summary["slips"] == 0
-        assert not summary["torn"] and not summary["failure"]
 
 
 def test_a_ball_s_thickness_is_measured():

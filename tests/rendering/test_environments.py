@@ -1,13 +1,11 @@
 """Pictures through Gymnasium: vector environments, videos; the simulation is not touched."""
 
 import pickle
-import warnings
 from itertools import islice
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.rendering import gl, stage
@@ -27,24 +25,6 @@ def env_id(request):
 EACH_ID = pytest.mark.parametrize(
     "env_id", [pytest.param(one, marks=[pytest.mark.slow] * (one != PALPATE)) for one in IDS], indirect=True
 )
-
-
-@EACH_ID
-@needs_opengl
-def test_passes_gymnasiums_checker_without_a_warning(env_id):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
-
-
-@pytest.mark.agents
-@EACH_ID
-@needs_opengl
-def test_passes_stable_baselines3s_checker_without_a_warning(env_id):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the `agents` extra")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checker.check_env(gym.make(env_id, render_mode="rgb_array").unwrapped, skip_render_check=False)
 
 
 @EACH_ID

@@ -10,7 +10,7 @@ from msdm_core.mesh.geodesic import NearestTriangle
 from surgsim_env.rendering import stage
 from surgsim_env.rendering.embedding import organ_surface
 from surgsim_env.rendering.options import CAMERAS, RenderOptions
-from surgsim_env.rendering.renderer import ARROW_COLOUR, OrganRenderer, contact_point
+from surgsim_env.rendering.renderer import OrganRenderer
 from surgsim_env.rendering.stage import LABELS
 
 pytestmark = pytest.mark.usefixtures("opengl")
@@ -147,34 +147,6 @@ def test_same_state_same_bytes(press, draw):
         twin.close()
 
 
-def coloured(frame, colour=ARROW_COLOUR[:3]):
-    return (np.abs(frame.astype(int) - colour).max(axis=2) < 3).sum()
-
-
-def test_force_arrow_comes_with_a_force_and_points_along_it(press, draw):
-    renderer = draw(press)
-    assert coloured(renderer.rgb()) == 0, "nothing is touched yet"
-    press.press(0.004)
-    simulation = press.simulation
-    force = simulation.contact_wrench[0, :3]
-    assert np.linalg.norm(force) > 0.05
-    assert coloured(draw(press, show_force=False).rgb()) == 0
-    frame = renderer.rgb()
-    assert coloured(frame) > 30
-    start = contact_point(simulation, 0)
-    radius = simulation.anatomy.scene.instrument.tip_radius
-    assert np.linalg.norm(start - simulation.instrument.tip_position) == pytest.approx(radius, abs=0.15 * radius)
-    # Along the arrow's shaft every picture point is the arrow's; twice its length beyond the head none is.
-    share = np.array([0.2, 0.4, 2.0])
-    places = start + share[:, None] * force * 0.06
-    (near, far, beyond), _ = renderer.cameras["overview"].project(places, 640, 480)
-    for place in (near, far):
-        assert np.abs(frame[int(place[1]), int(place[0])].astype(int) - ARROW_COLOUR[:3]).max() < 12
-    assert np.abs(frame[int(beyond[1]), int(beyond[0])].astype(int) - ARROW_COLOUR[:3]).max() > 12
-    longer = draw(press, force_mm_per_newton=120.0).rgb()
-    assert coloured(longer) > 1.3 * coloured(frame)
-
-
 @pytest.mark.parametrize("options", [{"show_lesion": True}, {"cut_away": True}])
 def test_lesion_is_seen_where_it_is_and_only_when_asked(press, draw, options):
     plain, shown = draw(press, show_force=False), draw(press, show_force=False, **options)
@@ -191,22 +163,6 @@ def test_lesion_is_seen_where_it_is_and_only_when_asked(press, draw, options):
     # Yellowish there, tissue elsewhere: the lesion's green is well above the tissue's.
     green = [int(frame.rgb()[rows, columns, 1].mean()) for frame in (plain, shown)]
     assert green[1] > green[0] + 40
-
-
-def test_lesion_is_a_ball_inside_and_a_disc_in_the_section(phantom, draw):
-    """Where the centre is seen: the ball's front is nearer by its radius or more, the section is at the centre."""
-    lesion = phantom.lesion
-    for options, ball in (({"show_lesion": True}, True), ({"cut_away": True}, False)):
-        renderer = draw(phantom, camera="overview", **options)
-        view = renderer.cameras["overview"]
-        (place,), (distance,) = view.project(np.array([lesion.centre]), 640, 480)
-        column, row = np.floor(place).astype(int)
-        assert renderer.segmentation()[row, column] == LESION
-        # The drawn organ is in front of a ball, so its depth is looked at without: the section has none.
-        if ball:
-            assert renderer.depth()[row, column] < distance - lesion.radius
-        else:
-            assert renderer.depth()[row, column] == pytest.approx(distance, abs=1e-3)
 
 
 def test_cut_away_takes_the_near_side(press, draw):

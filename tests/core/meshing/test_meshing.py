@@ -222,13 +222,3 @@ def test_quality_of_a_regular_and_a_corner_tet():
     np.testing.assert_allclose(radius_ratios(corner), 3 / (3 + np.sqrt(3)) / (np.sqrt(3) / 2))
     assert mesh_quality(corner).volume_error is None
     assert "4 nodes, 1 tets" in str(mesh_quality(corner))
-
-
-def test_real_liver_is_meshed(anatomy_folder):
-    solid = trimesh.load(anatomy_folder / "openhelp_liver.stl", process=False)
-    vertices = np.array(solid.vertices) * 1e-3
-    mesh = mesh_surface(vertices, solid.faces, cell_size=0.012)
-    quality = mesh_quality(mesh, (vertices, solid.faces))
-    assert (boundary_edge_counts(mesh) == 2).all()
-    assert quality.dihedral_smallest_deg >= 10
-    assert abs(quality.volume_error) < 0.02

@@ -1,12 +1,7 @@
 """Label images filled with tets: volumes, places, shapes, regions, what is left out and what is refused."""
 
-import warnings
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy import ndimage
 
 from msdm_core.errors import MeshError
 from msdm_core.material.regions import Lesion, Material, lesion_extent
@@ -147,21 +142,3 @@ GOOD = np.pad(np.ones((10, 10, 10), dtype=np.uint8), 1)
 def test_what_cannot_be_filled_is_refused(labels, spacing, cell_size, names, named):
     with pytest.raises(MeshError, match=named):
         mesh_segmentation(labels, spacing, cell_size=cell_size, region_names=names)
-
-
-@pytest.mark.slow
-@settings(max_examples=12, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(0.3, 0.7), st.tuples(*[st.sampled_from((0.001, 0.002, 0.004))] * 3))
-def test_any_blob_becomes_a_sound_mesh_or_a_clear_error(seed, share, spacing):
-    noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(16, 16, 16)), 2)
-    labels = (noise > np.quantile(noise, share)).astype(np.uint8)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            mesh = mesh_segmentation(labels, spacing, cell_size=0.004, region_names={1: "blob"})
-    except MeshError as error:
-        assert "use" in str(error) or "try" in str(error)
-        return
-    assert mesh.volumes.min() > 0
-    assert mesh_quality(mesh).dihedral_smallest_deg > 9.3  # the lattice's own bound
-    assert np.unique(np.sort(mesh.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), 1), axis=0).size

@@ -220,16 +220,6 @@ def test_any_tools_move_the_same(tool):
         assert peak > 0.01
 
 
-def test_a_step_beyond_the_limit_is_the_last():
-    model, state = free_organ()
-    tools, wrench = free_ball(), np.zeros((1, 6))
-    taken = haptic_steps(model, state, tools, LAW, 2e-4, 5, wrench, 100, force_limit=0.05, compiled=True)
-    assert 1 < taken.step_count < 100
-    assert taken.force_peak > 0.05
-    assert taken.force_peak == pytest.approx(np.linalg.norm(wrench[0, :3]), rel=1e-14)
-    assert tools.data.time == pytest.approx(taken.step_count * 1e-3)
-
-
 @pytest.mark.parametrize(
     ("value", "fault"),
     [

@@ -78,15 +78,3 @@ def test_an_episode_is_longer_on_a_wide_face(liver):
     liver.reset(seed=3)
     observation, _, _, truncated, _ = liver.step(np.zeros(4, dtype=np.float32))
     assert read(liver, observation)["time_left"] == pytest.approx(1.0 - 1.0 / 1200, abs=1e-6) and not truncated
-
-
-def test_an_episode_has_the_steps_that_were_asked_for():
-    env = gym.make(ID, episode_steps=3)
-    up = np.array([0.0, 0.0, 0.2, 0.0], dtype=np.float32)
-    env.reset(seed=0)
-    steps = [env.step(up) for _ in range(3)]
-    assert [one[3] for one in steps] == [False, False, True]
-    assert steps[-1][0][9] == 0.0
-    envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", episode_steps=2)
-    envs.reset(seed=0)
-    assert [envs.step(np.tile(up, (2, 1)))[3].all() for _ in range(2)] == [False, True]

@@ -114,19 +114,6 @@ def test_no_lesion_no_estimate(noise, seed):
     assert felt(sites, contrast_with_model(stiffness, stiffness_of(sites))) == []
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 5])
-def test_few_sites(count):
-    sites = raster()[:count]
-    stiffness = np.full(count, 50.0)
-    for contrast in (contrast_with_neighbours(stiffness, sites[:, :2]), contrast_with_model(stiffness, stiffness)):
-        assert contrast.shape == (count,)
-        np.testing.assert_allclose(contrast, 1.0)
-        assert felt(sites, contrast) == []
-        scored = score_map("m", sites, contrast, [], [truth_at(0.1, 0.08)], SURFACE, spacing=SPACING)
-        assert scored.felt_count == 0
-        assert scored.scores[0].error == np.inf
-
-
 def test_score_counts_misses_false_alarms_and_the_healthy_spread():
     sites = raster()
     # Lesion at (0.05, 0.05); the map shows one 7 mm beside it and one where there is nothing.

@@ -97,13 +97,3 @@ def test_a_step_cut_short_by_the_hard_limit_is_recorded_as_far_as_it_went():
     assert info["hard_limit"] and len(record) % 50
     assert (sizes[:-1] <= env.task.force_limit).all() and sizes[-1] > env.task.force_limit
     assert sizes.max() == pytest.approx(info["force_peak"], rel=1e-15)
-
-
-def test_a_step_that_faults_is_not_recorded():
-    env = made()
-    begin(env)
-    with env.simulation.recording() as record:
-        env.step(np.zeros(4, dtype=np.float32))
-        env.simulation.organ_state.node_velocity[700, 1] = np.nan
-        _, _, terminated, _, info = env.step(np.zeros(4, dtype=np.float32))
-    assert terminated and info["sim_fault"] and len(record) == 50

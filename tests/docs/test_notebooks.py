@@ -9,8 +9,9 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
 NEEDS_AGENTS = {"train_an_agent"}
-# About a minute each; `train_an_agent` takes as long, but is the one that is run where the `agents` extra is.
-SLOW = {"stiffness_map", "two_arms"}
+# A minute or half each; `train_an_agent` takes as long, but is the one that is run where the `agents` extra is. The
+# tutorial of the same name has most of `own_patient`.
+SLOW = {"stiffness_map", "two_arms", "own_patient"}
 
 
 def script(path: Path):

@@ -39,7 +39,7 @@ help:
 	@echo "make lock         renew $(CONSTRAINTS), the versions that make installs"
 	@echo "make bench        time everything beside MuJoCo flex and Newton; writes docs/benchmarks.md"
 	@echo "make soak         play all environments for an hour with random, corner and adversarial actions"
-	@echo "make docs         the documentation site, in site/; warnings are errors"
+	@echo "make docs         the documentation site, in site/; warnings and lost links are errors"
 	@echo "make lint         ruff and pyright"
 	@echo "make dist         the source archive and the wheel, in dist/"
 	@echo "make test-dist    installs the wheel, nothing else, for each Python from 3.11 that is here, and tries it"
@@ -134,6 +134,7 @@ soak: $(VENV)/.ready-demo
 # Material for MkDocs advertises its successor at each build.
 docs: $(VENV)/.ready-dev
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
+	$(PY) -m pytest -q -m slow tests/docs/test_site.py
 	@echo "surgsim: the site is in site/; open site/index.html (searching needs a server: $(PY) -m http.server -d site)"
 
 lint: $(VENV)/.ready-dev

@@ -1,7 +1,6 @@
-"""What several test modules share: patience, a browser, the anatomy files and random meshes."""
+"""What several test modules share: patience, a browser and random meshes."""
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,16 +15,6 @@ from tests.chromium import CHROMIUM, Chromium
 # Nothing that passes depends on how fast it runs.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
-
-ANATOMY = Path(__file__).resolve().parents[2] / "shared" / "data" / "anatomy"
-
-
-@pytest.fixture(scope="session")
-def anatomy_folder() -> Path:
-    """The folder of organs from CT, which lies beside the repository and is no part of it."""
-    if not ANATOMY.is_dir():
-        pytest.skip(f"the surfaces of OpenHELP (doi 10.1007/s00464-015-4094-0) are not in {ANATOMY}")
-    return ANATOMY
 
 
 @pytest.fixture(scope="session")

@@ -40,11 +40,6 @@ def test_circular_functions(name):
     assert np.abs(getattr(arithmetic, name)(angle) - getattr(np, name)(angle)).max() <= 3e-16
 
 
-def test_circular_functions_refuse_large_angles():
-    with pytest.raises(ValueError, match="must be at most"):
-        arithmetic.cos([0.0, 1e6])
-
-
 def test_power():
     """e^(y ln x) loses as many digits as y ln x has before the point."""
     base, exponent = RNG.uniform(0.01, 100.0, 3000), RNG.uniform(-3.0, 3.0, 3000)
@@ -105,11 +100,6 @@ def test_matmul_takes_views_as_they_are():
     plain = arithmetic.matmul(a, b)
     assert np.array_equal(arithmetic.matmul(np.asfortranarray(a), np.asfortranarray(b)), plain)
     assert np.array_equal(arithmetic.matmul(np.repeat(a, 2, axis=1)[:, ::2], b), plain)
-
-
-def test_matmul_refuses_other_lengths():
-    with pytest.raises(ValueError, match="shapes"):
-        arithmetic.matmul(np.ones((2, 3)), np.ones((2, 3)))
 
 
 def test_solve():

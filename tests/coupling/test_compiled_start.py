@@ -1,4 +1,4 @@
-"""The compiled control step makes no object, holds no lock, starts from the cache, and says why it cannot be had."""
+"""The compiled control step makes no object, holds no lock, and starts from the cache."""
 
 import os
 import subprocess
@@ -8,7 +8,6 @@ import time
 import warnings
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 
@@ -16,7 +15,6 @@ from msdm_core.kernels.structure_kernels import FAULT_NONE
 from surgsim_env.coupling import mujoco_library
 from surgsim_env.coupling.exchange import haptic_steps, step_outcome
 from surgsim_env.coupling.haptic_kernels import StepPlan, advance_haptic_steps
-from surgsim_env.instruments.mujoco_kernels import MUJOCO_FUNCTIONS
 from surgsim_env.instruments.tool_bodies import ToolBodies
 from tests.allocations import allocations
 from tests.coupling.test_compiled_step import DOWN, on_phantom, pair
@@ -83,14 +81,6 @@ def test_a_missing_library_has_a_reason(tmp_path):
     assert mujoco_library.missing() == ""
 
 
-def test_functions_are_asked_for_before_any_is_called(monkeypatch):
-    assert mujoco_library.check_functions(MUJOCO_FUNCTIONS) == ""
-    assert "no function mj_stepp, mj_leap" in mujoco_library.check_functions(("mj_step1", "mj_stepp", "mj_leap"))
-    assert set(MUJOCO_FUNCTIONS) >= {"mj_step1", "mj_step2", "mj_fullM"}
-    monkeypatch.setattr(mujoco, "mj_version", lambda: 123)
-    assert "another MuJoCo" in mujoco_library.check_functions(MUJOCO_FUNCTIONS)
-
-
 def test_without_the_library_the_plain_loop_runs_and_says_so_once(monkeypatch):
     reason = "no library of MuJoCo in /nowhere"
     monkeypatch.setattr(mujoco_library, "_missing", reason)
@@ -123,16 +113,6 @@ def test_tools_that_drive_themselves_are_refused():
     with pytest.raises(TypeError, match="Shaker has a drive of its own"):
         haptic_steps(model, state, shaker, LAW, 2e-4, 5, np.zeros((1, 6)))
     assert shaker.data.time == 0.0
-
-
-def test_the_loop_can_be_chosen(monkeypatch):
-    monkeypatch.setenv(mujoco_library.LOOP_VARIABLE, "python")
-    assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is False
-    monkeypatch.setenv(mujoco_library.LOOP_VARIABLE, "compiled")
-    assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is True
-    monkeypatch.setenv(mujoco_library.LOOP_VARIABLE, "fast")
-    with pytest.raises(ValueError, match="SURGSIM_LOOP is 'fast'"):
-        gym.make("SurgSim/Palpate-v0")
 
 
 FRESH = """

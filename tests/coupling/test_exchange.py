@@ -15,7 +15,6 @@ from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.measure import angular_momentum, momentum
 from surgsim_env.coupling import haptic_kernels
 from surgsim_env.coupling.exchange import haptic_steps
-from surgsim_env.coupling.haptic_kernels import FORCE_CAP
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.make import Probe
 from surgsim_env.instruments.tool_bodies import ToolBodies
@@ -186,29 +185,6 @@ def test_a_force_that_is_not_finite_never_reaches_mujoco():
     assert untouched(probe)
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        (np.nan, "the contact wrench is not finite"),
-        (np.inf, "the contact wrench is not finite"),
-        (120.0, rf"contact force 120 N is beyond the physical cap of {FORCE_CAP:g} N"),
-    ],
-)
-def test_a_bad_wrench_never_reaches_mujoco(value: float, message: str, monkeypatch: pytest.MonkeyPatch):
-    """Even where every node is finite."""
-
-    def push(_model, _state, _shapes, _law, _response, _dt, _decay, _count, _reference, wrench) -> int:
-        wrench[:] = [0.0, 0.0, value, 0.0, 0.0, 0.0]
-        return FAULT_NONE
-
-    monkeypatch.setattr(haptic_kernels, "advance_substeps", push)
-    model, state = free_organ()
-    probe = driven_probe()
-    taken = haptic_steps(model, state, probe, LAW, DT / SUBSTEPS, SUBSTEPS, np.zeros((1, 6)))
-    assert taken.ended and re.search(message, taken.fault)
-    assert untouched(probe)
-
-
 # ---- the simulation -----------------------------------------------------------------------------------------------
 
 ABOVE = np.array([0.03, 0.03, 0.0385])  # the tip's centre, 0.5 mm clear of the phantom's top [m]
@@ -319,21 +295,6 @@ def test_a_saved_state_resumes_to_the_bit():
             assert array.tobytes() == after[name].tobytes(), name
 
 
-def test_a_resumed_command_goes_on():
-    """The velocity that was commanded is part of the state."""
-    simulated = simulation()
-    run(simulated, (0.0, 0.0, -0.03), 60)
-    saved = simulated.get_state()
-    for _ in range(30):
-        simulated.haptic_step()
-    tip = simulated.instrument.tip_position
-    other = simulation()
-    other.set_state(simulated.organ_model, saved)
-    for _ in range(30):
-        other.haptic_step()
-    np.testing.assert_array_equal(other.instrument.tip_position, tip)
-
-
 def test_the_wrist_feels_what_the_tissue_gives():
     """Static press: the force sensor between slide and tip carries the contact force, within 1 %."""
     simulated = simulation()
@@ -347,12 +308,6 @@ def test_the_wrist_feels_what_the_tissue_gives():
     # The servo holds the tip with 5000 N/m: it is off its target by force / 5000.
     data = simulated.instrument.data
     np.testing.assert_allclose(data.qpos[:3] - data.ctrl[:3], wrench[:3] / 5000.0, rtol=0, atol=0.01 * force / 5000.0)
-
-
-def test_time_counts_haptic_steps():
-    simulated = simulation()
-    run(simulated, (0.0, 0.0, 0.0), 7)
-    assert simulated.time == pytest.approx(0.007, rel=1e-15)
 
 
 def test_restart_goes_back_to_the_settled_shape_under_gravity():

@@ -205,25 +205,3 @@ def test_lanes_stop_at_the_pull_limit_too():
         if stopped:
             break
     assert stopped and together[1].time > together[0].time
-
-
-@pytest.mark.parametrize("model", JAWS)
-def test_a_state_in_mid_closing_is_restored_to_the_bit(model: str):
-    one = simulation(model)
-    one.instrument.command_jaw(-0.7)
-    turning = np.full(one.instrument.turning_size, 0.2)
-    run(one, 6, (0.0, 0.005, 0.0), turning)
-    saved, pull_peak = one.get_state(), one.pull_peak
-    ends = []
-    for spoil in (False, True):
-        if spoil:
-            one.instrument.command_jaw(1.0)
-            run(one, 5, (0.0, 0.01, 0.01), turning)
-            one.set_state(one.organ_model, saved)
-            for name, array in one.get_state().items():
-                assert saved[name].tobytes() == array.tobytes(), name
-            assert one.pull_peak == pull_peak > 0.0
-        run(one, 12, (0.0, 0.005, 0.0), turning)
-        ends.append({name: array.tobytes() for name, array in one.get_state().items()})
-    assert ends[0] == ends[1]
-    assert one.instrument.jaw.target == pytest.approx(-0.7)

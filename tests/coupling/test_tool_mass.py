@@ -67,11 +67,10 @@ def test_mass_is_felt_at_the_lightest_end():
 
 
 def test_a_tool_too_light_is_refused_and_the_ways_out_work():
-    """At 0.99 and 1.01 of the least mass; a light one passes with the damping that the message gives."""
+    """At 0.99 and 1.01 of the least mass; a light one passes with the damping that is reported."""
     area = np.pi * 0.01**2
     least = 0.5 * 2e7 * area * DT**2
-    match = rf"scene 'x': tool 'ball' weighs {0.99 * least * 1e3:.3g} g at its tip.*at least {least * 1e3:.3g} g, or"
-    with pytest.raises(OrganError, match=match):
+    with pytest.raises(OrganError, match=rf"'ball'.* {least * 1e3:.3g} g"):
         check_tool_masses("x", free_ball(0.99 * least, 0.01, 0.01, joint=UPRIGHT), ELASTIC, WIDE)
     check_tool_masses("x", free_ball(1.01 * least, 0.01, 0.01, joint=UPRIGHT), ELASTIC, WIDE)
     light = free_ball(0.3 * least, 0.01, 0.01, joint=UPRIGHT)
@@ -79,7 +78,7 @@ def test_a_tool_too_light_is_refused_and_the_ways_out_work():
     light.model.dof_damping[:] = 1.001 * found.least_damping
     check_tool_masses("x", light, ELASTIC, WIDE)
     light.model.dof_damping[:] = 0.99 * found.least_damping
-    with pytest.raises(OrganError, match="weighs"):
+    with pytest.raises(OrganError, match="'ball'"):
         check_tool_masses("x", light, ELASTIC, WIDE)
 
 
@@ -98,7 +97,7 @@ def test_a_scene_whose_contact_is_too_stiff_for_its_tool_is_refused():
     stiff = replace(
         scene, contact=replace(scene.contact, stiffness=4e8), timing=replace(scene.timing, substep_count=50)
     )
-    with pytest.raises(OrganError, match=r"scene 'phantom': tool 'tip' weighs 80 g .* lower contact.stiffness"):
+    with pytest.raises(OrganError, match=r"'phantom'.* 80 g"):
         Simulation(replace(load_anatomy(scene), scene=stiff))
 
 

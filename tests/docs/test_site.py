@@ -1,4 +1,4 @@
-"""The documentation site builds without a warning, asks nothing of the network, and its links lead somewhere."""
+"""The site that `make docs` has just built asks nothing of the network, and its links lead somewhere."""
 
 import html.parser
 import os
@@ -8,7 +8,10 @@ from urllib.parse import unquote
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+SITE = Path(__file__).resolve().parents[2] / "site"
+# `make docs` runs these.
+pytestmark = pytest.mark.slow
+
 # What a browser fetches by itself; links are fetched when somebody follows them.
 FETCHED = {"img": "src", "script": "src", "link": "href", "source": "src", "iframe": "src", "video": "src"}
 
@@ -33,6 +36,13 @@ class Html(html.parser.HTMLParser):
 
 
 @pytest.fixture(scope="module")
+def site_folder() -> Path:
+    if not (SITE / "index.html").is_file():
+        pytest.skip(f"no site in {SITE}: `make docs` builds it and runs these tests")
+    return SITE
+
+
+@pytest.fixture(scope="module")
 def site(site_folder) -> dict[str, Html]:
     """Every page of the built site, by its path."""
     found = site_folder.rglob("*.html")
@@ -41,26 +51,6 @@ def site(site_folder) -> dict[str, Html]:
 
 def pages(site: dict[str, Html]) -> dict[str, Html]:
     return {path: page for path, page in site.items() if path != "404.html"}
-
-
-def test_every_page_of_docs_is_on_the_site(site):
-    written = {
-        path.relative_to(ROOT / "docs").with_suffix(".html").as_posix() for path in (ROOT / "docs").rglob("*.md")
-    }
-    assert written | {"agents.html", "contributing.html", "changelog.html"} <= set(site)
-
-
-def test_every_page_is_in_the_navigation(site):
-    """From the home page, by links alone, to all."""
-    reached, waiting = set(), ["index.html"]
-    while waiting:
-        path = waiting.pop()
-        if path in reached:
-            continue
-        reached.add(path)
-        found = [os.path.normpath(os.path.join(os.path.dirname(path), link.split("#")[0])) for link in site[path].links]
-        waiting += [link for link in found if link in pages(site)]
-    assert set(pages(site)) - reached == set()
 
 
 def test_links_lead_somewhere(site, site_folder):
@@ -94,27 +84,3 @@ def test_equations_became_mathml(site_folder):
         for drawn in re.findall(r"<math.*?</math>", text, flags=re.DOTALL):
             assert "\\" not in drawn and "merror" not in drawn, (path, drawn)
     assert (site_folder / "concepts.html").read_text(encoding="utf-8").count("equation-number") >= 6
-
-
-@pytest.mark.parametrize(
-    "fault",
-    ["[lost](nowhere.md)", "[lost](arms.md#nowhere)", "![lost](images/nowhere.png)", r"$\nocommand{x}$"],
-)
-def test_a_fault_ends_the_build(build, tmp_path, fault):
-    """That warnings are errors, and that each of these is noticed: a site of two pages with our configuration."""
-    docs = tmp_path / "docs"
-    docs.mkdir()
-    (docs / "arms.md").write_text("# Arms\n", encoding="utf-8")
-    (docs / "index.md").write_text(f"# Home\n\n[there](arms.md#arms) {fault}\n", encoding="utf-8")
-    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    text = re.sub(r"^nav:\n(?:[ #].*\n|\n)*?(?=\S)", "", text, flags=re.MULTILINE)
-    text = re.sub(r"^  (logo|favicon):.*\n", "", text, flags=re.MULTILINE).replace("  - docs/hooks/site_pages.py\n", "")
-    text = text.replace("docs/hooks/", f"{ROOT}/docs/hooks/").replace("extra_css: [stylesheets/site.css]\n", "")
-    configuration = tmp_path / "mkdocs.yml"
-    configuration.write_text(text, encoding="utf-8")
-    done = build(tmp_path / "site", configuration=configuration)
-    assert done.returncode != 0
-    assert "nowhere" in done.stderr + done.stdout or "nocommand" in done.stderr + done.stdout
-    (docs / "index.md").write_text("# Home\n\n[there](arms.md#arms) $\\alpha$\n", encoding="utf-8")
-    done = build(tmp_path / "site", configuration=configuration)
-    assert done.returncode == 0, done.stderr

@@ -46,12 +46,3 @@ def test_an_end_ends_it_for_both_and_time_runs_out(env):
     assert all(env.step(still)[3].values()) and env.agents == []
     with pytest.raises(gym.error.ResetNeeded):
         env.step(still)
-
-
-def test_wrong_actions_are_refused(env):
-    env.reset(seed=1)
-    still = {agent: np.zeros(env.action_space(agent).shape, dtype=np.float32) for agent in env.agents}
-    with pytest.raises(ValueError, match=r"actions are for \['left'\]"):
-        env.step({"left": still["left"]})
-    with pytest.raises(ValueError, match=r"the action of 'left' has shape \(6,\); the rule is \(7,\)"):
-        env.step({"left": still["right"], "right": still["left"]})

@@ -1,17 +1,13 @@
-"""SurgSim/BimanualRetract-v0: what counts as touched and exposed, what ends it, what it pays and refuses."""
-
-from dataclasses import replace
+"""SurgSim/BimanualRetract-v0: what counts as touched and exposed, what ends it, and what it pays."""
 
 import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.envs.ids import BimanualRetractEnv
 from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Grasp
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene, pair_names, with_instrument
+from surgsim_env.scene.load import pair_names
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE
 
@@ -142,53 +138,13 @@ def test_both_arms_go_as_told_and_only_the_left_jaw_closes(env):
     assert observation[slices["arm_distance"]] == pytest.approx(pair.distance, abs=1e-6)
 
 
-def test_a_touch_beside_the_lobe_is_felt(env):
-    """The right tip driven into the bare bed: its force is told, and no tissue is."""
-    left = env.simulation.instrument.arms["left"].tip_position
-    radius = env.scene.instrument.tip_radius
-    env.simulation.restart(np.stack([left, [0.105, 0.020, radius + 0.001]]))
-    for _ in range(40):
-        action = env.task.action(np.zeros(3), right=np.array([0.0, 0.0, -0.002])).astype(np.float32)
-        observation, _, terminated, _, info = env.step(action)
-        if info["touch_force"] > 0.2:
-            break
-    assert not terminated and 0.2 < info["touch_force"] < 1.5 and not info["touches"]
-    assert observation[env.observation_slices["touch_force"]] == pytest.approx(info["touch_force"], rel=1e-6)
-    assert info["touch_force"] == env.simulation.instrument.touch_force("right", "bed")
-
-
-def test_one_arm_and_scenes_for_one_are_refused():
-    with pytest.raises(ValueError, match="is one arm, and two are needed"):
-        BimanualRetractEnv(instrument="grasper")
-    scene = with_instrument(make_scene("lobe"), "psm_pair")
-    assert scene.retract is not None
-    anatomy = load_anatomy(replace(scene, retract=replace(scene.retract, right_start_lower=None)))
-    with pytest.raises(ValueError, match="two hands need"):
-        BimanualRetractTask(anatomy, Simulation(anatomy).instrument)
-
-
 def test_any_two_arms_are_a_pair(tmp_path):
     assert pair_names("psm_pair") == pair_names("psm_retractor+psm_palpator") == ("psm_retractor", "psm_palpator")
     assert pair_names("a+b/mine.toml+six_axis") == ("a+b/mine.toml", "six_axis")
     for model in ("psm_retractor", "my+arm.toml", "psm_retractor+", "+six_axis", "probe.xml"):
         assert pair_names(model) is None, model
-    with pytest.raises(ValueError, match="two arms as LEFT"):
-        BimanualRetractEnv(instrument="psm_retractor+psm_palpater")
     pair = BimanualRetractEnv(instrument="psm_retractor+six_axis").simulation.instrument
     assert [arm.arm.description.name for arm in pair.arms.values()] == ["psm_retractor", "six_axis"]
-
-
-@pytest.mark.parametrize(
-    ("instrument", "message"),
-    [
-        ("psm_grasper+psm_palpator", r"the left arm 'psm_grasper' at its port .* has no jaw with flat pads"),
-        ("psm_palpator+psm_palpator", r"the left arm 'psm_palpator' at its port .* has no jaw with flat pads"),
-        ("psm_retractor+psm_retractor", r"the right arm 'psm_retractor' at its port .* has no ball at its tip"),
-    ],
-)
-def test_arms_that_cannot_do_it_are_refused(instrument, message):
-    with pytest.raises(ValueError, match=message):
-        BimanualRetractEnv(instrument=instrument)
 
 
 @pytest.mark.parametrize(

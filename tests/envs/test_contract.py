@@ -31,6 +31,11 @@ CASES = [(env_id, SETTINGS.get(env_id, {})) for env_id in IDS] + [
     ("SurgSim/Palpate-v0", {"scene": "phantom", "instrument": "psm_palpator"}),
     pytest.param(("SurgSim/Retract-v0", {"instrument": "psm_retractor"}), marks=pytest.mark.slow),
     ("SurgSim/Palpate-v0", {"scene": "kidney_family"}),
+    # All that an episode may remember, draw and follow.
+    (
+        "SurgSim/Palpate-v0",
+        {"scene": "phantom_small", "memory": True, "frame": "face", "level": "standard", "motion": "calm"},
+    ),
     *(
         pytest.param((env_id, {"scene": scene}), marks=pytest.mark.slow)
         for env_id, scene in (
@@ -51,10 +56,14 @@ CELLS = {
 }
 # Entries of an observation that a walk of some steps leaves as they are: the axis of a wrist that is a hinge, what is
 # grasped and what is seen.
-# (Of the sites of a chart's grid a walk presses some.)
+# (Of the sites of a chart's grid a walk presses some, and the phantom is flat.)
 HINGE = {f"tip_axes[{entry}]" for entry in range(4)}
 UNSEEN = {"grip_force[0]", "holds[0]", "visible[0]"}
 STILL = {
+    "SurgSim/Palpate-v0": {
+        *(f"{name}[{site}]" for name in ("contrast", "visited", "face") for site in range(MAP_SIDE**2)),
+        *(f"{name}[{axis}]" for name in ("surface_normal", "map_cell", "chart_share") for axis in range(3)),
+    },
     "SurgSim/PalpateSites-v0": {
         *(f"{name}[{site}]" for name in ("contrast_map", "pressed_map", "face_map") for site in range(MAP_SIDE**2)),
         *(

@@ -90,43 +90,6 @@ def test_a_scene_of_one_organ_names_no_member():
     assert "member" not in env.reset(seed=0)[1]
 
 
-@pytest.mark.parametrize(("env_id", "settings"), [(SITES, {"budget": 3}), (PALPATE, {"memory": True})])
-def test_a_saved_state_brings_its_member(blocks, env_id, settings):
-    def make(**more):
-        return gym.make(env_id, scene=blocks, **{**settings, **more}).unwrapped
-
-    env = make()
-    env.reset(seed=1)
-    moves = actions(env_id, 3, np.random.default_rng(0))
-    env.step(moves[0])
-    saved, name = env.save_state(), str(env.task.anatomy.member)
-    expected = env.step(moves[1])
-    other = make()
-    for seed in range(20):
-        if other.reset(seed=seed)[1]["member"] != name:
-            break
-    other.load_state(saved)
-    assert str(other.task.anatomy.member) == str(other.simulation.anatomy.member) == name
-    assert other.save_state() == saved
-    found = other.step(moves[1])
-    assert_equal(found[:4], expected[:4])
-    assert_equal(found[4], expected[4])
-    test = make(split="test")
-    test.reset(seed=0)
-    before = test.save_state()
-    with pytest.raises(ValueError, match=rf"member '{name}', this environment plays split 'test': make it with that"):
-        test.load_state(saved)
-    assert test.save_state() == before, "what is refused changes nothing"
-
-
-def test_unknown_splits_are_refused(blocks):
-    for env_id in (SITES, PALPATE):
-        with pytest.raises(ValueError, match=r"split 'tset' is unknown; .* did you mean 'test'"):
-            gym.make(env_id, scene=blocks, split="tset")
-        with pytest.raises(ValueError, match="split is 'test', and scene 'phantom_small' is one organ"):
-            gym.make(env_id, scene="phantom_small", split="test")
-
-
 @pytest.mark.parametrize(
     ("env_id", "settings"),
     [

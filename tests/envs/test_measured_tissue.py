@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -11,9 +10,6 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import SitePress, press_alone, press_phases
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.save import scene_toml
-
-IDS = ("SurgSim/Palpate-v0", "SurgSim/PalpateSites-v0")
 
 
 @pytest.fixture(scope="module")
@@ -25,13 +21,6 @@ def scene():
         relaxation=Relaxation(relative_moduli=(0.3, 0.3), times=(0.05, 0.5)),
     )
     return replace(plain, name="measured", material=material)
-
-
-@pytest.fixture(scope="module")
-def scene_file(scene, tmp_path_factory):
-    path = tmp_path_factory.mktemp("scenes") / "measured.toml"
-    path.write_text(scene_toml(scene))
-    return str(path)
 
 
 def press_once(simulation, scene):
@@ -46,39 +35,3 @@ def test_a_second_press_equals_the_first(scene):
     assert first.force_peak > 0.1
     np.testing.assert_array_equal(second.force, first.force)
     assert second.force_peak == first.force_peak
-
-
-@pytest.mark.parametrize("env_id", IDS)
-def test_a_saved_state_continues_as_the_episode_did(env_id, scene_file):
-    """To the bit, with what the arms have given way to."""
-    env = gym.make(env_id, scene=scene_file)
-    env.reset(seed=1)
-    env.action_space.seed(1)
-    actions = [env.action_space.sample() for _ in range(6)]
-    for action in actions[:3]:
-        env.step(action)
-    state = env.unwrapped.save_state()
-    later = [env.step(action)[:2] for action in actions[3:]]
-    env.reset(seed=2)
-    env.unwrapped.load_state(state)
-    for action, (observation, reward) in zip(actions[3:], later):
-        again, same, *_ = env.step(action)
-        np.testing.assert_array_equal(again, observation)
-        assert same == reward
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", IDS)
-def test_environments_side_by_side_equal_single_ones(env_id, scene_file):
-    together = gym.make_vec(env_id, num_envs=3, vectorization_mode="vector_entry_point", scene=scene_file)
-    alone = [gym.make(env_id, scene=scene_file) for _ in range(3)]
-    first, _ = together.reset(seed=5)
-    np.testing.assert_array_equal(first, [env.reset(seed=5 + n)[0] for n, env in enumerate(alone)])
-    together.action_space.seed(5)
-    for _ in range(4):
-        actions = together.action_space.sample()
-        observations, rewards, *_ = together.step(actions)
-        for n, (env, action) in enumerate(zip(alone, actions)):
-            observation, reward, *_ = env.step(action)
-            np.testing.assert_array_equal(observations[n], observation)
-            assert rewards[n] == reward

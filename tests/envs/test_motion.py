@@ -32,7 +32,6 @@ BREATH = CyclicMotion(
 BEAT = CyclicMotion(
     "heartbeat", (0.0, 0.0, 0.002), period=(0.2, 0.3), rise=0.2, fall=0.3, centre=(0.0, 0.0, 0.0), reach=0.05
 )
-IDS = ("SurgSim/Palpate-v0", "SurgSim/PalpateSites-v0")
 
 
 @pytest.fixture(scope="module")
@@ -86,56 +85,6 @@ def test_the_ground_is_where_the_signals_say_after_each_haptic_step(scene):
         np.testing.assert_allclose(simulation.organ_state.node_position[anatomy.anchors], at_rest + shift, atol=1e-12)
         farthest = max(farthest, float(np.abs(shift).max()))
     assert farthest > 0.003
-
-
-@pytest.mark.parametrize("env_id", IDS)
-def test_a_saved_state_continues_as_the_episode_did(env_id, scene_file):
-    """To the bit, with the cycles that were drawn; another environment that loads it too."""
-    env = gym.make(env_id, scene=scene_file)
-    env.reset(seed=1)
-    env.action_space.seed(1)
-    actions = [env.action_space.sample() for _ in range(6)]
-    for action in actions[:3]:
-        env.step(action)
-    state = env.unwrapped.save_state()
-    expected = [env.step(action)[0] for action in actions[3:]]
-    other = gym.make(env_id, scene=scene_file)
-    other.reset(seed=9)
-    other.unwrapped.load_state(state)
-    for action, observation in zip(actions[3:], expected, strict=True):
-        assert other.step(action)[0].tobytes() == observation.tobytes()
-    assert other.unwrapped.save_state() == env.unwrapped.save_state()
-
-
-def test_a_saved_retraction_continues_as_the_episode_did():
-    """On a lobe whose bed moves, as above."""
-    env, other = (gym.make("SurgSim/Retract-v0", motion="calm") for _ in range(2))
-    env.reset(seed=1)
-    env.step(env.action_space.sample())
-    state, action = env.unwrapped.save_state(), env.action_space.sample()
-    expected = env.step(action)[0]
-    other.reset(seed=2)
-    other.unwrapped.load_state(state)
-    assert other.step(action)[0].tobytes() == expected.tobytes()
-
-
-@pytest.mark.parametrize("env_id", IDS)
-def test_organs_side_by_side_breathe_as_alone(env_id, scene_file):
-    """Each lane its own cycles, to the bit."""
-    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled"}
-    many = gym.make_vec(env_id, num_envs=3, scene=scene_file, **lanes)
-    one = [gym.make(env_id, scene=scene_file) for _ in range(3)]
-    first, _ = many.reset(seed=[3, 4, 5])
-    for row, env, seed in zip(first, one, (3, 4, 5), strict=True):
-        assert env.reset(seed=seed)[0].tobytes() == row.tobytes()
-    one[0].action_space.seed(0)
-    for _ in range(4):
-        action = one[0].action_space.sample()
-        rows = many.step(np.stack([action] * 3))[0]
-        for row, env in zip(rows, one, strict=True):
-            assert env.step(action)[0].tobytes() == row.tobytes()
-    courses = [env.unwrapped.simulation.organ_state.motion[:, 0] for env in one]
-    assert np.ptp(courses, axis=0).max() > 1e-3
 
 
 def patient(anatomy, seed=3) -> Simulation:
@@ -223,16 +172,14 @@ def test_a_state_saved_in_a_held_breath_goes_on_to_the_bit(anatomy):
         assert other.organ_state.motion[0, SIGNAL] > 0.1
 
 
-def test_what_a_scene_says_of_motion_is_checked(scene):
-    for changes, words in (
-        ({"period": (0.0, 1.0)}, "period"),
-        ({"rise": 0.7, "fall": 0.5}, "together at most 1"),
+def test_what_a_scene_says_of_motion_is_checked():
+    for changes, named in (
+        ({"rise": 0.7, "fall": 0.5}, "rise"),
         ({"size": (2.0, 1.0)}, "size"),
-        ({"variation": 0.9}, "variation is 0.9; it must be from 0 to 0.3"),
+        ({"variation": 0.9}, "variation is 0.9"),
         ({"side": (0.0, 0.0, 1.0)}, "reach"),
-        ({"side": (0.0, 0.0, 1.0), "reach": 0.1, "centre": (0.0, 0.0, 0.0)}, "give a side or a centre, not both"),
     ):
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=named):
             replace(BREATH, **changes)
 
 
@@ -256,16 +203,6 @@ def test_a_preset_moves_towards_feet_and_front(name):
     centre = liver.motions[1].ground(points).centre
     assert way[np.linalg.norm(points - centre, axis=1) > heartbeat.cranial_reach].max() == 0.0 < way[below < 0.01].max()
     assert below[way.argmax()] < 0.1 * np.ptp(below)
-
-
-def test_motion_none_and_unknown_ones():
-    """ "none" takes away what a scene says, None keeps it, another name is refused with those that there are."""
-    scene = replace(make_scene("phantom_small"), motions=(BREATH,))
-    assert with_motion(scene, "none").motions == () and with_motion(scene, None) is scene
-    for env_id in gym.registry:
-        if env_id.startswith("SurgSim/"):
-            with pytest.raises(ValueError, match="motion 'clam' is unknown; the motions are none, calm, free; did you"):
-                gym.make(env_id, motion="clam")
 
 
 # ---- a surface that moves --------------------------------------------------------------------------------------------
@@ -301,17 +238,6 @@ def test_an_organ_rests_on_its_moving_ground(breathing):
         for _ in range(100):
             assert brought.haptic_step() and put.haptic_step()
         assert put.motion_time == pytest.approx(brought.motion_time)
-
-
-def test_a_saved_simulation_goes_on_with_its_motion(breathing):
-    """Its clock began later than its motions, as in a press after others."""
-    first, second = Simulation(breathing), Simulation(breathing)
-    first.draw_motion(np.random.default_rng(3))
-    first.restart(first.instrument.parked, elapsed=float(first.drive.delay[0]) + 0.5)
-    second.set_state(first.organ_model, first.get_state())
-    for _ in range(50):
-        assert first.haptic_step() and second.haptic_step()
-    assert first.organ_state.node_position.tobytes() == second.organ_state.node_position.tobytes()
 
 
 def test_a_press_goes_with_the_surface(breathing, still):

@@ -3,11 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401
 from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.tasks.declaration import ControlStep
 from surgsim_env.tasks.palpate import EPISODE_STEPS, EPISODE_STEPS_WIDE
 
 ID = "SurgSim/Palpate-v0"
@@ -65,29 +63,6 @@ def test_a_command_moves_the_tip_along_an_axis_of_the_face(liver, axis):
     np.testing.assert_allclose(liver.task.action(world)[:3], action[:3], atol=1e-7)
 
 
-def test_the_frame_keeps_to_the_contract_and_saved_states():
-    env = gym.make(ID, memory=True, frame="face")
-    check_env(env.unwrapped, skip_render_check=True)
-    env.reset(seed=2)
-    down = np.array([0.1, 0.0, -0.5, 0.0], dtype=np.float32)
-    for _ in range(5):
-        env.step(down)
-    state = env.unwrapped.save_state()
-    rows = [[env.step(down)[0] for _ in range(3)]]
-    env.unwrapped.load_state(state)
-    rows.append([env.step(down)[0] for _ in range(3)])
-    np.testing.assert_array_equal(*rows)
-
-
-def test_lanes_in_the_frame_equal_a_single_environment():
-    envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", frame="face")
-    single, action = gym.make(ID, frame="face"), np.array([0.3, 0.1, -0.5, 0.0], dtype=np.float32)
-    envs.reset(seed=[5, 6])
-    single.reset(seed=6)
-    for _ in range(10):
-        np.testing.assert_array_equal(envs.step(np.tile(action, (2, 1)))[0][1], single.step(action)[0])
-
-
 def test_a_member_of_a_family_has_its_own_frame():
     env = gym.make(ID, scene="kidney_family", frame="face").unwrapped
     env.reset(seed=1)
@@ -103,46 +78,3 @@ def test_an_episode_is_longer_on_a_wide_face(liver):
     liver.reset(seed=3)
     observation, _, _, truncated, _ = liver.step(np.zeros(4, dtype=np.float32))
     assert read(liver, observation)["time_left"] == pytest.approx(1.0 - 1.0 / 1200, abs=1e-6) and not truncated
-
-
-def test_an_episode_has_the_steps_that_were_asked_for():
-    env = gym.make(ID, episode_steps=3)
-    up = np.array([0.0, 0.0, 0.2, 0.0], dtype=np.float32)
-    env.reset(seed=0)
-    steps = [env.step(up) for _ in range(3)]
-    assert [one[3] for one in steps] == [False, False, True]
-    assert steps[-1][0][9] == 0.0
-    envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", episode_steps=2)
-    envs.reset(seed=0)
-    assert [envs.step(np.tile(up, (2, 1)))[3].all() for _ in range(2)] == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"frame": "faces"}, "frame 'faces' is unknown; did you mean 'face'"),
-        ({"episode_steps": 0}, "episode_steps is 0; it must be a whole number"),
-        ({"episode_steps": True}, "episode_steps is True"),
-        ({"episode_steps": 2.5}, "episode_steps is 2.5"),
-    ],
-)
-def test_a_wrong_argument_is_refused(wrong, said):
-    with pytest.raises(ValueError, match=said):
-        gym.make(ID, **wrong)
-
-
-def test_episodes_of_any_length_cost_alike():
-    """An episode of 3 control steps without contact costs what one of 600 does, and a late failure no more."""
-    costs = []
-    for settings in ({}, {"episode_steps": 3}):
-        env = gym.make(ID, scene="phantom_small", **settings).unwrapped
-        env.reset(seed=0)
-        *_, info = env.step(np.array([0.0, 0.0, 0.2, 0.0], dtype=np.float32))
-        costs.append(info["reward_time"] * env.task.episode_steps)
-        step = ControlStep(env.simulation, 0.0)
-        forgone = next(one for one in env.task.rewards if one.name == "forgone")
-        assert forgone.value is not None
-        left = 1.0 - 1.0 / env.task.episode_steps
-        assert forgone.weight * forgone.value(env.task, step) == pytest.approx(-0.015 * 600 * left)
-        env.close()
-    assert costs == pytest.approx([-3.0, -3.0])

@@ -1,11 +1,10 @@
-"""SurgSim/Palpate-v0 with a level: one lesion whatever the level says, the rest as it says, in lanes too; the cost."""
+"""SurgSim/Palpate-v0 with a level: one lesion whatever the level says, the rest as it says; the cost."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from tests.envs.test_vector_env import assert_equal
 
 ID = "SurgSim/Palpate-v0"
 DOWN = np.array([0.0, 0.0, -0.6, 0.0], dtype=np.float32)
@@ -30,26 +29,6 @@ def test_without_a_level_the_scene_is_as_it_is():
     assert not env.scene.timing.mass_scaling and env.scene.sensor.noise == 0.005
     with pytest.raises(ValueError, match=r"level 'normal' is unknown.*easy, standard, hard"):
         gym.make(ID, level="normal")
-
-
-def test_lanes_of_drawn_organs_equal_single_environments():
-    """Moduli, capsules and masses that differ from lane to lane: to the bit."""
-    count, settings = 3, {"scene": "phantom_small", "level": "standard"}
-    together = gym.make_vec(ID, count, vectorization_mode="vector_entry_point", autoreset_mode="SameStep", **settings)
-    apart = gym.make_vec(ID, count, vectorization_mode="sync", vector_kwargs={"autoreset_mode": "SameStep"}, **settings)
-    assert_equal(together.reset(seed=[0, 1, 2]), apart.reset(seed=[0, 1, 2]))
-    for step in range(12):
-        actions = np.tile(DOWN, (count, 1))
-        actions[:, 0] = np.cos(step + np.arange(count))
-        found, expected = together.step(actions), apart.step(actions)
-        assert_equal(found[:4], expected[:4])
-        assert_equal(found[4], expected[4])
-    organs = [env.unwrapped.simulation.organ_model for env in together.envs]  # type: ignore[attr-defined]
-    assert len({float(organ.spring_stiffness.sum()) for organ in organs}) == count
-    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
-        assert one.unwrapped.save_state() == other.unwrapped.save_state()
-    together.close()
-    apart.close()
 
 
 def test_cost_is_the_force_beyond_the_soft_limit():

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401
 from surgsim_env.palpation.chart import MAP_SIDE
@@ -90,38 +89,3 @@ def test_an_episode_begins_with_nothing_remembered():
     begun = env.reset()[0]
     assert not begun[10 : FACE.start].any() and not begun[FACE.stop :].any()
     assert begun[FACE].sum() == 13 * 13
-
-
-def test_passes_gymnasiums_checker_and_bounds_are_finite():
-    env = gym.make(ID, memory=True, scaled=False).unwrapped
-    assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
-    check_env(env)
-
-
-def test_a_saved_state_holds_the_memory():
-    env = gym.make(ID, memory=True, scaled=False).unwrapped
-    walked(env)
-    saved = env.save_state()
-    expected = env.step(WALK[0])
-    other = gym.make(ID, memory=True, scaled=False).unwrapped
-    other.reset(seed=50)
-    other.load_state(saved)
-    assert other.save_state() == saved
-    assert other.step(WALK[0])[0].tobytes() == expected[0].tobytes()
-    with pytest.raises(ValueError, match="'observation' has shape"):
-        gym.make(ID, scaled=False).unwrapped.load_state(saved)
-
-
-@pytest.mark.slow
-def test_side_by_side_is_as_alone():
-    envs = gym.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", memory=True)
-    rows = [envs.reset(seed=[8, 3])[0]]
-    rows += [envs.step(np.tile(action, (2, 1)))[0] for action in WALK]
-    np.testing.assert_array_equal(np.array(rows)[:, 1], walked(gym.make(ID, memory=True, scaled=False)))
-
-
-def test_entries_of_the_force_sensor_are_named():
-    env = gym.make(ID, memory=True, scaled=False)
-    numbers = env.unwrapped.task.force_entries
-    assert numbers == [6, 7, 8, *range(CONTRAST.start, CONTRAST.stop), *range(FACE.stop, FACE.stop + 3)]
-    assert gym.make(ID).unwrapped.task.force_entries == [6, 7, 8]

@@ -1,6 +1,5 @@
 """SurgSim/PalpateSites-v0: its press, its chart, what is felt and believed, what it pays, and many side by side."""
 
-import json
 from dataclasses import replace
 
 import gymnasium as gym
@@ -10,13 +9,12 @@ import pytest
 import surgsim_env  # noqa: F401
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation import chart as healthy_module
-from surgsim_env.palpation.chart import ChartedFace, charted_face, healthy_map, interpolated, make_chart
+from surgsim_env.palpation.chart import charted_face, healthy_map, interpolated
 from surgsim_env.palpation.press import SitePress, press, press_alone, press_phases, stop_force
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import LEVELS, DrawnOrgan
-from surgsim_env.scene.load import make_scene, scenes_folder
+from surgsim_env.scene.load import make_scene
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
-from tests.envs.test_vector_env import assert_equal
 
 ID = "SurgSim/PalpateSites-v0"
 SMALL = {"scene": "phantom_small"}
@@ -88,36 +86,7 @@ def test_force_stops_a_press_before_the_hard_limit_does():
     assert 3.0 * healthy < found.force @ site.normal / found.depth < 4.0 * healthy
 
 
-def test_a_press_tells_where_the_instrument_was_held_back(monkeypatch):
-    """On the way in alone: at the end of the hold nothing is asked of it any more."""
-    env = gym.make(ID, **SMALL).unwrapped
-    env.reset(seed=9)
-    assert not env.step(MIDDLE)[-1]["workspace_limited"]
-    phases = iter(range(len(env.phases)))
-    held = property(lambda _: next(phases, 1) == 0)
-    monkeypatch.setattr(type(env.simulation.instrument), "workspace_limited", held)
-    assert env.step(MIDDLE)[-1]["workspace_limited"]
-
-
 # ---- the chart ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_charts_hold_the_sites_that_keep_the_margin():
-    for name, extent, side in (("phantom", 0.04, 13), ("phantom_small", 0.03, 13), ("phantom_wide", 0.1, 25)):
-        scene = make_scene(name)
-        anatomy = load_anatomy(scene)
-        chart = make_chart(anatomy.face, scene.instrument.tip_radius)
-        np.testing.assert_allclose(chart.extent, extent, rtol=1e-12)
-        assert chart.side_count == side
-        charted = ChartedFace(anatomy, chart)
-        for place in ([-1.0, -1.0], [1.0, 1.0], [0.3, -0.7]):
-            site = charted.site(place)
-            assert site.moved == 0.0
-            top, margin = scene.mesh.block.size[2], scene.palpation.face_margin
-            expected = [*(margin + 0.5 * (np.array(place) + 1.0) * extent), top]
-            np.testing.assert_allclose(site.point, expected, atol=1e-12)
-            np.testing.assert_allclose(charted.surface(place), expected, atol=1e-12)
 
 
 def test_a_place_beyond_the_liver_is_moved_to_its_nearest_site():
@@ -183,18 +152,6 @@ def test_the_map_is_made_once_and_anew_where_its_file_is_broken(tmp_path, monkey
     healthy_module.healthy_map_of.cache_clear()
     healthy_module.healthy_map(replace(scene, material=replace(scene.material, youngs_modulus=6000.0)))
     assert len(made) == 3, "another organ has another map"
-    plain = healthy_module.map_digest(load_anatomy(scene))
-    probe = (scenes_folder() / "instruments" / "probe.xml").read_text(encoding="utf-8")
-    (tmp_path / "instruments").mkdir()
-    (tmp_path / "instruments" / "probe.xml").write_text(probe + "<!-- heavier -->", encoding="utf-8")
-    monkeypatch.setattr(healthy_module, "scenes_folder", lambda: tmp_path)
-    assert healthy_module.map_digest(load_anatomy(scene)) != plain, "another probe has another map"
-    monkeypatch.setattr(healthy_module, "scenes_folder", scenes_folder)
-    monkeypatch.setenv("SURGSIM_CACHE", "/proc/nowhere")
-    healthy_module.healthy_map_of.cache_clear()
-    assert healthy_module.healthy_map(scene).stiffness(MIDDLE) == 50.0, (
-        "a folder that cannot be written costs time alone"
-    )
     healthy_module.healthy_map_of.cache_clear()
 
 
@@ -270,12 +227,6 @@ def test_a_fault_ends_the_episode_with_the_last_finite_observation():
     assert reward < -3.0
 
 
-@pytest.mark.parametrize("budget", [0, -3, 2.5, True, "25"])
-def test_budgets_that_are_none_are_refused(budget):
-    with pytest.raises(ValueError, match=r"budget is .*; it must be a whole number of presses, at least 1"):
-        gym.make(ID, budget=budget, **SMALL)
-
-
 def test_the_budget_of_a_wide_scene_is_larger():
     level, scene = LEVELS["standard"], make_scene("phantom_wide")
     flat = healthy_module.HealthyMap(np.full((25, 25), 55.0))
@@ -284,59 +235,7 @@ def test_the_budget_of_a_wide_scene_is_larger():
     assert PalpateSitesTask(load_anatomy(level.scene(scene)), level, flat, budget=7).budget == 7
 
 
-def test_an_unknown_level_is_refused():
-    with pytest.raises(ValueError, match="did you mean 'standard'"):
-        gym.make(ID, level="standart")
-
-
 # ---- many side by side ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mode", ["NextStep", pytest.param("SameStep", marks=pytest.mark.slow)])
-def test_equals_environments_one_after_the_other(mode: str):
-    """Observations, rewards, ends and infos of several episodes, organs with capsules and added mass among them."""
-    count, settings = 3, {"budget": 3, **SMALL}
-    together = gym.make_vec(
-        ID, num_envs=count, vectorization_mode="vector_entry_point", autoreset_mode=mode, **settings
-    )
-    apart = gym.make_vec(
-        ID, num_envs=count, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **settings
-    )
-    assert together.observation_space == apart.observation_space and together.action_space == apart.action_space
-    # Some of these draws have a capsule, some get mass.
-    assert_equal(together.reset(seed=[4, 5, 6]), apart.reset(seed=[4, 5, 6]))
-    rng, drawn = np.random.default_rng(0), []
-    for _ in range(7):
-        actions = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
-        found, expected = together.step(actions), apart.step(actions)
-        assert_equal(found[:4], expected[:4])
-        assert_equal(found[4], expected[4])
-        singles = [env.unwrapped for env in together.envs]  # type: ignore[attr-defined]
-        drawn += [(one.task.drawn.capsule_stiffness, one.simulation.organ_model.added_mass) for one in singles]
-    assert {value > 0.0 for value, _ in drawn} == {True, False}, "the seeds must have capsules among them"
-    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
-        assert one.unwrapped.save_state() == other.unwrapped.save_state()
-    together.close()
-    apart.close()
-
-
-def test_a_saved_state_says_what_was_drawn():
-    env = gym.make(ID, **SMALL).unwrapped
-    env.reset(seed=9)
-    env.step(MIDDLE)
-    table = json.loads(env.task.get_state())
-    assert len(table["kept"]["record"]["touches"]) == table["step_count"] == 1
-
-
-def test_a_saved_state_of_another_budget_is_refused():
-    env, short = (gym.make(ID, budget=budget, **SMALL).unwrapped for budget in (5, 3))
-    for one in (env, short):
-        one.reset(seed=9)
-        one.step(MIDDLE)
-    before = short.save_state()
-    with pytest.raises(ValueError, match=r"with budget=5, this environment has budget=3: make it with that"):
-        short.load_state(env.save_state())
-    assert short.save_state() == before, "what is refused changes nothing"
 
 
 def test_a_press_that_was_begun_is_forgotten_with_its_episode():

@@ -1,13 +1,10 @@
-"""SurgSim/Retract-v0: what it observes and measures, and what it refuses."""
+"""SurgSim/Retract-v0: what it observes and measures."""
 
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
-from surgsim_env.envs.ids import PalpateEnv, RetractEnv
-from surgsim_env.scene.load import make_scene
 from surgsim_env.tasks.retract import EPISODE_STEPS, RetractionRecord, region_strains
 from tests.envs.retract_steps import EMPTY, HELD, STEP, act
 
@@ -88,41 +85,3 @@ def test_strains_are_those_of_a_stretched_lobe(retract_env):
         region_strains(model, moved, (rest.min(axis=0), rest.max(axis=0))), [0.02, 0.02, 0.05], rtol=1e-6
     )
     np.testing.assert_allclose(region_strains(model, 0.9 * rest, (rest.min(axis=0), rest.max(axis=0))), 0.0)
-
-
-# ---- what it refuses --------------------------------------------------------------------------------------------
-
-
-def test_scenes_of_the_other_task_are_refused():
-    with pytest.raises(ValueError, match=r"scene 'phantom' has no \[retract\] table.* such as 'lobe'"):
-        RetractEnv(scene="phantom")
-    with pytest.raises(ValueError, match=r"scene 'lobe' has no \[lesion\] table.* such as 'phantom'"):
-        PalpateEnv(scene="lobe")
-
-
-def test_instruments_without_a_jaw_are_refused():
-    with pytest.raises(ValueError, match=r"'probe\.xml' has no jaw"):
-        RetractEnv(instrument="probe")
-
-
-def test_two_arms_are_refused():
-    with pytest.raises(ValueError, match="'psm_pair' is two arms, and one is needed"):
-        RetractEnv(instrument="psm_pair")
-
-
-def test_unknown_observations_are_refused():
-    with pytest.raises(ValueError, match="obs_mode 'pixels' is unknown; the modes are state, rgb"):
-        RetractEnv(obs_mode="pixels")
-
-
-def test_impossible_cameras_and_limits_are_refused():
-    scene = make_scene("lobe")
-    with pytest.raises(ValueError, match=r"retract\.camera\.shift is -1"):
-        replace(scene.retract.camera, shift=-1.0)
-    with pytest.raises(ValueError, match=r"limits\.tear_force is -2 N"):
-        replace(scene.limits, tear_force=-2.0)
-
-
-def test_it_is_registered_with_its_time_limit():
-    spec = gym.spec("SurgSim/Retract-v0")
-    assert spec.max_episode_steps == EPISODE_STEPS

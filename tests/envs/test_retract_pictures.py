@@ -1,10 +1,6 @@
-"""SurgSim/Retract-v0 with pictures: what is seen, observed, and said without OpenGL."""
+"""SurgSim/Retract-v0 with pictures: what is seen and observed."""
 
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +8,7 @@ import pytest
 from surgsim_env.envs.ids import RetractEnv
 from surgsim_env.rendering import gl
 from surgsim_env.rendering.stage import LABELS
-from surgsim_env.scripting import Hold, Until, run_script
 from tests.envs.retract_steps import act
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -66,19 +59,6 @@ def test_what_is_seen_is_what_a_picture_shows(width, height, tolerance):
 
 
 @pytest.mark.usefixtures("opengl")
-def test_observing_pictures_changes_no_bit_of_the_episode():
-    plain, seeing = RetractEnv(), RetractEnv(obs_mode="rgb")
-    assert seeing.observation_space.shape == (84, 84, 3) and seeing.observation_space.dtype == np.uint8
-    one, other = plain.reset(seed=5), seeing.reset(seed=5)
-    assert seeing.observation_space.contains(other[0]) and np.ptp(other[0]) > 50
-    for _ in range(5):
-        one, other = act(plain, (0.0, -0.02, 0.0), jaw=-1.0), act(seeing, (0.0, -0.02, 0.0), jaw=-1.0)
-    assert one[1:] == other[1:]
-    assert plain.save_state() == seeing.save_state()
-    seeing.close()
-
-
-@pytest.mark.usefixtures("opengl")
 def test_a_fault_shows_the_last_picture_before_it():
     """Not one of a lobe whose nodes are nowhere."""
     env = RetractEnv(obs_mode="rgb")
@@ -89,45 +69,3 @@ def test_a_fault_shows_the_last_picture_before_it():
     assert terminated and "no longer finite" in info["sim_fault"]
     np.testing.assert_array_equal(observation, before)
     env.close()
-
-
-@pytest.mark.usefixtures("opengl")
-def test_scripts_feel_forces_where_pictures_are_observed(tmp_path):
-    """The sensor's reading is a force, not rows of the picture, and a trace's table has no pictures in it."""
-    env, felt = RetractEnv(obs_mode="rgb"), []
-    wait = Until(Hold(0.2), lambda view: felt.append(view.sensed_force) or False)
-    trace = run_script(env, [wait], seed=6)
-    assert trace.observation.shape == (4, 84, 84, 3)
-    bias, noise = env.task.sensors["contact_force"].bias, env.scene.sensor.noise
-    np.testing.assert_allclose(np.array(felt), np.tile(bias, (len(felt), 1)), atol=6 * noise)
-    _, table = trace.to_csv(tmp_path / "run.csv")
-    columns = table.read_text().splitlines()[0].split(",")
-    assert columns[:3] == ["time_s", "step", "action_0"]
-    env.close()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("opengl")
-def test_the_checker_accepts_pictures():
-    from gymnasium.utils.env_checker import check_env
-
-    env = RetractEnv(obs_mode="rgb")
-    check_env(env)
-    env.close()
-
-
-@pytest.mark.slow
-def test_pictures_without_opengl_say_what_is_missing():
-    code = """
-import gymnasium as gym, surgsim_env
-env = gym.make("SurgSim/Retract-v0", obs_mode="rgb").unwrapped
-try:
-    env.reset(seed=0)
-except Exception as error:
-    print(type(error).__name__)
-"""
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code], cwd=REPOSITORY, env={**os.environ, gl.VARIABLE: "off"},
-        capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
-    assert done.stdout.strip() == "NoGLError", done.stderr

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.envs.ids import PalpateEnv, RetractEnv
-from surgsim_env.envs.vector_env import LaneVectorEnv, vector_class
+from surgsim_env.envs.ids import RetractEnv
+from surgsim_env.envs.vector_env import vector_class
 from tests.envs.test_vector_env import assert_equal
 
 ID = "SurgSim/Retract-v0"
@@ -75,69 +75,6 @@ def test_equals_environments_one_after_the_other(mode: str, instrument: str | No
     assert len({float(model.node_rest_position.max()) for model in models}) == COUNT, "sizes differ"
     together.close()
     apart.close()
-
-
-def test_a_fault_leaves_the_neighbours_untouched():
-    spoilt, whole = side_by_side(autoreset_mode="SameStep"), side_by_side(autoreset_mode="SameStep")
-    still = np.zeros((COUNT, 5), dtype=np.float32)
-    for envs in (spoilt, whole):
-        envs.reset(seed=SEED)
-        envs.step(still)
-    spoilt.envs[1].unwrapped.simulation.organ_state.node_velocity[700, 1] = np.nan  # type: ignore[attr-defined]
-    found, expected = spoilt.step(still), whole.step(still)
-    assert found[2].tolist() == [False, True, False]
-    assert "no longer finite" in found[4]["final_info"]["sim_fault"][1]
-    for _ in range(2):
-        for lane in (0, 2):
-            np.testing.assert_array_equal(found[0][lane], expected[0][lane])
-            assert found[1][lane] == expected[1][lane]
-        found, expected = spoilt.step(still), whole.step(still)
-
-
-@pytest.mark.slow  # compiles float32 for rest shapes of their own
-def test_single_precision_feels_the_same_force():
-    """Over an approach and a grasp: within 0.5 % of the largest force on a finger."""
-    exact, fast = side_by_side(), side_by_side(dtype="float32")
-    felt = []
-    for envs in (exact, fast):
-        observation, _ = envs.reset(seed=SEED)
-        goal, rows = goals(envs), []
-        for step in range(56):
-            observation = envs.step(action(observation, goal, grasp=step >= 45, size=5))[0]
-            rows.append([env.unwrapped.simulation.contact_wrench[:, :3] for env in envs.envs])  # type: ignore[attr-defined]
-        felt.append(np.array(rows))
-    largest, error = np.abs(felt[0]).max(), np.abs(felt[1] - felt[0]).max()
-    print(f"\nlargest force {largest:.3f} N, float32 off by {error:.2e} N, {100.0 * error / largest:.3f} %")
-    assert largest > 0.1
-    assert 0.0 < error < 0.005 * largest
-
-
-def test_lanes_have_rest_shapes_of_their_own_only_where_they_differ():
-    """Lesions leave the phantom's rest shape alone: its lanes share it, which is faster."""
-    lobes, phantoms = side_by_side(), vector_class(PalpateEnv)(2, scene="phantom")
-    for envs in (lobes, phantoms):
-        assert isinstance(envs, LaneVectorEnv)
-        envs.reset(seed=SEED)
-        envs.step(np.zeros(envs.action_space.shape, dtype=np.float32))  # type: ignore[arg-type]
-    assert lobes._groups[0]._own_rest and not phantoms._groups[0]._own_rest  # type: ignore[attr-defined]
-
-
-@pytest.mark.slow
-def test_a_state_saved_alone_goes_on_in_a_lane():
-    envs, single = side_by_side(), gym.make(ID)
-    observation, _ = envs.reset(seed=SEED)
-    goal = goals(envs)
-    single.reset(seed=SEED + 1)
-    for _ in range(3):
-        told = action(observation, goal, grasp=False, size=5)
-        observation = envs.step(told)[0]
-        single.step(told[1])
-    state = envs.envs[1].unwrapped.save_state()  # type: ignore[attr-defined]
-    assert state == single.unwrapped.save_state()  # type: ignore[attr-defined]
-    told = action(observation, goal, grasp=False, size=5)
-    ahead = envs.step(told)[0][1]
-    envs.envs[2].unwrapped.load_state(state)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(envs.step(np.tile(told[1], (COUNT, 1)))[0][2], ahead)
 
 
 def test_lobes_on_moving_ground_equal_environments_one_after_the_other():

@@ -5,10 +5,8 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.coupling import lane_group
 from surgsim_env.envs.ids import PalpateEnv
-from surgsim_env.envs.vector_env import group_width, vector_class
-from tests.allocations import allocations
+from surgsim_env.envs.vector_env import vector_class
 
 ID = "SurgSim/Palpate-v0"
 COUNT = 3  # five lanes stay empty
@@ -126,19 +124,6 @@ def test_an_environment_whose_episode_is_over_can_be_paused():
     assert [env.unwrapped.simulation.time for env in envs.envs] == times
 
 
-@pytest.mark.parametrize(
-    ("mode", "mask", "message"),
-    [
-        ("SameStep", np.zeros(COUNT, dtype=np.bool_), 'only with "Disabled" can environments be paused'),
-        ("Disabled", np.zeros(COUNT + 1, dtype=np.bool_), r"the mask has shape \(4,\) of bool; it must be one bool"),
-        ("Disabled", np.zeros(COUNT), r"the mask has shape \(3,\) of float64"),
-    ],
-)
-def test_a_wrong_pause_is_refused(mode: str, mask: np.ndarray, message: str):
-    with pytest.raises(ValueError, match=message):
-        side_by_side(autoreset_mode=mode).pause(mask)
-
-
 def test_a_fault_leaves_the_neighbours_untouched():
     """A node of the middle organ is not a number any more: its episode ends, the others' bits are as without it."""
     spoilt, whole = side_by_side(autoreset_mode="SameStep"), side_by_side(autoreset_mode="SameStep")
@@ -155,53 +140,6 @@ def test_a_fault_leaves_the_neighbours_untouched():
         for lane in (0, 2):
             np.testing.assert_array_equal(found[0][lane], expected[0][lane])
             assert found[1][lane] == expected[1][lane]
-
-
-@pytest.mark.slow
-def test_single_precision_feels_the_same_force():
-    """Within 0.5 % of the largest contact force of a press to 4 mm and back."""
-    exact, fast = side_by_side(), side_by_side(dtype="float32")
-    forces = []
-    for envs in (exact, fast):
-        envs.reset(seed=3)
-        felt = []
-        for step in range(24):
-            envs.step(np.tile(DOWN * (0.5 if step < 14 else -0.5), (COUNT, 1)))
-            felt.append([env.unwrapped.simulation.contact_force for env in envs.envs])
-        forces.append(np.array(felt))
-    largest = np.abs(forces[0]).max()
-    error = np.abs(forces[1] - forces[0]).max()
-    print(f"\nlargest force {largest:.3f} N, float32 off by {error:.2e} N, {100.0 * error / largest:.4f} %")
-    assert largest > 0.1
-    assert 0.0 < error < 0.005 * largest
-
-
-@pytest.mark.parametrize(
-    ("envs", "dtype", "threads", "lanes"),
-    [
-        (16, "float32", 2, 8),
-        (17, "float32", 2, 16),
-        (3, "float32", 1, 8),
-        (16, "float32", 1, 16),
-        (16, "float64", 2, 8),
-    ],
-)
-def test_groups_are_as_wide_as_keeps_the_threads_busy(envs: int, dtype: str, threads: int, lanes: int):
-    assert group_width(envs, np.dtype(dtype), threads) == lanes
-
-
-def test_nothing_is_allocated_within_the_loop(monkeypatch):
-    envs = side_by_side()
-    envs.reset(seed=0)
-    envs.step(np.tile(DOWN, (COUNT, 1)))
-    compiled, counts = lane_group.advance_lane_haptic_steps, []
-
-    def counted(*given) -> None:
-        counts.append(allocations(compiled, *given))
-
-    monkeypatch.setattr(lane_group, "advance_lane_haptic_steps", counted)
-    envs._groups[0].control_step(np.ones(COUNT, dtype=np.bool_), 30, np.inf)
-    assert counts == [0]
 
 
 def test_states_are_saved_and_loaded_as_alone():
@@ -234,13 +172,6 @@ def test_threads_and_the_number_of_environments_change_nothing():
         envs.close()
     np.testing.assert_array_equal(runs[0], runs[1])
     np.testing.assert_array_equal(runs[0], runs[2])
-
-
-def test_a_shorter_time_limit_truncates():
-    envs = side_by_side(max_episode_steps=4)
-    envs.reset(seed=0)
-    ends = [envs.step(np.zeros((COUNT, 4), dtype=np.float32))[3].all() for _ in range(4)]
-    assert ends == [False, False, False, True]
 
 
 def test_a_bad_action_is_refused_before_anything_moves():

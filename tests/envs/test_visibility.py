@@ -121,24 +121,11 @@ def test_a_box_hides_what_its_upper_face_hides():
     assert found == pytest.approx(1.0 - (2.0 * half * shadow / RADIUS) ** 2 / math.pi, abs=0.01)
 
 
-def test_a_plane_hides_what_lies_behind_it():
-    assert seen(geoms='<geom type="plane" size="1 1 1" pos="0 0 0.01"/>') == 0.0
-    assert seen(geoms='<geom type="plane" size="1 1 1" pos="0 0 -0.001"/>') == 1.0
-    upright = '<geom type="plane" size="1 1 1" pos="0.004 0 0" euler="0 90 0"/>'
-    assert seen(geoms=upright) == pytest.approx(1.0 - segment(0.5), abs=0.01)
-
-
 def test_what_is_not_shown_and_not_felt_hides_nothing():
     ball = '<geom type="sphere" size="0.02" pos="0 0 0.03" {}/>'
     assert seen(geoms=ball.format('rgba="1 1 1 0"')) == 1.0
     assert seen(geoms=ball.format('group="4"')) == 1.0
     assert seen(geoms=ball.format('group="3" rgba="1 1 1 0"')) == 0.0
-
-
-def test_surface_and_shapes_hide_together():
-    half_plane = rectangle(-SIDE, 0.0, -SIDE, SIDE)
-    box = f'<geom type="box" size="0.05 0.05 0.001" pos="0 -0.05 {HEIGHT}"/>'
-    assert seen(half_plane, box) == pytest.approx(0.25, abs=0.01)
 
 
 def test_a_tilted_disc_is_seen_as_an_upright_one():
@@ -150,8 +137,3 @@ def test_a_tilted_disc_is_seen_as_an_upright_one():
     # The mean square distance from the middle of an even disc is r^2 / 2.
     assert np.mean(np.sum((points - disc.centre) ** 2, axis=1)) == pytest.approx(0.5 * RADIUS**2, rel=1e-3)
     np.testing.assert_allclose(disc.rotation.T @ disc.rotation, np.eye(3), atol=1e-12)
-
-
-def test_an_eye_among_the_points_is_refused():
-    with pytest.raises(ValueError, match="stands among the points"):
-        seen(eye=[0.001, 0.0, 0.0])

@@ -1,7 +1,6 @@
-"""Arms in a hand: tips follow through inverse kinematics, the hand feels the tissue; two arms take two hands."""
+"""Arms in a hand: tips follow through inverse kinematics, the hand feels the tissue."""
 
 import numpy as np
-import pytest
 
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.loop import HapticLoop
@@ -67,9 +66,3 @@ def test_two_hands_move_two_arms():
     assert not told.fault and len(told.tips) == 2
     moved = [tip.tip - place for tip, place in zip(told.tips, start, strict=True)]
     np.testing.assert_allclose(moved, [[0.0, 0.0, 0.006], [0.004, 0.0, 0.006]], atol=1.5e-3)
-
-
-def test_two_arms_in_one_hand_are_refused():
-    loop, devices = held_arms("lobe", "psm_pair", [[0.0] * 3, [0.0] * 3], Hand())
-    with pytest.raises(ValueError, match=r"1 devices and 1 settings for the 2 tips of scene 'lobe'"):
-        HapticLoop(loop.simulation, devices[0])

@@ -5,16 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import coupling_for, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.settings import ForceLimits, HapticSettings
 from surgsim_env.haptics.simulated import Hand, SimulatedDevice
 from surgsim_env.haptics.tip_drive import tip_drives
-from surgsim_env.instruments.arm.arm_instrument import parked_place
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
 from tests.haptics.bench_hand import (
     DT,
     START,
@@ -139,11 +135,6 @@ def test_ten_seconds_of_tapping_give_no_energy(encoder):
 
 
 @pytest.mark.slow
-def test_ten_minutes_of_tapping_give_no_energy():
-    tapping(0.05, 600.0, 0.0)
-
-
-@pytest.mark.slow
 def test_holding_dies_out():
     """A hand that pushes steadily, with no damping of its own: after ten seconds nothing moves any more."""
     simulation = touching_simulation()
@@ -158,28 +149,6 @@ def test_holding_dies_out():
             fastest.append(0.0)
         fastest[-1] = max(fastest[-1], float(np.abs(device.velocity).max()))
     assert max(fastest[1:]) < 1e-6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", ["liver", "lobe"])
-def test_contact_at_the_limit_on_other_organs(scene):
-    """A probe on the liver and a grasper on the lobe: the tip's mass and the organ differ, the promise does not."""
-    anatomy = load_anatomy(make_scene(scene))
-    simulation = Simulation(anatomy)
-    simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
-    push = tuple((0.3 * anatomy.face.approach).tolist())
-    device = SimulatedDevice(
-        mass=0.05, damping=0.5, haptic_step=DT, position=parked_place(anatomy), hand=Hand(push=push)
-    )
-    stiffest = limit(simulation, device.dynamics, 0.125)
-    loop = HapticLoop(simulation, device, bare_settings(stiffest * (1.0 - 1e-9), 0.125))
-    touched = False
-    for told in run(loop, device, 5000):
-        assert not told.fault
-        assert -device.work >= -ROUNDING
-        touched |= bool(told.tip.contact_force.any())
-    assert touched
-    assert np.abs(device.velocity).max() < 5e-3
 
 
 @pytest.mark.slow

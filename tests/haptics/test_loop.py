@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from msdm_core.errors import OrganError
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.device import DeviceDynamics, DevicePose
 from surgsim_env.haptics.loop import HapticLoop, SlewLimit, Watchdog
@@ -161,15 +160,6 @@ def test_organ_that_comes_to_grief_lets_go_and_can_be_reset():
     assert told.time == pytest.approx(0.05) and not told.fault and told.tip.energy == 0.0
 
 
-def test_numbers_that_are_not_finite_in_the_organ_let_go():
-    loop, device = pressed()
-    loop.simulation.organ_state.node_velocity[5] = np.nan
-    for _ in range(50):
-        told = loop.step()
-    assert told.fault
-    np.testing.assert_array_equal(device._forces[-1], 0.0)
-
-
 def test_a_warning_of_mujoco_lets_go():
     loop, device = pressed()
     assert np.linalg.norm(device.force) > 0.1
@@ -179,28 +169,6 @@ def test_a_warning_of_mujoco_lets_go():
     np.testing.assert_array_equal(told.tip.force, 0.0)
     np.testing.assert_array_equal(device.force, 0.0)
     loop.reset(tip_position=START)
-    assert not loop.step().fault
-
-
-@pytest.mark.slow
-def test_reset_takes_another_organ():
-    loop, device = pressed()
-    healthy = loop.simulation.anatomy.organ()
-    before = loop.step().tip.depth
-    loop.reset(healthy, START)
-    for _ in run(loop, device, 1500):
-        pass
-    told = loop.step()
-    assert loop.simulation.organ_model is healthy
-    assert told.tip.depth > 1.03 * before
-
-
-def test_organ_that_the_step_does_not_bear_leaves_the_loop_as_it_was():
-    loop, _ = pressed()
-    before = loop.simulation.organ_model
-    with pytest.raises(OrganError, match="substep_count"):
-        loop.reset(loop.simulation.anatomy.organ(modulus_factor=16.0), START)
-    assert loop.simulation.organ_model is before
     assert not loop.step().fault
 
 
@@ -290,70 +258,33 @@ def test_button_closes_the_jaw():
     assert simulation.instrument.opening == pytest.approx(open_gap, abs=1e-3)
 
 
-def test_button_without_a_jaw_is_nothing():
-    device = Puppet()
-    loop = HapticLoop(touching_simulation(), device)
-    device.buttons = 1
-    assert not loop.step().fault
-
-
 @pytest.mark.parametrize(
-    ("device", "settings", "words"),
+    ("device", "settings", "named"),
     [
-        (held_device(), bare_settings(900.0), "is stiffer than 800 N/m"),
-        (
-            held_device(),
-            HapticSettings(limits=ForceLimits(force_largest=25.0)),
-            "is 25 N; the instrument's servo",
-        ),
-        ([held_device(), held_device()], None, "2 devices and 2 settings for the 1 tips"),
-        (held_device(), [HapticSettings()] * 2, "1 devices and 2 settings for the 1 tips"),
-        (held_device(), HapticSettings(smoothing=0.01), None),
-        (held_device(), bare_settings(700.0), None),
+        (held_device(), bare_settings(900.0), "800 N/m"),
+        (held_device(), HapticSettings(limits=ForceLimits(force_largest=25.0)), "25 N"),
+        ([held_device(), held_device()], None, "2 devices"),
+        (held_device(), [HapticSettings()] * 2, "2 settings"),
     ],
 )
-def test_what_cannot_be_coupled_is_refused_at_construction(device, settings, words):
+def test_what_cannot_be_coupled_is_refused_at_construction(device, settings, named):
     simulation = touching_simulation()
-    if words is None:
+    with pytest.raises(ValueError, match=named):
         HapticLoop(simulation, device, settings)
-        return
-    with pytest.raises(ValueError, match=words):
-        HapticLoop(simulation, device, settings)
-
-
-def test_device_too_weak_for_the_force_is_refused():
-    device = Puppet()
-    device.dynamics = DeviceDynamics(0.5, 0.05, force_largest=2.0)
-    with pytest.raises(ValueError, match=r"is 3 N; the device can exert 2 N: lower it"):
-        HapticLoop(touching_simulation(), device)
-
-
-def test_smoothing_counts_as_lag():
-    settings = HapticSettings(bare_settings(700.0).coupling, smoothing=2e-3)
-    with pytest.raises(ValueError, match="a lag of 2 ms"):
-        HapticLoop(touching_simulation(), held_device(), settings)
+    HapticLoop(simulation, held_device(), bare_settings(700.0))
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("make", "named"),
     [
-        (lambda: ForceLimits(force_largest=0.0), "limits.force_largest is 0.0 N"),
-        (lambda: ForceLimits(slew_largest=math.nan), "limits.slew_largest is nan N/s"),
-        (lambda: WatchdogTimes(timeout=-1.0), "watchdog.timeout is -1.0 s"),
-        (lambda: WatchdogTimes(fade=0.0), "watchdog.fade is 0.0 s"),
-        (lambda: HapticSettings(approach_speed=0.0), "approach_speed is 0.0 m/s"),
-        (lambda: HapticSettings(smoothing=-1.0), "smoothing is -1.0 s"),
+        (lambda: ForceLimits(slew_largest=math.nan), "slew_largest is nan"),
+        (lambda: WatchdogTimes(timeout=-1.0), "timeout is -1"),
         (lambda: HapticSettings(jaw_button=32), "jaw_button is 32"),
-        (lambda: DeviceFrame(scale=0.0), "frame.scale is 0.0"),
-        (lambda: DeviceFrame(origin=(0.0, math.nan, 0.0)), "frame.origin"),
-        (lambda: DeviceFrame(rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.1, 1.0))), "perpendicular"),
-        (lambda: DeviceFrame(rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))), "reflection"),
-        (lambda: Hand(stiffness=-1.0), "hand stiffness is -1.0"),
+        (lambda: DeviceFrame(scale=0.0), "scale is 0"),
+        (lambda: DeviceFrame(rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))), "rotation"),
         (lambda: held_device(pose_delay=-1), "pose_delay -1"),
-        (lambda: held_device(force_delay=-1), "force_delay -1"),
-        (lambda: held_device(encoder=math.nan), "encoder nan must not be negative"),
     ],
 )
-def test_bad_settings_are_refused(make, words):
-    with pytest.raises(ValueError, match=words):
+def test_bad_settings_are_refused(make, named):
+    with pytest.raises(ValueError, match=named):
         make()

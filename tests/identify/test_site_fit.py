@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.identify.recordings import SitePress
-from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, draw_halves, fit_sites, sort_out
+from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites, sort_out
 from tests.identify.made import recording, truth
 
 
@@ -40,16 +40,6 @@ def test_the_wrong_shape_has_the_error_that_follows_from_it():
     assert fits.site_errors[0] == pytest.approx(np.median(wanted), abs=2e-3)
 
 
-def test_rows_of_different_lengths_do_not_touch_each_other():
-    made = recording(hertz)
-    short = SitePress(99, np.zeros(3), made.presses[0].depth[::2], made.presses[0].force[::2])
-    curve = sampled(hertz)
-    both = fit_sites(curve, SiteSamples.of([*made.presses, short], 1.5e-3))
-    alone = fit_sites(curve, SiteSamples.of([short], 1.5e-3))
-    assert both.modulus[-1] == pytest.approx(alone.modulus[0], rel=1e-9)
-    assert both.offset[-1] == pytest.approx(alone.offset[0], abs=1e-12)
-
-
 def test_sites_that_cannot_be_used_are_named_with_their_reason():
     made = recording(hertz)
     one = made.presses[0]
@@ -69,10 +59,3 @@ def test_sites_that_cannot_be_used_are_named_with_their_reason():
     assert {reason.split(" ")[0]: sites for reason, sites in left_out.items()} == {
         "less": [100], "fewer": [101], "a": [102], "force": [103], "deeper": [104]
     }  # fmt: skip
-
-
-def test_halves_are_drawn_by_the_seed():
-    training, held_out = draw_halves(11, 0)
-    assert sorted([*training, *held_out]) == list(range(11)) and len(training) == 6
-    assert not np.array_equal(training, draw_halves(11, 1)[0])
-    assert np.array_equal(training, draw_halves(11, 0)[0])

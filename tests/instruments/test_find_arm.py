@@ -18,8 +18,6 @@ from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.instruments.arm.find_arm import find_arm, joint_inertia
 from surgsim_env.instruments.arm.model import hold_joints, read_model
 from surgsim_env.instruments.arm.urdf import find_mesh
-from surgsim_env.rendering.arm_picture import draw_arm
-from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.scene.arm_description import AddedShape, LinkInertia, read_description
 from surgsim_env.scene.load import scenes_folder
 from surgsim_env.scene.save import arm_toml
@@ -128,20 +126,6 @@ def test_meshes_of_a_package_are_found_and_drawn(scope):
     np.testing.assert_allclose(sizes, [[0.1, 0.2, 0.3]] * 3, atol=1e-6)
 
 
-def test_the_picture_shows_the_meshes(scope):
-    arm = load_arm(find_arm(scope).description)
-    bare = load_arm(replace(arm.description, dropped_meshes=("package://scope/meshes/visual/block.stl",)))
-    try:
-        whole, less = (draw_arm(one, one.home).astype(int) for one in (arm, bare))
-    except NoGLError as error:
-        pytest.skip(str(error))
-    drawn = [(np.abs(image - image[0, 0]).sum(axis=2) > 30).sum() for image in (whole, less)]
-    assert drawn[0] > 1.2 * drawn[1] > 0
-    # The arm fills the picture in one direction.
-    rows, columns = np.nonzero(np.abs(whole - whole[0, 0]).sum(axis=2) > 30)
-    assert max(np.ptp(rows) / whole.shape[0], np.ptp(columns) / whole.shape[1]) > 0.8
-
-
 def vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray:
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     return model.mesh_vert[first : first + count]
@@ -152,11 +136,7 @@ def vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray:
     [
         ("package://scope/meshes/link.stl", "scope/meshes/link.stl"),
         ("package://scope/meshes/link.stl", "link.stl"),
-        ("package://scope/meshes/link.stl", "scope/urdf/meshes/link.stl"),
         ("/home/them/ws/meshes/link.stl", "scope/meshes/link.stl"),
-        ("meshes/link.stl", "scope/urdf/link.stl"),
-        ("../meshes/link.stl", "scope/meshes/link.stl"),
-        ("C:\\cad\\link.stl", "scope/urdf/link.stl"),
         ("link.stl", "scope/urdf/parts/link.stl"),
     ],
 )
@@ -167,16 +147,6 @@ def test_a_mesh_is_found_where_folders_differ(tmp_path, name, place):
     found = find_mesh(tmp_path / "scope/urdf/arm.urdf", name, "parts")
     assert found is not None
     assert found.samefile(tmp_path / place)
-
-
-def test_of_two_meshes_of_one_name_each_is_taken_from_its_own_folder(tmp_path):
-    for kind in ("visual", "collision"):
-        (tmp_path / "meshes" / kind).mkdir(parents=True)
-        (tmp_path / "meshes" / kind / "link.stl").write_text(kind)
-    found = [
-        find_mesh(tmp_path / "arm.urdf", f"package://x/meshes/{kind}/link.stl") for kind in ("visual", "collision")
-    ]
-    assert [path and path.read_text() for path in found] == ["visual", "collision"]
 
 
 def test_missing_meshes_are_named_and_left_out(scope):
@@ -227,22 +197,11 @@ def test_what_is_coupled_to_a_driven_joint_is_held_where_it_is_at_home(scope, le
     assert {load_arm(found).model.joint(index).name for index in range(5)} == set(found.joints)
 
 
-def test_a_joint_without_limits_gets_some_and_says_so(scope):
-    found = find_arm(scope)
-    assert found.description.limits == {"roll": pytest.approx((-2.0 * math.pi, 2.0 * math.pi))}
-    assert any("roll" in sentence and "limits" in sentence for sentence in found.chosen)
-
-
 def test_its_file_reads_back_equal(scope):
     description = find_arm(scope).description
     path = scope.parent / "scope.toml"
     path.write_text(arm_toml(description))
     assert read_description(path) == description
-
-
-def test_a_trocar_beside_the_remote_centre_is_refused(scope):
-    with pytest.raises(ValueError, match=r"the mechanism keeps its shaft at \(.*0\.3\): leave --trocar out"):
-        find_arm(scope, trocar=(0.0, 0.0, 0.35))
 
 
 def test_it_presses_like_the_probe(scope):
@@ -299,22 +258,11 @@ def test_a_given_trocar_gets_a_home(bare_six_axis):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"trocar": (5.0, 0.0, 0.0)}, r"no pose was found with the shaft in the trocar at \(5\.0, 0\.0, 0\.0\)"),
-        ({"tip": "wrist_4"}, r"no link or site 'wrist_4'; did you mean 'wrist_\d'\?"),
-        ({"tip": "world"}, "no link or site 'world'"),
-    ],
+    ("options", "named"), [({"trocar": (5.0, 0.0, 0.0)}, r"\(5\.0, 0\.0, 0\.0\)"), ({"tip": "wrist_4"}, "'wrist_4'")]
 )
-def test_what_is_not_possible_is_refused(bare_six_axis, options, message):
-    with pytest.raises(ValueError, match=message):
+def test_what_is_not_possible_is_refused(bare_six_axis, options, named):
+    with pytest.raises(ValueError, match=named):
         find_arm(bare_six_axis, **options)
-
-
-def test_a_model_without_joints_is_refused(tmp_path):
-    (tmp_path / "post.xml").write_text('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>')
-    with pytest.raises(ValueError, match="has no joint: name the model of an arm"):
-        find_arm(tmp_path / "post.xml")
 
 
 def test_servos_replace_the_models_actuators_and_its_limits_on_them(tmp_path):
@@ -356,55 +304,44 @@ def described(scope: Path, **changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "named"),
     [
-        ({"dropped_meshes": ("block.stl",)}, "scope.urdf has no mesh 'block.stl'"),
-        ({"inertias": (LinkInertia("wirst", 1.0, (0, 0, 0), (1, 1, 1)),)}, "no link 'wirst'; did you mean 'wrist'"),
-        ({"shapes": (AddedShape("tip_ball", "nose", (0, 0, 0), 0.01),)}, "body of shape 'tip_ball', 'nose' is not in"),
-        ({"held": {"lost": 0.0}}, "held joint 'lost' is not in the model"),
-        ({"limits": {"lost": (0.0, 1.0)}}, "limits of joint 'lost' is not in the model"),
+        ({"dropped_meshes": ("block.stl",)}, "'block.stl'"),
+        ({"inertias": (LinkInertia("wirst", 1.0, (0, 0, 0), (1, 1, 1)),)}, "'wirst'"),
+        ({"shapes": (AddedShape("tip_ball", "nose", (0, 0, 0), 0.01),)}, "'nose'"),
+        ({"held": {"lost": 0.0}}, "'lost'"),
     ],
 )
-def test_what_is_not_in_the_model_is_refused(scope, changes, message):
-    with pytest.raises(ValueError, match=message):
+def test_what_is_not_in_the_model_is_refused(scope, changes, named):
+    with pytest.raises(ValueError, match=named):
         load_arm(described(scope, **changes))
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "named"),
     [
-        ({"held": {"yaw": 0.0}}, "joints, jaw and held name 'yaw' twice"),
-        ({"held": {"counter": math.nan}}, "held joint 'counter' is at nan; it must be finite"),
-        ({"limits": {"roll": (1.0, 1.0)}}, "limits of joint 'roll' are 1 to 1; they must be finite and rise"),
-        ({"limits": {"roll": (0.0, math.inf)}}, "must be finite and rise"),
+        ({"held": {"yaw": 0.0}}, "'yaw'"),
+        ({"held": {"counter": math.nan}}, "'counter' is at nan"),
+        ({"limits": {"roll": (1.0, 1.0)}}, "'roll' are 1 to 1"),
     ],
 )
-def test_wrong_entries_are_refused(scope, changes, message):
-    with pytest.raises(ValueError, match=message):
+def test_wrong_entries_are_refused(scope, changes, named):
+    with pytest.raises(ValueError, match=named):
         described(scope, **changes)
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "named"),
     [
-        (lambda: AddedShape("s", "b", (0, 0, 0), 0.0), "radius of shape 's' is 0 m"),
-        (lambda: AddedShape("s", "b", (0, 0, math.inf), 0.01), "start of shape 's'"),
-        (lambda: AddedShape("s", "b", (0, 0, 1), 0.01, (0, 0, 1)), "ends where it starts"),
-        (lambda: AddedShape("", "b", (0, 0, 1), 0.01), "a shape has no name"),
-        (lambda: LinkInertia("l", 0.0, (0, 0, 0), (1, 1, 1)), "mass of link 'l' in inertias is 0 kg"),
-        (lambda: LinkInertia("l", 1.0, (0, 0, math.nan), (1, 1, 1)), "centre of link 'l'"),
-        (lambda: LinkInertia("l", 1.0, (0, 0, 0), (1, 0, 1)), "moment of link 'l' in inertias is 0"),
-        (lambda: LinkInertia("l", 1.0, (0, 0, 0), (3, 1, 1)), "in a body none exceeds the sum of the others"),
+        (lambda: AddedShape("s", "b", (0, 0, 0), 0.0), "'s' is 0"),
+        (lambda: AddedShape("s", "b", (0, 0, 1), 0.01, (0, 0, 1)), "'s'"),
+        (lambda: LinkInertia("l", 0.0, (0, 0, 0), (1, 1, 1)), "'l' .*is 0"),
+        (lambda: LinkInertia("l", 1.0, (0, 0, 0), (3, 1, 1)), "'l'"),
     ],
 )
-def test_wrong_shapes_and_inertias_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
+def test_wrong_shapes_and_inertias_are_refused(make, named):
+    with pytest.raises(ValueError, match=named):
         make()
-
-
-def test_entries_for_urdf_are_refused_with_mjcf():
-    with pytest.raises(ValueError, match="inertias is for URDF files"):
-        read_model(SIX_AXIS, inertias=[LinkInertia("wrist_3", 1.0, (0, 0, 0), (1, 1, 1))])
 
 
 # ---- the command -------------------------------------------------------------------------------------------------
@@ -423,54 +360,3 @@ def test_the_command_writes_a_commented_file_and_a_picture(scope, capsys):
     assert len(entries) == 4
     assert all("#" in line for line in entries)
     assert (scope.parent / "scope.png").exists() or "no picture: " in said
-
-
-def test_every_entry_that_it_writes_has_a_comment(scope, bare_six_axis, tmp_path):
-    for file in (scope, bare_six_axis):
-        assert main(["arm", "check", str(file), "--out", str(tmp_path / "made")]) == 0
-        lines = (tmp_path / "made" / f"{file.stem}.toml").read_text().splitlines()
-        tables = {"home", "held", "limits"}
-        table = ""
-        for line in lines:
-            table = line.strip("[ ").partition("]")[0] if line.startswith("[") else table
-            plain = not line or line.startswith("#") or (table in tables and not line.startswith("["))
-            assert plain or line.startswith(("name =", "link =")) or " # " in line, line
-
-
-def test_a_file_in_another_folder_names_the_model_by_its_way_there(scope, tmp_path):
-    assert main(["arm", "check", str(scope), "--out", str(tmp_path / "deep" / "made")]) == 0
-    assert load_arm(tmp_path / "deep" / "made" / "scope.toml").description.model == "../../scope/urdf/scope.urdf"
-
-
-def test_a_file_that_is_there_is_not_replaced(scope, capsys):
-    (scope.parent / "scope.toml").write_text("mine")
-    assert main(["arm", "check", str(scope)]) == 2
-    assert "is there already" in capsys.readouterr().err
-    assert (scope.parent / "scope.toml").read_text() == "mine"
-
-
-def test_without_opengl_it_says_so_and_writes_no_picture(scope, capsys, monkeypatch):
-    def none(*_):
-        raise NoGLError("no OpenGL here")
-
-    monkeypatch.setattr("surgsim_env.rendering.arm_picture.draw_arm", none)
-    assert main(["arm", "check", str(scope)]) == 0
-    assert "no picture: no OpenGL here" in capsys.readouterr().out
-    assert sorted(path.name for path in scope.parent.iterdir()) == ["scope.toml", "scope.urdf"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["arm.urdf.xacro"], "is a xacro file: expand it"),
-        (["nothing.urdf"], "cannot be read"),
-        (["nothing.urdf", "--trocar", "1,2"], "--trocar is '1,2'; the form is x,y,z"),
-        (["nothing.urdf", "--tool", "0.01"], "--tool is 0.01 m; it must be finite and at least 0.05"),
-    ],
-)
-def test_the_command_refuses_in_one_line(tmp_path, capsys, monkeypatch, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    assert main(["arm", "check", *arguments]) == 2
-    said = capsys.readouterr().err.strip()
-    assert message in said
-    assert "\n" not in said

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.scene.anatomy import load_anatomy
@@ -120,36 +119,6 @@ def test_both_loops_do_the_same():
         assert compiled.get_state()[name].tobytes() == array.tobytes(), name
     assert compiled.grasp == plain.grasp and compiled.pull_peak == plain.pull_peak > 0.0
     assert compiled.instrument.distance == plain.instrument.distance
-
-
-def test_lanes_do_the_same():
-    together, apart = [grasped(), simulation()], [grasped(), simulation()]
-    group = LaneGroup(together)
-    for _ in range(4):
-        for one in (*together, *apart):
-            one.instrument.command_velocity(np.array([[0.0, 0.0, 0.01], [0.0, -0.02, 0.0]]))
-        group.control_step(np.ones(2, dtype=bool), 50, np.inf)
-        for one, other in zip(together, apart, strict=True):
-            assert one.control_step(50) == other.control_step(50)
-            one.instrument.refresh()
-            other.instrument.refresh()
-            for name, array in other.get_state().items():
-                assert one.get_state()[name].tobytes() == array.tobytes(), name
-
-
-def test_a_state_is_restored_to_the_bit():
-    one = grasped()
-    turning = np.array([[-0.3, 0.0, 0.0], [0.0, 0.0, 0.2]])
-    run(one, 2, [[0.0, 0.0, 0.01], [0.01, 0.0, 0.0]], turning)
-    saved, ends = one.get_state(), []
-    for spoil in (False, True):
-        if spoil:
-            one.instrument.arms["left"].command_jaw(1.0)
-            run(one, 3, [[0.01, 0.0, 0.01], [0.01, 0.02, 0.0]], -turning)
-            one.set_state(one.organ_model, saved)
-        run(one, 4, [[0.0, 0.0, 0.01], [-0.01, 0.0, 0.0]], turning)
-        ends.append({name: array.tobytes() for name, array in one.get_state().items()})
-    assert ends[0] == ends[1]
 
 
 def test_a_pair_needs_two_ports():

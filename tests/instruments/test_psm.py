@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.instruments.arm.psm import JAW_RANGE, PSM_LINKS, psm_frames, psm_manipulability, psm_tip, shaft_depth
+from surgsim_env.instruments.arm.psm import psm_frames, psm_manipulability, psm_tip, shaft_depth
 from surgsim_env.scene.model import Port
 from tests.instruments.joints import random_joints
 
@@ -98,18 +98,6 @@ def test_manipulability_of_an_arm_is_yoshikawas(arm):
     assert abs(np.linalg.det(three)) == pytest.approx(depth**2 * math.cos(-0.5), abs=EXACT)
     linear = arm.tip_jacobian(joints)[:3]
     assert arm.manipulability(joints) == pytest.approx(np.prod(np.linalg.svd(linear)[1]), rel=1e-9)
-
-
-def test_limits_and_efforts_are_the_tables(arm):
-    for index, link in enumerate(PSM_LINKS):
-        assert (arm.lower[index], arm.upper[index]) == pytest.approx((link.lower, link.upper), abs=1e-12)
-        joint = arm.model.joint(link.joint)
-        assert tuple(arm.model.jnt_actfrcrange[joint.id]) == pytest.approx((-link.effort, link.effort))
-    assert [math.degrees(link.upper) for link in PSM_LINKS[:2]] == pytest.approx([91.0, 53.0])
-    if arm.description.jaw:
-        # The retractor's pads are 7 mm apart at 0, 26 mm from the axis: 5.5 mm at the stop.
-        stop = -2.0 * math.asin(0.00075 / 0.026), 2.0 * math.radians(19.0)
-        assert arm.jaw_range == pytest.approx(JAW_RANGE if arm.description.name == "psm_grasper" else stop)
 
 
 def test_jaw_opens_both_fingers_alike():

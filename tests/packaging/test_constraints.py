@@ -42,8 +42,3 @@ def test_what_make_installs_is_pinned_within_its_bounds(python):
         one = Requirement(text)
         if one.name != "torch":
             assert one.specifier.contains(known.get(same(one.name), "0")), f"{text}: run `make lock`"
-
-
-def test_where_packages_come_from_is_left_to_the_user():
-    """Neither the address of an index nor a file's path or hash."""
-    assert all(re.fullmatch(r"#.*|[a-z0-9-]+==[^\s/@]+( ; [^/@]+)?", line) for line in LINES)

@@ -1,17 +1,11 @@
 """`surgsim doctor`: a sound installation, what is missing, what is broken."""
 
-import os
-import subprocess
-import sys
-import warnings
 from importlib import metadata
 
-import pytest
 from packaging.requirements import Requirement
 
 from surgsim_env.cli import doctor
 from surgsim_env.cli.main import main
-from surgsim_env.coupling import mujoco_library
 from surgsim_env.rendering import gl
 
 
@@ -67,16 +61,6 @@ def test_packages_that_are_absent_or_of_another_version(monkeypatch):
     assert found["video"].state == "ok"
 
 
-def test_the_plain_loop_and_its_reason_are_said(monkeypatch):
-    monkeypatch.setenv(mujoco_library.LOOP_VARIABLE, "python")
-    assert doctor.loop().state == "ok" and "SURGSIM_LOOP=python" in doctor.loop().text
-    monkeypatch.setattr(mujoco_library, "missing", lambda: "no library of MuJoCo")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = doctor.loop()
-    assert found.state == "missing" and found.text.endswith("no library of MuJoCo")
-
-
 def test_no_opengl_and_no_cache_are_missing_features(monkeypatch):
     def none():
         raise gl.NoGLError("install libegl1")
@@ -86,11 +70,3 @@ def test_no_opengl_and_no_cache_are_missing_features(monkeypatch):
     monkeypatch.setattr(doctor.tempfile, "TemporaryFile", lambda dir: (_ for _ in ()).throw(OSError(30, "Read-only")))
     found = doctor.cache()
     assert found.state == "missing" and "NUMBA_CACHE_DIR" in found.text
-
-
-@pytest.mark.parametrize(("features", "bits"), [("", 128), ("+avx,+avx2,-avx512f", 256), ("+avx,+avx2,+avx512f", 512)])
-def test_vector_registers_are_those_that_compiled_code_may_use(features, bits):
-    setting = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": features}
-    line = "from surgsim_env.bench.report import registers; print(registers())"
-    told = subprocess.run([sys.executable, "-c", line], env=os.environ | setting, capture_output=True, text=True)
-    assert told.stdout.startswith(f"vector registers of {bits} bits; 4 springs or tets of an organ alone"), told

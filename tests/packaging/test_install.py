@@ -38,13 +38,6 @@ def test_wheel_says_that_its_packages_are_typed(wheel):
     assert {"msdm_core/py.typed", "surgsim_env/py.typed"} <= set(zipfile.ZipFile(wheel).namelist())
 
 
-def test_wheel_holds_the_templates_of_reports(wheel):
-    folder = "surgsim_env/reports/templates"
-    names = zipfile.ZipFile(wheel).namelist()
-    shipped = {name.removeprefix(f"{folder}/") for name in names if name.startswith(f"{folder}/")}
-    assert shipped == {path.name for path in (REPOSITORY / folder).iterdir()} >= {"base.html.j2", "style.css"}
-
-
 def test_installed_wheel_finds_its_scenes(wheel, make_environment, tmp_path, clean_environ):
     environment: Environment = make_environment(tmp_path / "venv")
     environment.install(wheel)
@@ -99,13 +92,3 @@ def test_editable_install_sees_an_edit_at_once(
     assert (found / "organs" / "planted.toml").is_file()
     stale = environment.site_packages / "surgsim_env" / "assets"
     assert not (stale / "organs" / "planted.toml").exists()
-
-
-def test_missing_scenes_name_both_places_and_the_way_out(tmp_path):
-    from surgsim_env.scene.load import scenes_folder
-
-    package = tmp_path / "surgsim_env"
-    package.mkdir()
-    with pytest.raises(FileNotFoundError, match="reinstall surgsim") as caught:
-        scenes_folder(package)
-    assert str(package / "assets") in str(caught.value) and str(tmp_path / "scenes") in str(caught.value)

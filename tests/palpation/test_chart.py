@@ -85,10 +85,3 @@ def test_no_site_lies_under_a_ligament():
     sites = [*charted.grid_sites(), *(charted.site(touch_map.places[number]) for number in covered)]
     assert min(np.linalg.norm(held - site.point, axis=1).min() for site in sites) > tip
     assert min(site.moved for site in sites[-len(covered) :]) > 0.0
-
-
-def test_a_margin_that_leaves_nothing_is_refused():
-    anatomy = load_anatomy(make_scene("phantom"))
-    wide = replace(anatomy.face, margin=0.031)
-    with pytest.raises(ValueError, match=r"face_margin of 31 mm leaves nothing of a palpable face of 60 x 60 mm"):
-        make_chart(wide, 0.008)

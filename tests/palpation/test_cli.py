@@ -2,11 +2,9 @@
 
 import csv
 import json
-import re
 
 import numpy as np
 import pytest
-import trimesh
 from matplotlib.image import imread
 
 from surgsim_env.cli.main import main
@@ -16,7 +14,6 @@ from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
 COARSE = ["palpate", "--scene", "phantom", "--spacing", "0.008"]
-STL_FACET = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
 
 
 @pytest.fixture(scope="module")
@@ -36,20 +33,6 @@ def rows(run):
 @pytest.fixture(scope="module")
 def summary(run):
     return json.loads((run / "summary.json").read_text(encoding="utf-8"))
-
-
-def write_stl(path, vertices, triangles):
-    facets = "".join(
-        STL_FACET.format("".join(f"vertex {x} {y} {z}\n" for x, y, z in np.asarray(vertices)[list(triangle)]))
-        for triangle in triangles
-    )
-    path.write_text(f"solid s\n{facets}endsolid s\n", encoding="ascii")
-    return path
-
-
-CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
-FACES = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4)]
-FACES += [(1, 5, 7), (1, 7, 3)]
 
 
 def test_files(run, rows):
@@ -106,188 +89,6 @@ def test_the_lesion_raises_the_stiffness_above_it(rows):
     assert np.linalg.norm(stiffest - [0.036, 0.026]) < 0.008
 
 
-@pytest.mark.slow
-def test_a_lesion_below_a_site_that_is_too_deep_is_missed_for_that_reason(tmp_path, capsys, rows):
-    """Around a site of the middle; 10 mm of cover, twice as stiff, hardly changes a press."""
-    place = np.array([float(rows[5][key]) for key in "xyz"])
-    around = ",".join(map(str, [*place, 0.012]))
-    given = [*COARSE, "--lesion-below", "5,0.016,0.006,2", "--around", around, "--out", str(tmp_path)]
-    assert main(given) == 0
-    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    (truth,) = summary["truth"]
-    assert truth["centre_m"] == pytest.approx([*place[:2], place[2] - 0.016], abs=1e-6)
-    said = " ".join(capsys.readouterr().out.split())
-    for entry in summary["maps"].values():
-        (lesion,) = entry["lesions"]
-        assert lesion["miss"] in ("deeper than the map's reach", "below the sensor's noise")
-        assert lesion["why"].startswith(f"{lesion['miss']}: a press feels ")
-        assert entry["healthy_sites"] < 8
-    assert "weak baseline: " in said and "of Hertz's force; far nodes move by " in said
-
-
-@pytest.mark.slow
-def test_same_seed_same_table_and_another_seed_another(run, tmp_path, capsys):
-    around = ["--around", "0.036,0.026,0.03,0.008"]
-    for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
-        assert main([*COARSE, *around, "--out", str(tmp_path / name), "--seed", seed, "--workers", "1"]) == 0
-    first, again, other = ((tmp_path / name / "palpation.csv").read_bytes() for name in "abc")
-    assert first == again
-    assert first != other
-    said = " ".join(capsys.readouterr().out.split())
-    for bar in ("organ", "its pre-operative model"):
-        assert re.search(rf"pressing {bar} \S+ (\d+)/\1 ", said), "the bar did not fill"
-    assert "real time" in said
-    assert "peak force" in said
-    assert "felt" in said
-
-
-@pytest.mark.slow
-def test_organ_reports_and_writes(tmp_path, capsys):
-    cube = write_stl(tmp_path / "cube.stl", CUBE * [60.0, 60.0, 40.0], FACES)
-    out = tmp_path / "made" / "by it" / "organ.vtu"
-    given = ["organ", str(cube), "--length-unit", "mm", "--cell-size", "0.01", "--no-healthy-map"]
-    assert main([*given, "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    for word in ("nodes", "tets", "springs", "mass", "dihedral", "radius ratio", "stable step", "reoriented", "error"):
-        assert word in said, word
-    assert "0.15" in said  # 144 ml at 1060 kg/m^3
-    assert main(["organ", str(out)]) == 0
-    assert "0 reoriented" in capsys.readouterr().out
-
-
-def test_scenes_are_listed_with_what_they_are(capsys):
-    assert main(["scenes"]) == 0
-    said = capsys.readouterr().out
-    for word in ("phantom", "liver", "bonded to its tray", "held by its ligaments"):
-        assert word in " ".join(said.split())
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["palpate", "--help"], ["organ", "--help"]])
-def test_help(arguments, capsys):
-    assert main(arguments) == 0
-    assert "surgsim" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "palpate, retract, organ, scenes"),
-        (["palpat"], "palpat"),
-        (["palpate", "--sceen", "liver"], "--sceen"),
-        (["palpate", "--seed", "x"], "--seed"),
-    ],
-)
-def test_unknown_words_are_named_with_exit_2(arguments, words, capsys):
-    assert main(arguments) == 2
-    assert words in capsys.readouterr().err
-
-
-def test_counts_and_files_that_cannot_be_used(capsys):
-    assert "workers is 0" in refused(capsys, "palpate", "--scene", "phantom", "--workers", "0")
-    assert "cannot be read" in refused(capsys, "palpate", "--organ", "mine.tml")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--spacing", "inf"], "spacing is inf; it must be finite"),
-        (["--press-depth", "inf"], "press depth is inf"),
-        (["--spacing", "1e-6"], "raster points"),
-        (["--seed", "-1"], "--seed is -1"),
-        (["--around", "0,0,0,-1"], "the radius is -1 m"),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused_at_once(arguments, words, capsys, tmp_path):
-    assert words in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "out"), *arguments)
-
-
-def test_a_place_that_cannot_be_written_is_known_before_the_work(capsys, tmp_path):
-    (tmp_path / "file").write_text("")
-    assert "cannot be written" in refused(capsys, "palpate", "--scene", "phantom", "--out", str(tmp_path / "file"))
-    path = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(2, radius=30).export(path)
-    given = ("organ", str(path), "--length-unit", "mm", "--out")
-    assert "is no folder that you may write to" in refused(capsys, *given, str(tmp_path / "file" / "a.vtu"))
-    assert "unknown extension" in refused(capsys, *given, str(tmp_path / "a.xyz"))
-
-
-def test_zero_modulus_is_refused_by_organ_too(capsys, tmp_path):
-    path = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(2, radius=30).export(path)
-    said = refused(capsys, "organ", str(path), "--length-unit", "mm", "--youngs-modulus", "0")
-    assert "Young's modulus is 0; it must be finite and above 0 (Pa)" in said
-
-
-def refused(capsys, *arguments):
-    """The one line on standard error."""
-    assert main(list(arguments)) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1, said
-    assert "Traceback" not in said
-    return said
-
-
-def test_unknown_scene_suggests_the_nearest(capsys):
-    said = refused(capsys, "palpate", "--scene", "fantom")
-    assert "did you mean 'phantom'" in said
-    assert "liver" in said
-
-
-def test_lesion_outside(capsys, tmp_path):
-    assert "lies inside the organ" in refused(
-        capsys, *COARSE, "--lesion", "-0.3,0.1,0.2,0.008,8", "--out", str(tmp_path)
-    )
-
-
-@pytest.mark.parametrize(
-    ("extra", "words"),
-    [
-        (["--lesion", "0.03,0.03,0.015,0.008,-8"], "modulus ratio is -8; it must be above 0"),
-        (["--lesion", "0.03,0.03,0.015,-0.008,8"], "radius is -0.008"),
-        (["--lesion", "0.03,0.03,0.015,0.001,8"], "less than half of the"),
-        (["--lesion", "0.03,0.03"], "the form is x,y,z,radius,ratio"),
-        (["--lesion", "0.03,0.03,0.025,0.008,8"], "sticks out of the organ by 3 mm at 30.0, 30.0, 30.0 mm"),
-        (["--lesion-below", "3,0.015"], "the form is SITE,DEPTH,RADIUS,RATIO"),
-        (["--lesion-below", "99,0.015,0.008,8"], "there are 16 sites, from 0 to 15"),
-        (["--lesion-below", "1.5,0.015,0.008,8"], "the site is 1.5; it must be a site's number"),
-        (["--lesion-below", "-1,0.015,0.008,8"], "the site is -1; it must be a site's number"),
-        (["--lesion-below", "3,0.007,0.008,8"], "the rule is depth > radius > 0, or it sticks out"),
-        (["--lesion-below", "3,0.015,0.008,0"], "modulus ratio is 0; it must be above 0"),
-        (["--lesion-below", "3,0.025,0.008,8"], "sticks out of the organ by 3 mm"),
-        (["--approach", "down"], "the form is x,y,z"),
-        (["--approach", "0,0,0"], "give a direction"),
-        (["--press-depth", "0"], "press depth is 0; it must be finite and above 0"),
-        (["--spacing", "nan"], "spacing is nan"),
-        (["--around", "1,1,1,0.01"], "no site to press"),
-        (["--organ", "x.toml"], "only one of"),
-    ],
-)
-def test_bad_values(extra, words, capsys, tmp_path):
-    assert words in refused(capsys, *COARSE, "--out", str(tmp_path), *extra)
-
-
-def test_missing_files(capsys, tmp_path):
-    assert "cannot be read" in refused(capsys, "palpate", "--organ", str(tmp_path / "none.toml"))
-    assert "no such file" in refused(capsys, "organ", "none.vtu")
-
-
-def test_units_and_sizes(capsys, tmp_path):
-    cube = str(write_stl(tmp_path / "cube.stl", CUBE * 60.0, FACES))
-    assert 'did you mean "mm"' in refused(capsys, "organ", cube, "--length-unit", "milimeter")
-    assert "units forgotten" in refused(capsys, "organ", cube, "--length-unit", "0.3")  # 18 m
-    assert "too coarse" in refused(capsys, "organ", cube, "--length-unit", "mm", "--cell-size", "0.05")
-
-
-def test_open_surface(capsys, tmp_path):
-    cube = str(write_stl(tmp_path / "open.stl", CUBE * 60.0, FACES[:-1]))
-    assert "open" in refused(capsys, "organ", cube, "--length-unit", "mm")
-
-
-def test_a_place_that_cannot_be_written(capsys, tmp_path):
-    (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    assert "file" in refused(capsys, *COARSE, "--out", str(tmp_path / "file" / "out"))
-
-
 def test_interrupt(monkeypatch, capsys):
     def stop(*_, **__):
         raise KeyboardInterrupt
@@ -311,3 +112,26 @@ def test_an_interrupt_during_a_scan_ends_after_the_press_at_hand():
         scan(anatomy, anatomy.organ(), sites, normals, progress=stop, workers=2)
     assert len(sites) > 8
     assert len(pressed) <= 4  # the two that were at hand when it came
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["palpat"], "palpat"),
+        (["palpate", "--sceen", "liver"], "--sceen"),
+        (["palpate", "--scene", "fantom"], "'phantom'"),
+        ([*COARSE, "--seed", "-1"], "-1"),
+        ([*COARSE, "--lesion", "0.03,0.03,0.015,0.008,-8"], "-8"),
+        ([*COARSE, "--lesion", "0.03,0.03,0.025,0.008,8"], "30.0, 30.0, 30.0 mm"),
+        ([*COARSE, "--lesion-below", "99,0.015,0.008,8"], "0 to 15"),
+        ([*COARSE, "--lesion-below", "3,0.007,0.008,8"], "depth"),
+        ([*COARSE, "--approach", "down"], "down"),
+        ([*COARSE, "--youngs-modulus", "-5000"], "-5000"),
+        ([*COARSE, "--spacing", "nan"], "nan"),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_2(arguments, named, capsys):
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("surgsim: error: ") and said.count("\n") == 1, said
+    assert named in said

@@ -96,17 +96,3 @@ def test_figures_are_beside_hertz_at_the_depth_that_was_reached():
 def test_faults_are_the_median_force_and_the_largest_travel(force, far, faults):
     hold = Hold(np.zeros((3, 3)), np.array(force), np.ones(3), np.array([0.01, far, 0.02]))
     assert len(hold.faults) == faults
-
-
-@pytest.mark.parametrize(
-    ("force", "far", "said"),
-    [
-        (0.9, 0.16, "moves by 16% of the tip's depth; the rule is at most 15%"),
-        (0.9, 0.154, "moves by 15.4% of the tip's depth; the rule is at most 15.0%"),
-        (0.9, 0.1501, "moves by 15.01% of the tip's depth; the rule is at most 15.00%"),
-        (0.5961, 0.1, "feel 0.596 of Hertz's force (median), the rule is at least 0.600"),
-    ],
-)
-def test_a_value_is_told_from_its_rule(force, far, said):
-    (fault,) = Hold(np.zeros((1, 3)), np.array([force]), np.ones(1), np.array([far])).faults
-    assert said in fault

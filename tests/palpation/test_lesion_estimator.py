@@ -1,4 +1,4 @@
-"""The common estimator: its posterior against brute conditioning and scikit-learn, its lesions against made maps."""
+"""The common estimator: its posterior against brute conditioning, its lesions against made maps."""
 
 import numpy as np
 import pytest
@@ -53,22 +53,6 @@ def test_posterior_is_that_of_the_joint_normal() -> None:
     np.testing.assert_allclose(excess.ravel(), expected, atol=1e-10)
 
 
-def test_posterior_is_that_of_scikit_learn() -> None:
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
-
-    made, (places, values) = estimator(), scattered(25)
-    rbf = ConstantKernel(module.EXCESS_SPREAD**2) * RBF(module.EXCESS_LENGTH)
-    peer = GaussianProcessRegressor(
-        ConstantKernel(module.BACKGROUND_SPREAD**2) + rbf,
-        alpha=NOISE**2 + module.MODEL_SPREAD**2,
-        optimizer=None,  # pyright: ignore[reportArgumentType]  (None is documented)
-    )
-    expected = peer.fit(places, values).predict(map_points(made))
-    background, excess = made.process.mean(places, values)
-    np.testing.assert_allclose(background + excess.ravel(), expected, atol=1e-8)
-
-
 @pytest.mark.parametrize(
     "centres", [[(0.020, 0.022)], [(0.010, 0.012), (0.030, 0.035)], [(0.008, 0.008), (0.032, 0.010), (0.020, 0.036)]]
 )
@@ -116,15 +100,6 @@ def test_outline_is_a_disc_around_the_lesion() -> None:
     assert radius == pytest.approx(0.006 * np.sqrt(-2.0 * np.log(module.OUTLINE_SHARE)), rel=0.15)
 
 
-def test_lengths_scale_with_the_lesions() -> None:
-    """Everything twice as large gives the same estimate, twice as large."""
-    places = raster()
-    values = bumps(places, [(0.012, 0.030), (0.030, 0.012)])
-    small = estimator().estimate(places, values)
-    large = LesionEstimator(2.0 * np.array(EXTENT), lesion_radius=2.0 * LESION_RADIUS, noise=NOISE)
-    np.testing.assert_allclose(large.estimate(2.0 * places, values).points, 2.0 * small.points, atol=1e-12)
-
-
 def test_a_map_that_deviates_asks_for_more_excess() -> None:
     """A maximum of 0.12 is a lesion beside a map of a block, and none beside one that deviates by 0.05."""
     places = raster()
@@ -137,23 +112,7 @@ def test_a_map_that_deviates_asks_for_more_excess() -> None:
     assert len(doubtful.estimate(places, values).points) == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"extent": (0.04, 0.0)}, "extent is"),
-        ({"extent": (0.04,)}, "extent is"),
-        ({"lesion_radius": 0.0}, "lesion_radius is 0 m"),
-        ({"noise": -0.1}, "noise is -0.1"),
-        ({"map_spread": -0.1}, "map_spread is -0.1"),
-    ],
-)
-def test_refusals_at_construction(arguments: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("arguments", [{"extent": (0.04, 0.0)}, {"lesion_radius": 0.0}, {"noise": -0.1}])
+def test_refusals_at_construction(arguments: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(arguments))} is"):
         LesionEstimator(**({"extent": EXTENT, "lesion_radius": LESION_RADIUS, "noise": NOISE} | arguments))
-
-
-def test_refusals_of_presses() -> None:
-    with pytest.raises(ValueError, match="2 places but log contrasts"):
-        estimator().estimate(np.zeros((2, 2)), np.zeros(3))
-    with pytest.raises(ValueError, match="not finite"):
-        estimator().estimate(np.zeros((1, 2)), np.array([np.nan]))

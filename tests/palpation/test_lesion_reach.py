@@ -1,17 +1,11 @@
-"""A large lesion under a thin cover is felt, a small one far below is not, and one is not mistaken for another."""
+"""A small lesion far below is not felt."""
 
 import pytest
 
-from surgsim_env.palpation.scores import LesionReach, lesion_reaches
+from surgsim_env.palpation.scores import lesion_reaches
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import DrawnOrgan, find_level
 from surgsim_env.scene.load import make_scene
-
-
-@pytest.mark.slow
-def test_noise_hides_a_small_difference() -> None:
-    assert LesionReach(force=0.219, force_without=0.20, noise=0.01).below
-    assert not LesionReach(force=0.221, force_without=0.20, noise=0.01).below
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Each lesion that a map does not show has its reason: one organ, in which a lesion can be missed in every way."""
 
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -84,54 +83,6 @@ def test_the_reason(monkeypatch, reason, lesions, options):
     assert miss.text.startswith(f"{reason}: ")
 
 
-def test_the_approach_that_would_face_it_is_said(monkeypatch):
-    """A lesion near the flank at y = 0, below: from there."""
-    (miss,) = missed(monkeypatch, lesion(0.034, 0.011, 0.022), forces=(0.201, 0.2))
-    said = re.search(r"--approach (\S+) faces it", miss.text)
-    assert said, miss.text
-    into = np.array([float(part) for part in said[1].split(",")])
-    np.testing.assert_allclose(into, [0.0, 1.0, 0.0], atol=0.01)
-
-
 def test_a_deep_lesion_that_a_press_feels_all_the_same_is_not_called_hidden(monkeypatch):
     (miss,) = missed(monkeypatch, lesion(0.034, 0.042, 0.012), forces=(0.30, 0.2))
     assert miss.reason == NO_MAXIMUM
-
-
-def test_presses_that_ended_early_are_counted(monkeypatch):
-    (miss,) = missed(monkeypatch, ABOVE, sites=SITES[:12], early=np.array([[0.034, 0.042, 0.05], [0.0, 0.0, 0.05]]))
-    assert "1 presses near it ended early" in miss.text
-
-
-def test_a_weak_baseline_is_said_so(monkeypatch):
-    few = SITES[np.linalg.norm(SITES - [0.034, 0.042, 0.05], axis=1) < 0.02]
-    (miss,) = missed(monkeypatch, ABOVE, sites=few)
-    assert "the baseline is weak: 0 healthy sites, 8 are the rule" in miss.text
-    assert "weak" not in missed(monkeypatch, ABOVE)[0].text
-
-
-def test_forces_and_noise_are_in_the_text(monkeypatch):
-    (miss,) = missed(monkeypatch, lesion(0.034, 0.042, 0.030), forces=(0.219, 0.2))
-    assert "0.219 N, 0.200 N without the lesion (contrast 1.09); the sensor's noise is 0.01 N" in miss.text
-
-
-def test_presses_over_missed_lesions_are_counted(monkeypatch):
-    """Two for each lesion that a map misses, told before the first and counted after each."""
-    told, done = [], []
-
-    def scan(*args, progress, **options):
-        assert told == [2]
-        progress()
-        return [SimpleNamespace(force=0.2)]
-
-    monkeypatch.setattr(misses, "scan", scan)
-    truths = seen_from_surface((ABOVE,), ANATOMY)
-    one = score_map("m", SITES, np.ones(len(SITES)), [], truths, ANATOMY.along_surface, spacing=SPACING)
-    pressed = PressedSites(SITES, NOWHERE, SPACING)
-
-    def progress(count):
-        told.append(count)
-        return lambda: done.append(1)
-
-    explain_misses(ANATOMY, ANATOMY.organ((ABOVE,)), (ABOVE,), truths, (one,), pressed, progress)
-    assert len(done) == 2

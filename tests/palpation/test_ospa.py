@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.scores import CUTOFF, matched_distances, ospa, ospa_cutoff
+from surgsim_env.palpation.scores import ospa
 
 NONE = np.zeros((0, 2))
 
@@ -45,19 +45,3 @@ def test_is_a_metric() -> None:
         assert ospa(a, b, 0.02) == pytest.approx(ospa(b, a, 0.02))
         assert ospa(a, a[::-1], 0.02) == 0.0
         assert ospa(a, c, 0.02) <= ospa(a, b, 0.02) + ospa(b, c, 0.02) + 1e-15
-
-
-def test_distances_are_matched_one_to_one() -> None:
-    truth = np.array([[0.0, 0.0], [0.01, 0.0]])
-    estimate = np.array([[0.009, 0.0], [0.012, 0.0]])
-    # Both estimates are nearest to the second lesion; one of them must serve the first.
-    rows, columns, distance = matched_distances(truth, estimate, 0.02)
-    assert (rows.tolist(), columns.tolist()) == ([0, 1], [0, 1])
-    np.testing.assert_allclose(distance, [0.009, 0.002])
-
-
-def test_cutoff_goes_with_the_tip() -> None:
-    assert ospa_cutoff(0.008) == CUTOFF
-    assert ospa_cutoff(0.012) == pytest.approx(1.5 * CUTOFF)
-    with pytest.raises(ValueError, match="cutoff is 0 m"):
-        ospa(NONE, NONE, 0.0)

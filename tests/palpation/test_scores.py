@@ -8,7 +8,6 @@ import pytest
 
 from surgsim_env.palpation.scores import (
     ERROR_LINE,
-    EVALUATION_SEEDS,
     FOUND_SHARE,
     MapScore,
     PalpationRecord,
@@ -149,12 +148,3 @@ def test_intervals_are_those_of_the_mean() -> None:
     # 2000 draws: the ends are known to some 4 % of the half width.
     assert figure.value - figure.low == pytest.approx(half, rel=0.15)
     assert figure.high - figure.value == pytest.approx(half, rel=0.15)
-
-
-def test_no_episode_is_refused() -> None:
-    with pytest.raises(ValueError, match="no episode"):
-        score([], BUDGET, np.random.default_rng(0))
-
-
-def test_seeds_are_a_hundred_and_stand_apart() -> None:
-    assert len(EVALUATION_SEEDS) == 100 and EVALUATION_SEEDS[0] == 1_000_000

@@ -5,7 +5,6 @@ import trimesh
 
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import mesh_surface
-from surgsim_env.scene.load import scenes_folder
 
 
 def kidney_surface() -> trimesh.Trimesh:
@@ -23,9 +22,3 @@ def kidney(cell: float = 0.006) -> TetMesh:
     """That bean, filled."""
     surface = kidney_surface()
     return mesh_surface(surface.vertices, surface.faces, cell_size=cell)
-
-
-def liver_surface(scale: float) -> trimesh.Trimesh:
-    """The shipped liver (scenes/meshes/make_liver.py), smaller."""
-    liver = trimesh.load(scenes_folder() / "meshes" / "liver.ply", process=False)
-    return trimesh.Trimesh(scale * liver.vertices, liver.faces, process=False)

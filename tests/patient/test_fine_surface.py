@@ -1,21 +1,14 @@
 """The fine surface of a patient's organ: from labels or a file, fitted to the tets, written, read and drawn."""
 
-import base64
-import io
-import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
-from scipy.spatial import KDTree
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.carriers import find_carriers
 from msdm_core.mesh.surface import check_surface, surface_volume
-from msdm_core.mesh_files.surface_io import read_surface
 from msdm_core.meshing.lattice_meshing import mesh_surface
 from msdm_core.meshing.segmentation_meshing import smoothed_share
 from surgsim_env.palpation.surface_drawing import organ_patches
@@ -25,12 +18,8 @@ from surgsim_env.patient.fine_surface import (
     level_surface,
     split_edges,
     surface_area,
-    surface_file,
 )
-from surgsim_env.patient.make_patient import check_targets
-from surgsim_env.patient.report import organ_picture
 from surgsim_env.rendering.embedding import EmbeddedSurface, organ_surface
-from surgsim_env.rendering.surface import DrawnSurface
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
 from surgsim_env.scene.model import FineSurface
@@ -147,88 +136,10 @@ def test_a_scan_s_surface_is_written_named_and_drawn(written):
     np.testing.assert_allclose(drawn.follow(anatomy.mesh.points)[0], vertices, rtol=0, atol=1e-12)
 
 
-def test_pictures_without_opengl_draw_it_in_the_colours_below_it(written):
-    anatomy = load_anatomy(load_scene(written / "patient.toml"))
-    vertices, triangles = anatomy.fine_surface
-    patches = organ_patches(anatomy)
-    # A split and bent triangle keeps its corners.
-    assert KDTree(patches.corners.reshape(-1, 3)).query(vertices)[0].max() < 1e-12
-    # Each patch is near the boundary triangle that it lies over: within the triangle's radius, a patch's longest edge
-    # and the largest distance of a vertex from the boundary.
-    below = anatomy.mesh.points[anatomy.mesh.boundary_triangles]
-    centres = below.mean(axis=1)
-    radius = np.linalg.norm(below - centres[:, None], axis=2).max(axis=1)
-    apart = find_carriers(vertices, anatomy.mesh).distance.max()
-    distance = np.linalg.norm(patches.corners.mean(axis=1) - centres[patches.origin], axis=1)
-    assert (distance <= radius[patches.origin] + longest_edge(vertices, triangles) + apart).all()
-    assert len(np.unique(patches.origin)) > 0.95 * len(below)
-
-
-def test_the_report_of_an_organ_shows_it(written):
-    """Its picture is that of the organ as it is read back, and not that of the tets' boundary."""
-    page = (written / "report.html").read_text(encoding="utf-8")
-    shown = pixels(base64.b64decode(page.split("data:image/png;base64,")[1].split('"')[0]))
-    anatomy = load_anatomy(load_scene(written / "patient.toml"))
-
-    def unlike(one):
-        """The share of pixels that differ from a picture of the organ by more than rounding in its files."""
-        mesh = one.mesh
-        volumes = [
-            SimpleNamespace(name=name, mesh=mesh.volumes[mesh.region == tag].sum()) for tag, name in mesh.region_names
-        ]
-        patient = SimpleNamespace(volumes=volumes, lesions=(), is_scan=True, organ_name="liver")
-        organ = SimpleNamespace(material=one.scene.material)
-        drawn = organ_picture(SimpleNamespace(anatomy=one, patient=patient, organ=organ))
-        return (np.abs(pixels(drawn) - shown).max(axis=2) > 8).mean()
-
-    assert unlike(anatomy) < 0.2 * unlike(plain(anatomy))
-
-
-def pixels(png):
-    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
-
-
-def plain(anatomy):
-    """The same organ without a fine surface."""
-    scene = anatomy.scene
-    return load_anatomy(replace(scene, mesh=replace(scene.mesh, fine_surface=None)))
-
-
-def test_a_scene_without_one_draws_the_boundary(written):
-    bare = plain(load_anatomy(load_scene(written / "patient.toml")))
-    assert bare.fine_surface is None and isinstance(organ_surface(bare), DrawnSurface)
-    patches, triangles = organ_patches(bare), bare.mesh.boundary_triangles
-    assert np.array_equal(patches.origin, np.repeat(np.arange(len(triangles)), len(patches.origin) // len(triangles)))
-
-
 def test_a_surface_of_another_organ_or_unit_is_refused_when_it_is_drawn(written):
     scene = load_scene(written / "patient.toml")
-
-    def drawn(draw=organ_surface, **changed):
-        return draw(load_anatomy(replace(scene, mesh=replace(scene.mesh, fine_surface=FineSurface(**changed)))))
-
-    with pytest.raises(MeshError, match="units forgotten"):
-        drawn(file="patient_surface.ply", length_unit=1000.0)
+    other = FineSurface(file="patient_surface.ply", length_unit=0.8)
+    anatomy = load_anatomy(replace(scene, mesh=replace(scene.mesh, fine_surface=other)))
     for draw in (organ_surface, organ_patches):
-        with pytest.raises(MeshError, match=r"vertex \d+ of the fine surface.*same axes and unit"):
-            drawn(draw, file="patient_surface.ply", length_unit=0.8)
-    with pytest.raises(MeshError, match="no such file"):
-        drawn(file="patient_surface_2.ply", length_unit="m")
-
-
-def test_a_surface_that_no_run_has_written_stays(tmp_path):
-    out = tmp_path / "patient.vtu"
-    surface_file(out).write_text("mine")
-    with pytest.raises(ValueError, match=re.escape("patient_surface.ply is there, and not of an earlier run")):
-        check_targets(out)
-
-
-def test_a_file_s_own_surface_is_read_back_as_it_was(tmp_path):
-    ball = trimesh.creation.icosphere(4, RADIUS)
-    mesh = mesh_surface(ball.vertices, ball.faces, cell_size=0.008)
-    fit = fitted_surface(np.array(ball.vertices), np.array(ball.faces), mesh, 0.008)
-    np.testing.assert_array_equal(fit.vertices, ball.vertices)
-    fit.write(tmp_path / "own.ply")
-    vertices, triangles = read_surface(tmp_path / "own.ply", length_unit="m")
-    # The file holds single precision.
-    np.testing.assert_allclose(vertices[triangles], fit.vertices[fit.triangles], rtol=0, atol=1e-8)
+        with pytest.raises(MeshError, match=r"vertex \d+"):
+            draw(anatomy)

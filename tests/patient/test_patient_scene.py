@@ -1,4 +1,4 @@
-"""What a patient's scene is made of: materials by names, sites, and what an organ has no room for."""
+"""A patient's scene: materials by names, and an organ without room for hidden lesions."""
 
 import pytest
 import trimesh
@@ -9,7 +9,6 @@ from surgsim_env.palpation.job import plan_sites
 from surgsim_env.patient.materials import is_lesion, organ_material, region_material
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
-from tests.patient.scans import LABELS, scan
 
 
 @pytest.mark.parametrize(
@@ -33,23 +32,6 @@ def test_materials_go_by_names(region, organ, lesion, modulus, source):
     assert found.material.youngs_modulus == pytest.approx(modulus)
     assert source in found.source
     assert (found.material.density, found.material.poisson_ratio) == (1060.0, 0.45)
-
-
-def test_an_organ_nobody_knows_takes_the_liver_s_modulus_and_says_so():
-    assert organ_material("pancreas").material == organ_material("liver").material
-    assert "the liver's: nothing is known of 'pancreas' here" in organ_material("pancreas").source
-
-
-@pytest.mark.slow
-def test_a_raster_of_too_many_sites_is_made_wider(tmp_path, monkeypatch):
-    monkeypatch.setattr("surgsim_env.patient.patient_scene.SITES_MOST", 6)
-    file = scan(tmp_path / "ct.nii.gz", spacing=(4.0, 4.0, 4.0))
-    out = tmp_path / "a.vtu"
-    assert main(["organ", str(file), *LABELS, "--cell-size", "0.009", "--out", str(out)]) == 0
-    scene = load_scene(out.with_suffix(".toml"))
-    assert 1 <= len(plan_sites(load_anatomy(scene))[0]) <= 6
-    # Before, as in the scene liver: 13/12 of the tip's radius.
-    assert scene.palpation.site_spacing > 13 / 12 * scene.instrument.tip_radius + 1e-3
 
 
 @pytest.mark.slow

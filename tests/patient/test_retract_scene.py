@@ -1,6 +1,5 @@
-"""The scene of retraction of a patient's organ: which edge is lifted, what is written, what takes it, who refuses."""
+"""The scene of retraction of a patient's organ: which edge is lifted, what is written, and what takes it."""
 
-import json
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,7 +12,6 @@ from msdm_core.mesh_files.mesh_io import read_mesh
 from msdm_core.mesh_files.surface_io import read_surface
 from msdm_core.meshing.lattice_meshing import mesh_surface
 from surgsim_env.cli.main import main
-from surgsim_env.patient.make_patient import FIRST_LINE, check_targets
 from surgsim_env.patient.retract_scene import (
     JAW_OPENING,
     JAW_PLAY,
@@ -25,9 +23,7 @@ from surgsim_env.patient.retract_scene import (
     _thickness,
     find_rim,
 )
-from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene, make_retract_scene
-from surgsim_env.scene.model import Flap, Retraction
 from surgsim_env.scripting.oracle import edge_section, oracle_script
 from surgsim_env.scripting.run import run_script
 from tests.patient.scans import LABELS, WEDGE_EDGE, WEDGE_SLOPE, wedge
@@ -143,20 +139,6 @@ def test_environments_of_retraction_take_the_patient_s_scene(folder, name):
     env.close()
 
 
-def test_a_saved_state_goes_on_to_the_bit(env):
-    inner = env.unwrapped
-    env.reset(seed=4)
-    env.action_space.seed(4)
-    actions = [env.action_space.sample() for _ in range(4)]
-    env.step(actions[0])
-    state = inner.save_state()
-    first = [env.step(action)[0] for action in actions[1:]]
-    env.reset(seed=5)
-    inner.load_state(state)
-    again = [env.step(action)[0] for action in actions[1:]]
-    np.testing.assert_array_equal(first, again)
-
-
 @pytest.mark.slow
 def test_the_oracle_lifts_the_wedge_s_edge(env):
     env.reset(seed=0)
@@ -164,40 +146,6 @@ def test_the_oracle_lifts_the_wedge_s_edge(env):
     assert trace.info["success"]
     assert trace.info["slips"] == 0
     assert trace.info["pull_force_peak"] < env.unwrapped.scene.limits.soft_force
-
-
-@pytest.mark.slow
-def test_a_real_liver_s_edge_is_lifted_from_the_command_line(tmp_path, anatomy_folder):
-    out = tmp_path / "patient.vtu"
-    given = ["organ", str(anatomy_folder / "openhelp_liver.stl"), "--length-unit", "mm", "--no-healthy-map"]
-    assert main([*given, "--out", str(out)]) == 0
-    for arms in ([], ["--bimanual"]):
-        run = ["retract", "--scene", str(out.with_suffix(".toml")), "--seed", "3", "--out", str(tmp_path / "run")]
-        assert main([*run, *arms]) == 0
-        summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
-        assert summary["success"] and summary["slips"] == 0
-        assert not summary["torn"] and not summary["failure"]
-
-
-@pytest.mark.slow
-def test_an_organ_without_a_thin_edge_says_so(tmp_path, capsys):
-    ball = trimesh.creation.icosphere(3, 30.0)
-    ball.export(tmp_path / "ball.stl")
-    out = tmp_path / "patient.vtu"
-    # An earlier run found an edge.
-    earlier = [tmp_path / "patient_retract.vtu", tmp_path / "patient_retract.toml"]
-    for file in earlier:
-        file.write_text(f"{FIRST_LINE}\n", encoding="utf-8")
-    given = ["organ", str(tmp_path / "ball.stl"), "--length-unit", "mm", "--no-healthy-map"]
-    assert main([*given, "--out", str(out)]) == 0
-    assert "retraction: none: " in capsys.readouterr().out
-    assert not any(file.exists() for file in earlier)
-    reason = load_scene(out.with_suffix(".toml")).retract_refusal
-    assert reason is not None and f"the jaw opens {JAW_OPENING * 1e3:g} mm" in reason
-    for name in RETRACTIONS:
-        with pytest.raises(ValueError) as refusal:
-            gym.make(name, scene=str(out.with_suffix(".toml")))
-        assert str(refusal.value).endswith(reason)
 
 
 def test_a_ball_s_thickness_is_measured():
@@ -228,27 +176,3 @@ def test_the_section_of_a_box_is_its_border_and_its_sides():
     np.testing.assert_allclose(sides, [[-0.006, 0.006]] * len(place), atol=1e-12)
     with pytest.raises(ValueError, match=r"no tissue at x = 0\.2 m"):
         edge_section(np.asarray(box.vertices), np.asarray(box.faces), 0.2, 0.0)
-
-
-def test_files_of_one_s_own_are_not_replaced(tmp_path):
-    out = tmp_path / "patient.vtu"
-    (tmp_path / "patient_retract.vtu").write_text("mine")
-    with pytest.raises(ValueError, match=r"patient_retract\.vtu is there, and not of an earlier run"):
-        check_targets(out)
-    (tmp_path / "patient_retract.toml").write_text("mine")
-    with pytest.raises(ValueError, match=r"patient_retract\.toml is there, and not of an earlier run"):
-        check_targets(out)
-
-
-def test_a_flap_has_corners_and_goes_with_an_organ_as_it_is():
-    with pytest.raises(ValueError, match=r"flap: it reaches from y = 0.1 to 0 m; give low < high"):
-        Flap((0.0, 0.1, 0.0), (0.1, 0.0, 0.1))
-    ranges = {"target_distance": (0.01, 0.02), "target_along": (0.01, 0.02)}
-    starts = {"start_lower": (0.0, 0.0, 0.0), "start_upper": (0.0, 0.0, 0.0)}
-    with pytest.raises(ValueError, match=r"with retract.flap both are \[1, 1\]"):
-        Retraction(**ranges, **starts, scale=(0.9, 1.1), flap=Flap((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)))
-
-
-def test_a_scene_that_names_no_other_is_its_own():
-    assert make_retract_scene("lobe").name == "lobe"
-    assert load_anatomy(make_retract_scene("phantom_small")).scene.retract is None

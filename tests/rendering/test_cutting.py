@@ -81,16 +81,3 @@ def test_lesion_in_the_section_has_its_circles_area():
     moved = tissue.shapes(anatomy.mesh.points + up)["section"]
     np.testing.assert_allclose(moved.vertices, at_rest["section"].vertices + up, atol=1e-15)
     assert np.ptp(tissue.shapes(bent(anatomy.mesh.points))["section"].vertices @ towards) > 1e-3
-
-
-def test_lesion_moves_with_the_mean_of_its_nodes():
-    anatomy = load_anatomy(make_scene("phantom"))
-    lesion = anatomy.demonstration_lesions()[0]
-    points, centre = anatomy.mesh.points, np.asarray(lesion.centre)
-    tissue = Tissue(anatomy, drawn_surface(points, anatomy.mesh.boundary_triangles), [lesion], False)
-    np.testing.assert_array_equal(tissue.lesion_centres(points)[0], centre)
-    inside = np.linalg.norm(points - centre, axis=1) <= lesion.radius
-    moved, shift = points.copy(), np.array([0.001, 0.002, -0.003])
-    moved[inside] += shift
-    moved[~inside] += 1.0
-    np.testing.assert_allclose(tissue.lesion_centres(moved)[0], centre + shift, atol=1e-15)

@@ -81,21 +81,9 @@ def test_values_at_boundary_nodes_are_mixed_and_never_exceeded(ball):
     np.testing.assert_allclose(surface.interpolate(np.ones(mesh.node_count)), 1.0)
 
 
-def test_the_held_part_is_where_all_nodes_are_held(ball):
-    mesh, surface, vertices = ball
-    low = np.flatnonzero(mesh.points[:, 2] < -0.01).astype(np.int32)
-    held = surface.faces_among(low)
-    heights = vertices[surface.faces][:, :, 2]
-    assert held.any() and (heights[held] < -0.01 + 1e-4).all()
-    assert held[(heights < -0.01 - CELL).all(axis=1)].all()
-    assert not surface.faces_among(np.zeros(0, dtype=np.int32)).any()
-
-
 def test_a_vertex_far_outside_is_refused_by_its_name(ball):
     mesh, surface, vertices = ball
     moved = vertices.copy()
     moved[17] *= 1.5
-    with pytest.raises(MeshError, match=r"vertex 17 of the fine surface.* is 15(\.\d+)? mm from the boundary"):
+    with pytest.raises(MeshError, match=r"vertex 17 .* 15(\.\d+)? mm"):
         embedded_surface(moved, surface.faces, mesh)
-    with pytest.raises(MeshError, match="in the same axes and unit"):
-        embedded_surface(vertices * 1e3, surface.faces, mesh)

@@ -1,17 +1,14 @@
-"""Pictures through Gymnasium: modes, checkers, vector environments, videos; the simulation is not touched."""
+"""Pictures through Gymnasium: vector environments, videos; the simulation is not touched."""
 
 import pickle
-import warnings
 from itertools import islice
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.rendering import gl, stage
-from surgsim_env.rendering.episode_view import offered_modes
 from tests.envs.walks import walk
 
 PALPATE = "SurgSim/Palpate-v0"
@@ -28,24 +25,6 @@ def env_id(request):
 EACH_ID = pytest.mark.parametrize(
     "env_id", [pytest.param(one, marks=[pytest.mark.slow] * (one != PALPATE)) for one in IDS], indirect=True
 )
-
-
-@EACH_ID
-@needs_opengl
-def test_passes_gymnasiums_checker_without_a_warning(env_id):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
-
-
-@pytest.mark.agents
-@EACH_ID
-@needs_opengl
-def test_passes_stable_baselines3s_checker_without_a_warning(env_id):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the `agents` extra")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checker.check_env(gym.make(env_id, render_mode="rgb_array").unwrapped, skip_render_check=False)
 
 
 @EACH_ID
@@ -70,86 +49,11 @@ def test_pictures_change_no_bit_of_an_episode(env_id):
     drawn.close()
 
 
-@EACH_ID
-@needs_opengl
-def test_loaded_state_looks_like_the_saved_one(env_id):
-    env, other = (gym.make(env_id, render_mode="rgb_array", show_lesion=True).unwrapped for _ in range(2))
-    env.reset(seed=5)
-    other.reset(seed=6)
-    for action in islice(walk(env, np.random.default_rng(7)), 20):
-        env.step(action)
-    assert env.render().tobytes() != other.render().tobytes()
-    other.load_state(env.save_state())
-    assert env.render().tobytes() == other.render().tobytes()
-    env.close()
-    other.close()
-
-
-@needs_opengl
-def test_frames_are_what_was_asked_for(env_id):
-    env = gym.make(env_id, render_mode="rgb_array", width=200, height=100, camera="endoscope")
-    env.reset(seed=0)
-    frame = env.render()
-    assert isinstance(frame, np.ndarray) and frame.shape == (100, 200, 3) and frame.dtype == np.uint8
-    assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 50
-    env.close()
-    env.close()
-
-
-def test_nothing_to_show_before_the_first_reset(env_id):
-    env = gym.make(env_id, render_mode="rgb_array")
-    with pytest.raises(gym.error.ResetNeeded):
-        env.render()
-    for look in (env.unwrapped.render, lambda: env.unwrapped.renderer):
-        with pytest.raises(gym.error.ResetNeeded, match="nothing to show"):
-            look()
-
-
-def test_without_a_mode_render_warns_and_shows_nothing(env_id):
-    env = gym.make(env_id)
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="without a render_mode shows nothing"):
-        assert env.unwrapped.render() is None
-
-
-def test_metadata_says_what_this_machine_offers(env_id, monkeypatch):
-    """All modes by the class; by an environment those that work here, and one frame for each control step."""
-    assert gym.spec(env_id).entry_point and type(gym.make(env_id).unwrapped).metadata["render_modes"] == [
-        "human",
-        "rgb_array",
-    ]
-    env = gym.make(env_id).unwrapped
-    assert env.metadata == {"render_modes": offered_modes(), "render_fps": 20}
-    assert env.metadata["render_fps"] == pytest.approx(1.0 / env.scene.timing.control_step)
-    for name in gl.DISPLAYS:
-        monkeypatch.delenv(name, raising=False)
-    assert "human" not in offered_modes()
-    monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.delenv(gl.VARIABLE, raising=False)
-    assert "human" in offered_modes()
-    monkeypatch.setenv(gl.VARIABLE, "disabled")
-    assert offered_modes() == [] == gym.make(env_id).unwrapped.metadata["render_modes"]
-
-
 def test_window_without_a_display_says_what_to_do(env_id, monkeypatch):
     for name in gl.DISPLAYS:
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(gl.NoGLError, match=r'no display .*use render_mode="rgb_array"'):
         gym.make(env_id, render_mode="human")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"camera": "front"}, "camera 'front' is unknown; the cameras are"),
-        ({"widht": 3}, "argument 'widht' is unknown; .*did you mean 'width'"),
-        ({"render_mode": "ansi"}, "render_mode 'ansi' is unknown; the modes are None, human, rgb_array"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:.*render_mode='ansi'")
-def test_bad_options_are_refused(env_id, options, message):
-    with pytest.raises(ValueError, match=message):
-        gym.make(env_id, **options)
 
 
 @needs_opengl
@@ -171,36 +75,6 @@ def test_vector_environments_give_a_frame_for_each(mode):
     alone.close()
     envs.close()
     assert len(stage._stages) == held
-
-
-@pytest.mark.slow
-@needs_opengl
-def test_works_in_other_processes():
-    """Workers that are started anew draw by themselves; a fork of a process that has drawn says why it cannot."""
-    envs = gym.make_vec(
-        IDS[0],
-        num_envs=2,
-        vectorization_mode="async",
-        vector_kwargs={"context": "spawn"},
-        render_mode="rgb_array",
-        width=64,
-        height=48,
-    )
-    envs.reset(seed=[3, 4])
-    assert [frame.shape for frame in envs.render()] == [(48, 64, 3)] * 2
-    envs.close()
-
-
-def test_forked_process_is_told(monkeypatch):
-    monkeypatch.setattr(gl, "_first_context", lambda: (object(), -1))
-    with pytest.raises(gl.NoGLError, match=r"forked .*forkserver"):
-        gl.context()
-
-
-def test_windows_are_not_opened_by_the_dozen(monkeypatch):
-    monkeypatch.setenv("DISPLAY", ":0")
-    with pytest.raises(ValueError, match="shows one environment, not 4"):
-        gym.make_vec(PALPATE, num_envs=4, vectorization_mode="vector_entry_point", render_mode="human")
 
 
 @needs_opengl

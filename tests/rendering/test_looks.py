@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.rendering.cameras import Camera
 from surgsim_env.rendering.looks import (
     CAMERA_ROLL,
@@ -21,11 +20,9 @@ from surgsim_env.rendering.looks import (
     draw_look,
     look_generator,
 )
-from surgsim_env.rendering.vessels import AXIS_COUNT, TEXTURE_SIZE, TEXTURE_WIDTH, texture_places, vessel_texture
-from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.rendering.vessels import AXIS_COUNT, TEXTURE_WIDTH, texture_places, vessel_texture
 
 RETRACT = "SurgSim/Retract-v0"
-IDS = sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"))
 needs_opengl = pytest.mark.usefixtures("opengl")
 BANDS = [one.name for one in dataclasses.fields(LookRanges) if one.name.endswith("_bands")]
 
@@ -117,11 +114,6 @@ def test_vessels_are_as_dense_as_said(density):
     assert np.mean(counts) == pytest.approx(expected, rel=0.3)
 
 
-def test_no_strength_is_plain():
-    assert (vessel_texture(1, 100.0, 0.0, 0.2) == 255).all()
-    assert vessel_texture(1, 100.0, 0.5, 0.2).shape == (TEXTURE_SIZE, TEXTURE_SIZE, 3)
-
-
 def test_each_triangle_is_stretched_by_sqrt_3_at_most():
     """Projected along the axis nearest to its normal n, an area shrinks by the largest |n_i|, at least 1 / sqrt(3)."""
     rng = np.random.default_rng(0)
@@ -208,47 +200,6 @@ def test_noise_is_of_the_moment():
 
 
 @needs_opengl
-def test_side_by_side_they_are_what_they_are_alone():
-    """Pictures, looks and forces of environments that share one stage, after steps and a reset of one of them."""
-    settings = {"obs_mode": "rgb_force", "looks": "train"}
-    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled", "dtype": "float64"}
-    envs = gym.make_vec(RETRACT, num_envs=2, threads=1, **lanes, **settings)
-    alone = [gym.make(RETRACT, **settings) for _ in range(2)]
-    together, _ = envs.reset(seed=[3, 4])
-    apart = [env.reset(seed=seed)[0] for env, seed in zip(alone, (3, 4))]
-    envs.action_space.seed(0)
-    for step in range(3):
-        assert envs.observation_space.contains(together)
-        for index, one in enumerate(apart):
-            assert envs.single_observation_space.contains(one)
-            np.testing.assert_array_equal(together["picture"][index], one["picture"])
-            np.testing.assert_array_equal(together["force"][index], one["force"])
-        actions = envs.action_space.sample()
-        together, *_ = envs.step(actions)
-        apart = [env.step(action)[0] for env, action in zip(alone, actions)]
-        if step == 1:
-            together, _ = envs.reset(seed=[5, 5], options={"reset_mask": np.array([True, False])})
-            apart[0], _ = alone[0].reset(seed=5)
-    envs.close()
-    for env in alone:
-        env.close()
-
-
-@needs_opengl
-@pytest.mark.parametrize("env_id", [pytest.param(one, marks=[pytest.mark.slow] * (one != RETRACT)) for one in IDS])
-def test_every_id_takes_looks(env_id):
-    """In what it observes and in what it renders."""
-    env = gym.make(env_id, obs_mode="rgb_force", looks="test", render_mode="rgb_array", width=120, height=90).unwrapped
-    plain = gym.make(env_id, obs_mode="rgb_force", render_mode="rgb_array", width=120, height=90).unwrapped
-    (seen, _), (own, _) = env.reset(seed=1), plain.reset(seed=1)
-    assert env.observation_space.contains(seen)
-    assert (seen["picture"] != own["picture"]).mean() > 0.3 and (env.render() != plain.render()).mean() > 0.3
-    np.testing.assert_array_equal(seen["force"], own["force"])
-    env.close()
-    plain.close()
-
-
-@needs_opengl
 def test_force_beside_the_picture_is_what_the_sensor_reads():
     env, state = gym.make(RETRACT, obs_mode="rgb_force").unwrapped, gym.make(RETRACT).unwrapped
     (seen, _), (numbers, _) = env.reset(seed=2), state.reset(seed=2)
@@ -260,27 +211,3 @@ def test_force_beside_the_picture_is_what_the_sensor_reads():
     assert not without.reset(seed=2)[0]["force"].any()
     env.close()
     without.close()
-
-
-def test_looks_without_a_picture_are_refused():
-    with pytest.raises(ValueError, match=r"looks is 'train', and no picture is drawn: give obs_mode"):
-        gym.make(RETRACT, looks="train")
-    with pytest.raises(ValueError, match="looks is 'validation'"):
-        gym.make(RETRACT, obs_mode="rgb", looks="validation")
-    with pytest.raises(ValueError, match=r"obs_mode is \"state\", which observes no picture"):
-        gym.make(RETRACT).unwrapped.picture(None)
-
-
-class Numb(RetractTask):
-    """Retraction without a force sensor."""
-
-    channels = tuple(one for one in RetractTask.channels if not one.felt)
-
-
-class NumbEnv(SurgicalEnv):
-    task_class = Numb
-
-
-def test_force_of_a_task_that_feels_none_is_refused():
-    with pytest.raises(ValueError, match="Numb has no channel that depends on force sensing"):
-        NumbEnv(obs_mode="rgb_force")

@@ -33,10 +33,6 @@ def test_a_side_is_the_surface_that_faces_that_way():
     assert ((x < 1e-9) | (z < 1e-9)).all() and (x < 1e-9).sum() > 10 and (z < 1e-9).sum() > 10
 
 
-def test_every_way_round_is_all_of_the_surface():
-    assert set(held(Anchor("a", side=Side(DOWN, 180.0))).anchors) == set(MESH.boundary_nodes)
-
-
 def test_elastic_tissue_holds_by_its_surface_and_fixes_nothing():
     box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.015))
     fixed, elastic = held(Anchor("a", box=box)), held(Anchor("a", box=box, **FAT))
@@ -80,35 +76,13 @@ def test_a_scene_with_elastic_tissue_is_written_and_read():
 
 
 @pytest.mark.parametrize(
-    ("entries", "message"),
+    ("entries", "named"),
     [
-        ({"stiffness": 1e5}, "stiffness and shear_stiffness go together"),
-        ({"shear_stiffness": 1e5}, "stiffness and shear_stiffness go together"),
-        ({"stiffness": 0.0, "shear_stiffness": 0.0}, r"stiffness is 0 N/m\^3; it must be finite and above 0"),
+        ({"stiffness": 1e5}, "shear_stiffness"),
         ({"stiffness": math.inf, "shear_stiffness": 0.0}, "stiffness is inf"),
-        (
-            {"stiffness": 1.0, "shear_stiffness": -1.0},
-            r"shear_stiffness is -1 N/m\^3; it must be finite and at least 0",
-        ),
-        ({"ball": Ball((0.0, 0.0, 0.0), 0.1)}, "give one of a box, a ball and a side"),
+        ({"stiffness": 1.0, "shear_stiffness": -1.0}, "shear_stiffness is -1"),
     ],
 )
-def test_bad_anchors_are_refused(entries, message):
-    with pytest.raises(ValueError, match=f"anchor 'fat'.*{message}"):
+def test_bad_anchors_are_refused(entries, named):
+    with pytest.raises(ValueError, match=f"'fat'.*{named}"):
         Anchor("fat", **{"side": Side(DOWN), **entries})
-
-
-@pytest.mark.parametrize("angle", [0.0, -1.0, 181.0, math.nan])
-def test_bad_angles_are_refused(angle):
-    with pytest.raises(ValueError, match=r"side: angle_deg is .*; it must be above 0 and at most 180"):
-        Side(DOWN, angle)
-
-
-def test_a_side_without_direction_is_refused():
-    with pytest.raises(ValueError, match=r"side: direction is .*; it must be a direction"):
-        Side((0.0, 0.0, 0.0))
-
-
-def test_an_elastic_anchor_that_holds_nothing_is_refused():
-    with pytest.raises(ValueError, match="anchor 'far' holds no node of the organ"):
-        held(Anchor("far", ball=Ball((9.0, 0.0, 0.0), 0.01), **FAT))

@@ -8,7 +8,7 @@ import pytest
 
 from surgsim_env.scene import levels
 from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.levels import LEVELS, DrawnOrgan, Level, find_level
+from surgsim_env.scene.levels import LEVELS, DrawnOrgan, Level
 from surgsim_env.scene.load import make_scene
 
 SCENES = ("phantom", "phantom_small")
@@ -100,23 +100,15 @@ def test_stiff_draws_get_little_mass_and_need_no_more_substeps():
     assert 0.0 < organ.added_mass < 0.02 * organ.node_mass.sum()
 
 
-@pytest.mark.parametrize("name", ["harder", None, 3])
-def test_unknown_levels_are_refused(name: object):
-    with pytest.raises(ValueError, match=r"level .* is unknown.*the levels are easy, standard, hard"):
-        find_level(name)  # type: ignore[arg-type]
-
-
 def test_scenes_that_a_level_cannot_draw_from_are_refused(monkeypatch):
-    with pytest.raises(ValueError, match=r"scene 'lobe' has no \[lesion\] table"):
+    with pytest.raises(ValueError, match="'lobe'"):
         LEVELS["easy"].scene(make_scene("lobe"))
     scene = make_scene("phantom")
     wide = replace(scene, lesion=replace(scene.lesion, radius=(0.002, 0.012)))
     LEVELS["standard"].scene(wide)
-    with pytest.raises(
-        ValueError, match=r"level 'hard' of scene 'phantom' draws lesion\.radius from \[-0\.001, 0\.004"
-    ):
+    with pytest.raises(ValueError, match=r"'hard'.*lesion\.radius"):
         LEVELS["hard"].scene(wide)
     monkeypatch.setattr(levels, "TRIES_MOST", 3)
     crowded = load_anatomy(LEVELS["standard"].scene(make_scene("phantom_small")))
-    with pytest.raises(ValueError, match=r"9 lesions of level 'standard' found no room beside each other"):
+    with pytest.raises(ValueError, match="9 lesions"):
         LEVELS["standard"].draw(crowded, np.random.default_rng(0), lesion_count=9)

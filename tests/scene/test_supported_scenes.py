@@ -1,4 +1,4 @@
-"""Scenes whose organ rests on something: read, settled, saved; tools and pictures meet the same supports."""
+"""An organ that rests on its bed is settled, and tools meet its bed alike in both loops."""
 
 from dataclasses import replace
 from functools import cache
@@ -6,21 +6,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from msdm_core.errors import OrganError
 from msdm_core.material.regions import Capsule
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.organ.compile import compile_organ, rest_state
 from msdm_core.organ.measure import support_forces
 from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.support import Support
-from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_BIT
-from surgsim_env.rendering.options import render_options
-from surgsim_env.rendering.renderer import OrganRenderer
-from surgsim_env.rendering.stage import LABELS
 from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import load_scene, make_scene, scenes_folder, with_instrument
+from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.model import Scene, substeps_needed
 
 # Beside the lobe, over its bed, whose top is z = 0 [m].
@@ -41,24 +35,6 @@ def simulation(*, compiled: bool = True, instrument: str | None = None, tip=ABOV
     return made
 
 
-def test_a_scene_file_says_what_the_organ_rests_on(tmp_path):
-    text = (scenes_folder() / "organs" / "lobe.toml").read_text(encoding="utf-8")
-    assert scene().supports == (
-        Support("bed", "box", position=(0.04, -0.01075, -0.015), size=(0.08, 0.04925, 0.015), friction=0.2),
-    )
-    organ = load_anatomy(scene()).organ()
-    assert organ.gravity.tolist() == [0.0, 0.0, -9.81]
-    assert (organ.support_stiffness, organ.support_damping) == (scene().contact.stiffness, scene().contact.damping)
-    path = tmp_path / "other.toml"
-    wall = '[[supports]]\nname = "wall"\nkind = "plane"\naxis = [0, 1, 0]\n'
-    path.write_text(text + wall, encoding="utf-8")
-    other = load_scene(path)
-    assert other.supports[1].axis == (0.0, 1.0, 0.0)
-    path.write_text(text + wall.replace("plane", "floor"), encoding="utf-8")
-    with pytest.raises(ValueError, match="scene 'other': support 'wall': kind is 'floor'"):
-        load_scene(path)
-
-
 def test_the_lobe_lies_on_its_bed_at_the_start_and_stays():
     """No node is faster than 1 mm/s from before step 0 to 100 ms after; the bed bears most of the weight."""
     simulated = simulation()
@@ -71,33 +47,6 @@ def test_the_lobe_lies_on_its_bed_at_the_start_and_stays():
     for _ in range(100):
         simulated.control_step(1)
         assert np.linalg.norm(state.node_velocity, axis=1).max() < 1e-3
-
-
-def test_a_restart_rests_as_a_reset_does():
-    """What sticks to the bed is back too: both run on to the same bits."""
-    one, other = simulation(), simulation()
-    one.instrument.command_velocity(np.array([0.01, 0.0, -0.03]))
-    one.control_step(300)
-    assert one.contact_force[2] > 0.05
-    one.restart(ABOVE)
-    for simulated in (one, other):
-        simulated.control_step(50)
-    for name, array in other.get_state().items():
-        assert one.get_state()[name].tobytes() == array.tobytes(), name
-
-
-def test_saved_and_restored_to_the_bit():
-    one, other = simulation(), simulation()
-    one.instrument.command_velocity(np.array([0.01, 0.0, -0.03]))
-    one.control_step(250)
-    saved = one.get_state()
-    assert saved["organ_support_stretch"].any()
-    other.set_state(one.organ_model, saved)
-    for simulated in (one, other):
-        simulated.control_step(100)
-    assert one.contact_force.any()
-    for name, array in one.get_state().items():
-        assert other.get_state()[name].tobytes() == array.tobytes(), name
 
 
 @pytest.mark.parametrize(
@@ -156,12 +105,6 @@ def test_tools_meet_supports_and_not_each_other(instrument):
     np.testing.assert_allclose(model.geom_size[bed], scene().supports[0].size)
 
 
-def test_instruments_of_other_scenes_know_of_no_supports():
-    model = Simulation(load_anatomy(make_scene("phantom"))).instrument.model
-    assert not model.geom_contype.any() and not model.geom_conaffinity.any()
-    assert model.opt.cone == 0
-
-
 @pytest.mark.parametrize("scale", [0.92, 1.08])
 def test_the_lobes_substeps_bear_its_hardest_draw(scale: float):
     """10 kPa, cells of 0.92 x 4 mm, a capsule of 20 N/m; it settles too."""
@@ -173,53 +116,3 @@ def test_the_lobes_substeps_bear_its_hardest_draw(scale: float):
     timing = scene().timing
     assert substeps_needed(timing.haptic_step, stable_dt(organ, scene().contact.law)) <= timing.substep_count
     assert np.isfinite(rest_state(organ).node_position).all()
-
-
-def test_a_scene_whose_substeps_are_too_few_for_its_bed_is_refused():
-    stiff = replace(scene(), contact=replace(scene().contact, stiffness=3e8))
-    with pytest.raises(OrganError, match=r"5 substeps.*too long.*timing.substep_count = "):
-        Simulation(load_anatomy(stiff))
-
-
-def test_pictures_show_the_bed_as_background():
-    """The bed hides what is below it, is no instrument, and takes the drape's place right under the lobe."""
-    simulated = simulation(tip=np.array([0.06, 0.09, 0.03]))
-    with_bed = OrganRenderer(simulated, render_options({"width": 160, "height": 120, "camera": "endoscope"}))
-    labels, depth = with_bed.segmentation(), with_bed.depth()
-    with_bed.close()
-    names = set(np.unique(labels).tolist())
-    assert names == {LABELS[name] for name in ("background", "organ", "instrument")}
-    bare = Simulation(load_anatomy(replace(scene(), supports=(), gravity=(0.0, 0.0, 0.0), name="bare")))
-    bare.reset(bare.organ_model, np.array([0.06, 0.09, 0.03]))
-    without = OrganRenderer(bare, render_options({"width": 160, "height": 120, "camera": "endoscope"}))
-    drape, tool = without.depth(), without.segmentation() == LABELS["instrument"]
-    without.close()
-    np.testing.assert_array_equal(labels == LABELS["instrument"], tool, err_msg="the bed is no instrument")
-    below = (labels == LABELS["background"]) & (np.arange(120)[:, None] > 90)
-    # The drape of the bare scene lies at z = -0.5 mm, the bed's side face stands nearer, its drape is 30 mm lower.
-    assert (depth[below] > drape[below] + 0.005).any(), "the drape is below the bed"
-    assert np.isfinite(depth[below]).all()
-
-
-@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
-def test_lobes_side_by_side_rest_as_they_do_alone(dtype):
-    """Two lobes pressed aside on their beds: in float64 to the bit, in float32 within 0.5 % of the force."""
-    alone, together = [simulation() for _ in range(2)], [simulation() for _ in range(2)]
-    group = LaneGroup(together, dtype)
-    for _ in range(8):
-        for one in (alone, together):
-            for number, simulated in enumerate(one):
-                simulated.instrument.command_velocity(np.array([0.01 * number, 0.005, -0.02]))
-        group.control_step(np.ones(2, dtype=np.bool_), 50, np.inf)
-        for simulated in (*alone, *together):
-            simulated.control_step(50)
-            assert simulated.end_control_step(), simulated.fault
-    for one, other in zip(alone, together, strict=True):
-        assert one.contact_force[2] > 0.1
-        if dtype is np.float64:
-            for name, array in one.get_state().items():
-                assert other.get_state()[name].tobytes() == array.tobytes(), name
-        assert np.abs(other.contact_force - one.contact_force).max() < 0.005 * np.linalg.norm(one.contact_force)
-        stretch = one.organ_state.support_stretch, other.organ_state.support_stretch
-        assert np.abs(stretch[0]).max() > 1e-6
-        np.testing.assert_allclose(*stretch, atol=0.02 * np.abs(stretch[0]).max())

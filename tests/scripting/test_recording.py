@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.coupling.exchange import StepsTaken
 
 RADIUS, TOP = 0.008, 0.03
 
@@ -98,37 +97,3 @@ def test_a_step_cut_short_by_the_hard_limit_is_recorded_as_far_as_it_went():
     assert info["hard_limit"] and len(record) % 50
     assert (sizes[:-1] <= env.task.force_limit).all() and sizes[-1] > env.task.force_limit
     assert sizes.max() == pytest.approx(info["force_peak"], rel=1e-15)
-
-
-def test_a_step_that_faults_is_not_recorded():
-    env = made()
-    begin(env)
-    with env.simulation.recording() as record:
-        env.step(np.zeros(4, dtype=np.float32))
-        env.simulation.organ_state.node_velocity[700, 1] = np.nan
-        _, _, terminated, _, info = env.step(np.zeros(4, dtype=np.float32))
-    assert terminated and info["sim_fault"] and len(record) == 50
-
-
-def test_recording_twice_is_refused_and_ends_with_an_error():
-    env = made()
-    begin(env)
-    with env.simulation.recording():
-        with pytest.raises(RuntimeError, match="recorded already"):
-            with env.simulation.recording():
-                pass
-    with pytest.raises(KeyError):
-        with env.simulation.recording():
-            raise KeyError
-    with env.simulation.recording() as record:
-        env.step(np.zeros(4, dtype=np.float32))
-    assert len(record) == 50
-
-
-def test_steps_made_among_others_are_not_recorded():
-    env = made()
-    begin(env)
-    simulation = env.simulation
-    with simulation.recording(), pytest.raises(RuntimeError, match="step its environment alone"):
-        simulation.take_over(simulation.organ_state, simulation.contact_wrench, StepsTaken(50, 0.0, ""))
-    assert simulation.time == 0.0 and not simulation.taken_over

@@ -1,4 +1,4 @@
-"""What a script is refused for, before anything runs: the value, the rule, the way out."""
+"""Scripts that are refused before anything runs."""
 
 import math
 
@@ -17,7 +17,6 @@ from surgsim_env.scripting import (
     MoveTo,
     PressUntil,
     WaitUntil,
-    oracle_script,
     run_script,
 )
 
@@ -52,32 +51,12 @@ def test_numbers_that_are_not_above_zero(place, value):
     assert str(caught.value).startswith(f"{step}: {field} is {value!r}; it must be a finite number above 0")
 
 
-@given(st.sampled_from(NUMBERS), st.floats(min_value=1e-6, max_value=1e6))
-def test_any_number_above_zero_is_taken(place, value):
-    step, field = place
-    more = {}
-    if step == "PressUntil" and field in ("force", "tolerance"):
-        more = {"tolerance": value / 2.0} if field == "force" else {"force": 2.0 * value}
-    assert getattr(MADE[step](**{field: value, **more}), field) == value
-
-
 POINTS = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3)
-
-
-@given(POINTS, st.sampled_from([tuple, list, np.array]))
-def test_any_three_numbers_are_a_point(values, kind):
-    assert MoveTo(kind(values)).point == tuple(values)
 
 
 @given(st.one_of(st.lists(st.floats(-1.0, 1.0)).filter(lambda values: len(values) != 3), st.text(), st.none()))
 def test_other_than_three_numbers_are_no_point(value):
-    with pytest.raises(ValueError, match=r"MoveTo: point is .* it must be three finite numbers, x, y and z"):
-        MoveTo(value)
-
-
-@pytest.mark.parametrize("value", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), ("x", 0.0, 0.0)])
-def test_points_are_finite(value):
-    with pytest.raises(ValueError, match="three finite numbers"):
+    with pytest.raises(ValueError, match="MoveTo: point"):
         MoveTo(value)
 
 
@@ -89,22 +68,9 @@ def test_directions_are_brought_to_length_one(values):
         assert np.dot(step.direction, values) > 0.0
 
 
-@pytest.mark.parametrize("step", ["PressUntil", "Lift"])
-def test_a_direction_points_somewhere(step):
-    with pytest.raises(ValueError, match=f"{step}: direction is .* must point somewhere"):
-        MADE[step](direction=(0.0, 0.0, 0.0))
-
-
-def test_a_tolerance_as_large_as_the_force():
-    with pytest.raises(ValueError, match=r"tolerance is 0\.2 N with a force of 0\.2 N; it must be smaller"):
-        PressUntil(0.2, 0.004, tolerance=0.2)
-
-
-@pytest.mark.parametrize(
-    ("step", "field"), [("WaitUntil", "predicate"), ("Control", "controller"), ("Control", "until")]
-)
+@pytest.mark.parametrize(("step", "field"), [("WaitUntil", "predicate"), ("Control", "until")])
 def test_what_is_called_must_be_callable(step, field):
-    with pytest.raises(TypeError, match=rf"{step}: {field} is 3\.0; it must be callable"):
+    with pytest.raises(TypeError, match=rf"{step}: {field} is 3\.0"):
         MADE[step](**{field: 3.0})
 
 
@@ -115,39 +81,10 @@ def env():
     return env
 
 
-def test_an_empty_script(env):
-    with pytest.raises(ValueError, match="the script is empty"):
-        run_script(env, [])
-
-
-def test_two_steps_of_one_name(env):
-    with pytest.raises(ValueError, match="two steps are called 'wait'"):
-        run_script(env, [Hold(0.1, name="wait"), Hold(0.2), Hold(0.1, name="wait")])
-
-
-def test_a_name_that_does_not_print(env):
-    with pytest.raises(ValueError, match=r"a step is called 'up\\ndown'"):
-        run_script(env, [Hold(0.1, name="up\ndown")])
-
-
-def test_a_speed_that_no_action_asks_for(env):
-    with pytest.raises(ValueError, match=r"'Lift 2': speed is 0\.021 m/s; .* than 0\.02 m/s"):
-        run_script(env, [Lift(0.01), Lift(0.01, speed=0.021)])
-    assert env.unwrapped.simulation.time == 0.0
-
-
-class Halved(gym.Wrapper):
-    def step(self, action):
-        return self.env.step(0.5 * action)
-
-
 def test_a_wrapper_that_changes_actions(env):
     changed = gym.wrappers.RescaleAction(env, np.float32(-2.0), np.float32(2.0))
-    with pytest.raises(ValueError, match=r"a wrapper in <RescaleAction.* changes the actions of step 'Lift'"):
+    with pytest.raises(ValueError, match="RescaleAction"):
         run_script(changed, [Lift(0.01)], seed=0)
-    # Whatever kind of wrapper it is.
-    with pytest.raises(ValueError, match="a wrapper in <Halved"):
-        run_script(Halved(env), [Lift(0.01)], seed=0)
     # One that leaves them as they are is none, and a controller speaks the wrapper's language.
     run_script(gym.wrappers.ClipAction(env), [Lift(0.001)], seed=0)
     trace = run_script(changed, [Control(lambda seen: np.array([0.0, 0.0, 1.0, 0.0]), timeout=0.5)], seed=0)
@@ -155,19 +92,15 @@ def test_a_wrapper_that_changes_actions(env):
 
 
 def test_other_environments_and_several_at_once():
-    with pytest.raises(TypeError, match="CartPoleEnv is no environment of this project"):
+    with pytest.raises(TypeError, match="CartPoleEnv"):
         run_script(gym.make("CartPole-v1"), [Hold(0.1)])
-    with pytest.raises(TypeError, match="not in several abreast"):
+    with pytest.raises(TypeError, match="several"):
         run_script(gym.make_vec("CartPole-v1", num_envs=2), [Hold(0.1)])
-    with pytest.raises(TypeError, match=r"PalpateSitesTask cannot be scripted: steps command `velocity` and sense"):
+    with pytest.raises(TypeError, match="PalpateSitesTask"):
         run_script(gym.make("SurgSim/PalpateSites-v0", scene="phantom_small"), [Hold(0.1)])
-    with pytest.raises(ValueError, match="no oracle is known for CartPoleEnv; there is one for PalpateTask"):
-        oracle_script(gym.make("CartPole-v1"))
 
 
 def test_before_the_first_reset():
     env = gym.make("SurgSim/Palpate-v0")
     with pytest.raises(gym.error.ResetNeeded):
         run_script(env, [Hold(0.1)])
-    with pytest.raises(ValueError, match="none has begun"):
-        oracle_script(env)

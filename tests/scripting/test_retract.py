@@ -1,4 +1,4 @@
-"""Scripts that grasp: jaw steps, steps that end otherwise, and the oracle of a retraction."""
+"""Scripts that grasp: jaw steps, and the oracle of a retraction."""
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,6 @@ from surgsim_env.scripting import (
     OpenJaw,
     PressUntil,
     ScriptError,
-    Until,
     oracle_script,
     run_script,
 )
@@ -48,31 +47,9 @@ def test_jaw_closes_to_its_force_and_opens_to_nothing(env):
     assert trace.between("Hold 2").peak_force == 0.0
 
 
-@pytest.mark.parametrize("step", [CloseJaw(0.2), OpenJaw(0.01)])
-def test_jaw_steps_need_a_jaw(step):
-    env = gym.make("SurgSim/Palpate-v0")
-    with pytest.raises(TypeError, match=f"{type(step).__name__} needs"):
-        run_script(env, [step], seed=0)
-
-
-@pytest.mark.parametrize(("make", "field"), [(CloseJaw, "force"), (OpenJaw, "gap"), (AwaitEnd, "timeout")])
-def test_wrong_values_are_refused(make, field):
-    with pytest.raises(ValueError, match=rf"{make.__name__}: {field} is -1; it must be a finite number above 0"):
-        make(-1)
-
-
 def test_a_jaw_that_closes_on_nothing_fails(env):
     with pytest.raises(ScriptError, match=r"CloseJaw.*ran out of its 1 s"):
         run_script(env, [CloseJaw(0.2, timeout=1.0)], seed=0)
-
-
-def test_until_ends_a_step_and_keeps_its_name(env):
-    step = Until(MoveTo((0.040, 0.068, 0.006), name="there"), lambda view: view.step_time >= 0.2)
-    trace = run_script(env, [step, Hold(0.1)], seed=0)
-    assert [one.name for one in trace.steps] == ["there", "Hold"]
-    assert trace.between("there").duration == pytest.approx(0.2)
-    with pytest.raises(TypeError, match="Until: predicate"):
-        Until(Hold(0.1), True)
 
 
 @pytest.mark.slow
@@ -196,17 +173,3 @@ def test_command_retracts_and_writes(tmp_path, capsys):
     assert "retracted in" in capsys.readouterr().out
     written = {path.name for path in tmp_path.iterdir()}
     assert {"trace.csv", "trace_control.csv", "forces.png", "summary.json"} <= written
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--seed", "-1"], "--seed is -1"),
-        (["--scene", "phantom"], "has no [retract] table"),
-        (["--instrument", "psm_palpator"], "has no jaw"),
-    ],
-)
-def test_command_refuses_in_one_line(words, said, tmp_path, capsys):
-    assert main(["retract", *words, "--out", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1

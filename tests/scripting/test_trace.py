@@ -1,4 +1,4 @@
-"""A trace: what it says of itself, its cuts, its tables read back, its picture."""
+"""A trace: its cuts, its depth, and its tables read back."""
 
 import csv
 from functools import cache
@@ -6,11 +6,6 @@ from functools import cache
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
-from matplotlib.figure import Figure
-from matplotlib.image import imread
 
 import surgsim_env  # noqa: F401
 from surgsim_env.scripting import Hold, Lift, PressUntil, StepInterval, Trace, run_script
@@ -24,24 +19,6 @@ def pressed():
     env.reset(seed=2)
     env.unwrapped.simulation.restart(np.array([0.03, 0.03, 0.039]))
     return run_script(env, [PressUntil(0.15, 0.008), Hold(0.1, name="a, hold"), Lift(0.006), Hold(0.05)])
-
-
-def test_what_it_says_of_itself():
-    trace = pressed()
-    assert [step.name for step in trace.steps] == ["PressUntil", "a, hold", "Lift", "Hold"]
-    assert [one.end for one in trace.steps[:-1]] == [one.start for one in trace.steps[1:]]
-    assert trace.start == trace.steps[0].start == 0.0 and trace.steps[-1].end == trace.haptic_time[-1]
-    assert trace.wrench.shape == (len(trace.haptic_time), 1, 6) and trace.tool_names == ("tip",)
-    np.testing.assert_allclose(trace.control_time, trace.haptic_time[49::50], atol=1e-12)
-    assert trace.observation.shape == (len(trace.control_time), 10) and trace.action.shape[1] == 4
-    # The environment's own account of the same forces.
-    assert trace.peak_force == pytest.approx(max(info["force_peak"] for info in trace.infos), rel=1e-14)
-    assert trace.reward.sum() == pytest.approx(-0.005 * len(trace.reward))
-    np.testing.assert_allclose(trace.force, trace.wrench[:, 0, :3])
-    assert trace.duration == pytest.approx(trace.haptic_time[-1])
-    for array in (trace.wrench, trace.observation, trace.depth):
-        with pytest.raises(ValueError, match="read-only"):
-            array[:] = 0.0
 
 
 def test_cuts_are_the_steps_and_together_the_whole():
@@ -115,20 +92,6 @@ def test_tables_read_back_to_the_bit_and_repeat_to_the_byte(tmp_path):
         trace.to_csv(tmp_path / "run.txt")
 
 
-NUMBERS = st.floats(-1e100, 1e100)
-NAMES = st.text(st.characters(codec="utf-8"), min_size=1).filter(str.isprintable)
-
-
-@given(arrays(np.float64, (3, 2, 6), elements=NUMBERS), NAMES)
-def test_any_force_and_any_name_survive_the_table(tmp_path_factory, wrench, name):
-    trace = made_up(wrench, name)
-    table = read(trace.to_csv(tmp_path_factory.mktemp("table") / "any.csv")[0])
-    first = table[0].index("left_force_x_N")
-    values = np.array([[float(value) for value in row[first:]] for row in table[1]])
-    assert values.tobytes() == wrench.reshape(3, 12).tobytes()
-    assert [row[1] for row in table[1]] == [name] * 3
-
-
 def made_up(wrench, name):
     """A trace of three haptic steps and no control step, with two tools."""
     time = np.array([0.001, 0.002, 0.003])
@@ -158,16 +121,3 @@ def test_the_total_force_is_that_of_all_tools():
     trace = made_up(wrench, "x")
     np.testing.assert_allclose(trace.force_size, [0.0, 5.0, 0.0])
     assert trace.peak_force == 5.0 and trace.info == {}
-
-
-def test_a_picture_in_a_file_and_in_axes_of_ones_own(tmp_path):
-    trace = pressed()
-    trace.plot(tmp_path / "run.png")
-    picture = imread(tmp_path / "run.png")
-    assert picture.shape[0] > 300 and picture.std() > 0.02
-    upper, lower = Figure().subplots(2, 1)
-    trace.plot((upper, lower))
-    assert upper.lines[0].get_ydata().tobytes() == trace.force_size.tobytes()
-    np.testing.assert_allclose(lower.lines[0].get_ydata(), trace.depth * 1e3)
-    assert [text.get_text() for text in upper.texts] == [step.name for step in trace.steps]
-    assert "[N]" in upper.get_ylabel() and "[mm]" in lower.get_ylabel() and "[s]" in lower.get_xlabel()

@@ -80,10 +80,3 @@ def test_shortfalls_have_reasons(tmp_path):
     path.write_text('[[shortfall]]\nreason = " "\ncases = { a = 0.1 }\n')
     with pytest.raises(ValueError, match="needs `cases` and a `reason`"):
         suite.load_shortfalls(path)
-
-
-def test_without_scikit_fem_its_rows_are_said_to_be_skipped(monkeypatch):
-    monkeypatch.setattr(suite, "has_fem", lambda: False)
-    cases = (Case("block", lambda: [row("block", 1.0)], needs_fem=True),)
-    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
-    assert found.passed and found.rows[0].verdict == "skipped" and "scikit-fem is not installed" in found.rows[0].note

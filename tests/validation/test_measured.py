@@ -47,21 +47,3 @@ def test_a_law_that_is_worse_than_linear_tissue_ends_with_status_1(folder, monke
     real = measured.identify_folder
     monkeypatch.setattr(measured, "identify_folder", spoilt)
     assert main(["validate", "--measured", str(folder), "--out", str(folder / "out")]) == 1
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda folder: folder / "gone", "there is no such folder"),
-        (lambda folder: folder, "no CSV file is there"),
-    ],
-)
-def test_a_folder_without_recordings_is_refused(tmp_path, make, words, capsys):
-    assert main(["validate", "--measured", str(make(tmp_path)), "--out", str(tmp_path / "out")]) == 2
-    assert words in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_quick_goes_without_measured(tmp_path, capsys):
-    assert main(["validate", "--quick", "--measured", str(tmp_path)]) == 2
-    assert "--quick goes without --measured" in capsys.readouterr().err

@@ -38,23 +38,6 @@ def test_advance_counts_contact_in_the_stable_step_and_refuses_a_foreign_state()
         advance(oracle.block(), state, dt=1e-5)
 
 
-def test_advance_refuses_shapes_and_counts_that_make_no_sense():
-    model = oracle.block()
-    state = rest_state(model, shape_count=1)
-    shapes = oracle.single_tool([[[0.0, 0.0, 0.1]] * 2], [0.008])
-    wrong = [
-        (shapes._replace(shape_tool=np.array([7], dtype=np.int32)), "names tools"),
-        (shapes._replace(tool_centre=np.full((1, 3), np.nan)), "tool_centre has a number that is not finite"),
-        (shapes._replace(tool_twist=np.zeros((2, 6))), "tool_twist has shape"),
-    ]
-    for one, message in wrong:
-        with pytest.raises(OrganError, match=message):
-            advance(model, state, dt=1e-5, shapes=one)
-    for count in (0, -1, 1.5, True):
-        with pytest.raises(OrganError, match="substep_count"):
-            advance(model, state, dt=1e-5, substep_count=count)
-
-
 HAPTIC_STEP = 1e-3  # [s]
 PRESS_SPEED = 0.01  # [m/s]
 SITES = {"a node": (0.03, 0.03, 0.03), "between nodes": (0.0312, 0.0287, 0.03)}

@@ -25,7 +25,7 @@ from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.foundation import Foundation
 from msdm_core.organ.motion import Motion, ground_work, steer
-from msdm_core.organ.stepping import advance_organ, describe_fault
+from msdm_core.organ.stepping import advance_organ
 from msdm_core.organ.support import Support, SupportLaw
 from tests.core import oracle
 from tests.core.lanes.test_lanes import DAMPED, LAW, SUBSTEP, SUBSTEPS, same, varied
@@ -166,13 +166,6 @@ def test_foundations_and_moving_ground_are_those_of_the_organ_alone():
     assert (np.array([ground_work(single) for single in both.alone]) != 0.0).all(), "the ground drags every lane"
 
 
-def test_lanes_on_other_nodes_of_the_ground_are_refused():
-    one = held(0)
-    fewer = one._replace(foundation_nodes=np.ascontiguousarray(one.foundation_nodes[::-1]))
-    with pytest.raises(OrganError, match=r"lane 1 has another foundation_nodes .* share tets, supports"):
-        stack_organs([one, fewer], own_rest=True)
-
-
 def test_squeezed_tets_are_those_of_the_organ_alone():
     """Lanes that begin with half their volume: the tets' own rest volumes tell how far they are squeezed."""
     both = Both([drawn(index) for index in range(8)])
@@ -204,28 +197,3 @@ def test_another_organ_comes_into_a_lane():
     with pytest.raises(OrganError, match="surface_count of the lanes' organs and of their states differ"):
         put_lane(both.state, 2, rest_state(drawn(5), shape_count=1))
         next(both.press(1))
-
-
-def test_a_fault_stops_its_lane_and_no_other():
-    both, whole = (Both([drawn(index) for index in range(4)]) for _ in range(2))
-    for one in (both, whole):
-        for _ in one.press(30):
-            pass
-    both.alone[1].node_velocity[100, 2] = np.nan
-    put_lane(both.state, 1, both.alone[1])
-    faults = next(both.press(1))
-    next(whole.press(1))
-    assert "no longer finite" in describe_fault(both.organs[1], get_lane(both.state, 1), int(faults[1]))
-    for lane in (0, 2, 3):
-        assert same(get_lane(both.state, lane), get_lane(whole.state, lane)) == []
-
-
-@pytest.mark.slow  # compiles float32 for rest shapes of their own
-def test_float32_presses_like_float64():
-    """Within 0.5 % of the largest force of a press."""
-    both, off, largest = Both([drawn(index) for index in range(8)], np.float32), 0.0, 0.0
-    for _ in both.press(300):
-        off = max(off, float(np.abs(both.lane_wrench[:, 0, :3] - both.wrench[:, 0, :3]).max()))
-        largest = max(largest, float(np.abs(both.wrench[:, 0, :3]).max()))
-    print(f"\nfloat32 off by {100.0 * off / largest:.3f} % of {largest:.3f} N")
-    assert largest > 0.05 and 0.0 < off < 0.005 * largest

@@ -1,8 +1,6 @@
-"""Springs fitted to the mesh: stiffness of whole bodies against the solid's, the fallback, the cache and the file."""
+"""Springs fitted to the mesh: stiffness of whole bodies against the solid's, and the fallback."""
 
-import gc
 import warnings
-import weakref
 from functools import cache
 
 import numpy as np
@@ -11,19 +9,14 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.sparse import csr_array
 
-from msdm_core.errors import OrganError
-from msdm_core.material import fitting
 from msdm_core.material.fitting import (
     LARGEST_RESIDUAL,
     SINGLE_NODE_SHARE,
     SMALLEST_FACTOR,
     UNIT_STRAINS,
-    dot,
     fit_springs,
     minimise_bounded,
-    read_fit,
     spring_fit,
-    write_fit,
 )
 from msdm_core.material.regions import Lesion, Material, lesion_fraction
 from msdm_core.material.stiffness import spring_network
@@ -97,16 +90,6 @@ def test_thick_block(cells: int):
     for axis in range(3):
         assert uniaxial_modulus(mesh, fitted, axis) == pytest.approx(MODULUS, rel=0.02)
     assert clamped_torsion(mesh, fitted) == pytest.approx(clamped_torsion(mesh, solid), rel=0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("nu", [0.25, 0.40, 0.45])
-def test_finer_prism(nu: float):
-    """At 5 mm, E within 2 % and torsion within 15 %, where formula (6) is 7 % and 31 % too stiff."""
-    mesh = prism(4)
-    fitted = body_matrix(mesh, "fitted", nu)
-    assert uniaxial_modulus(mesh, fitted) == pytest.approx(MODULUS, rel=0.02)
-    assert clamped_torsion(mesh, fitted) == pytest.approx(TORSION[nu], rel=0.15)
 
 
 # ---- the factors ------------------------------------------------------------------------------------------------
@@ -230,25 +213,6 @@ def test_minimum_is_the_one_that_scipy_finds():
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_no_convergence_is_said():
-    """A matrix that is not positive definite has no minimum."""
-    with pytest.raises(OrganError, match=r'did not converge in 60 rounds .* use stiffness_rule="lloyd"'):
-        minimise_bounded(csr_array(np.diag([1.0, -1.0])), np.array([0.0, 1.0]), np.ones(2), 0.05)
-
-
-def test_repeats_to_the_bit_and_ignores_the_place():
-    """The same mesh gives the same bits; turned by 90 degrees and moved, the same factors to the solver's tolerance."""
-    again = box_mesh(PRISM, (2, 5, 10))
-    np.testing.assert_array_equal(fit_springs(again).edge_factor, spring_fit(prism(2)).edge_factor)
-    turned = TetMesh(again.points[:, [1, 2, 0]] + [0.3, -0.2, 0.1], again.tets)
-    np.testing.assert_allclose(fit_springs(turned).edge_factor, spring_fit(prism(2)).edge_factor, atol=1e-3)
-
-
-def test_size_does_not_matter():
-    large = TetMesh(10.0 * prism(2).points, prism(2).tets)
-    np.testing.assert_allclose(fit_springs(large).edge_factor, spring_fit(prism(2)).edge_factor, atol=1e-3)
-
-
 # ---- lesions ----------------------------------------------------------------------------------------------------
 
 
@@ -308,51 +272,3 @@ def test_fallback_where_cells_of_several_sizes_meet():
     assert fit.report.fallback and fit.report.residual_after < LARGEST_RESIDUAL
     np.testing.assert_array_equal(fit.edge_factor, 1.0)
     assert np.unique(fit.tet_factor).tolist() == [fit.report.factor_smallest] == [fit.report.factor_largest]
-
-
-def test_cells_alike_are_no_reason_for_a_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        fit_springs(prism(2))
-
-
-# ---- cache, file, time ------------------------------------------------------------------------------------------
-
-
-def test_a_mesh_is_fitted_once_and_forgotten_with_it():
-    mesh = box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
-    fit = spring_fit(mesh)
-    spring_network(mesh, MODULUS, rule="fitted")
-    assert spring_fit(mesh) is fit
-    gone = weakref.ref(fit)
-    del fit, mesh
-    gc.collect()
-    assert gone() is None
-
-
-def test_file_keeps_a_fit(tmp_path):
-    mesh = box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
-    written = write_fit(tmp_path / "fit.npz", mesh)
-    twin = box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
-    read = read_fit(tmp_path / "fit.npz", twin)
-    np.testing.assert_array_equal(read.edge_factor, written.edge_factor)
-    np.testing.assert_array_equal(read.tet_factor, written.tet_factor)
-    assert read.report == written.report and spring_fit(twin) is read
-    with pytest.raises(OrganError, match="fitted to another mesh"):
-        read_fit(tmp_path / "fit.npz", prism(2))
-    (tmp_path / "bad.npz").write_bytes(b"nothing")
-    with pytest.raises(OrganError, match="cannot be read as fitted springs"):
-        read_fit(tmp_path / "bad.npz", twin)
-
-
-@pytest.mark.parametrize("cells", [(4, 10, 20), pytest.param((14, 14, 22), marks=pytest.mark.slow)])
-def test_a_fit_takes_few_products(cells: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch):
-    """The conjugate gradients' products with a matrix, each linear in the nodes, are as few for 9487 as for 1955.
-
-    They take a second on the machine that the limit was found on; two sums belong to each, some to each round.
-    """
-    sums = []
-    monkeypatch.setattr(fitting, "dot", lambda left, right: sums.append(dot(left, right)) or sums[-1])
-    report = fit_springs(box_mesh(0.005 * np.array(cells), cells)).report
-    assert 100 < len(sums) < 2000
-    assert 0.0 < report.duration and not report.fallback

@@ -1,7 +1,5 @@
 """Graded lattices: balance, conformity, shapes, fit, node counts and what the seams cost."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -18,10 +16,6 @@ from msdm_core.meshing import grading
 from msdm_core.meshing.grading import balanced_levels, octree_tets
 from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
 from msdm_core.meshing.stuffing import SurfaceBody, lattice_around, stuff
-
-ROOT = Path(__file__).parents[3]
-APPROACH = (0.0, 0.5**0.5, -(0.5**0.5))  # of scenes/organs/liver.toml, with its angle of the palpable face:
-FACE_ANGLE_DEG = 60.0
 
 
 def bumpy_body(seed):
@@ -152,63 +146,6 @@ def test_a_folded_tet_counts_as_poor():
     assert not grading._poor_tets(points, tets).any()
     points[4] = points[2] + 0.3
     assert grading._poor_tets(points, tets).any()
-
-
-def face_edges(mesh):
-    """Longest edge of each boundary triangle that faces the instrument [m], and its area [m^2]."""
-    corners = mesh.points[mesh.boundary_triangles]
-    edges = np.roll(corners, -1, axis=1) - corners
-    area = np.cross(edges[:, 0], edges[:, 1]) / 2
-    size = np.linalg.norm(area, axis=1)
-    facing = -area @ APPROACH >= np.cos(np.radians(FACE_ANGLE_DEG)) * size
-    return np.linalg.norm(edges, axis=2).max(axis=1)[facing], size[facing]
-
-
-def assert_meets_the_targets(vertices, faces, cell_size, coarsening, volume_error):
-    uniform = mesh_surface(vertices, faces, cell_size=cell_size)
-    fine = triangles_facing(vertices, faces, APPROACH, FACE_ANGLE_DEG)
-    mesh = mesh_surface(
-        vertices, faces, cell_size=cell_size, coarse_cell_size=coarsening * cell_size, fine_triangles=fine
-    )
-    quality = mesh_quality(mesh, (vertices, faces))
-    share = mesh.node_count / uniform.node_count
-    print(f"{coarsening} x {cell_size * 1000:g} mm: {quality}; {share:.3f} of {uniform.node_count} nodes")
-    assert_sound(mesh)
-    assert share <= 0.4
-    assert quality.dihedral_smallest_deg >= 8
-    assert abs(quality.volume_error) < volume_error
-    # The palpable face comes from fine cells: no triangle is longer than the diagonal of a cell's face. At the rim,
-    # where the surface bends out of the angle, a coarse triangle or two may still face the instrument.
-    longest, area = face_edges(mesh)
-    assert area[longest > 2**0.5 * cell_size].sum() <= 0.002 * area.sum()
-    assert area.sum() == pytest.approx(face_edges(uniform)[1].sum(), rel=0.02)
-
-
-@pytest.mark.slow
-def test_shipped_liver_with_a_fine_palpable_face():
-    solid = trimesh.load(ROOT / "scenes" / "meshes" / "liver.ply", process=False)
-    assert_meets_the_targets(np.array(solid.vertices), solid.faces, 0.009, 4, 0.04)
-
-
-@pytest.mark.slow
-def test_ct_liver_with_a_fine_palpable_face(anatomy_folder):
-    solid = trimesh.load(anatomy_folder / "openhelp_liver.stl", process=False)
-    assert_meets_the_targets(np.array(solid.vertices) * 1e-3, solid.faces, 0.008, 2, 0.015)
-
-
-@pytest.mark.slow
-def test_all_of_the_surface_is_fine_when_nothing_is_chosen_and_deeper_where_asked():
-    solid = trimesh.creation.icosphere(4, 0.08)
-    uniform, along, deep = (
-        mesh_surface(solid.vertices, solid.faces, cell_size=0.008, **graded)
-        for graded in ({}, {"coarse_cell_size": 0.032}, {"coarse_cell_size": 0.032, "fine_depth": 0.016})
-    )
-    assert along.node_count < deep.node_count < uniform.node_count
-    # Fine cells lie where those of the uniform lattice do; one layer below the surface it is cut alike.
-    known = {tuple(place) for place in deep.points.round(9)}
-    depth = 0.08 - np.linalg.norm(uniform.points, axis=1)
-    assert all(tuple(place) in known for place in uniform.points[depth < 0.016].round(9))
-    assert mesh_quality(deep).dihedral_smallest_deg == pytest.approx(mesh_quality(uniform).dihedral_smallest_deg)
 
 
 @pytest.mark.parametrize(("coarsening", "share"), [pytest.param(2, 0.4, marks=pytest.mark.slow), (4, 0.33)])

@@ -1,4 +1,4 @@
-"""Motion of what holds an organ: quasi-static, work against energy, damping, supports, lanes, bad input."""
+"""Motion of what holds an organ: quasi-static, work against energy, damping, supports, bad input."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,7 @@ import pytest
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
-from msdm_core.lanes.lanes import advance_lanes, get_lane, put_lane, rest_lanes, stack_organs, stack_shapes
+from msdm_core.lanes.lanes import advance_lanes, put_lane, rest_lanes, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Material
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
@@ -160,44 +160,17 @@ def test_a_support_carries_what_lies_on_it():
     assert support_forces(model, state)[0, 2] == pytest.approx(9.81 * model.node_mass.sum(), rel=1e-3)
 
 
-def test_lanes_move_as_organs_alone():
-    """Two lanes with signals of their own and one that stands still, to the bit."""
-    model = compile_organ(replace(HELD, motions=(BREATH, HEART)))
-    dt, signals = 0.5 * stable_dt(model), ([0.5, -0.2], [0.0, 0.0], [0.1, 0.9])
-    stacked, lanes = stack_organs([model] * 3), rest_lanes([model] * 3)
-    shapes, wrench = stack_shapes([NO_SHAPES] * 3, len(stacked.lanes)), np.zeros((len(stacked.lanes), 0, 6))
-    alone = [rest_state(model) for _ in signals]
-    for _ in range(5):
-        for lane, (state, signal) in enumerate(zip(alone, signals, strict=True)):
-            steer(state, signal, 5 * 40 * dt)
-            lanes.motion[lane] = state.motion
-            advance_organ(model, state, NO_SHAPES, NO_CONTACT, dt, 40, np.zeros((0, 6)))
-        advance_lanes(stacked, lanes, shapes, NO_CONTACT, dt, 40, wrench=wrench)
-    for lane, state in enumerate(alone):
-        found = get_lane(lanes, lane)
-        for name in ("node_position", "node_velocity", "motion"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(state, name), err_msg=name)
-    assert np.ptp([state.node_position[MARKER, 0] for state in alone]) > 1e-4
-
-
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("given", "named"),
     [
-        ({"displacement": (0.0, math.nan, 0.0)}, "displacement is .* 3 finite numbers"),
-        ({"displacement": (0.0, 0.1)}, "displacement"),
-        ({"reach": -1.0, "centre": (0.0, 0.0, 0.0)}, "reach is -1 m; it must be above 0"),
-        ({"reach": 0.1}, "give both"),
-        ({"centre": (0.0, 0.0, 0.0)}, "give both"),
+        ({"displacement": (0.0, math.nan, 0.0)}, "displacement is .*nan"),
+        ({"reach": -1.0, "centre": (0.0, 0.0, 0.0)}, "reach is -1"),
+        ({"reach": 0.1}, "centre"),
     ],
 )
-def test_motions_that_are_impossible_are_refused(given, words):
-    with pytest.raises(OrganError, match=words):
+def test_motions_that_are_impossible_are_refused(given, named):
+    with pytest.raises(OrganError, match=named):
         Motion(**{"name": "breathing", "displacement": (0.0, 0.0, 0.01), **given})
-
-
-def test_two_motions_of_one_name_are_refused():
-    with pytest.raises(OrganError, match="two motions are named 'breathing'"):
-        compile_organ(replace(HELD, motions=(BREATH, BREATH)))
 
 
 def test_a_state_of_an_organ_that_moves_otherwise_is_refused():

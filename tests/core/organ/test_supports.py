@@ -255,14 +255,6 @@ def test_lanes_rest_as_their_organs_do_alone():
             assert getattr(other, name).tobytes() == getattr(single, name).tobytes(), f"lane {lane}: {name}"
 
 
-def test_lanes_share_their_supports():
-    one, other = free_block(FLOOR), free_block(Support("floor", "plane", friction=0.1))
-    with pytest.raises(OrganError, match="lane 1 has another support_friction "):
-        stack_organs([one, other])
-    with pytest.raises(OrganError, match="lane 1 has another support_kind "):
-        stack_organs([one, free_block()])
-
-
 def test_a_state_of_other_supports_is_refused():
     with pytest.raises(OrganError, match=r"memory of supports .*0, 0, 3"):
         advance(free_block(FLOOR), rest_state(free_block(gravity=(0.0, 0.0, 0.0))), dt=1e-5)

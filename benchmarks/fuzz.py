@@ -384,11 +384,12 @@ def policy_cases(folder: Path) -> Iterator[Case]:
 
 def read_policy(path: Path) -> None:
     from surgsim_env.training.policy_files import load_policy
+    from surgsim_env.training.policy_network import PolicyNetwork
 
     policy = load_policy(path)
     policy.reset(2)
-    # Not zeros: a policy of sites refuses lengths of 0.
-    policy.act(np.full((2, *policy.observation_shape), 0.5, dtype=np.float32))
+    if isinstance(policy.decider, PolicyNetwork) and policy.decider.layout.features is None:
+        policy.act(np.full((2, policy.decider.layers[0].in_features), 0.5, dtype=np.float32))
 
 
 KINDS = {
@@ -400,7 +401,7 @@ KINDS = {
         Kind("arms", arm_cases, read_arm),
         Kind("states", state_cases, read_state),
         Kind("csv", csv_cases, read_csv),
-        Kind("policies", policy_cases, read_policy, needs="stable_baselines3"),
+        Kind("policies", policy_cases, read_policy, needs="safetensors"),
     )
 }
 

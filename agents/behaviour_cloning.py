@@ -1,7 +1,7 @@
 """Clone a policy from a Minari data set of flat observations (`agents/record_demonstrations.py` writes such sets).
 
-    python -m agents.behaviour_cloning surgsim/retract/oracle-v0 --out runs/clone.json
-    surgsim evaluate --policy runs/clone.json --seeds 500000:500009
+python -m agents.behaviour_cloning surgsim/retract/oracle-v0 --out runs/clone.json
+surgsim evaluate --policy runs/clone.json --seeds 500000:500009
 """
 
 import argparse

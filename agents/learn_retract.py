@@ -14,7 +14,6 @@ import argparse
 import json
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -177,7 +176,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--steps", type=int, default=170, help="control steps of each environment in a round")
     parser.add_argument("--envs", type=int, default=16)
-    parser.add_argument("--updates", type=int, default=2000, help="minibatches of a fit; the last one has twice as many")
+    parser.add_argument("--updates", type=int, default=2000, help="minibatches of a fit, twice as many of the last")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -188,7 +187,7 @@ def main() -> None:
     if given.pictures:
         network = PolicyNetwork(NetworkLayout("relu", "PictureAndForce"), (920, 128, 64, 5))
     else:
-        network = PolicyNetwork(NetworkLayout("tanh"), (envs.single_observation_space.shape[0], 128, 128, 5), normalised=True)
+        network = PolicyNetwork(NetworkLayout("tanh"), (56, 128, 128, 5), normalised=True)
     player, samples, began = Player(envs, pictures=given.pictures, seed=given.seed), Samples(), time.time()
     for index in range(given.rounds):
         won = player.play(network, samples, given.steps, (*EXPERT_SHARES, 0.0)[min(index, len(EXPERT_SHARES))])

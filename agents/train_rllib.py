@@ -14,7 +14,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
 
 with one_line_errors(__name__, "distributed"):
@@ -30,7 +29,7 @@ MODULE = Path("runs/rllib/module")
 
 def make_env(context: dict[str, Any]) -> Any:
     """One environment, or as many in lanes as RLlib asks for; it runs in the workers."""
-    import surgsim_env  # noqa: F401
+    import surgsim_env  # noqa: F401  (registers the ids)
 
     if "num_envs" not in context:
         return gym.make(ENV_ID, **ENV_KWARGS)

@@ -77,7 +77,7 @@ class Acquisition:
         fresh = process.candidates & ~pressed
         allowed = fresh if fresh.any() else process.candidates
         worth = self.worth(process, belief).masked_fill(~torch.as_tensor(allowed), -torch.inf)
-        # Mirror images on a symmetric face differ by rounding: as shares of the whole most are equal, and the first wins.
+        # Mirror images on a symmetric face differ by rounding: as shares most are equal, and the first of them wins.
         logits = SHARPNESS * worth
         return int(torch.softmax(logits - logits.logsumexp(0), dim=0).argmax())
 

@@ -127,8 +127,8 @@ class TrainedPolicy:
             return
         if wrong := [one for one in {**reads, **given} if reads.get(one) != given.get(one)]:
             raise ValueError(
-                f"{name} reads {({one: reads.get(one) for one in wrong})} where the observation of {own.env_id} with "
-                f"{own.env_kwargs} has {({one: given.get(one) for one in wrong})}: make the environment as the "
+                f"{name} reads { ({one: reads.get(one) for one in wrong}) } where the observation of {own.env_id} with "
+                f"{own.env_kwargs} has { ({one: given.get(one) for one in wrong}) }: make the environment as the "
                 "policy's file says"
             )
         scene = env.unwrapped.scene.name  # type: ignore[attr-defined]

@@ -19,7 +19,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["p
 # Names that packages of the extras are imported by.
 PACKAGES = {
     *("cma", "minari", "moviepy", "msgspec", "pettingzoo", "ray", "safetensors", "sklearn"),
-    *("stable_baselines3", "torch", "viser", "websockets"),
+    *("stable_baselines3", "torch", "tqdm", "viser", "websockets"),
 }
 # Of ours, what imports them; imported anew here.
 NEEDING = (
@@ -65,7 +65,7 @@ def without_extras(monkeypatch) -> Iterator[None]:
 
 def test_the_scripts_that_need_extras_declare_them():
     names = {Path(name).stem for name in SCRIPTS}
-    assert names >= {"behaviour_cloning", "learn_from_scratch", "learn_retract", "live_browser", "record_demonstrations"}
+    assert names >= {"behaviour_cloning", "learn_from_scratch", "live_browser", "record_demonstrations"}
     for extras in SCRIPTS.values():
         assert all(extra.strip('"') in EXTRAS for extra in extras.split(", "))
 

@@ -22,6 +22,8 @@ from surgsim_env.training.picture_features import PictureAndForce
 from surgsim_env.training.policy_files import load_policy
 
 pytestmark = pytest.mark.agents
+
+
 @pytest.fixture(scope="module")
 def opengl():
     try:

@@ -92,10 +92,10 @@ def test_the_actor_of_stable_baselines3_acts_as_its_model(drawn: bool):
     model = stable_baselines3.PPO("MlpPolicy", gym.make(ENV_ID), n_steps=8, batch_size=8, seed=0, device="cpu")
     made = actor_of(model.policy, NetworkLayout("tanh"), drawn=drawn)
     wanted, _ = model.predict(seen(3), deterministic=True)
-    spread = np.exp(0.0) if drawn else 0.0
     acted = [made.actions(seen(3), [torch.Generator().manual_seed(n + one) for n in range(3)]) for one in range(200)]
-    assert np.std(acted, axis=0).max() <= spread
-    np.testing.assert_allclose(np.mean(acted, axis=0), wanted, atol=0.3 if drawn else 0.0)
+    # Means of 200 draws of a unit normal, cut to [-1, 1], are off by 4 x 0.72 / 14 at most.
+    np.testing.assert_allclose(np.mean(acted, axis=0), wanted, atol=0.21 if drawn else 1e-6)
+    assert (np.std(acted, axis=0) > 0.6).all() == drawn
 
 
 DAMAGES = {
@@ -140,5 +140,5 @@ def test_a_policy_does_not_act_on_other_observations():
     policy.check_environment(gym.make(ENV_ID, scene="phantom_small", memory=True))
     with pytest.raises(ValueError, match="make the environment as the policy's file says"):
         policy.check_environment(gym.make(ENV_ID, scene="phantom_small"))
-    with pytest.raises(ValueError, match="was trained on the scene 'phantom_small', .* cannot play 'phantom'"):
+    with pytest.raises(ValueError, match=r"was trained on the scene 'phantom_small', .* cannot play 'phantom'"):
         policy.check_environment(gym.make(ENV_ID, scene="phantom", memory=True))

@@ -36,6 +36,8 @@ with one_line_errors(__name__, "agents"):
     from surgsim_env.training.touch_features import TouchSummary
 
 ENVS, REPEAT = 16, 5
+# Of each periodic evaluation.
+EPISODES = 48
 # Seeds of training and of its evaluations; scores use seeds from 1,000,000.
 TRAINING_SEED, EVALUATION_SEED = 2_000_000, 500_000
 COMMON: dict[str, Any] = {"n_steps": 64, "batch_size": 128, "n_epochs": 10, "gae_lambda": 0.95, "clip_range": 0.2}
@@ -168,7 +170,7 @@ def train(recipe: Recipe, folder: Path, seed: int, *, decisions: int | None = No
         CurriculumCallback(recipe, staged),
         CheckpointCallback(every // ENVS, str(folder), "checkpoint", save_vecnormalize=True),
         # The search is the policy's random walk: its mean action does not search.
-        EvalCallback(*(evaluated, None, None, 48, every // ENVS), log_path=logs, deterministic=False, verbose=0),
+        EvalCallback(*(evaluated, None, None, EPISODES, every // ENVS), log_path=logs, deterministic=False, verbose=0),
     ]
     left = total - model.num_timesteps
     model.learn(left, callbacks, reset_num_timesteps=model.num_timesteps == 0)  # type: ignore[arg-type]

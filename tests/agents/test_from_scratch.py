@@ -178,9 +178,10 @@ def test_a_run_leaves_a_policy_that_plays_and_is_resumed(tmp_path: Path, monkeyp
     stages = (recipe.stages[0], Stage(256, novelty=0.1))
     recipe = replace(recipe, stages=stages, settings={**recipe.settings, "n_steps": 8, "batch_size": 32, "n_epochs": 1})
     monkeypatch.setattr(learn_from_scratch, "ENVS", 4)
-    model = train(recipe, tmp_path, 0, decisions=64, every=32)
+    monkeypatch.setattr(learn_from_scratch, "EPISODES", 4)
+    model = train(recipe, tmp_path, 0, decisions=64, every=64)
     assert model.num_timesteps == 64 and model.get_env().venv.stage == stages[0]
-    again = train(recipe, tmp_path, 0, decisions=288, every=32)
+    again = train(recipe, tmp_path, 0, decisions=288, every=288)
     assert again.num_timesteps == 288 and again.get_env().venv.stage == stages[1]
     assert (tmp_path / "from_64" / "progress.csv").is_file() and (tmp_path / "from_0" / "evaluations.npz").is_file()
     policy = load_policy(tmp_path / "policy.json")

@@ -50,7 +50,9 @@ class NetworkLayout:
 class PolicyNetwork(nn.Module):
     """A policy's network; called with observations it gives the mean actions."""
 
-    def __init__(self, layout: NetworkLayout, sizes: Sequence[int], *, normalised: bool = False, drawn: bool = False):
+    def __init__(
+        self, layout: NetworkLayout, sizes: Sequence[int], *, normalised: bool = False, drawn: bool = False
+    ) -> None:
         """Make the network with weights as torch initialises them.
 
         Args:

@@ -420,6 +420,5 @@ def test_level_and_motion_beside_a_policy_are_honoured(tmp_path: Path) -> None:
     assert (made.scene, made.env_kwargs["level"], made.motion) == ("phantom", "easy", "calm")
     assert set(made.origin["agent"]) == {path.name}
     assert made.command == (
-        "surgsim evaluate --policy agents/policies/sites_evolved.json --scene phantom --level easy "
-        "--seeds 3 --motion calm"
+        "surgsim evaluate --policy agents/policies/sites_evolved.json --level easy --seeds 3 --motion calm"
     )

@@ -1,6 +1,6 @@
 """Teach a network the expert of SurgSim/Palpate-v0 on any organ, and correct it where it plays itself (DAgger).
 
-    python -m agents.learn_palpate_organs --out runs/palpate_organs.safetensors
+    python -m agents.learn_palpate_organs --out runs/palpate_organs.json
 
 The network sees the observation alone, through `surgsim_env.training.face_features.FaceSummary`. It is fitted to
 imagined features, which fill their ranges, and to the states that it reaches on organs whose forces a formula gives
@@ -10,7 +10,7 @@ kept in place of observations of 5069 numbers.
 
 import argparse
 import time
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,25 +20,23 @@ from agents.command_line import one_line_errors
 with one_line_errors(__name__, "agents"):
     import gymnasium as gym
     import torch
-    from stable_baselines3 import PPO
 
     from surgsim_env.scoring.expert_organs import DEPTH, expert_actions
     from surgsim_env.training.face_features import (
         LATE,
-        OBSERVATION_SIZE,
         SUMMARY_SIZE,
         WAY_MOST,
         FaceFeatures,
-        FaceSummary,
         face_features,
         face_summary,
     )
     from surgsim_env.training.face_surrogate import FaceSurrogate
-    from surgsim_env.training.imitation import CloningOptions, clone
-    from surgsim_env.training.policy_files import TrainedPolicy, describe, policy_path, save_policy
+    from surgsim_env.training.fit import fit
+    from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+    from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
 
 ENV_ID = "SurgSim/Palpate-v0"
-NETWORK = {"net_arch": [192, 192], "activation_fn": torch.nn.ELU}
+BATCH = 512
 KWARGS = {"memory": True, "frame": "face"}
 # Errors of the player: first-order autoregressive noise on the velocity of every other organ.
 ERROR, ERROR_KEPT = 0.15, 0.9
@@ -46,13 +44,6 @@ ERROR, ERROR_KEPT = 0.15, 0.9
 REPEAT = 4.0
 # The organs of a round; the first scene stands in the policy's file.
 SCENES = ["liver"] * 3 + ["liver_family"] * 2 + ["kidney_family"] * 2 + ["spleen_family", "phantom", "phantom"]
-
-
-class _Spaces(gym.Env):
-    """Spaces for an algorithm that is fitted and plays nothing itself."""
-
-    def __init__(self, observation_space: gym.Space, action_space: gym.Space) -> None:
-        self.observation_space, self.action_space = observation_space, action_space
 
 
 def imagined(count: int, rng: np.random.Generator) -> FaceFeatures:
@@ -93,15 +84,13 @@ def _ways(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     return size * way / np.abs(way).max(axis=1, keepdims=True)
 
 
-def play_round(envs: FaceSurrogate, policy: TrainedPolicy | None) -> tuple[NDArray, NDArray, list[bool]]:
+def play_round(envs: FaceSurrogate, policy: PolicyNetwork | None) -> tuple[NDArray, NDArray, list[bool]]:
     """Features (n, SUMMARY_SIZE) of the states that a policy reaches, the expert's actions there (n, 4), and successes.
 
     The policy plays an episode in each environment, or the expert if there is none.
     """
     count = len(envs.envs)
-    observations, begins = envs.reset(), np.ones(count, dtype=np.bool_)
-    if policy is not None:
-        policy.reset(count)
+    observations = envs.reset()
     error = np.zeros((count, 3))
     seen, labels = [], []
     while not envs.over.all():
@@ -110,56 +99,44 @@ def play_round(envs: FaceSurrogate, policy: TrainedPolicy | None) -> tuple[NDArr
             wanted, features = expert_actions(found).numpy(), face_summary(found).numpy()
         seen.append(features[~envs.over])
         labels.append(wanted[~envs.over])
-        action = wanted.copy() if policy is None else policy.act(observations, begins)
-        begins[:] = False
+        action = wanted.copy() if policy is None else policy.actions(observations, ())
         error = ERROR_KEPT * error + ERROR * envs.rng.normal(size=error.shape)
         action[:, :3] = np.clip(action[:, :3] + error * (np.arange(count) % 2 == 0)[:, None], -1.0, 1.0)
         observations = envs.step(action)
     return np.concatenate(seen), np.concatenate(labels), [bool(info["success"]) for info in envs.infos]
 
 
-def fitted(
-    seen: NDArray, labels: NDArray, *, imagined_count: int, options: CloningOptions, model: PPO | None = None
-) -> tuple[PPO, float]:
-    """A network on features, and its loss: fitted to labelled features, each REPEAT times, and to imagined ones."""
-    rng = np.random.default_rng(options.seed)
+def refit(
+    network: PolicyNetwork,
+    seen: NDArray,
+    labels: NDArray,
+    *,
+    imagined_count: int,
+    epochs: int,
+    rates: tuple[float, float],
+    seed: int,
+) -> float:
+    """Fit the layers to labelled features, each with the weight REPEAT, and to imagined ones; returns the loss."""
     with torch.no_grad():
-        made = imagined(imagined_count, rng)
+        made = imagined(imagined_count, np.random.default_rng(seed))
         inputs, wanted = face_summary(made).numpy(), expert_actions(made).numpy()
-    action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
-    space = gym.spaces.Box(-np.inf, np.inf, (SUMMARY_SIZE,), np.float32)
-    model = model or PPO("MlpPolicy", _Spaces(space, action_space), policy_kwargs=NETWORK, device="cpu", seed=0)
     weight = np.concatenate([np.full(len(seen), REPEAT), np.ones(imagined_count)])
-    curve = clone(
-        *(model, np.concatenate([seen, inputs]), np.concatenate([labels, wanted])),
-        sample_weight=weight, options=options,
-    )  # fmt: skip
-    return model, curve.validation[curve.best]
-
-
-def on_observations(model: PPO) -> PPO:
-    """The network of `fitted` behind the extractor that gives its features."""
-    space: gym.Space = gym.spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
-    arguments = {**NETWORK, "features_extractor_class": FaceSummary}
-    whole = PPO("MlpPolicy", _Spaces(space, model.action_space), policy_kwargs=arguments, device="cpu", seed=0)
-    whole.policy.load_state_dict(model.policy.state_dict())
-    return whole
-
-
-def save(model: PPO, env: gym.Env, scene: str, level: str | None, steps: int, out: Path) -> TrainedPolicy:
-    """Write the policy's files; returns it."""
-    whole = on_observations(model)
-    description = describe(
-        *(whole, None, env), env_id=ENV_ID, env_kwargs={"scene": scene, "level": level, **KWARGS}, trained_steps=steps
+    return fit(
+        network.layers,
+        np.concatenate([seen, inputs]),
+        np.concatenate([labels, wanted]),
+        weight=(weight / weight.mean())[:, None],
+        updates=epochs * len(weight) // BATCH + 1,
+        rates=rates,
+        batch=BATCH,
+        seed=seed,
     )
-    save_policy(whole.policy, description, out)
-    return TrainedPolicy(whole.policy, description)
 
 
 def main() -> None:
     """Train; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
+    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.json")
     parser.add_argument("--scenes", nargs="+", default=SCENES, help="organs of a round, each played once")
     parser.add_argument("--level", default="standard")
     parser.add_argument("--rounds", type=int, default=5, help="the first is the expert's")
@@ -168,23 +145,31 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2_000_000)
     given = parser.parse_args()
     torch.set_num_threads(1)
+    torch.manual_seed(given.seed)
     begin = time.time()
     envs = FaceSurrogate(
         [gym.make(ENV_ID, scene=scene, level=given.level, **KWARGS) for scene in given.scenes],
         np.random.default_rng(given.seed),
     )
     seen, labels = np.zeros((0, SUMMARY_SIZE), np.float32), np.zeros((0, 4), np.float32)
-    model, policy = None, None
+    network = PolicyNetwork(NetworkLayout("elu", "FaceSummary"), (SUMMARY_SIZE, 192, 192, 4))
+    description = PolicyDescription(
+        env_id=ENV_ID,
+        env_kwargs={"scene": given.scenes[0], "level": given.level, **KWARGS},
+        observation=observation_declaration(envs.envs[0]),
+    )
     for index in range(given.rounds):
-        new_seen, new_labels, won = play_round(envs, policy)
+        new_seen, new_labels, won = play_round(envs, network if index else None)
         seen, labels = np.concatenate([seen, new_seen]), np.concatenate([labels, new_labels])
         last = index == given.rounds - 1
-        options = CloningOptions(
-            epochs=given.epochs * (4 if last else 1), patience=8, batch_size=512, std=0.05, seed=index,
-            learning_rate=3e-4 if last else 1e-3,
-        )  # fmt: skip
-        model, loss = fitted(seen, labels, imagined_count=given.imagined, options=options, model=model)
-        policy = save(model, envs.envs[0], given.scenes[0], given.level, len(seen), given.out)
+        loss = refit(
+            *(network, seen, labels),
+            imagined_count=given.imagined,
+            epochs=given.epochs * (4 if last else 1),
+            rates=(3e-4, 3e-5) if last else (1e-3, 3e-4),
+            seed=index,
+        )
+        save_policy(network, replace(description, trained_steps=len(seen)), given.out)
         print(
             f"{time.time() - begin:6.0f} s round {index}: success {np.mean(won):.2f}, {len(seen)} steps, "
             f"loss {loss:.5f}",

@@ -1,130 +1,213 @@
-"""Learn SurgSim/Retract-v0 from the scripted expert with DAgger: the policy plays, the expert labels.
+"""Learn SurgSim/Retract-v0 from a scripted expert with DAgger: the policy plays, the expert labels.
 
-    python -m agents.learn_retract --rounds 6 --out runs/retract_dagger.safetensors
-    python -m agents.learn_retract --rounds 6 --without-force --out runs/retract_dagger_without_force.safetensors
+    python -m agents.learn_retract --rounds 6 --out runs/retract_dagger.json
+    python -m agents.learn_retract --pictures --rounds 22 --out runs/retract_pixels.json
 
-With `--without-force` the policy sees 0 in place of the jaw's wrench, its grip and its pull; the expert sees all
-channels. The result is a policy of stable-baselines3's PPO, from which `surgsim train` can start (`warm_start`).
+With `--pictures` the policy sees the endoscope's picture of 84 x 84 pixels and the force sensor (obs_mode="rgb_force")
+alone: not where tip, lobe or target are, nor how far the jaw is open. Its expert knows them, but acts on the target's
+place only once the target is in sight, so that a policy can know what it knows. Each state is kept under two looks of
+the split "train". Hard pulls are rare, and tear tissue: they are imagined. Forces of states in which something is
+pulled are scaled up, and the expert, which gives way to them, labels these too.
 """
 
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from agents.command_line import one_line_errors
-from surgsim_env.scoring.expert_retract import RetractExpert
+from surgsim_env.rendering.looks import draw_look, find_look_ranges
+from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, RetractExpert, TolerantExpert
 
 with one_line_errors(__name__, "agents"):
     import torch
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.vec_env import VecNormalize
 
-    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
-    from surgsim_env.training.environments import blinded
-    from surgsim_env.training.imitation import CloningOptions, dagger
-    from surgsim_env.training.policy_files import describe, policy_path, save_policy
+    from surgsim_env.training.fit import fit
+    from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+    from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
 
 ID = "SurgSim/Retract-v0"
-# The same as in the configurations of `surgsim train` that start from the result.
-NETWORK = {"net_arch": [128, 128], "activation_fn": torch.nn.Tanh}
-# Training seeds; scores use seeds from 1,000,000, periodic evaluations from 500,000.
+PICTURES: dict[str, Any] = {"obs_mode": "rgb_force", "looks": "train"}
+# Training seeds; scores use seeds from 1,000,000.
 FIRST_SEED = 2_000_000
+# Along the lobe, where the expert of pictures grasps it: the middle of the edge [m].
+GRASP_ALONG = 0.04
+# Noise on played actions, of full scale 1, so that a policy learns to recover (DART, Laskey et al. 2017).
+DISTURBANCE = 0.06
+# Of the first rounds, the share of steps that the expert plays.
+EXPERT_SHARES = (1.0, 0.3)
+# Channels that a layer beside the policy, which is not kept, predicts from features of pictures: they teach what to
+# look at. The errors of all of them together count as much as TAUGHT_WEIGHT entries of the action.
+TAUGHT = ("tip_position", "opening", "holds", "edge_points", "visible")
+TAUGHT_WEIGHT = 0.5
+# Share of states with a pull above PULL_LEAST [N] that are kept a second time, with an imagined pull [N]. States in
+# which the jaw pushes without holding anything are rare: all of them are kept, with UNHELD_PULLS imagined pulls each.
+# Of the others SLIPPED_SHARE are imagined without a grip, as if the edge had just slipped out.
+IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL, UNHELD_PULLS, SLIPPED_SHARE = 0.2, 0.05, (0.4, 1.3), 4, 0.3
 
 
-class SeeingExpert:
-    """The expert in each environment; it sees the unmodified observation, whatever the policy is shown."""
+class TaughtNetwork(torch.nn.Module):
+    """A policy's network and a layer that predicts TAUGHT from its features."""
 
-    def __init__(self, envs: VectorEnv) -> None:
-        self._singles = [env.unwrapped for env in envs.unwrapped.envs]  # type: ignore[attr-defined]
-        self._expert = RetractExpert()
+    def __init__(self, network: PolicyNetwork, taught_count: int) -> None:
+        super().__init__()
+        self.network = network
+        self.taught = torch.nn.Linear(network.features.features_dim, taught_count)  # type: ignore[arg-type]
 
-    def __call__(self, observations: NDArray, begun: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Actions (n_env, 5); both arguments are the policy's."""
-        return np.array([self._expert.act(one.task_observation) for one in self._singles])
+    def forward(self, observations: Any) -> torch.Tensor:
+        """Mean actions and predictions (n, n_action + n_taught)."""
+        features = self.network.features(self.network.read(observations))
+        return torch.cat([self.network.layers(features), self.taught(features)], dim=1)
 
 
-class Blind(VectorWrapper):
-    """Environments with some entries of their observations set to 0; `final_obs` is not changed.
+@dataclass
+class Samples:
+    """Labelled states: lists of arrays (n, ...).
 
-    Gymnasium's own wrapper refuses environments that reset in the same step.
+    Fields:
+        seen: observations; with pictures dictionaries
+        labels: the expert's actions, and beside pictures the scaled channels of TAUGHT
     """
 
-    def __init__(self, envs: VectorEnv, entries: Sequence[int]) -> None:
-        super().__init__(envs)
-        self._entries = list(entries)
+    seen: list[Any] = field(default_factory=list)
+    labels: list[NDArray[np.float32]] = field(default_factory=list)
 
-    def reset(self, **kwargs: Any) -> tuple[NDArray, dict[str, Any]]:
-        """Start an episode everywhere."""
-        observations, info = self.env.reset(**kwargs)
-        return blinded(observations, self._entries), info
-
-    def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
-        """One control step of all."""
-        observations, *rest = self.env.step(actions)
-        return (blinded(observations, self._entries), *rest)  # type: ignore[return-value]
+    def joined(self) -> tuple[Any, NDArray[np.float32]]:
+        """All observations, and their labels."""
+        if isinstance(self.seen[0], dict):
+            parts = {name: np.concatenate([one[name] for one in self.seen]) for name in self.seen[0]}
+            return parts, np.concatenate(self.labels)
+        return np.concatenate(self.seen), np.concatenate(self.labels)
 
 
-def learn(arguments: argparse.Namespace) -> None:
-    """Run DAgger; save the policy and print a line of figures after each round."""
-    torch.set_num_threads(1)
-    # DAgger requires environments that reset in the same step.
-    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep", "dtype": arguments.dtype}
-    envs = gym.make_vec(ID, num_envs=arguments.envs, threads=arguments.threads, **lanes)
-    expert = SeeingExpert(envs)
-    entries = list(envs.unwrapped.envs[0].unwrapped.task.force_entries) if arguments.without_force else []  # type: ignore[attr-defined]
-    normalisation = VecNormalize(VectorEnvForStableBaselines(envs), norm_reward=False)
-    model = PPO("MlpPolicy", normalisation, policy_kwargs=NETWORK, seed=arguments.seed, device="cpu")
-    options = CloningOptions(epochs=arguments.epochs, patience=15, std=0.05, seed=arguments.seed)
-    began, rounds = time.time(), []
-    for done in dagger(
-        Blind(envs, entries),
-        expert,
-        model,
-        rounds=arguments.rounds,
-        steps=arguments.steps,
-        expert_share=lambda index: 1.0 if index == 0 else 0.3 if index == 1 else 0.0,
-        disturbance=arguments.disturbance,
-        normalisation=normalisation,
-        options=options,
-        seed=FIRST_SEED + 10_000 * arguments.seed,
-    ):
-        rounds.append({**vars(done), "seconds": round(time.time() - began)})
-        print(json.dumps(rounds[-1]), flush=True)
-        description = describe(
-            model,
-            normalisation,
-            envs.unwrapped.envs[0],  # type: ignore[attr-defined]
-            env_id=ID,
-            force_entries=entries,
-            trained_steps=done.sample_count,
-            seed=arguments.seed,
-        )
-        save_policy(model.policy, description, arguments.out)
-    envs.close()
+class Player:
+    """Plays environments, and labels what it sees."""
+
+    def __init__(self, envs: gym.vector.VectorEnv, *, pictures: bool, seed: int) -> None:
+        self.envs, self.pictures = envs, pictures
+        self.singles: list[Any] = [env.unwrapped for env in envs.unwrapped.envs]  # type: ignore[attr-defined]
+        self.rng = np.random.default_rng(seed)
+        self.ranges = find_look_ranges(PICTURES["looks"])
+        self.expert = TolerantExpert(grasp_along=GRASP_ALONG) if pictures else RetractExpert()
+        parts = [self.singles[0].observation_slices[name] for name in TAUGHT]
+        self.taught = np.concatenate([np.arange(part.start, part.stop) for part in parts])
+        self.turning = self.singles[0].task.action_slices["turning"]
+        # All readings but the grip's grow with the pull.
+        self.pulled = np.array([entry != SLICES["grip_force"].start for entry in self.singles[0].task.force_entries])
+        self.seen, _ = envs.reset(seed=FIRST_SEED + 10_000 * seed)
+
+    def play(self, network: PolicyNetwork, samples: Samples, steps: int, expert_share: float) -> list[bool]:
+        """Play so many control steps of all environments; returns whether each episode that ended succeeded."""
+        won: list[bool] = []
+        for _ in range(steps):
+            wanted = np.array([self.expert.act(one.task_observation) for one in self.singles])
+            self.keep(samples, wanted)
+            by_expert = self.rng.random((len(wanted), 1)) < expert_share
+            taken = np.where(by_expert, wanted, network.actions(self.seen, ()) if expert_share < 1.0 else wanted)
+            noise = self.rng.normal(scale=DISTURBANCE, size=taken.shape)
+            if self.pictures:
+                # Their expert does not turn the wrist back.
+                noise[:, self.turning] = 0.0
+            taken = np.clip(taken + noise, -1.0, 1.0).astype(np.float32)
+            self.seen, _, terminated, truncated, info = self.envs.step(taken)
+            won += [bool(info["final_info"]["success"][index]) for index in np.flatnonzero(terminated | truncated)]
+        return won
+
+    def keep(self, samples: Samples, wanted: NDArray[np.float32]) -> None:
+        """Add the present states with the expert's actions; pictures under another look too, and imagined pulls."""
+        if not self.pictures:
+            samples.seen.append(self.seen.copy())
+            samples.labels.append(wanted)
+            return
+        taught = np.array([one.as_observed(one.task_observation)[self.taught] for one in self.singles])
+        other = np.stack([one.picture(draw_look(self.ranges, self.rng)) for one in self.singles])
+        for picture in (self.seen["picture"].copy(), other):
+            samples.seen.append({"picture": picture, "force": self.seen["force"].copy()})
+            samples.labels.append(np.concatenate([wanted, taught], axis=1))
+        chosen, forces, actions = self.imagined()
+        if len(chosen):
+            samples.seen.append({"picture": self.seen["picture"][chosen].copy(), "force": forces})
+            samples.labels.append(np.concatenate([actions, taught[chosen]], axis=1))
+
+    def imagined(self) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+        """Some of the present states with a harder pull: their numbers (k,), readings and the expert's actions."""
+        pulls, holds = np.array([one.task_observation[[PULL, HOLDS]] for one in self.singles]).T
+        held = self.rng.random(len(pulls)) < IMAGINED_SHARE
+        count = np.where(holds > 0.5, held, UNHELD_PULLS)
+        chosen = np.repeat(np.arange(len(pulls)), np.where(pulls > PULL_LEAST, count, 0))
+        forces, actions = self.seen["force"][chosen].copy(), []
+        for row, index in enumerate(chosen):
+            observation = self.singles[index].task_observation.copy()
+            factor = self.rng.uniform(*IMAGINED_PULL) / observation[PULL]
+            observation[PULL] *= factor
+            forces[row, self.pulled] *= factor
+            if observation[HOLDS] > 0.5 and self.rng.random() < SLIPPED_SHARE:
+                observation[[HOLDS, GRIP]] = 0.0
+                forces[row, ~self.pulled] = 0.0
+            actions.append(self.expert.act(observation))
+        return chosen, forces, np.array(actions, dtype=np.float32)
+
+
+def learn(network: PolicyNetwork, samples: Samples, *, updates: int, rates: tuple[float, float], seed: int) -> float:
+    """Fit a network to all samples; returns the mean loss."""
+    seen, labels = samples.joined()
+    if not isinstance(seen, dict):
+        network.normalise_by(seen)
+        return fit(network, seen, labels, updates=updates, rates=rates, seed=seed)
+    taught = labels[:, network.action_size :]
+    labels[:, network.action_size :] = (taught - taught.mean(axis=0)) / (taught.std(axis=0) + 1e-3)
+    weight = np.ones(labels.shape[1])
+    weight[network.action_size :] = TAUGHT_WEIGHT / taught.shape[1]
+    whole = TaughtNetwork(network, taught.shape[1])
+    return fit(whole, seen, labels, updates=updates, rates=rates, batch=128, weight=weight, seed=seed)
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run DAgger; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
-    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.json")
+    parser.add_argument("--pictures", action="store_true", help="from pictures and force, not from the state")
+    parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--steps", type=int, default=170, help="control steps of each environment in a round")
     parser.add_argument("--envs", type=int, default=16)
-    parser.add_argument("--epochs", type=int, default=200, help="of each fit, at most")
-    parser.add_argument("--disturbance", type=float, default=0.06, help="noise on actions while it plays, full scale 1")
-    parser.add_argument("--dtype", choices=("float64", "float32"), default="float32")
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--updates", type=int, default=2000, help="minibatches of a fit, twice as many of the last")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--without-force", action="store_true")
-    learn(parser.parse_args())
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(given.seed)
+    settings = PICTURES if given.pictures else {}
+    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep", "dtype": "float32"}
+    envs = gym.make_vec(ID, num_envs=given.envs, **lanes, **settings)
+    if given.pictures:
+        network = PolicyNetwork(NetworkLayout("relu", "PictureAndForce"), (920, 128, 64, 5))
+    else:
+        network = PolicyNetwork(NetworkLayout("tanh"), (56, 128, 128, 5), normalised=True)
+    player, samples, began = Player(envs, pictures=given.pictures, seed=given.seed), Samples(), time.time()
+    for index in range(given.rounds):
+        won = player.play(network, samples, given.steps, (*EXPERT_SHARES, 0.0)[min(index, len(EXPERT_SHARES))])
+        last = index == given.rounds - 1
+        updates, rates = (2 * given.updates, (1e-3, 3e-5)) if last else (given.updates, (1e-3, 3e-4))
+        loss = learn(network, samples, updates=updates, rates=rates, seed=given.seed + index)
+        count = sum(len(one) for one in samples.labels)
+        success = float(np.mean(won)) if won else None
+        line = {"round": index, "samples": count, "episodes": len(won), "success": success, "loss": loss}
+        print(json.dumps({**line, "seconds": round(time.time() - began)}), flush=True)
+        description = PolicyDescription(
+            env_id=ID,
+            # Scores are of looks that are held out.
+            env_kwargs={**settings, "looks": "test"} if given.pictures else {},
+            observation=observation_declaration(player.singles[0]),
+            trained_steps=count,
+            seed=given.seed,
+        )
+        save_policy(network, description, given.out)
+    envs.close()
 
 
 if __name__ == "__main__":

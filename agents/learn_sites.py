@@ -1,14 +1,13 @@
 """Learn where to press on any organ: an evolution strategy finds the acquisition function of a site policy.
 
-    python -m agents.learn_sites --out runs/sites.safetensors
-    python -m agents.learn_sites --faces runs/liver_faces.npz --check-faces runs/validation_faces.npz \
-        --start agents/policies/sites_evolved.safetensors --out runs/sites.safetensors
+    python -m agents.learn_sites --faces agents/faces/phantom_standard.npz \
+        --check-faces agents/faces/phantom_standard_held.npz --out runs/sites.json
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
-`cma`) changes the 13 numbers of `surgsim_env.training.site_policy.Acquisition`, beginning at the upper confidence
-bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes on faces of
-`surgsim_env/training/bell_sites.py`, and as many on those that `agents.record_faces` has recorded, with `--weights`
-in the cost; each generation has new ones. Processes share the episodes. An episode costs
+`cma`) changes the 13 numbers of `surgsim_env.training.acquisition.Acquisition`, beginning at the upper confidence
+bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes on faces that
+`agents.record_faces` has recorded, as many of each recording, with `--weights` in the cost; each generation has new
+ones. Processes share the episodes. An episode costs
 
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / presses
     + mean over presses 8 to 20 of 1 / (1 + exp((5 mm - error) / 1 mm))
@@ -16,10 +15,8 @@ in the cost; each generation has new ones. Processes share the episodes. An epis
 with the lines 5 mm and 3.3 mm, over the first 30 presses. The last term is a smooth share of episodes whose error is
 above 5 mm after so many presses: the leaderboard counts the presses until that is a half of them. Without it a search
 leaves lesions at errors of 5 to 9 mm and looks for others, which costs less on average and more in the median. The
-result is a policy of stable-baselines3's PPO, whose convolutional part is 0; `surgsim train` can go on from it
-(`warm_start`). A generation of 12 candidates and 96 episodes takes a minute of processor time. The policy of the
-generation that costs least on other episodes is kept: on the faces of `--check-faces`, if given, so that faces it has
-learned on do not choose it.
+policy of the generation that costs least on other episodes is kept: on the faces of `--check-faces`, so that faces it
+has learned on do not choose it.
 """
 
 import argparse
@@ -42,25 +39,19 @@ with one_line_errors(__name__, "agents"):
     import cma
     import torch
     from scipy.special import expit
-    from stable_baselines3 import PPO
-    from tqdm import tqdm
 
     from surgsim_env.palpation.chart import MAP_SIDE
     from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
-    from surgsim_env.training.bell_sites import BellFaces
-    from surgsim_env.training.policy_files import describe, load_policy, policy_path, save_policy
+    from surgsim_env.training.acquisition import Acquisition
+    from surgsim_env.training.policy_files import (
+        PolicyDescription,
+        load_policy,
+        observation_declaration,
+        policy_path,
+        save_policy,
+    )
     from surgsim_env.training.recorded_faces import load_faces
     from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
-    from surgsim_env.training.site_policy import (
-        CHOICE_SPACE,
-        FEATURE_SPACE,
-        MAPS,
-        NUMBERS,
-        Acquisition,
-        SitePolicy,
-        open_sites,
-        stacked_features,
-    )
     from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
@@ -83,48 +74,27 @@ PRESSES_MOST = 30
 FIRST_SEED, GENERATION_SEEDS, CHECK_SEED = 4_000_000, 1000, 3_900_000
 
 
-class SitesSpaces(gym.Env):
-    """The spaces of a policy that reads belief maps; it is never stepped."""
-
-    observation_space = FEATURE_SPACE
-    action_space = CHOICE_SPACE
-
-
 def play(acquisition: Acquisition, seeds: Sequence[int], draw: Draw) -> list[NDArray[np.float64]]:
-    """Errors [mm] after each press of episodes that an acquisition function plays side by side.
+    """Errors [mm] after each press of episodes that an acquisition function plays.
 
     Of each episode the first PRESSES_MOST, or the budget where that is less.
     """
-    envs = [SiteSurrogate(draw) for _ in seeds]
-    begun = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
-    processes = [SiteProcess(observed_facts(observation)) for observation in begun]
-    beliefs = [GrowingBelief(process, env.budget) for process, env in zip(processes, envs, strict=True)]
-    pressed = np.zeros((len(envs), MAP_SIDE**2))
-    errors: list[list[float]] = [[] for _ in envs]
-    while playing := [index for index, env in enumerate(envs) if len(errors[index]) < min(env.budget, PRESSES_MOST)]:
-        features = np.stack(
-            [
-                stacked_features(
-                    processes[index],
-                    beliefs[index].belief.excess,
-                    beliefs[index].belief.spread,
-                    pressed[index],
-                    1.0 - len(errors[index]) / envs[index].budget,
-                )
-                for index in playing
-            ]
-        )
-        values = torch.as_tensor(features)
-        maps = values[:, :-NUMBERS].reshape(len(playing), MAPS, MAP_SIDE, MAP_SIDE)
-        with torch.no_grad():
-            worth = acquisition(maps, values[:, -NUMBERS:]).masked_fill(~open_sites(maps), -torch.inf)
-        for index, site in zip(playing, worth.flatten(1).argmax(dim=1).tolist(), strict=True):
-            env = envs[index]
-            _, _, _, _, info = env.step(env.face.map.places[site].astype(np.float32))
-            beliefs[index].add(site, env.values[-1])
-            pressed[index, site] = 1.0
-            errors[index].append(info["error_mm"])
-    return [np.array(one) for one in errors]
+    return [_play(acquisition, seed, draw) for seed in seeds]
+
+
+def _play(acquisition: Acquisition, seed: int, draw: Draw) -> NDArray[np.float64]:
+    env = SiteSurrogate(draw)
+    observation, _ = env.reset(seed=seed)
+    process = SiteProcess(observed_facts(observation))
+    growing, pressed = GrowingBelief(process, env.budget), np.zeros(MAP_SIDE**2, dtype=np.bool_)
+    errors: list[float] = []
+    while len(errors) < min(env.budget, PRESSES_MOST):
+        site = acquisition.best(process, growing.belief, pressed)
+        _, _, _, _, info = env.step(env.face.map.places[site].astype(np.float32))
+        growing.add(site, env.values[-1])
+        pressed[site] = True
+        errors.append(info["error_mm"])
+    return np.array(errors)
 
 
 def played(
@@ -186,40 +156,25 @@ class Evolution:
 
     def acquisition(self, steps: NDArray[np.float64]) -> Acquisition:
         """The acquisition function so many steps from the first one (13,)."""
-        made = Acquisition()
-        with torch.no_grad():
-            made.values.copy_(self.start.values + torch.as_tensor(steps * PARAMETER_STEPS, dtype=torch.float32))
-        return made
+        return Acquisition(tuple((np.array(self.start.values) + steps * PARAMETER_STEPS).tolist()))
 
     @property
     def best(self) -> Acquisition:
         """The mean of the candidates' distribution."""
         return self.acquisition(self.strategy.mean)
 
-    def cost(
-        self, acquisition: Acquisition, seeds: Sequence[int], sources: Sequence[tuple[Draw, float]] | None = None
-    ) -> float:
-        """The mean cost of the episodes of seeds on faces of weighted sources, those of the search if None."""
-        weighted = self.sources if sources is None else sources
-        return sum(weight * cost(self.play(acquisition, seeds, draw)) for draw, weight in weighted)
+    def cost(self, acquisition: Acquisition, seeds: Sequence[int], sources: Sequence[tuple[Draw, float]]) -> float:
+        """The mean cost of the episodes of seeds on faces of weighted sources."""
+        return sum(weight * cost(self.play(acquisition, seeds, draw)) for draw, weight in sources)
 
     def step(self) -> None:
         """Play one generation."""
         first = FIRST_SEED + (1000 * self.seed + self.generation) * GENERATION_SEEDS
         seeds = range(first, first + self.episodes)
         candidates = self.strategy.ask()
-        shown = tqdm(candidates, desc=f"generation {self.generation + 1}", leave=False)
-        self.strategy.tell(candidates, [self.cost(self.acquisition(one), seeds) for one in shown])
+        self.strategy.tell(candidates, [self.cost(self.acquisition(one), seeds, self.sources) for one in candidates])
         self.generation += 1
         self.episode_count += self.population * self.episodes * len(self.sources)
-
-
-def as_policy(acquisition: Acquisition, seed: int) -> PPO:
-    """A model of stable-baselines3 whose policy is an acquisition function."""
-    model = PPO(SitePolicy, SitesSpaces(), n_steps=8, batch_size=8, seed=seed, device="cpu")
-    with torch.no_grad():
-        model.policy.mlp_extractor.acquisition.values.copy_(acquisition.values)
-    return model
 
 
 def policy_acquisition(path: Path) -> Acquisition:
@@ -228,27 +183,22 @@ def policy_acquisition(path: Path) -> Acquisition:
     Raises:
         ValueError: a policy that has none.
     """
-    networks = load_policy(path).networks
-    if not isinstance(networks, SitePolicy):
+    decider = load_policy(path).decider
+    if not isinstance(decider, Acquisition):
         raise ValueError(f"--start {path} has no acquisition function: take a policy of agents.learn_sites")
-    return networks.mlp_extractor.acquisition  # type: ignore[union-attr, return-value]
+    return decider
 
 
 def weighted_sources(paths: Sequence[Path], weights: Sequence[float] | None = None) -> list[tuple[Draw, float]]:
-    """Recordings with their weights, by default equal ones of half in all, and bell curves with the rest.
+    """Recordings with their shares of the weights, by default equal ones.
 
     Raises:
-        ValueError: not a weight for each recording, negative ones, or a sum above 1.
+        ValueError: not a weight for each recording, or negative ones.
     """
-    if weights is None:
-        weights = [0.5 / len(paths)] * len(paths) if paths else []
-    if len(weights) != len(paths) or min(weights, default=0.0) < 0.0 or math.fsum(weights) > 1.0:
-        raise ValueError(
-            f"{len(weights)} weights {list(weights)} for {len(paths)} recordings; each has one, none is negative, and "
-            "bell curves have the rest of 1"
-        )
-    recorded = [(load_faces(path), weight) for path, weight in zip(paths, weights, strict=True)]
-    return [(BellFaces(), 1.0 - math.fsum(weights)), *recorded]
+    weights = [1.0] * len(paths) if weights is None else weights
+    if len(weights) != len(paths) or min(weights) < 0.0 or math.fsum(weights) == 0.0:
+        raise ValueError(f"--weights are {list(weights)} for {len(paths)} recordings; each has one, none is negative")
+    return [(load_faces(path), weight / math.fsum(weights)) for path, weight in zip(paths, weights, strict=True)]
 
 
 def learn(arguments: argparse.Namespace) -> None:
@@ -262,7 +212,7 @@ def search(arguments: argparse.Namespace, play: Play) -> None:
     """As `learn`, with a function that plays the episodes."""
     start = Acquisition() if arguments.start is None else policy_acquisition(arguments.start)
     sources = weighted_sources(arguments.faces, arguments.weights)
-    check_sources = weighted_sources(arguments.check_faces or arguments.faces, arguments.weights)
+    check_sources = weighted_sources(arguments.check_faces, arguments.weights)
     evolution = Evolution(
         arguments.population, arguments.episodes, arguments.seed, start, sources, arguments.spread, play
     )
@@ -281,31 +231,24 @@ def search(arguments: argparse.Namespace, play: Play) -> None:
         if said >= least:
             continue
         least = said
-        model = as_policy(evolution.best, arguments.seed)
-        description = describe(
-            model,
-            None,
-            made,  # type: ignore[arg-type]
+        description = PolicyDescription(
             env_id=ID,
-            belief=True,
+            observation=observation_declaration(made),
             trained_steps=evolution.episode_count,
             seed=arguments.seed,
-            score=-said,
         )
-        save_policy(model.policy, description, arguments.out)
+        save_policy(evolution.best, description, arguments.out)
 
 
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.safetensors")
+    parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.json")
     parser.add_argument("--start", type=Path, help="a policy to begin at, in place of the upper confidence bound")
-    parser.add_argument("--faces", type=Path, nargs="*", default=[], help="recordings of agents.record_faces")
+    parser.add_argument("--faces", type=Path, nargs="+", required=True, help="recordings of agents.record_faces")
+    parser.add_argument("--weights", type=float, nargs="*", help="of the recordings in the cost; equal by default")
     parser.add_argument(
-        "--weights", type=float, nargs="*", help="of the recordings in the cost, bell curves have the rest of 1"
-    )
-    parser.add_argument(
-        "--check-faces", type=Path, nargs="*", default=[], help="as many, that generations are compared on"
+        "--check-faces", type=Path, nargs="+", required=True, help="as many, that generations are compared on"
     )
     parser.add_argument("--generations", type=int, default=40)
     parser.add_argument("--population", type=int, default=12, help="candidates of a generation")

@@ -53,7 +53,7 @@ with one_line_errors(__name__, "agents", "demonstrations"):
     from tqdm import tqdm
 
 CODE = "agents/record_demonstrations.py of surgsim"
-POLICY_SUFFIXES = (".safetensors", ".zip")
+POLICY_SUFFIXES = (".json", ".safetensors")
 
 # Plays one episode in an environment, reset with a seed.
 Player = Callable[[gym.Env, int], None]
@@ -148,14 +148,13 @@ def play_oracle(env: gym.Env, seed: int) -> None:
         print(f"seed {seed}: {failure}")
 
 
-def player(by: str, env: gym.Env, env_arguments: dict[str, Any], *, trust_pickle: bool = False) -> Player:
+def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
     """The player of a name.
 
     Args:
         by: "oracle", "keyboard", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
         env: where it plays, made with gym.make.
         env_arguments: of the environment, as an agent is told them; without those of the recording's pictures.
-        trust_pickle: the policy may be a zip of stable-baselines3, which runs any code that its author put there.
 
     Raises:
         ValueError: another name, a policy for another environment, or a class that is no agent (says which method).
@@ -168,12 +167,12 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any], *, trust_pickle
     if by.endswith(POLICY_SUFFIXES):
         from surgsim_env.training.policy_files import load_policy
 
-        policy = load_policy(Path(by), trust_pickle=trust_pickle)
+        policy = load_policy(Path(by))
         policy.check_environment(env, f"policy {by}")
         policy.reset(1)
         return lambda env, seed: play_actor(env, seed, policy)
     if ":" not in by:
-        raise ValueError(f"--by is {by!r}; the rule is oracle, keyboard, NAME.safetensors or MODULE:CLASS")
+        raise ValueError(f"--by is {by!r}; the rule is oracle, keyboard, a policy's NAME.json or MODULE:CLASS")
     make, _ = strangers_agent(by, "--by")
     assert env.spec is not None
     env_id = env.spec.id
@@ -294,8 +293,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
-    parser.add_argument("--by", default="oracle", help="oracle, keyboard, a policy's NAME.safetensors, or MODULE:CLASS")
-    parser.add_argument("--trust-pickle", action="store_true", help="let --by be a zip, which runs code of its author")
+    parser.add_argument("--by", default="oracle", help="oracle, keyboard, a policy's NAME.json, or MODULE:CLASS")
     parser.add_argument("--episodes", type=int, default=10, help="number of episodes to play")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
@@ -324,7 +322,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _episodes(given: argparse.Namespace, env: gym.Env, read: Reading | None = None) -> Iterator[RecordedEpisode]:
     """The episodes that the command line asks for."""
     seeds = range(given.first_seed, given.first_seed + given.episodes)
-    play = player(given.by, env, given.env_arguments, trust_pickle=given.trust_pickle)
+    play = player(given.by, env, given.env_arguments)
     return record(env, play, seeds, keep_failures=given.keep_failures, read=read)
 
 

@@ -40,8 +40,8 @@ ORDER = {
     ),
     # One script each.
     "agents": (
-        *("__init__", "command_line", "raster", "keyboard", "make_press_library", "record_faces", "learn_palpate"),
-        *("learn_palpate_organs", "learn_palpate_recurrent", "learn_retract", "learn_retract_pixels", "learn_sites"),
+        *("__init__", "command_line", "raster", "keyboard", "record_faces", "learn_from_scratch"),
+        *("learn_palpate_organs", "learn_retract", "learn_sites"),
         *(
             "envhub",
             "lerobot_dataset",
@@ -51,7 +51,6 @@ ORDER = {
             "leaderboard_tables",
             "leaderboard",
         ),
-        *("palpation_figures", "organ_film", "learning_curves", "convert_policy"),
     ),
     "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }

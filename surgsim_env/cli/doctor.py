@@ -27,7 +27,7 @@ from surgsim_env.scene.load import make_scene
 
 # What each extra of the package is for; `dev` is for its own tests.
 FEATURES = {
-    "agents": "training and scoring of agents (surgsim train, surgsim evaluate)",
+    "agents": "training and scoring of agents (agents/, surgsim evaluate)",
     "bench": "other simulators in `surgsim bench`",
     "demonstrations": "recorded demonstrations (agents/record_demonstrations.py)",
     "distributed": "training with Ray (agents/train_rllib.py)",

@@ -14,14 +14,13 @@ class Evaluate:
     """Score a method on fixed seeds: a search or a script by name, a trained policy, or an agent of your own.
 
     Give one of --agent, --policy, --all, --reach and --compare. Results, the agents' interface and what makes
-    a score comparable: docs/own_agent.md. Reading NAME.safetensors runs no code of its author; a zip of
-    stable-baselines3 is read with --trust-pickle only.
+    a score comparable: docs/own_agent.md. Reading a policy's files runs no code of its author.
     """
 
     agent: MaybeText = None
     """MODULE:CLASS, or a name such as gp_ucb, raster_4, sobol, random, oracle (an unknown one lists all)."""
     policy: MaybePath = None
-    """A shipped policy by name, or NAME.safetensors with NAME.json beside it."""
+    """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
     all: bool = False
     """Every search, and every shipped policy for this scene."""
     reach: bool = False
@@ -41,8 +40,6 @@ class Evaluate:
             told = " and ".join(f"--{name}" for name in asked) or "none"
             raise ValueError(f"give one of --agent, --policy, --all, --reach, --compare; given: {told}")
         options = self.played
-        if options.video is not None and self.policy is None:
-            raise ValueError("--video films a policy: give --policy as well")
         if options.submit is not None and self.agent is None and self.policy is None:
             raise ValueError("--submit writes one result: give --agent or --policy as well")
         ignored = [name for name in ("motion", "budget", "no_tracking") if getattr(options, name)]

@@ -20,7 +20,6 @@ from surgsim_env.cli.organ import Organ
 from surgsim_env.cli.palpate import Palpate
 from surgsim_env.cli.retract import Retract
 from surgsim_env.cli.scenes import Scenes
-from surgsim_env.cli.train import Train
 from surgsim_env.cli.validate import Validate
 from surgsim_env.cli.view import View
 
@@ -34,7 +33,6 @@ Command = (
     | Arm
     | Arms
     | Identify
-    | Train
     | Evaluate
     | Validate
     | Bench

@@ -56,8 +56,11 @@ class VectorEnvForStableBaselines(VecEnv):
         done = terminated | truncated
         for index in np.flatnonzero(done):
             last = infos[index]
+            final = last.pop("final_info")
             infos[index] = {
-                **last.pop("final_info"),
+                **final,
+                # stable-baselines3's logger and its evaluation report this entry as a success rate.
+                **({"is_success": bool(final["success"])} if "success" in final else {}),
                 "terminal_observation": last.pop("final_obs"),
                 "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
             }

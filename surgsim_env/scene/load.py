@@ -35,7 +35,7 @@ def scenes_folder(package_folder: Path = PACKAGE_FOLDER) -> Path:
 
 
 def agents_folder(package_folder: Path = PACKAGE_FOLDER) -> Path:
-    """The folder with `policies/`, `configs/` and `results/` of agents; as `_shipped_folder`."""
+    """The folder with `policies/` and `results/` of agents; as `_shipped_folder`."""
     return _shipped_folder(
         package_folder / "assets" / "agents", package_folder.parent / "agents", "policies", "policies of agents"
     )

@@ -210,7 +210,7 @@ def find_agent(name: str) -> Callable[[], SiteAgent]:
 
 def evaluate_all(options: ScoringOptions, console: Console) -> None:
     """Every baseline on the scene and level of the options, then every shipped policy that can play there."""
-    from surgsim_env.training.policy_files import home_scene, read_description
+    from surgsim_env.training.policy_files import read_description
 
     places = _places(options, PLACES)
     options = replace(options, **places)
@@ -222,9 +222,8 @@ def evaluate_all(options: ScoringOptions, console: Console) -> None:
             evaluate(find_player(name, options), options, console)
     for path in sorted(policies_folder().glob("*.json")):
         described = read_description(path)
-        home = home_scene(described.env_id, described.env_kwargs)
-        if described.plays_every_scene or home == Path(places["scene"]).stem:
-            evaluate(policy_player(path.with_suffix(".safetensors"), options), options, console)
+        if described.plays_every_scene or described.home_scene == Path(places["scene"]).stem:
+            evaluate(policy_player(path, options), options, console)
 
 
 def find_player(name: str, options: ScoringOptions) -> Player:
@@ -300,7 +299,7 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
     """A trained policy on its own environment, or on the scene and level of the options where it can play them.
 
     Args:
-        path: of its file, or the name of a shipped policy.
+        path: of either of its files, or the name of a shipped policy.
         options: of the evaluation.
 
     Raises:
@@ -308,18 +307,11 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
     """
     from surgsim_env.training.policy_files import load_policy
 
-    shipped = policies_folder() / f"{path}.safetensors"
-    if not path.exists() and shipped.is_file():
+    shipped = policies_folder() / f"{path}.json"
+    if shipped.is_file():
         path = shipped
-
-    policy = load_policy(path, trust_pickle=options.trust_pickle)
+    policy = load_policy(path)
     env_id = policy.description.env_id
-    module, _, _ = env_id.rpartition(":")
-    if module not in ("", "surgsim_env") and not options.trust_pickle:
-        raise ValueError(
-            f"policy {path}: env_id {env_id!r} imports the module {module!r}: give --trust-pickle "
-            "if you trust the policy's author"
-        )
     own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
     kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
     command = f"surgsim evaluate --policy {_from_here(path)}"
@@ -329,18 +321,12 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
 
     def check(env: gym.Env) -> None:
         policy.check_environment(env, f"policy {path}")
-        if options.video is not None:
-            from surgsim_env.scoring.policy_video import film
 
-            film(policy, _arguments(player, options), options.played_seeds[: options.video_episodes], options.video)
-            policy.reset(min(options.envs, len(options.played_seeds)))
-
-    player = Player(
+    return Player(
         *(path.stem, policy, env_id, kwargs, command + _place_options(told)),
         ours=_is_ours(path),
         check=check,
     )
-    return player
 
 
 def _is_ours(path: Path) -> bool:

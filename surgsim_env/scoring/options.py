@@ -41,21 +41,15 @@ class ScoringOptions:
     """The environment of --agent MODULE:CLASS; default: SurgSim/PalpateSites-v0."""
     env_arguments: str = "{}"
     """Of the environment of --agent MODULE:CLASS, as a JSON object."""
-    trust_pickle: bool = False
-    """Let --policy be a zip, which runs any code of its author."""
     results: Path | None = None
     """Folder of result files; default: agents/results of a checkout."""
     submit: Path | None = None
     """Write the result into this file, and nowhere else."""
-    video: Path | None = None
-    """Film the first episodes of a policy into this mp4 file."""
-    video_episodes: int = 3
-    """Episodes in the film."""
 
     def __post_init__(self) -> None:
         if self.split is not None and self.split not in SPLITS:
             raise ValueError(f"--split is {self.split!r}; it is one of {', '.join(SPLITS)}")
-        for name in ("envs", "threads", "video_episodes"):
+        for name in ("envs", "threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
         given = EVALUATION_SEEDS if self.seeds is None else read_seeds(self.seeds)

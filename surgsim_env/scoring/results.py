@@ -141,7 +141,7 @@ def picture_name(result: Result) -> str:
 
 
 def family(method: str) -> str:
-    """The name that policies of one configuration and several training seeds share: sites_ppo of sites_ppo_seed3."""
+    """The name that policies of one configuration and several training seeds share: mine of mine_seed3."""
     return re.sub(r"_seed\d+(?=_untracked$|$)", "", method)
 
 

@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-import gymnasium as gym
 import torch
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
 from torch.nn.functional import max_pool2d
 
 from surgsim_env.palpation.chart import MAP_SIDE
@@ -158,21 +157,10 @@ def face_features(observations: torch.Tensor) -> FaceFeatures:
     )
 
 
-class FaceSummary(BaseFeaturesExtractor):
-    """Features extractor: `face_features` as SUMMARY_SIZE numbers of order 1 (`face_summary`)."""
+class FaceSummary(nn.Module):
+    """`face_features` as SUMMARY_SIZE numbers of order 1 (`face_summary`)."""
 
-    def __init__(self, observation_space: gym.Space) -> None:
-        """Check the space.
-
-        Raises:
-            ValueError: an observation that is not Palpate-v0's with memory in the frame of the face.
-        """
-        if observation_space.shape != (OBSERVATION_SIZE,):
-            raise ValueError(
-                f"an observation of shape {observation_space.shape} is not that of Palpate-v0 with memory=True and "
-                f'frame="face" ({OBSERVATION_SIZE},): leave the features extractor out'
-            )
-        super().__init__(observation_space, SUMMARY_SIZE)
+    features_dim = SUMMARY_SIZE
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """The features (n, SUMMARY_SIZE) of observations (n, n_observation)."""

@@ -1,13 +1,12 @@
-"""A fast surrogate of SurgSim/Palpate-v0 on blocks: forces from a formula instead of an organ.
+"""A fast surrogate of SurgSim/Palpate-v0 on the block of `phantom_small`: forces from a formula instead of an organ.
 
-Training starts here and ends on the full physics; agents are scored on the full physics only. The force of a press at
-x, y and depth d is
+Agents are scored on the full physics only. The force of a press at x, y and depth d is
 
-    F = c (d / 1 m)^p b (1 + A exp(-r^2 / (2 s^2))) e(x, y)
+    F = c (d / 1 m)^p (1 + A exp(-r^2 / (2 s^2))) e(x, y)
 
-with b the background's factor, r the distance from the lesion's place, and e the fall towards the block's edges. The
-numbers are fitted to presses of the full physics (`TOUCH_MODELS`); sensor, limits, rewards, memory and episode are the
-environment's own. All environments are stepped together.
+with r the distance from the lesion's place, and e the fall towards the block's edges. The numbers are fitted to presses
+of the full physics (`TOUCH`); sensor, limits, rewards, memory and episode are the environment's own. All environments
+are stepped together.
 """
 
 from collections.abc import Callable
@@ -35,7 +34,7 @@ from surgsim_env.tasks.task import SPEED_FULL_SCALE
 
 @dataclass(frozen=True)
 class TouchModel:
-    """Force model of a scene at level "standard", fitted to the full physics.
+    """Force model of a block, fitted to the full physics at level "standard".
 
     Args:
         stiffness: c [N], the force of healthy tissue in the middle, extrapolated to a depth of 1 m.
@@ -56,13 +55,8 @@ class TouchModel:
     friction: float
 
 
-TOUCH_MODELS = {
-    "phantom": TouchModel(425.0, 1.37, 0.437, 4.14, (0.25, 0.85), (0.0055, 0.0078), 0.21),
-    "phantom_small": TouchModel(587.0, 1.42, 0.315, 3.06, (0.13, 0.50), (0.0045, 0.0066), 0.2),
-}
-
-# The range of b at level "standard": its moduli times the effect of a capsule.
-BACKGROUND = (0.7, 1.4)
+SCENE = "phantom_small"
+TOUCH = TouchModel(587.0, 1.42, 0.315, 3.06, (0.13, 0.50), (0.0045, 0.0066), 0.2)
 
 
 class PalpateSurrogate(VectorEnv):
@@ -70,25 +64,13 @@ class PalpateSurrogate(VectorEnv):
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
-    def __init__(
-        self, count: int, scene: str = "phantom", *, level: str | None = "standard", memory: bool = True
-    ) -> None:
-        """Make the environments with spaces, limits, sensor and memory of the original, at level "standard" or none.
-
-        Raises:
-            ValueError: a scene or a level that no touch model was fitted to.
-        """
-        if level not in (None, "standard"):
-            raise ValueError(f'level is {level!r}; touch models were fitted at level "standard", or None')
-        if scene not in TOUCH_MODELS:
-            raise ValueError(f"scene {scene!r} has no touch model; there are: {', '.join(TOUCH_MODELS)}")
-        env: Any = gym.make("SurgSim/Palpate-v0", scene=scene, level=level, memory=memory).unwrapped
-        self.touch, self.scene, self.task = TOUCH_MODELS[scene], env.scene, env.task
+    def __init__(self, count: int) -> None:
+        """Make `count` environments with spaces, limits, sensor and memory of the original."""
+        env: Any = gym.make("SurgSim/Palpate-v0", scene=SCENE, memory=True).unwrapped
+        self.scene, self.task = env.scene, env.task
         remembered = touch_memory(env.simulation.anatomy)
         self.chart, self.map, self.bell_fit = remembered.chart, remembered.map, remembered.bell_fit
         self.indenter, self.least_depth = remembered.indenter, remembered.least_depth
-        self.memory = memory
-        self.background_range = (1.0, 1.0) if level is None else BACKGROUND
         timing = env.scene.timing
         self.control_step = timing.haptic_step * timing.haptic_steps_per_control
         instrument = env.simulation.instrument
@@ -105,7 +87,7 @@ class PalpateSurrogate(VectorEnv):
         sites = MAP_SIDE**2
         self.tip, self.velocity, self.bias = np.zeros((3, count, 3))
         self.lesion = np.zeros((count, 2))
-        self.excess, self.width, self.background = np.zeros((3, count))
+        self.excess, self.width = np.zeros((2, count))
         self.steps, self.declared = np.zeros((2, count), dtype=np.int64)
         self.product, self.square = np.zeros((2, count, sites))
 
@@ -144,21 +126,20 @@ class PalpateSurrogate(VectorEnv):
 
     def normal_force(self) -> NDArray[np.float64]:
         """Force along the normal [N] (n_env,): the formula above."""
-        touch, depth = self.touch, np.maximum(self.surface - self.tip[:, 2], 0.0)
+        touch, depth = TOUCH, np.maximum(self.surface - self.tip[:, 2], 0.0)
         off = np.abs(self.tip[:, :2] / (0.5 * self.block[:2]) - 1.0)
         edge = np.maximum(1.0 - touch.edge * (off**touch.edge_power).sum(axis=1), 0.3)
         gap = ((self.tip[:, :2] - self.lesion) ** 2).sum(axis=1)
         bump = 1.0 + self.excess * np.exp(-0.5 * gap / self.width**2)
-        return touch.stiffness * depth**touch.exponent * self.background * bump * edge
+        return touch.stiffness * depth**touch.exponent * bump * edge
 
     def _draw(self, which: NDArray[np.bool_]) -> None:
-        """Draw new episodes: lesion, background, sensor bias, start."""
+        """Draw new episodes: lesion, sensor bias, start."""
         count, rng, scene = int(which.sum()), self.rng, self.scene
         rim, margin = scene.lesion.rim_distance, scene.palpation.face_margin
         self.lesion[which] = rng.uniform(rim, self.block[:2] - rim, (count, 2))
-        self.excess[which] = rng.uniform(*self.touch.excess, count)
-        self.width[which] = rng.uniform(*self.touch.width, count)
-        self.background[which] = rng.uniform(*self.background_range, count)
+        self.excess[which] = rng.uniform(*TOUCH.excess, count)
+        self.width[which] = rng.uniform(*TOUCH.width, count)
         self.bias[which] = rng.uniform(-scene.sensor.bias, scene.sensor.bias, (count, 3))
         place = rng.uniform(margin, self.block[:2] - margin, (count, 2))
         height = self.surface + rng.uniform(*START_GAP, count)
@@ -172,16 +153,15 @@ class PalpateSurrogate(VectorEnv):
         normal = self.normal_force()
         speed = np.linalg.norm(self.velocity[:, :2], axis=1, keepdims=True)
         way = self.velocity[:, :2] / np.maximum(speed, 1e-9)
-        force = np.column_stack([-self.touch.friction * normal[:, None] * way, normal]) + self.bias
+        force = np.column_stack([-TOUCH.friction * normal[:, None] * way, normal]) + self.bias
         reach = self.scene.sensor.range
         reading = np.clip(force + self.rng.normal(0.0, self.scene.sensor.noise, force.shape), -reach, reach)
         left = 1.0 - self.steps / EPISODE_STEPS
         seen = {"tip_position": self.tip, "tip_velocity": self.velocity, "contact_force": reading}
         seen["time_left"] = left[:, None]
-        if self.memory:
-            self._remember(which, reading[:, 2])
-            seen |= zip(("contrast", "visited", "stiffest"), self._recalled(), strict=True)
-            seen["face"] = np.broadcast_to(self.map.pressable, seen["visited"].shape)
+        self._remember(which, reading[:, 2])
+        seen |= zip(("contrast", "visited", "stiffest"), self._recalled(), strict=True)
+        seen["face"] = np.broadcast_to(self.map.pressable, seen["visited"].shape)
         channels = self.task.observation_slices
         return self.envs[0].as_observed(np.concatenate([seen[name] for name in channels], axis=1))
 

@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parents[2]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
 # Names that packages of the extras are imported by.
 PACKAGES = {
-    *("cma", "minari", "moviepy", "msgspec", "pettingzoo", "ray", "safetensors", "sb3_contrib", "sklearn"),
-    *("stable_baselines3", "tensorboard", "torch", "tqdm", "viser", "websockets", "yaml"),
+    *("cma", "minari", "moviepy", "msgspec", "pettingzoo", "ray", "safetensors", "sklearn"),
+    *("stable_baselines3", "torch", "tqdm", "viser", "websockets"),
 }
 # Of ours, what imports them; imported anew here.
 NEEDING = (
@@ -65,8 +65,7 @@ def without_extras(monkeypatch) -> Iterator[None]:
 
 def test_the_scripts_that_need_extras_declare_them():
     names = {Path(name).stem for name in SCRIPTS}
-    assert names >= {"behaviour_cloning", "convert_policy", "learn_palpate", "learn_palpate_recurrent"}
-    assert names >= {"learn_retract", "record_demonstrations"}
+    assert names >= {"behaviour_cloning", "learn_from_scratch", "record_demonstrations"}
     for extras in SCRIPTS.values():
         assert all(extra.strip('"') in EXTRAS for extra in extras.split(", "))
 
@@ -82,7 +81,7 @@ def test_a_missing_extra_is_named_in_one_line(without_extras, name: str, monkeyp
     assert re.fullmatch(rf"{Path(name).stem}: error: \w+ is not installed: {re.escape(install)}", line)
 
 
-@pytest.mark.parametrize("name", ["make_press_library", "raster"])
+@pytest.mark.parametrize("name", ["record_faces", "raster"])
 def test_the_other_agents_need_no_extra(without_extras, name: str, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     with pytest.raises(SystemExit) as ended:
@@ -93,8 +92,7 @@ def test_the_other_agents_need_no_extra(without_extras, name: str, monkeypatch, 
 @pytest.mark.parametrize(
     ("arguments", "missing"),
     [
-        (["train", "palpate_phantom_ppo"], "yaml"),
-        (["evaluate", "--policy", "retract_ppo"], "safetensors"),
+        (["evaluate", "--policy", "retract_dagger"], "safetensors"),
         (["evaluate", "--agent", "expert_organs"], "torch"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Learning from scratch: a curriculum of rewards, a new policy's first actions, sampled policies, the touch summary."""
+"""Learning from scratch: rewards of a curriculum, repeated actions, the touch summary, a run that is resumed."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,25 +7,22 @@ import numpy as np
 import pytest
 
 pytestmark = pytest.mark.agents
-pytest.importorskip("sb3_contrib", reason="needs the `agents` extra")
-
-PALPATION = {"id": "SurgSim/Palpate-v0", "kind": "surrogate", "count": 3}
-SMALL = {"scene": "phantom_small", "memory": True}
-HYPERPARAMETERS = {"n_steps": 16, "batch_size": 16, "n_epochs": 1}
+pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 
 
-def environments(stage: dict | None, **changes):
+def environments(stage: dict | None, count: int = 3):
     """Environments with the rewards of a stage, or bare ones."""
-    from surgsim_env.training.config import EnvironmentSettings, Stage
-    from surgsim_env.training.environments import StagedRewards, make_environments
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.training.curriculum import Stage, StagedRewards
+    from surgsim_env.training.palpate_surrogate import PalpateSurrogate
 
-    bare = make_environments(EnvironmentSettings(**{**PALPATION, "kwargs": SMALL, **changes}))
+    bare = VectorEnvForStableBaselines(PalpateSurrogate(count))
     return bare if stage is None else StagedRewards(bare, Stage(**stage))
 
 
-def pressed_down(stage: dict | None, **changes):
+def pressed_down(stage: dict | None):
     """Rewards and sites felt, (n_step, n_env) each, and the last infos, of a way straight down to the hard limit."""
-    envs = environments(stage, **changes)
+    envs = environments(stage)
     envs.seed(3)
     envs.reset()
     visited = envs.get_attr("unwrapped", indices=[0])[0].task.observation_slices["visited"]
@@ -91,131 +88,57 @@ def test_a_near_declaration_is_paid_as_a_right_one(near: float, paid_as_right: b
     assert wrong
 
 
-def test_novelty_needs_a_touch_map():
-    with pytest.raises(ValueError, match=r"pays 0.5 .* no touch map.*memory: true"):
-        environments({"novelty": 0.5}, kwargs={"scene": "phantom_small", "memory": False})
-    envs = environments({}, kwargs={"scene": "phantom_small", "memory": False})
-    from surgsim_env.training.config import Stage
+class Counting:
+    """A vector environment of two that observe how often they were stepped; the first ends after three steps."""
 
-    with pytest.raises(ValueError, match="no touch map"):
-        envs.stage = Stage(novelty=0.1)
+    num_envs = 2
 
+    def __init__(self):
+        from gymnasium.spaces import Box
 
-# ---- configurations and runs -----------------------------------------------------------------------------------
+        self.observation_space, self.action_space = Box(-100, 100, (2,)), Box(-1, 1, (1,))
+        self.count, self.told, self.render_mode = np.zeros(2), [], None
+        self.reset_infos = [{}, {}]
 
+    def reset(self):
+        return np.stack([self.count, self.count], axis=1)
 
-def config(**changes):
-    from surgsim_env.scene.load import fill
-    from surgsim_env.training.config import TrainingConfig
+    def step(self, actions):
+        self.told.append(actions[:, 0].tolist())
+        self.count += 1
+        done = self.count >= [3, 99]
+        infos = [{"terminal_observation": np.full(2, self.count[0])} if done[0] else {}, {}]
+        reward = self.count.copy()
+        self.count[done] = 0
+        return np.stack([self.count, self.count], axis=1), reward, done, infos
 
-    table = {
-        "name": "tiny",
-        "algorithm": "PPO",
-        "environment": {**PALPATION, "kwargs": SMALL, "action_repeat": 5, "normalize_observation": False},
-        "total_steps": 96,
-        "hyperparameters": {**HYPERPARAMETERS, "policy_kwargs": {"features_extractor_class": "TouchSummary"}},
-        "evaluation": {"every": 0},
-        "checkpoint": {"every": 48},
-    }
-    return fill(TrainingConfig, table | changes, "test")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"stages": [{"failure": 1.5}]}, "stage.failure is 1.5; it is a share"),
-        ({"stages": [{"novelty": -0.1}]}, "stage.novelty is -0.1"),
-        ({"stages": [{"near": -0.01}]}, "stage.near is -0.01; it is a distance in m"),
-        ({"stages": [{"begin": 5}]}, r"stages begin at \[5\]; the first begins at 0"),
-        ({"stages": [{}, {"begin": 9}, {"begin": 9}]}, r"stages begin at \[0, 9, 9\]"),
-        ({"stages": [{"novlty": 0.1}]}, "did you mean 'novelty'"),
-        ({"initial_spread": [0.5, 0.0]}, r"initial_spread is \[0.5, 0.0\]; standard deviations are above 0"),
-        ({"initial_spread": [0.5], "warm_start": "x.safetensors"}, "warm_start names a trained one"),
-        ({"initial_action": [0.5], "warm_start": "x.safetensors"}, "initial_action is of a new policy"),
-    ],
-)
-def test_wrong_entries_are_refused(change: dict, message: str):
-    with pytest.raises(ValueError, match=message):
-        config(**change)
+    def get_attr(self, name, indices=None):
+        return [getattr(self, name)] * 2
 
 
-def test_a_run_goes_through_its_stages_also_when_it_is_resumed(tmp_path: Path):
-    from surgsim_env.training.config import Stage
-    from surgsim_env.training.run import BetweenRollouts, Run, train
+def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
+    from surgsim_env.training.curriculum import RepeatedAction
 
-    stages = [{"failure": 0.0, "novelty": 0.1}, {"begin": 48, "failure": 0.5}, {"begin": 96}]
-    settings = config(stages=stages)
-    run = Run(settings, tmp_path)
-    assert run.staged is not None and run.staged.stage == Stage(0, 0.0, 0.1)
-    run.model.learn(96, BetweenRollouts(run))
-    assert run.staged.stage == Stage(48, 0.5, 0.0)
-    run.save()
-    run.bare.close()
-    resumed = Run(replace(settings, total_steps=144), tmp_path)
-    assert resumed.resumed_from is not None and resumed.staged is not None
-    resumed.between_rollouts()
-    assert resumed.staged.stage == Stage(96)
-    resumed.bare.close()
-    assert train(replace(settings, total_steps=144), tmp_path) == 144
-
-
-def test_a_new_policy_begins_with_the_actions_of_the_configuration(tmp_path: Path):
-    from surgsim_env.training.run import Run
-
-    given = {"initial_action": [0.0, 0.1, 0.2, -0.4], "initial_spread": [0.8, 0.7, 0.4, 0.5]}
-    run = Run(config(**given), tmp_path / "ppo")
-    policy = run.model.policy
-    np.testing.assert_allclose(policy.log_std.detach().exp(), given["initial_spread"], rtol=1e-6)
-    # Orthogonal weights of gain 0.01 on 64 features in [-1, 1]: means lie near the bias.
-    action = policy.predict(np.asarray(run.bare.reset()), deterministic=True)[0]
-    np.testing.assert_allclose(action, np.tile(given["initial_action"], (3, 1)), atol=0.08)
-    run.bare.close()
-    with pytest.raises(ValueError, match="initial_spread has 3 values; an action has 4 entries"):
-        Run(config(initial_spread=[0.1, 0.1, 0.1]), tmp_path / "three")
-    with pytest.raises(ValueError, match="initial_action: the actions of SAC are not Gaussian with one standard"):
-        Run(config(algorithm="SAC", hyperparameters={}, initial_action=[0.0] * 4), tmp_path / "sac")
-
-
-def test_a_sampled_policy_repeats_its_draws_and_leaves_torchs_alone(tmp_path: Path):
-    import torch
-
-    from surgsim_env.training.policy_files import TrainedPolicy, load_policy, save_policy
-    from surgsim_env.training.run import Run
-
-    run = Run(config(evaluation={"every": 0, "sampled": True}), tmp_path / "run")
-    seen = np.asarray(run.bare.reset())
-    save_policy(run.model.policy, run.description(), tmp_path / "policy.safetensors")
-    policy = load_policy(tmp_path / "policy.safetensors")
-    assert policy.description.sampled
-    once = TrainedPolicy(policy.networks, replace(policy.description, action_repeat=1))
-    mean = TrainedPolicy(policy.networks, replace(policy.description, action_repeat=1, sampled=False))
-    state = torch.get_rng_state()
-    rows = []
-    for _ in range(2):
-        once.reset(3)
-        rows.append(np.array([once.act(seen) for _ in range(400)]))
-    assert torch.equal(torch.get_rng_state(), state)
-    np.testing.assert_array_equal(rows[0], rows[1])
-    mean.reset(3)
-    # 400 draws of a unit normal, cut to [-1, 1]: variance 0.516, so that a mean is off by 3 x 0.72 / 20 at most.
-    assert rows[0].std(axis=0).min() > 0.6
-    np.testing.assert_allclose(rows[0].mean(axis=0), mean.act(seen), atol=0.15)
-    run.bare.close()
-
-
-# ---- the touch summary ------------------------------------------------------------------------------------------
+    envs = RepeatedAction(Counting(), 4)
+    envs.reset()
+    observation, reward, done, infos = envs.step(np.ones((2, 1)))
+    assert reward.tolist() == [1 + 2 + 3, 1 + 2 + 3 + 4] and done.tolist() == [True, False]
+    assert envs.venv.told == [[1, 1]] * 3 + [[0, 1]]
+    assert infos[0]["terminal_observation"].tolist() == [3, 3] and observation[:, 0].tolist() == [1, 4]
+    _, reward, done, _ = envs.step(np.ones((2, 1)))
+    assert reward.tolist() == [1 + 2 + 3, 5 + 6 + 7 + 8], "the zeros' reward counts for the episode that they began"
 
 
 def test_the_touch_summary_is_what_it_says():
     import torch
 
-    from surgsim_env.training.extractors import TouchSummary
+    from surgsim_env.training.touch_features import TouchSummary
 
-    envs = environments(None, count=8, kind="surrogate")
+    envs = environments(None, count=8)
     envs.seed(5)
     observation = np.asarray(envs.reset())
     rng = np.random.default_rng(0)
-    extractor = TouchSummary(envs.observation_space)
+    extractor = TouchSummary()
     assert (extractor(torch.tensor(observation))[:, 8:10] == 0.0).all()
     for step in range(40):
         way = np.column_stack([rng.uniform(-1.0, 1.0, (8, 2)), np.full(8, -0.3 if step < 25 else 0.0), np.zeros(8)])
@@ -245,31 +168,37 @@ def test_the_touch_summary_is_what_it_says():
     assert np.abs(features).max() < 8.0
 
 
-def test_the_touch_summary_refuses_an_observation_without_memory():
-    from surgsim_env.training.extractors import TouchSummary
+def test_a_run_leaves_a_policy_that_plays_and_is_resumed(tmp_path: Path, monkeypatch):
+    from agents import learn_from_scratch
+    from agents.learn_from_scratch import RECIPES, train
+    from surgsim_env.training.curriculum import Stage
+    from surgsim_env.training.policy_files import load_policy
 
-    envs = environments(None, kwargs={"scene": "phantom_small", "memory": False})
-    with pytest.raises(ValueError, match="not that of Palpate-v0 with memory=True"):
-        TouchSummary(envs.observation_space)
+    recipe = RECIPES["palpate"]
+    stages = (recipe.stages[0], Stage(256, novelty=0.1))
+    recipe = replace(recipe, stages=stages, settings={**recipe.settings, "n_steps": 8, "batch_size": 32, "n_epochs": 1})
+    monkeypatch.setattr(learn_from_scratch, "ENVS", 4)
+    monkeypatch.setattr(learn_from_scratch, "EPISODES", 4)
+    model = train(recipe, tmp_path, 0, decisions=64, every=64)
+    assert model.num_timesteps == 64 and model.get_env().venv.stage == stages[0]
+    again = train(recipe, tmp_path, 0, decisions=288, every=288)
+    assert again.num_timesteps == 288 and again.get_env().venv.stage == stages[1]
+    assert (tmp_path / "from_64" / "progress.csv").is_file() and (tmp_path / "from_0" / "evaluations.npz").is_file()
+    policy = load_policy(tmp_path / "policy.json")
+    assert policy.description.trained_steps == 288 and policy.description.action_repeat == 5
+    envs = environments(None)
+    policy.check_environment(envs.get_attr("unwrapped", indices=[0])[0])
+    policy.reset(3)
+    acted = np.array([policy.act(np.asarray(envs.reset())) for _ in range(5)])
+    assert acted.shape == (5, 3, 4) and (np.abs(acted) <= 1.0).all() and (acted[0] == acted[4]).all()
 
 
-# ---- curves -----------------------------------------------------------------------------------------------------
+def test_a_new_policy_begins_with_the_actions_of_its_recipe():
+    from agents.learn_from_scratch import RECIPES, begin
 
-
-def test_curves_are_drawn_over_control_steps(tmp_path: Path, monkeypatch):
-    from matplotlib.image import imread
-
-    from agents import learning_curves
-
-    curve, out = tmp_path / "seed0.csv", tmp_path / "deeper" / "curve.png"
-    curve.write_text("steps,return,success\n20000,-1.5,0.25\n40000,3,0.875\n")
-    assert learning_curves.read_curve(curve, 5) == ([0.1, 0.2], [25.0, 87.5])
-    monkeypatch.setattr("sys.argv", ["learning_curves", str(curve), "--action-repeat", "5", "--out", str(out)])
-    learning_curves.main()
-    assert len(np.unique(imread(out).reshape(-1, 4), axis=0)) > 10
-    for wrong in ("steps,return\n1,2\n", "steps,success\n1,x\n"):
-        curve.write_text(wrong)
-        with pytest.raises(ValueError, match="needs columns steps and success"):
-            learning_curves.read_curve(curve, 5)
-    with pytest.raises(ValueError, match="cannot be read"):
-        learning_curves.read_curve(tmp_path / "none.csv", 5)
+    recipe, envs = RECIPES["palpate"], environments(None)
+    policy = begin(recipe, envs, 0).policy
+    np.testing.assert_allclose(policy.log_std.detach().exp(), recipe.spread, rtol=1e-6)
+    # Orthogonal weights of gain 0.01 on 64 features in [-1, 1]: means lie near the bias.
+    action = policy.predict(np.asarray(envs.reset()), deterministic=True)[0]
+    np.testing.assert_allclose(action, np.tile(recipe.action, (3, 1)), atol=0.08)

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
-import torch
+pytest.importorskip("cma", reason="needs the `agents` extra")
 
 from agents import learn_sites
 from agents.learn_sites import (
@@ -18,7 +17,6 @@ from agents.learn_sites import (
     PARAMETER_STEPS,
     PRESSES_MOST,
     Evolution,
-    as_policy,
     cost,
     learn,
     play,
@@ -28,17 +26,19 @@ from agents.learn_sites import (
     weighted_sources,
 )
 from surgsim_env.scoring.evaluate import policies_folder
-from surgsim_env.training.bell_sites import BellFaces
+from surgsim_env.training.acquisition import Acquisition
 from surgsim_env.training.policy_files import load_policy
+from surgsim_env.training.recorded_faces import load_faces
 from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
-from surgsim_env.training.site_policy import Acquisition, belief_features, site_actions
 from surgsim_env.training.site_surrogate import SiteSurrogate
 
 pytestmark = pytest.mark.agents
+FILE = Path(learn_sites.__file__).parent / "faces" / "phantom_standard_held.npz"
+FACES = load_faces(FILE)
 
 
 def test_a_growing_belief_is_that_of_all_presses_at_once():
-    env, rng = SiteSurrogate(BellFaces()), np.random.default_rng(0)
+    env, rng = SiteSurrogate(FACES), np.random.default_rng(0)
     observation, _ = env.reset(seed=11)
     process = SiteProcess(observed_facts(observation))
     growing = GrowingBelief(process, 20)
@@ -52,23 +52,20 @@ def test_a_growing_belief_is_that_of_all_presses_at_once():
 
 
 def test_a_search_goes_on_from_a_policy():
-    start = policy_acquisition(policies_folder() / "sites_evolved.safetensors")
+    start = policy_acquisition(policies_folder() / "sites_evolved.json")
     evolution = Evolution(population=4, episodes=1, seed=0, start=start, sources=[])
-    assert evolution.best.values.tolist() == start.values.tolist() != Acquisition().values.tolist()
+    assert evolution.best.values == start.values != Acquisition().values
     with pytest.raises(ValueError, match="has no acquisition function"):
-        policy_acquisition(policies_folder() / "retract_ppo.safetensors")
+        policy_acquisition(policies_folder() / "retract_dagger.json")
 
 
 def test_play_presses_what_the_policy_chooses():
-    acquisition = Acquisition()
-    acquisition.values.data += 0.1
-    (errors,) = play(acquisition, [7], BellFaces())
-    policy, env = as_policy(acquisition, 0).policy, SiteSurrogate(BellFaces())
+    acquisition, env = Acquisition(tuple(value + 0.1 for value in Acquisition().values)), SiteSurrogate(FACES)
+    (errors,) = play(acquisition, [7], FACES)
     observation, _ = env.reset(seed=7)
     said, over = [], False
     while not over:
-        sites, _ = policy.predict(belief_features(observation[None]), deterministic=True)
-        observation, _, over, _, info = env.step(site_actions(observation[None], sites)[0])
+        observation, _, over, _, info = env.step(acquisition.actions(observation[None])[0])
         said.append(info["error_mm"])
     assert len(errors) == min(len(said), PRESSES_MOST)
     np.testing.assert_allclose(errors, said[:PRESSES_MOST], atol=1e-9)
@@ -76,8 +73,8 @@ def test_play_presses_what_the_policy_chooses():
 
 def test_processes_play_the_same_episodes():
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        shared = played(Acquisition(), range(3), BellFaces(), pool=pool, shares=2)
-    for one, alone in zip(shared, play(Acquisition(), range(3), BellFaces()), strict=True):
+        shared = played(Acquisition(), range(3), FACES, pool=pool, shares=2)
+    for one, alone in zip(shared, play(Acquisition(), range(3), FACES), strict=True):
         np.testing.assert_array_equal(one, alone)
 
 
@@ -93,57 +90,52 @@ def test_the_cost_is_lower_the_earlier_a_lesion_is_found():
 
 
 def test_sources_count_by_their_weights(monkeypatch):
-    costs = {"bells": 1.0, "first": 3.0, "second": 5.0, "unseen": 9.0}
-    monkeypatch.setattr(learn_sites, "BellFaces", lambda: "bells")
+    costs = {"first": 3.0, "second": 5.0, "unseen": 9.0}
     monkeypatch.setattr(learn_sites, "load_faces", str)
     monkeypatch.setattr(learn_sites, "cost", lambda played: costs[played])
-    learned = weighted_sources([Path("first"), Path("second")], [0.5, 0.25])
-    checked = weighted_sources([Path("unseen")])
+    learned = weighted_sources([Path("first"), Path("second")], [1.5, 0.5])
     settings = {"population": 4, "episodes": 1, "seed": 0, "play": lambda acquisition, seeds, draw: draw}
     evolution = Evolution(start=Acquisition(), sources=learned, **settings)
-    assert evolution.cost(Acquisition(), [0]) == pytest.approx(0.25 * 1.0 + 0.5 * 3.0 + 0.25 * 5.0)
-    assert evolution.cost(Acquisition(), [0], checked) == pytest.approx(0.5 * 1.0 + 0.5 * 9.0)
-    assert weighted_sources([]) == [("bells", 1.0)]
-    # In floating point these add up to a little more than 1, one after the other.
-    assert weighted_sources([Path("first")] * 4, [0.2, 0.4, 0.3, 0.1])[0] == ("bells", 0.0)
-    for weights in ([0.5], [0.75, 0.5], [-0.1, 0.5]):
+    assert evolution.cost(Acquisition(), [0], learned) == pytest.approx(0.75 * 3.0 + 0.25 * 5.0)
+    assert evolution.cost(Acquisition(), [0], weighted_sources([Path("unseen")])) == 9.0
+    for weights in ([0.5], [-0.1, 0.5], [0.0, 0.0]):
         with pytest.raises(ValueError, match="for 2 recordings"):
             weighted_sources([Path("first"), Path("second")], weights)
 
 
 def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
     """On a cost whose least is known, so that the test says nothing of luck."""
-    steps = torch.tensor(PARAMETER_STEPS)
-    wanted = torch.tensor(Acquisition.INITIAL) + 0.7 * steps
+    steps = np.array(PARAMETER_STEPS)
+    wanted = np.array(Acquisition().values) + 0.7 * steps
     monkeypatch.setattr(learn_sites, "cost", lambda values: float((((values - wanted) / steps) ** 2).sum()))
-    settings = {"start": Acquisition(), "sources": [(BellFaces(), 1.0)]}
-    settings["play"] = lambda acquisition, seeds, draw: acquisition.values.detach()
+    settings = {"start": Acquisition(), "sources": [(FACES, 1.0)]}
+    settings["play"] = lambda acquisition, seeds, draw: np.array(acquisition.values)
     first, again = (Evolution(population=12, episodes=1, seed=3, **settings) for _ in range(2))
-    begin = learn_sites.cost(first.best.values.detach())
+    begin = learn_sites.cost(np.array(first.best.values))
     for _ in range(30):
         first.step()
         again.step()
-    assert learn_sites.cost(first.best.values.detach()) < 0.2 * begin
-    assert first.best.values.tolist() == again.best.values.tolist() and first.episode_count == 360
+    assert learn_sites.cost(np.array(first.best.values)) < 0.2 * begin
+    assert first.best.values == again.best.values and first.episode_count == 360
 
 
 def test_the_script_writes_a_policy_that_presses(tmp_path, capsys):
-    out = tmp_path / "sites.safetensors"
+    out = tmp_path / "sites.json"
     sizes = {
         "generations": 6,
         "population": 4,
         "episodes": 4,
         "check_episodes": 4,
         "processes": 2,
-        "faces": [],
+        "faces": [FILE],
         "weights": None,
-        "check_faces": [],
+        "check_faces": [FILE],
         "spread": FIRST_SPREAD,
     }
     learn(argparse.Namespace(out=out, start=None, seed=0, **sizes))
     said = [float(cost) for cost in re.findall(r"cost (\d+\.\d+)", capsys.readouterr().out)]
     assert len(said) == 7 and min(said[1:]) < said[0]
     policy = load_policy(out)
-    assert policy.description.score == pytest.approx(-min(said), abs=1e-3)
-    observation, _ = SiteSurrogate(BellFaces()).reset(seed=1)
+    assert policy.description.acquisition != Acquisition().values
+    observation, _ = SiteSurrogate(FACES).reset(seed=1)
     assert (np.abs(policy.act(observation[None], np.ones(1, dtype=bool))) <= 1.0).all()

@@ -2,86 +2,67 @@
 
 import sys
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
-
 from agents import record_faces as script
 from surgsim_env.palpation.chart import MAP_SIDE, interpolated
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.training import recorded_faces
-from surgsim_env.training.bell_sites import BellFaces
 from surgsim_env.training.recorded_faces import (
     FIRST_SEED,
     LANES,
-    SURFACE_SIDE,
-    RecordedFaces,
     load_faces,
     record_faces,
 )
+from surgsim_env.training.site_agent import observed_facts
 from surgsim_env.training.site_surrogate import SiteSurrogate
 
 pytestmark = pytest.mark.agents
 FACES = Path(script.__file__).parent / "faces"
 
 
-def flat_recording(count, first=0):
-    """A recording of drawn faces, which are flat."""
-    kept = {field.name: [] for field in fields(RecordedFaces)[3:]}
-    axis = np.linspace(0.0, 1.0, SURFACE_SIDE)
-    for seed in range(first, first + count):
-        face = BellFaces()(np.random.default_rng(seed))
-        tip, extent = face.tip_radius, face.map.extent * face.tip_radius
-        grid = np.stack(np.meshgrid(axis * extent[0], axis * extent[1]), axis=-1)
-        truth = np.full((3, 3), np.nan)
-        truth[: len(face.truth)] = np.pad(face.truth, ((0, 0), (0, 1)))
-        row = {
-            "extent": extent,
-            "cell": face.map.cell * tip,
-            "pressable": face.map.pressable,
-            "log_contrast": face.log_contrast,
-            "surface": np.pad(grid, ((0, 0), (0, 0), (0, 1))),
-            "truth": truth,
-            "tip_radius": tip,
-            "lesion_radius": face.estimator.lesion_radius,
-            "noise": face.estimator.noise,
-            "map_spread": 0.0,
-        }
-        for name, values in kept.items():
-            values.append(row[name])
-    return RecordedFaces("drawn", "", "standard", **{name: np.array(values) for name, values in kept.items()})
+def shortened(recorded, count, first=0):
+    """Some faces of a recording, over and over."""
+    rows = np.arange(first, first + count) % len(recorded)
+    return replace(recorded, **{field.name: getattr(recorded, field.name)[rows] for field in fields(recorded)[3:]})
 
 
-def test_a_recorded_face_plays_as_the_face_that_was_recorded(tmp_path):
-    flat_recording(6).save(tmp_path / "faces.npz")
-    recorded = load_faces(tmp_path / "faces.npz")
-    for number in range(6):
-        drawn = BellFaces()(np.random.default_rng(number))
-        # The estimator of a flat face, as recorded.
-        drawn = replace(drawn, estimator=recorded.faces[number].estimator)
-        one, other = (
-            SiteSurrogate(partial(lambda rng, face: face, face=face)) for face in (drawn, recorded.faces[number])
-        )
-        first = one.reset(seed=number)[0], other.reset(seed=number)[0]
-        np.testing.assert_allclose(*first, rtol=1e-6)
-        sites = drawn.map.places[drawn.map.pressable]
-        rng, over = np.random.default_rng(0), False
-        while not over:
-            action = sites[rng.integers(len(sites))].astype(np.float32)
-            (seen, reward, over, _, info), (*again, info_again) = one.step(action), other.step(action)
-            np.testing.assert_allclose(seen, again[0], rtol=1e-5, atol=1e-6)
-            assert again[1] == pytest.approx(reward, abs=1e-6)
-            # Places of up to 0.2 m are kept in single precision.
-            assert info_again["error_mm"] == pytest.approx(info["error_mm"], abs=2e-4)
+def test_a_face_is_drawn_as_it_was_recorded():
+    """Its map, contrasts and lesions; a press at the site over a lesion finds it."""
+    recorded = load_faces(FACES / "phantom_standard_held.npz")
+    for number, face in enumerate(recorded.faces[:6]):
+        env = SiteSurrogate(lambda rng, face=face: face)
+        observation, _ = env.reset(seed=number)
+        facts = observed_facts(observation)
+        np.testing.assert_allclose(facts.extent * face.tip_radius, recorded.extent[number], rtol=1e-5)
+        assert facts.map.pressable.tolist() == recorded.pressable[number].tolist()
+        site = int(np.flatnonzero(face.map.pressable)[number])
+        observation, *_ = env.step(face.map.places[site].astype(np.float32))
+        assert env.sites == [site]
+        assert env.values[0] == pytest.approx(recorded.log_contrast[number, site], abs=5.0 * face.estimator.noise)
+        assert len(face.truth) == np.isfinite(recorded.truth[number]).all(axis=1).sum()
+
+
+def test_pressing_everywhere_finds_lesions_and_pays_them_once():
+    recorded = load_faces(FACES / "phantom_standard_held.npz")
+    face = next(face for face in recorded.faces if len(face.truth) == 1)
+    env = SiteSurrogate(lambda rng: face)
+    env.reset(seed=7)
+    found, total, over, rng = env.found, 0.0, False, np.random.default_rng(0)
+    sites = face.map.places[face.map.pressable]
+    while not over:
+        _, reward, over, _, info = env.step(sites[rng.integers(len(sites))].astype(np.float32))
+        total += reward
+    gained = PalpateSitesTask.weights["found"] * (env.found - found)
+    assert gained + PalpateSitesTask.weights["error"] <= total <= gained and info["error_mm"] >= 0.0
 
 
 def test_draws_are_of_all_faces():
-    recorded, rng = flat_recording(3), np.random.default_rng(0)
+    recorded, rng = shortened(load_faces(FACES / "phantom_standard_held.npz"), 3), np.random.default_rng(0)
     drawn = [recorded(rng) for _ in range(60)]
     assert {id(face) for face in drawn} == {id(face) for face in recorded.faces}
 
@@ -91,7 +72,7 @@ def test_it_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
 
     def record_batch(envs, given):
         seeds.extend(given)
-        batch = flat_recording(len(given), given[0] - FIRST_SEED)
+        batch = shortened(load_faces(FACES / "phantom_standard_held.npz"), len(given), given[0] - FIRST_SEED)
         names = [field.name for field in fields(batch)[3:]]
         return [{name: getattr(batch, name)[number] for name in names} for number in range(len(given))]
 

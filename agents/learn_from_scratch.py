@@ -1,0 +1,205 @@
+"""Learn from random weights with PPO of stable-baselines3, without an expert: palpation by touch, or retraction.
+
+    python -m agents.learn_from_scratch palpate --seed 0    # 7 minutes of processor time
+    python -m agents.learn_from_scratch retract --seed 2    # two hours
+    surgsim evaluate --policy runs/palpate-seed0/policy.json
+
+Palpation plays a surrogate with a force formula (`surgsim_env.training.palpate_surrogate`), retraction 16 lobes side by
+side. The run's folder holds checkpoints (pickles: resume only runs of your own), for each start `progress.csv` and
+`evaluations.npz` of the periodic evaluations, and at the end the policy. The same command resumes a run that was
+stopped.
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+import surgsim_env  # noqa: F401  (registers the ids)
+from agents.command_line import one_line_errors
+
+with one_line_errors(__name__, "agents"):
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+    from stable_baselines3.common.logger import configure
+    from stable_baselines3.common.utils import LinearSchedule
+    from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+
+    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+    from surgsim_env.training.curriculum import RepeatedAction, Stage, StagedRewards
+    from surgsim_env.training.palpate_surrogate import PalpateSurrogate
+    from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, save_policy
+    from surgsim_env.training.policy_network import NetworkLayout, actor_of
+    from surgsim_env.training.touch_features import TouchSummary
+
+ENVS, REPEAT = 16, 5
+# Of each periodic evaluation.
+EPISODES = 48
+# Seeds of training and of its evaluations; scores use seeds from 1,000,000.
+TRAINING_SEED, EVALUATION_SEED = 2_000_000, 500_000
+COMMON: dict[str, Any] = {"n_steps": 64, "batch_size": 128, "n_epochs": 10, "gae_lambda": 0.95, "clip_range": 0.2}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A training run.
+
+    Args:
+        env_id, env_kwargs: the environment, in which a decision lasts REPEAT control steps.
+        surrogate: whether a formula gives the forces.
+        layout, hidden: of the policy's network.
+        spread: first standard deviation of each entry of the action.
+        stages: the curriculum.
+        decisions: of all environments together.
+        settings: of PPO.
+        action: first mean of each entry of the action; near 0 if None.
+    """
+
+    env_id: str
+    env_kwargs: dict[str, Any]
+    surrogate: bool
+    layout: NetworkLayout
+    hidden: tuple[int, ...]
+    spread: tuple[float, ...]
+    stages: tuple[Stage, ...]
+    decisions: int
+    settings: dict[str, Any]
+    action: tuple[float, ...] | None = None
+
+
+RECIPES = {
+    "palpate": Recipe(
+        env_id="SurgSim/Palpate-v0",
+        env_kwargs={"scene": "phantom_small", "memory": True},
+        surrogate=True,
+        layout=NetworkLayout("tanh", "TouchSummary"),
+        hidden=(64, 64),
+        spread=(0.45, 0.45, 0.35, 0.6),
+        action=(0.0, 0.0, 0.0, -0.3),
+        stages=(
+            Stage(0, failure=0.0, novelty=0.08, near=0.01),
+            Stage(15_000, failure=0.2, novelty=0.08, near=0.007),
+            Stage(25_000, failure=0.3, novelty=0.08, near=0.0055),
+            Stage(35_000, failure=0.5, novelty=0.1),
+            Stage(55_000, novelty=0.1),
+        ),
+        decisions=400_000,
+        settings={**COMMON, "gamma": 0.998, "learning_rate": LinearSchedule(6e-4, 0.0, 1.0)},
+    ),
+    "retract": Recipe(
+        env_id="SurgSim/Retract-v0",
+        env_kwargs={},
+        surrogate=False,
+        layout=NetworkLayout("tanh"),
+        hidden=(128, 128),
+        spread=(0.5, 0.5, 0.5, 0.2, 0.8),
+        stages=(Stage(failure=0.0),),
+        decisions=30_720,
+        settings={**COMMON, "gamma": 0.99, "learning_rate": 3e-4},
+    ),
+}
+
+
+class CurriculumCallback(BaseCallback):
+    """Begins each stage of a recipe between two rollouts."""
+
+    def __init__(self, recipe: Recipe, envs: StagedRewards) -> None:
+        super().__init__()
+        self.recipe, self.envs = recipe, envs
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.envs.stage = [stage for stage in self.recipe.stages if stage.begin <= self.num_timesteps][-1]
+
+
+def make_envs(recipe: Recipe, stage: Stage) -> StagedRewards:
+    """The environments with the rewards of a stage."""
+    if recipe.surrogate:
+        envs: Any = PalpateSurrogate(ENVS)
+    else:
+        lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep", "dtype": "float32"}
+        envs = gym.make_vec(recipe.env_id, num_envs=ENVS, **lanes, **recipe.env_kwargs)
+    return StagedRewards(VecMonitor(RepeatedAction(VectorEnvForStableBaselines(envs), REPEAT)), stage)
+
+
+def begin(recipe: Recipe, envs: VecEnv, seed: int) -> PPO:
+    """A new model with the recipe's first actions."""
+    network: dict[str, Any] = {"net_arch": list(recipe.hidden), "activation_fn": torch.nn.Tanh}
+    if recipe.layout.features == "TouchSummary":
+        network["features_extractor_class"] = lambda space: TouchSummary()
+    model = PPO("MlpPolicy", envs, policy_kwargs=network, seed=seed, device="cpu", **recipe.settings)
+    with torch.no_grad():
+        model.policy.log_std.copy_(torch.tensor(recipe.spread).log())
+        if recipe.action is not None:
+            model.policy.action_net.bias.copy_(torch.tensor(recipe.action))
+    return model
+
+
+def train(recipe: Recipe, folder: Path, seed: int, *, decisions: int | None = None, every: int = 40_000) -> PPO:
+    """Train, or resume a run from its last checkpoint, and write the policy.
+
+    Args:
+        recipe: of the run.
+        folder: of the run.
+        seed: of environments, network and exploration.
+        decisions: of the whole run, in place of the recipe's.
+        every: decisions between checkpoints, and between evaluations.
+    """
+    torch.set_num_threads(1)
+    total = decisions or recipe.decisions
+    staged = make_envs(recipe, recipe.stages[0])
+    saved = sorted(folder.glob("checkpoint_*_steps.zip"), key=lambda path: int(path.stem.split("_")[1]))
+    if saved:
+        steps = saved[-1].stem.split("_")[1]
+        envs = VecNormalize.load(str(folder / f"checkpoint_vecnormalize_{steps}_steps.pkl"), staged)
+        model = PPO.load(saved[-1], env=envs, device="cpu")
+    else:
+        envs = VecNormalize(staged, norm_obs=False, gamma=recipe.settings["gamma"])
+        model = begin(recipe, envs, seed)
+    envs.seed(TRAINING_SEED + 100_000 * seed + model.num_timesteps)
+    logs = str(folder / f"from_{model.num_timesteps}")
+    model.set_logger(configure(logs, ["csv"]))
+    evaluated = VecNormalize(make_envs(recipe, Stage()), training=False, norm_obs=False, norm_reward=False)
+    evaluated.seed(EVALUATION_SEED)
+    callbacks = [
+        CurriculumCallback(recipe, staged),
+        CheckpointCallback(every // ENVS, str(folder), "checkpoint", save_vecnormalize=True),
+        # The search is the policy's random walk: its mean action does not search.
+        EvalCallback(*(evaluated, None, None, EPISODES, every // ENVS), log_path=logs, deterministic=False, verbose=0),
+    ]
+    left = total - model.num_timesteps
+    model.learn(left, callbacks, reset_num_timesteps=model.num_timesteps == 0)  # type: ignore[arg-type]
+    description = PolicyDescription(
+        env_id=recipe.env_id,
+        env_kwargs=recipe.env_kwargs,
+        observation=observation_declaration(staged.get_attr("unwrapped", indices=[0])[0]),
+        action_repeat=REPEAT,
+        trained_steps=model.num_timesteps,
+        seed=seed,
+    )
+    save_policy(actor_of(model.policy, recipe.layout, drawn=True), description, folder / "policy.json")
+    return model
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recipe", choices=RECIPES)
+    parser.add_argument("--out", type=Path, help="the run's folder; runs/RECIPE-seedSEED otherwise")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--decisions", type=int, help="in place of the recipe's")
+    parser.add_argument("--every", type=int, default=40_000, help="decisions between checkpoints and evaluations")
+    given = parser.parse_args()
+    folder = given.out or Path("runs") / f"{given.recipe}-seed{given.seed}"
+    model = train(RECIPES[given.recipe], folder, given.seed, decisions=given.decisions, every=given.every)
+    print(f"{model.num_timesteps} decisions; policy in {folder}/policy.json")
+
+
+if __name__ == "__main__":
+    with one_line_errors(__name__, "agents"):
+        main()

@@ -75,7 +75,6 @@ UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
     "msdm_core/material/fitting.py": (("@",), "sparse matrices, whose products are plain loops"),
     "msdm_core/material/tissue_law.py": (("sum",), "arrays"),
     "msdm_core/meshing/segmentation_meshing.py": (("sum",), "whole numbers"),
-    "surgsim_env/envs/surgical_env.py": (("sum",), "whole numbers"),
     "surgsim_env/instruments/arm/arm_instrument.py": (("sum",), "whole numbers"),
     "surgsim_env/palpation/contrast_map.py": (("sum", "scipy.optimize"), "counts; the assignment only compares"),
     "surgsim_env/palpation/figures.py": (("np.sin", "np.cos", "np.linalg.norm", "np.linalg"), "pictures"),

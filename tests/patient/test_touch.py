@@ -37,7 +37,7 @@ def test_cells_are_fine_at_the_pressed_face_and_as_many_as_was_said(way, tmp_pat
     if way == "surface":
         cells = Cells(plan.cell_size, True, plan.coarsening, plan.fine_depth, approach, 60.0)
         mesh = mesh_surfaces(
-            read_surfaces([ball(tmp_path / "liver.stl")], (), "mm", mend=False), cells=cells, mesher="lattice"
+            read_surfaces([ball(tmp_path / "liver.stl")], "mm", mend=False), cells=cells, mesher="lattice"
         ).mesh
     else:
         axis = np.arange(-33.0, 34.0, 1.5)

@@ -34,7 +34,7 @@ class Organ:
     press_depth: MaybeNumber = None
     """Depth of a press [m]; default: 7/12 of the tip's radius."""
     out: MaybePath = None
-    """File for the mesh (vtu, vtk, msh, mesh)."""
+    """File for the mesh, a .vtu."""
     youngs_modulus: MaybeNumber = None
     """Young's modulus of the healthy tissue [Pa]; default: by the organ's name, else the liver's."""
     modulus: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

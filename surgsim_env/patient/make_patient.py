@@ -297,10 +297,10 @@ def check_targets(out: Path) -> None:
 
 def check_target(out: Path) -> None:
     """Refuse, before the work, a mesh file in an unknown format or below what is no folder."""
-    from msdm_core.mesh_files.mesh_io import FORMATS
+    from msdm_core.mesh_files.mesh_io import WRITTEN_SUFFIX
 
-    if out.suffix.lower() not in FORMATS:
-        raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; known: {', '.join(FORMATS)}")
+    if out.suffix.lower() != WRITTEN_SUFFIX:
+        raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; meshes are written as {WRITTEN_SUFFIX}")
     place = next(one for one in out.absolute().parents if one.exists())
     if not (place.is_dir() and os.access(place, os.W_OK)):
         raise ValueError(f"--out {out}: {place} is no folder that you may write to; choose another place")

@@ -193,7 +193,7 @@ def _mesh_labels(
         whole = math.fsum(volumes.values())
         smoothing, change = smoothed.smoothing, smoothed.volume_above(0.5) / whole - 1.0
     else:
-        names = list(enumerate(labels.names, start=1))
+        names = dict(enumerate(labels.names, start=1))
         fine = _fine_face(cells, image.geometry.direction)
         filled = fill_labels(
             labels.tags, image.geometry.spacing, cell_size=cell_size, region_names=names, fine_face=fine

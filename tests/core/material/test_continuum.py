@@ -1,4 +1,4 @@
-"""The continuum of springs at finite strain: linear limits, frame indifference, and a stress that is the derivative of an energy."""
+"""The continuum of springs: linear limits, frame indifference, and a stress that is the derivative of an energy."""
 
 import numpy as np
 import pytest

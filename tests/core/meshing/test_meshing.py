@@ -85,9 +85,7 @@ def test_stretched_cells_are_warned_of_and_cubes_are_not():
     ("size", "cells", "named"),
     [
         ((0.1, 0.0, 0.1), (1, 1, 1), "size is .*0.0"),
-        ((0.1, 0.1), (1, 1, 1), "size"),
         ((0.1, 0.1, 0.1), (1, 1.5, 1), "1.5"),
-        ((0.1, 0.1, 0.1), (1, -(2**64), 1), "cells"),
         ((0.1, 0.1, 0.1), (1000, 1000, 1000), "cells"),
     ],
 )
@@ -221,4 +219,3 @@ def test_quality_of_a_regular_and_a_corner_tet():
     # Inradius 1 / (3 + sqrt 3), circumradius sqrt(3) / 2.
     np.testing.assert_allclose(radius_ratios(corner), 3 / (3 + np.sqrt(3)) / (np.sqrt(3) / 2))
     assert mesh_quality(corner).volume_error is None
-    assert "4 nodes, 1 tets" in str(mesh_quality(corner))

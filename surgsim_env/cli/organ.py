@@ -93,7 +93,7 @@ class Organ:
                 "STL, a solid of a CAD program too, and tets of another program as vtu (meshio convert IN OUT.vtu)"
             )
         if self.out is not None:
-            patient.check_targets(self.out)
+            patient.check_target(self.out)
         out = self.out or Path("patient.vtu")
         with StepProgress(console) as progress:
             found = patient.make_patient(
